@@ -1,0 +1,1 @@
+"""The emitters that a scene can name: one file each."""

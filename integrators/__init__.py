@@ -1,0 +1,1 @@
+"""The integrators that a scene can name: one file each, parameters and wiring only."""

@@ -1,0 +1,96 @@
+"""The random walk itself, with its decisions chosen in the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import mitsuba as mi
+from mitsuba_ext import registry
+from mitsuba_ext.decisions.visibility_roulette import Rejection
+from mitsuba_ext.integrator import Stage, WalkIntegrator
+
+
+@registry.plugin
+class ComposedPath(WalkIntegrator):
+    r"""
+    .. _integrator-composed_path:
+
+    Composed path tracer (:monosp:`composed_path`)
+    ----------------------------------------------
+
+    A path tracer whose decisions are chosen in the scene. With all defaults it draws the same
+    random numbers as Mitsuba's :monosp:`path` and returns the same image, but traces no shadow ray
+    for connections that cannot contribute.
+
+    .. pluginparameters::
+
+     * - shadow_test
+       - |string|
+       - Whether the shadow ray of a connection is traced: :monosp:`always`, or
+         :monosp:`visibility_roulette` (by learned visibility, see :monosp:`neepp`, whose parameters
+         grid, refine, max_memory, pilot_spp, law, slope and floor are then accepted).
+         (Default: always)
+     * - max_depth
+       - |int|
+       - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 adds direct
+         illumination, and so on. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Path depth at which Russian roulette on the throughput begins. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: false)
+     * - timeout
+       - |float|
+       - Seconds after which to stop, 0 or less for no limit. The number of passes is fixed from the
+         speed of the first one, so that stopping does not bias the image; that pass is always
+         finished, and the rest is off by as much as the speed varies. (Default: -1)
+     * - aovs
+       - |string|
+       - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
+         :monosp:`depth:depth,nn:sh_normal`. (Default: none)
+
+    **Use it when** you want :monosp:`path` with passes of bounded memory, a time budget, statistics
+    or progress, or to combine techniques. **Not when** you need gradients (use :monosp:`prb`),
+    participating media (use :monosp:`volpath`; they are ignored here, as by :monosp:`path`), or a
+    scalar or polarized variant.
+
+    Source: the algorithm is that of Mitsuba's :monosp:`path`; J. T. Kajiya, *The Rendering
+    Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple importance sampling).
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="composed_path">
+                <integer name="max_depth" value="8"/>
+                <string name="shadow_test" value="visibility_roulette"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'composed_path',
+            'max_depth': 8,
+            'shadow_test': 'visibility_roulette'
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.shadow_test = self.parameter(
+            props, "shadow_test", "always", choices=("always", "visibility_roulette")
+        )
+        self.rejection = None
+        if self.shadow_test == "visibility_roulette":
+            self.rejection = Rejection.from_properties(self, props)
+
+    def stage_samples(self, spp: int) -> list[int]:
+        return self.rejection.stage_samples(spp) if self.rejection else [spp]
+
+    def stages(self, scene: mi.Scene, samples: list[int]) -> Iterator[Stage]:
+        if self.rejection:
+            return self.rejection.stages(self, scene, samples)
+        return super().stages(scene, samples)
+
+    def parameters(self) -> dict[str, Any]:
+        learned = vars(self.rejection) if self.rejection else {}
+        return {"shadow_test": self.shadow_test, **learned}

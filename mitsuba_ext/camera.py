@@ -1,0 +1,94 @@
+"""From pixels to rays, and from radiance back to the film: the two ends of every render."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+def film_extent(film: mi.Film) -> tuple[int, int]:
+    """Width and height of the sampled pixels: the crop window, plus the filter's border where the
+    film wants it sampled."""
+    border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+    width, height = film.crop_size()
+    return int(width) + border, int(height) + border
+
+
+def sample_rays(
+    sensor: mi.Sensor, sampler: mi.Sampler, spp_per_pass: int, spp: int
+) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Point2f]:
+    """Camera rays of one pass: ``spp_per_pass`` for each pixel of the film.
+
+    The random numbers are drawn in the order in which ``mi.SamplingIntegrator`` draws them, so that
+    the same seed gives the same rays as Mitsuba's own integrators.
+
+    Parameters:
+        sensor, sampler: The sampler is seeded for ``width · height · spp_per_pass`` lanes.
+        spp_per_pass: Samples per pixel of this pass.
+        spp: Samples per pixel of the whole render; it scales the ray differentials.
+
+    Returns:
+        The rays, their importance weights, and the positions on the film (in pixels) at which to
+        put what they bring back.
+    """
+    film = sensor.film()
+    width, height = film_extent(film)
+
+    # The divisor is opaque, so that passes of different length share a kernel
+    pixel = dr.arange(mi.UInt32, width * height * spp_per_pass) // dr.opaque(mi.UInt32, spp_per_pass)
+    y = pixel // width
+    corner = mi.Vector2i(mi.Int32(pixel - y * width), mi.Int32(y))
+    if film.sample_border():
+        corner -= film.rfilter().border_size()
+    corner += mi.Vector2i(film.crop_offset())
+
+    position = mi.Point2f(corner) + sampler.next_2d()
+    scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
+    offset = -mi.ScalarVector2f(film.crop_offset()) * scale
+    film_sample = dr.fma(position, scale, offset)
+
+    aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    wavelength_sample = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+
+    ray, weight = sensor.sample_ray_differential(
+        time, wavelength_sample, film_sample, aperture_sample
+    )
+    if ray.has_differentials:
+        ray.scale_differential(dr.opaque(mi.Float, spp**-0.5))
+
+    # A box filter ignores the offset inside the pixel: it would only add rounding errors
+    return ray, weight, mi.Point2f(corner) if film.rfilter().is_box_filter() else position
+
+
+def splat(
+    film: mi.Film,
+    block: mi.ImageBlock,
+    position: mi.Point2f,
+    L: mi.Spectrum,
+    valid: mi.Bool,
+    wavelengths: mi.Spectrum,
+    aovs: list[mi.Float],
+) -> None:
+    """Puts samples into an image block, in the channels that the film asks for.
+
+    Parameters:
+        L: Radiance times the ray's weight.
+        valid: Did the ray meet something? (alpha)
+        aovs: One value per channel that the integrator announced to ``film.prepare``.
+    """
+    alpha = dr.select(valid, mi.Float(1), 0)
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        values = film.prepare_sample(
+            L, wavelengths, block.channel_count(), weight=1, alpha=alpha, active=valid
+        )
+        block.put(position, values)
+        return
+    if mi.is_spectral:
+        rgb = mi.spectrum_to_srgb(L, wavelengths)
+    else:
+        rgb = mi.Color3f(L.x) if mi.is_monochromatic else L
+    has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+    block.put(position, [rgb.x, rgb.y, rgb.z, *([alpha] if has_alpha else []), 1.0, *aovs])

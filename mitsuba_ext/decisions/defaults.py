@@ -1,0 +1,107 @@
+"""The decisions that Mitsuba's ``path`` takes. They leave no code of their own in the kernel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+class DirectionSamples:
+    """Which primary samples choose the lobe and the direction of a BSDF sample: uniform ones."""
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
+        """The state before the first bounce."""
+        return ()
+
+    def draw(
+        self,
+        state: Any,
+        sampler: mi.Sampler,
+        si: mi.SurfaceInteraction3f,
+        depth: mi.UInt32,
+        active: mi.Bool,
+    ) -> tuple[mi.Float, mi.Point2f, mi.Float | float, Any]:
+        """The lobe's number, the direction's numbers, the factor by which the throughput is to be
+        multiplied (1 / density of the numbers), and the new state."""
+        return sampler.next_1d(), sampler.next_2d(), 1.0, state
+
+
+class EmitterSampling:
+    """Which point of which light to connect to: Mitsuba's choice (uniform, or by the emitters'
+    ``sampling_weight``)."""
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
+        """The state before the first bounce."""
+        return ()
+
+    def sample(
+        self,
+        state: Any,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        sample: mi.Point2f,
+        active: mi.Bool,
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum, Any]:
+        """A direction sample towards a light, its radiance / pdf (visibility not tested), and the
+        new state."""
+        ds, weight = scene.sample_emitter_direction(si, sample, False, active)
+        return ds, weight, state
+
+    def pdf(
+        self,
+        state: Any,
+        scene: mi.Scene,
+        ref: mi.Interaction3f,
+        ds: mi.DirectionSample3f,
+        active: mi.Bool,
+    ) -> tuple[mi.Float, Any]:
+        """The solid angle density with which :meth:`sample`, at ``ref``, gives the direction
+        ``ds`` that a BSDF sample ran into, and the new state."""
+        return scene.pdf_emitter_direction(ref, ds, active), state
+
+
+class ShadowTest:
+    """Whether the shadow ray of a connection is traced."""
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
+        """The state before the first bounce."""
+        return ()
+
+    def probability(
+        self, state: Any, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool
+    ) -> tuple[mi.Float | None, Any]:
+        """The probability, in (0, 1], of testing the connection from ``si`` to ``ds.p``, and the
+        new state. ``None`` means always, and leaves the roulette out of the kernel."""
+        raise NotImplementedError
+
+
+class AlwaysTest(ShadowTest):
+    """Every shadow ray is traced."""
+
+    def probability(self, state, si, ds, active):
+        return None, state
+
+
+class SceneQuery:
+    """How a ray meets the scene."""
+
+    def closest(
+        self, scene: mi.Scene, ray: mi.Ray3f, coherent: bool, active: mi.Bool
+    ) -> mi.PreliminaryIntersection3f:
+        """The closest intersection. ``coherent`` is a hint that neighbouring rays are alike."""
+        reorder = not coherent and dr.flag(dr.JitFlag.LoopRecord)
+        return scene.ray_intersect_preliminary(ray, coherent=coherent, reorder=reorder, active=active)
+
+    def interaction(
+        self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f
+    ) -> mi.SurfaceInteraction3f:
+        """Everything about an intersection that :meth:`closest` found."""
+        return pi.compute_surface_interaction(ray, mi.RayFlags.All)
+
+    def occluded(
+        self, scene: mi.Scene, si: mi.SurfaceInteraction3f, p: mi.Point3f, active: mi.Bool
+    ) -> mi.Bool:
+        """Is there anything between ``si`` and the point ``p``?"""
+        return scene.ray_test(si.spawn_ray_to(p), active=active)

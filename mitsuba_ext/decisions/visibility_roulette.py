@@ -1,0 +1,109 @@
+"""Russian roulette on the shadow ray, by learned visibility.
+
+Source: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, sections 3.3.1 and
+4.1 (= Guo's thesis, sections 3.3.3.1 and 3.4.1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..learning.visibility_map import VisibilityMap
+from .defaults import ShadowTest
+
+if TYPE_CHECKING:
+    from ..integrator import Stage, WalkIntegrator
+
+#: Initial value of a map entry in the paper; with its law, the least probability of a test.
+_PAPER_EPSILON = 1e-4
+
+
+class VisibilityRoulette(ShadowTest):
+    """Tests a connection with a probability that grows with the visibility of its voxels.
+
+    Connections to points that the map does not know (at infinity, in voxels without geometry) are
+    always tested.
+
+    Parameters:
+        visibility: The learned map, updated.
+        slope, floor: p = min(1, slope · V + floor).
+        law: ``affine`` for the above, ``paper`` for p = max(V, 1e-4) (Eq. 2).
+    """
+
+    def __init__(self, visibility: VisibilityMap, slope: float, floor: float, law: str) -> None:
+        self.map = visibility
+        V = visibility.visibility
+        if law == "paper":
+            # The paper's map holds plain ratios, and ε where no success was seen
+            ratio = mi.Float(visibility.successes) / dr.maximum(mi.Float(visibility.tests), 1)
+            self.table = dr.maximum(ratio, _PAPER_EPSILON)
+        else:
+            self.table = dr.minimum(1, slope * V + floor)
+        dr.eval(self.table)
+
+    def probability(
+        self, state: Any, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool
+    ) -> tuple[mi.Float, Any]:
+        entry, known = self.map.entry(si.p, ds.p, active)
+        p = dr.gather(mi.Float, self.table, entry, known)
+        return dr.select(known, p, 1), state
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Learning a visibility map in a pilot stage, and rejecting shadow rays with it in the next.
+
+    The attributes are the parameters of the plugins that use it; see ``neepp`` for their meaning.
+    """
+
+    grid: int
+    refine: int
+    max_memory: float
+    pilot_spp: int
+    law: str
+    slope: float
+    floor: float
+
+    @classmethod
+    def from_properties(cls, integrator: WalkIntegrator, props: mi.Properties) -> Rejection:
+        """Reads the parameters of a scene.
+
+        Raises:
+            TypeError, ValueError: A parameter has a wrong type or value.
+        """
+        get = integrator.parameter
+        return cls(
+            grid=get(props, "grid", 16, minimum=1, maximum=1024),
+            refine=get(props, "refine", 16, minimum=0),
+            max_memory=get(props, "max_memory", 64.0, minimum=1e-3),
+            pilot_spp=get(props, "pilot_spp", 4, minimum=0),
+            law=get(props, "law", "affine", choices=("affine", "paper")),
+            slope=get(props, "slope", 10.0, minimum=0.0),
+            floor=get(props, "floor", 0.1, minimum=1e-6, maximum=1.0),
+        )
+
+    def stage_samples(self, spp: int) -> list[int]:
+        """The pilot takes at most a quarter of the samples: beyond that there is little left to
+        save."""
+        pilot = min(self.pilot_spp, spp // 4)
+        return [pilot, spp - pilot] if pilot else [spp]
+
+    def stages(
+        self, integrator: WalkIntegrator, scene: mi.Scene, samples: list[int]
+    ) -> Iterator[Stage]:
+        """The pilot's walk, then the walk that rejects. Without a pilot nothing is known, and every
+        connection is tested; the same holds in a scene without lights that the map could cover."""
+        if len(samples) == 1:
+            yield integrator.stage()
+            return
+        visibility = VisibilityMap(scene, self.grid, int(self.max_memory * 2**20))
+        yield integrator.stage(observer=visibility)
+        visibility.refine(scene, self.refine)
+        visibility.update()
+        roulette = VisibilityRoulette(visibility, self.slope, self.floor, self.law)
+        yield integrator.stage(str(visibility), shadow_test=roulette)

@@ -1,0 +1,168 @@
+"""The base class of our integrators: Mitsuba's parameters, and errors where Mitsuba's are cryptic.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+
+from . import rendering
+from .walk import Walk
+
+_NO_DEPTH_LIMIT = 0xFFFFFFFF
+
+
+@dataclass
+class Stage:
+    """One stage of a render: the walk that its samples take, and what had been learned before."""
+
+    walk: Walk
+    learned: str = ""
+
+
+class WalkIntegrator(mi.SamplingIntegrator):
+    """An integrator whose samples are random walks.
+
+    A subclass reads its own parameters and says, in :meth:`stages`, which decisions of the walk it
+    takes over. Common parameters:
+
+    Parameters:
+        max_depth (int): Longest path in the image, −1 for no limit, 1 for visible emitters only.
+            Default: −1.
+        rr_depth (int): Depth at which Russian roulette begins. Default: 5.
+        hide_emitters (bool): Hide directly visible emitters. Default: false.
+        timeout (float): Seconds after which to stop; 0 or less for no limit. Default: −1.
+        aovs (str): Arbitrary output variables, as in Mitsuba's ``aov`` integrator
+            (``"depth:depth,nn:sh_normal"``). Default: none.
+
+    Attributes:
+        progress: Called after each pass with the fraction done; it may raise or call ``cancel``.
+        statistics: Of the last render (:class:`~mitsuba_ext.rendering.RenderStatistics`).
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.name = props.plugin_name()
+        self.timeout = self.parameter(props, "timeout", -1.0)
+        max_depth = self.parameter(props, "max_depth", -1, minimum=-1)
+        self.max_depth = max_depth if max_depth >= 0 else _NO_DEPTH_LIMIT
+        self.rr_depth = self.parameter(props, "rr_depth", 5, minimum=1)
+        self._aovs = self._aov_integrator(self.parameter(props, "aovs", ""))
+        self.progress: Callable[[float], None] | None = None
+        self.statistics = rendering.RenderStatistics()
+        self.is_cancelled = False
+
+    # ---- What a subclass says ----
+
+    def stage(self, learned: str = "", **decisions: Any) -> Stage:
+        """A stage whose walk has this integrator's parameters and the given decisions."""
+        walk = Walk(self.max_depth, self.rr_depth, self.hide_emitters, **decisions)
+        return Stage(walk, learned)
+
+    def stage_samples(self, spp: int) -> list[int]:
+        """The samples per pixel of each stage; they add up to ``spp``. Only the last stage's samples
+        do not teach anything."""
+        return [spp]
+
+    def stages(self, scene: mi.Scene, samples: list[int]) -> Iterator[Stage]:
+        """Yields one stage for each entry of ``samples``. What stands between two ``yield`` runs
+        between the stages: that is where a learner turns observations into tables."""
+        yield self.stage()
+
+    def parameters(self) -> dict[str, Any]:
+        """What ``str()`` shows besides the common parameters."""
+        return {}
+
+    # ---- What Mitsuba calls ----
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        self.is_cancelled = False
+        return rendering.render(self, scene, sensor, seed, spp, develop, evaluate)
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """One sample, for integrators that nest this one (``aov``, ``moment``). Nothing is learned
+        there: each decision that needs a pilot falls back to its default."""
+        sample = self.stage().walk(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
+        return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
+
+    def aov_names(self) -> list[str]:
+        return self._aovs.aov_names() if self._aovs else []
+
+    def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
+        """The values of the channels that :meth:`aov_names` names."""
+        if self._aovs is None:
+            return []
+        return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
+
+    def cancel(self) -> None:
+        """Ends the running render after the current pass (call it from ``progress`` or from another
+        thread); the image of the finished passes is returned."""
+        self.is_cancelled = True
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        raise self._no_gradients()
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        raise self._no_gradients()
+
+    def to_string(self) -> str:
+        parameters = {
+            "max_depth": -1 if self.max_depth == _NO_DEPTH_LIMIT else self.max_depth,
+            "rr_depth": self.rr_depth,
+            "hide_emitters": self.hide_emitters,
+            "timeout": self.timeout,
+            **self.parameters(),
+        }
+        if self._aovs:
+            parameters["aovs"] = ", ".join(self.aov_names())
+        lines = ",\n".join(f"  {key} = {value}" for key, value in parameters.items())
+        return f"{self.name}[\n{lines}\n]"
+
+    # ---- Helpers ----
+
+    def parameter(
+        self,
+        props: mi.Properties,
+        key: str,
+        default: Any,
+        minimum: float | None = None,
+        maximum: float | None = None,
+        choices: Sequence[str] = (),
+    ) -> Any:
+        """A parameter of the scene, checked. Its type is that of ``default``.
+
+        Raises:
+            TypeError: The scene gives another type (an integer passes for a float).
+            ValueError: The value is out of range, or not one of ``choices``.
+        """
+        value = props.get(key, default)
+        kind = type(default)
+        if kind is float and type(value) is int:
+            value = float(value)
+        accepted = f"of type {kind.__name__}"
+        if type(value) is not kind:
+            raise TypeError(self._message(key, value, accepted))
+        if choices and value not in choices:
+            raise ValueError(self._message(key, value, f"one of {', '.join(choices)}"))
+        if minimum is not None and not value >= minimum:
+            raise ValueError(self._message(key, value, f"at least {minimum}"))
+        if maximum is not None and not value <= maximum:
+            raise ValueError(self._message(key, value, f"at most {maximum}"))
+        return value
+
+    def _message(self, key: str, value: Any, accepted: str) -> str:
+        return f'"{self.name}": the parameter "{key}" is {value!r}; it must be {accepted}'
+
+    def _no_gradients(self) -> NotImplementedError:
+        return NotImplementedError(
+            f'"{self.name}" does not compute gradients: use an integrator made for that, such as '
+            f'"prb".'
+        )
+
+    def _aov_integrator(self, aovs: str) -> mi.Integrator | None:
+        return mi.load_dict({"type": "aov", "aovs": aovs}) if aovs else None

@@ -1,0 +1,1 @@
+"""What is learned from samples: tables that a decision reads, filled between the stages."""

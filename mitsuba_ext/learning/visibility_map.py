@@ -1,0 +1,136 @@
+"""The voxel-to-voxel visibility map of NEE++.
+
+Source: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, sections 3.1-3.2
+(= Guo's thesis, section 3.3).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .voxel_grid import VoxelGrid
+
+#: Two counters and the table that is made of them.
+_BYTES_PER_ENTRY = 12
+
+#: Length of the test segments of :meth:`VisibilityMap.refine`, short of the end point.
+_SEGMENT = 1 - 1e-4
+
+
+class VisibilityMap:
+    """Counts, for each pair of occupied voxels, how many segments between them were unoccluded.
+
+    The map is symmetric, so the lower triangle is stored. It is an observer of the random walk:
+    counters are integers, so that the same samples give bitwise the same map.
+
+    Parameters:
+        scene: The scene to learn.
+        grid: Voxels along each axis of the scene's bounding box.
+        max_memory: Bytes that the map may take. Where ``grid`` needs more, a coarser one is taken,
+            with a warning.
+
+    Attributes:
+        visibility (mi.Float): What :meth:`update` made of the counters: the estimate of the
+            probability that two points of a pair of voxels see each other.
+    """
+
+    def __init__(self, scene: mi.Scene, grid: int, max_memory: int) -> None:
+        self.voxels = VoxelGrid(scene, grid)
+        while self._entry_count() * _BYTES_PER_ENTRY > max_memory and self.voxels.resolution > 1:
+            self.voxels = VoxelGrid(scene, max(1, int(self.voxels.resolution * 0.8)))
+        if self.voxels.resolution < grid:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"The visibility map of grid={grid} would exceed max_memory="
+                f"{max_memory / 2**20:g} MiB: grid={self.voxels.resolution} is used.",
+            )
+        entries = self._entry_count()
+        self.tests = dr.zeros(mi.UInt32, entries)
+        self.successes = dr.zeros(mi.UInt32, entries)
+        self.visibility = None
+        self._holds_light = dr.zeros(mi.UInt32, self.voxels.occupied_count)
+
+    def _entry_count(self) -> int:
+        n = self.voxels.occupied_count
+        return n * (n + 1) // 2
+
+    def entry(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """The index of the pair of voxels that hold ``p`` and ``q``, and whether both are known
+        (points at infinity and in voxels without geometry are not)."""
+        i, i_known = self.voxels.index(p, active)
+        j, j_known = self.voxels.index(q, active)
+        row, column = dr.maximum(i, j), dr.minimum(i, j)
+        return row * (row + 1) // 2 + column, i_known & j_known
+
+    # ---- Observer of the walk ----
+
+    def shadow_ray(self, p: mi.Point3f, q: mi.Point3f, visible: mi.Bool, active: mi.Bool) -> None:
+        """A shadow ray was traced from ``p`` to the point ``q`` on a light."""
+        entry, known = self.entry(p, q, active)
+        self._count(entry, visible, known)
+        light_voxel, known = self.voxels.index(q, known)
+        dr.scatter(self._holds_light, mi.UInt32(1), light_voxel, known)
+
+    def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
+        """A path went from ``p`` to ``q``: they see each other."""
+        entry, known = self.entry(p, q, active)
+        self._count(entry, mi.Bool(True), known)
+
+    def _count(self, entry: mi.UInt32, visible: mi.Bool, active: mi.Bool) -> None:
+        dr.scatter_add(self.tests, mi.UInt32(1), entry, active)
+        dr.scatter_add(self.successes, mi.UInt32(1), entry, active & visible)
+
+    # ---- Between the stages ----
+
+    def refine(self, scene: mi.Scene, test_count: int) -> None:
+        """Adds ``test_count`` random tests to the entries in which a success was seen (section
+        3.2): segments between uniform random points of the two voxels. Only entries of a voxel
+        with a light are refined, since next event estimation asks for no others."""
+        if test_count == 0:
+            return
+        entry = dr.compress(self.successes > 0)
+        i, j = _row_and_column(entry)
+        lit = dr.gather(mi.UInt32, self._holds_light, i) | dr.gather(mi.UInt32, self._holds_light, j)
+        entry = dr.gather(mi.UInt32, entry, dr.compress(lit > 0))
+        if len(entry) == 0:
+            return
+        lane = dr.arange(mi.UInt32, len(entry) * test_count)
+        entry = dr.gather(mi.UInt32, entry, lane // test_count)
+        i, j = _row_and_column(entry)
+        rng = mi.PCG32(size=len(lane))
+
+        def uniform() -> mi.Point3f:
+            return mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+
+        p, q = self.voxels.point(i, uniform()), self.voxels.point(j, uniform())
+        ray = mi.Ray3f(p, q - p, _SEGMENT, 0.0, dr.zeros(mi.Ray3f).wavelengths)
+        self._count(entry, ~scene.ray_test(ray), mi.Bool(True))
+        dr.eval(self.tests, self.successes)
+
+    def update(self) -> None:
+        """Makes the table of the counters: the mean of a Beta posterior, whose prior is worth one
+        test and expects the share of all tests that succeeded."""
+        tests, successes = (int(dr.sum(mi.UInt64(n))[0]) for n in (self.tests, self.successes))
+        # Half a success and half a failure more: the prior never claims certainty
+        prior = mi.Float((successes + 0.5) / (tests + 1))
+        dr.make_opaque(prior)
+        self.visibility = (mi.Float(self.successes) + prior) / (mi.Float(self.tests) + 1)
+        dr.eval(self.visibility)
+
+    def __str__(self) -> str:
+        seen, succeeded = (int(dr.count(n > 0)[0]) for n in (self.tests, self.successes))
+        return (
+            f"visibility map: grid {self.voxels.resolution}, {self.voxels.occupied_count} occupied "
+            f"voxels, {self._entry_count()} entries ({seen} seen, {succeeded} with a success), "
+            f"{self._entry_count() * _BYTES_PER_ENTRY / 2**20:.1f} MiB"
+        )
+
+
+def _row_and_column(entry: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+    """Inverts ``entry = row (row + 1) / 2 + column``."""
+    row = mi.UInt32(dr.sqrt(2 * mi.Float(entry)))
+    # The square root is rounded: the exact row is at most one off
+    row[row * (row + 1) // 2 > entry] -= 1
+    row[(row + 1) * (row + 2) // 2 <= entry] += 1
+    return row, entry - row * (row + 1) // 2

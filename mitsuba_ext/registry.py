@@ -1,0 +1,95 @@
+"""Registers every plugin of the package in each variant that is selected.
+
+A plugin is a file in ``integrators/`` or ``emitters/``: the file's name is the plugin's name in a
+scene, and the one class that the file defines and decorates with :func:`plugin` is what Mitsuba
+instantiates. Deleting the file removes the plugin.
+
+Mitsuba's base classes differ from variant to variant, so a class body binds to the variant that is
+active when it runs. The plugin files are therefore executed once per variant (as Mitsuba does with
+its own Python integrators); everything else in the package is variant-agnostic.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import mitsuba as mi
+
+from . import runtime
+
+#: Folder of the plugins → Mitsuba's function that registers them.
+_KINDS: dict[str, str] = {"integrators": "register_integrator", "emitters": "register_emitter"}
+
+#: Variant-bound base classes, executed before the plugins that derive from them.
+_BASES = ("mitsuba_ext.integrator",)
+
+_registered: set[str] = set()
+
+
+def plugin(cls: type) -> type:
+    """Class decorator: makes ``cls`` the plugin that its file is named after."""
+    _, kind, name = cls.__module__.rsplit(".", 2)
+    getattr(mi, _KINDS[kind])(name, lambda props: cls(props))
+    return cls
+
+
+def plugin_names() -> dict[str, list[str]]:
+    """The names that a scene can use, by kind: ``{"integrators": [...], "emitters": [...]}``."""
+    return {kind: [path.stem for path in plugin_files(kind)] for kind in _KINDS}
+
+
+def plugin_files(kind: str) -> list[Path]:
+    """The source files of the plugins of one kind, sorted by name."""
+    package = importlib.import_module(f"mitsuba_ext.{kind}")
+    files = {path.stem: path for folder in package.__path__ for path in Path(folder).glob("*.py")}
+    return [files[name] for name in sorted(files) if not name.startswith("_")]
+
+
+def install() -> None:
+    """Registers the plugins now, if a variant is active, and whenever one is selected later."""
+    mi.detail.add_variant_callback(lambda _old, new: _register(new))
+    if mi.variant() is not None:
+        _register(mi.variant())
+
+
+def _register(variant: str) -> None:
+    if variant in _registered:
+        return
+    if variant in runtime.SUPPORTED_VARIANTS:
+        runtime.check(variant)
+        for module in (*_BASES, *_plugin_modules()):
+            _execute(module)
+    else:
+        _register_refusals(variant)
+    _registered.add(variant)
+
+
+def _plugin_modules() -> list[str]:
+    return [f"mitsuba_ext.{kind}.{name}" for kind, names in plugin_names().items() for name in names]
+
+
+def _execute(module: str) -> None:
+    if module in sys.modules:
+        importlib.reload(sys.modules[module])
+    else:
+        importlib.import_module(module)
+
+
+def _register_refusals(variant: str) -> None:
+    """Where our plugins cannot run, their names exist and say so."""
+
+    def refuse(name: str) -> Callable[[mi.Properties], None]:
+        def constructor(_props: mi.Properties) -> None:
+            raise RuntimeError(
+                f'"{name}" does not work in the variant "{variant}": select one of '
+                f"{', '.join(runtime.SUPPORTED_VARIANTS)}."
+            )
+
+        return constructor
+
+    for kind, names in plugin_names().items():
+        for name in names:
+            getattr(mi, _KINDS[kind])(name, refuse(name))

@@ -1,0 +1,219 @@
+"""The traced random walk that all unidirectional integrators share.
+
+The walk is Mitsuba's ``path``: next event estimation, multiple importance sampling with the power
+heuristic, Russian roulette. With the default decisions it draws the same random numbers in the same
+order and returns the same image. A technique replaces one decision (see ``decisions/``); Dr.Jit
+inlines Python while it traces, so a replaced decision costs what it does and a default one nothing.
+
+Dr.Jit's loops see local variables only. Whatever a decision changes from one bounce to the next is
+therefore a *state* that its methods take and return; its attributes are read-only during the walk.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .decisions import AlwaysTest, DirectionSamples, EmitterSampling, SceneQuery, ShadowTest
+
+
+@dataclass
+class PathSample:
+    """What one camera ray brings back.
+
+    Attributes:
+        L: Radiance estimate.
+        valid: Did the path meet a surface (or the visible environment)? It becomes alpha.
+        scatter_count: Rays traced in directions that a BSDF chose.
+        shadow_count: Shadow rays traced.
+        connection_count: Connections to a light that were considered: ``path`` traces a shadow ray
+            for each of them.
+    """
+
+    L: mi.Spectrum
+    valid: mi.Bool
+    scatter_count: mi.UInt32
+    shadow_count: mi.UInt32
+    connection_count: mi.UInt32
+
+
+@dataclass
+class Walk:
+    """A path tracer whose decisions can be replaced.
+
+    Parameters:
+        max_depth: Longest path in segments; 1 shows emitters only, 2**32 − 1 stands for no limit.
+        rr_depth: Depth at which Russian roulette begins.
+        hide_emitters: Do camera rays pass through area lights, and is the environment invisible?
+        directions: Which primary samples choose the lobe and the direction of a BSDF sample.
+        next_event: Which point of which light to connect to, and with what pdf.
+        shadow_test: Whether the shadow ray of a connection is traced.
+        query: How a ray meets the scene.
+        observer: Is told of each shadow ray and each path segment; ``None`` in final stages.
+    """
+
+    max_depth: int
+    rr_depth: int
+    hide_emitters: bool = False
+    directions: DirectionSamples = field(default_factory=DirectionSamples)
+    next_event: EmitterSampling = field(default_factory=EmitterSampling)
+    shadow_test: ShadowTest = field(default_factory=AlwaysTest)
+    query: SceneQuery = field(default_factory=SceneQuery)
+    observer: Any = None
+
+    @dr.syntax
+    def __call__(
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
+    ) -> PathSample:
+        """Traces one path for each lane of ``ray``."""
+        # What the scene lacks is left out of the kernel: these are Python booleans
+        has_emitters = len(scene.emitters()) > 0
+        connects = has_emitters and self.max_depth > 1
+        can_hit_emitters = has_emitters and _emitters_can_be_hit(scene)
+        sees_environment = scene.environment() is not None and not self.hide_emitters
+
+        # --------------------- Configure the loop state ----------------------
+        ctx = mi.BSDFContext()
+        ray = mi.Ray3f(ray)
+        L = mi.Spectrum(0)                              # Radiance accumulator
+        β = mi.Spectrum(1)                              # Path throughput weight
+        η = mi.Float(1)                                 # Product of relative indices of refraction
+        depth = mi.UInt32(0)                            # Depth of the current vertex
+        valid = mi.Bool(sees_environment)               # Has the path met anything?
+        prev_si = dr.zeros(mi.Interaction3f)            # Previous scattering event
+        prev_bsdf_pdf = mi.Float(1)
+        prev_bsdf_delta = mi.Bool(True)
+        scatter_count, shadow_count, connection_count = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+        active = mi.Bool(active) & (self.max_depth > 0)
+        directions_state = self.directions.begin(sampler, ray)
+        next_event_state = self.next_event.begin(sampler, ray)
+        shadow_state = self.shadow_test.begin(sampler, ray)
+
+        pi = self.query.closest(scene, ray, coherent=True, active=active)
+        if dr.hint(self.hide_emitters, mode="scalar"):
+            pi = self._skip_emitters(scene, ray, pi, active)
+
+        while dr.hint(active, label="walk"):
+            si = self.query.interaction(pi, ray)
+
+            # ----- How much does this vertex emit towards the previous one? -----
+            if dr.hint(can_hit_emitters, mode="scalar"):
+                L, next_event_state = self._add_emission(
+                    next_event_state, scene, L, β, si, prev_si, prev_bsdf_pdf, prev_bsdf_delta
+                )
+
+            # ----- Should we continue tracing to reach one more vertex? -----
+            active_next = (depth + 1 < self.max_depth) & si.is_valid()
+            bsdf = si.bsdf(ray)
+
+            # ----- Which point of which light do we connect to? -----
+            active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            emitter_sample = sampler.next_2d()
+            ds, em_weight, next_event_state = self._sample_emitter(
+                connects, next_event_state, scene, si, emitter_sample, active_em
+            )
+            wo = si.to_local(ds.d)
+
+            # ----- Evaluate the BSDF towards the light and choose where to scatter -----
+            sample_1, sample_2, directions_weight, directions_state = self.directions.draw(
+                directions_state, sampler, si, depth, active_next
+            )
+            bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
+                ctx, si, wo, sample_1, sample_2
+            )
+
+            # ----- Does the light reach this vertex? -----
+            if dr.hint(connects, mode="scalar"):
+                bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
+                mis = dr.select(ds.delta, 1, _mis_weight(ds.pdf, bsdf_pdf))
+                unoccluded = β * bsdf_value * em_weight * mis
+                active_em &= ds.pdf != 0
+                connection_count += dr.select(active_em, 1, 0)
+                # A connection that cannot contribute needs no shadow ray
+                active_em &= dr.max(dr.abs(unoccluded)) > 0
+                unoccluded, active_em, shadow_state = self._shadow_roulette(
+                    shadow_state, sampler, si, ds, unoccluded, active_em
+                )
+                visible = active_em & ~self.query.occluded(scene, si, ds.p, active_em)
+                L[visible] += unoccluded
+                shadow_count += dr.select(active_em, 1, 0)
+                if dr.hint(self.observer is not None, mode="scalar"):
+                    self.observer.shadow_ray(si.p, ds.p, visible, active_em)
+
+            # ----- Move on to the next vertex -----
+            bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)
+            ray = si.spawn_ray(si.to_world(bs.wo))
+            β *= bsdf_weight * directions_weight
+            η *= bs.eta
+            valid |= si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+
+            prev_si = mi.Interaction3f(si)
+            prev_bsdf_pdf = bs.pdf
+            prev_bsdf_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            depth[si.is_valid()] += 1
+
+            # ----- Russian roulette -----
+            β_max = dr.max(β)
+            rr_probability = dr.minimum(β_max * dr.square(η), 0.95)
+            rr_active = depth >= self.rr_depth
+            rr_continue = sampler.next_1d() < rr_probability
+            β[rr_active] *= dr.rcp(rr_probability)
+            active = active_next & (~rr_active | rr_continue) & (β_max != 0)
+
+            pi = self.query.closest(scene, ray, coherent=False, active=active)
+            scatter_count += dr.select(active, 1, 0)
+            if dr.hint(self.observer is not None, mode="scalar"):
+                self.observer.segment(prev_si.p, ray(pi.t), active & pi.is_valid())
+
+        return PathSample(
+            dr.select(valid, L, 0), valid, scatter_count, shadow_count, connection_count
+        )
+
+    def _add_emission(self, state, scene, L, β, si, prev_si, prev_bsdf_pdf, prev_bsdf_delta):
+        """Adds the light that the BSDF sample of the previous vertex ran into."""
+        ds = mi.DirectionSample3f(scene, si, prev_si)
+        em_pdf, state = self.next_event.pdf(state, scene, prev_si, ds, ~prev_bsdf_delta)
+        mis = _mis_weight(prev_bsdf_pdf, em_pdf)
+        return dr.fma(β, ds.emitter.eval(si, prev_bsdf_pdf > 0) * mis, L), state
+
+    def _sample_emitter(self, connects: bool, state, scene, si, sample, active):
+        if not connects:
+            return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), state
+        return self.next_event.sample(state, scene, si, sample, active)
+
+    def _shadow_roulette(self, state, sampler, si, ds, unoccluded, active):
+        """Lets the shadow test's decision drop connections; the survivors weigh 1/p."""
+        p, state = self.shadow_test.probability(state, si, ds, active)
+        if p is None:
+            return unoccluded, active, state
+        survives = sampler.next_1d() < p
+        # p > 0 wherever a lane survives: the random number is not negative
+        return unoccluded * dr.select(survives, dr.rcp(p), 0), active & survives, state
+
+    @dr.syntax
+    def _skip_emitters(self, scene, ray, pi, active):
+        """The first surface behind the area lights that a camera ray meets."""
+        ray = mi.Ray3f(ray)
+        on_emitter = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
+        while on_emitter:
+            si = self.query.interaction(pi, ray)
+            ray = si.spawn_ray(ray.d)
+            pi = self.query.closest(scene, ray, coherent=True, active=on_emitter)
+            on_emitter &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
+        return pi
+
+
+def _mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
+    """Power heuristic (β = 2); 0 where both densities vanish or overflow."""
+    a, b = dr.square(pdf_a), dr.square(pdf_b)
+    w = a / (a + b)
+    return dr.select(dr.isfinite(w), w, 0)
+
+
+def _emitters_can_be_hit(scene: mi.Scene) -> bool:
+    """Is there a light that a scattered ray can run into?"""
+    delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+    return any(not (int(e.flags()) & int(delta)) for e in scene.emitters())
