@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import mitsuba as mi
+
 from mitsuba_ext import registry
 from mitsuba_ext.decisions.visibility_roulette import Rejection
 from mitsuba_ext.integrator import Stage, WalkIntegrator

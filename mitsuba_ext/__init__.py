@@ -13,8 +13,11 @@ from . import runtime
 
 runtime.prepare()  # chooses the LLVM library, so it must come before the first import of drjit
 
+import mitsuba  # noqa: E402
+
 from . import registry  # noqa: E402
 
+runtime.guard(mitsuba)
 registry.install()
 
 __version__ = "0.1.0"

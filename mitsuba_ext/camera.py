@@ -35,7 +35,8 @@ def sample_rays(
     width, height = film_extent(film)
 
     # The divisor is opaque, so that passes of different length share a kernel
-    pixel = dr.arange(mi.UInt32, width * height * spp_per_pass) // dr.opaque(mi.UInt32, spp_per_pass)
+    lane = dr.arange(mi.UInt32, width * height * spp_per_pass)
+    pixel = lane // dr.opaque(mi.UInt32, spp_per_pass)
     y = pixel // width
     corner = mi.Vector2i(mi.Int32(pixel - y * width), mi.Int32(y))
     if film.sample_border():

@@ -65,8 +65,8 @@ class WalkIntegrator(mi.SamplingIntegrator):
         return Stage(walk, learned)
 
     def stage_samples(self, spp: int) -> list[int]:
-        """The samples per pixel of each stage; they add up to ``spp``. Only the last stage's samples
-        do not teach anything."""
+        """The samples per pixel of each stage; they add up to ``spp``. Those of the last stage
+        teach nothing."""
         return [spp]
 
     def stages(self, scene: mi.Scene, samples: list[int]) -> Iterator[Stage]:

@@ -68,7 +68,8 @@ def _register(variant: str) -> None:
 
 
 def _plugin_modules() -> list[str]:
-    return [f"mitsuba_ext.{kind}.{name}" for kind, names in plugin_names().items() for name in names]
+    kinds = plugin_names().items()
+    return [f"mitsuba_ext.{kind}.{name}" for kind, names in kinds for name in names]
 
 
 def _execute(module: str) -> None:

@@ -192,6 +192,7 @@ class _Job:
     def _run_stage(self, stage, passes: list[int], is_last: bool, interrupt) -> None:
         timeout = self.integrator.timeout
         allowed = len(passes)
+        seconds = 0.0
         for index, spp in enumerate(passes):
             if index >= allowed or self._stopped(interrupt):
                 return
@@ -200,7 +201,7 @@ class _Job:
                 # They get an image block of their own, whose weight stays what it was planned to
                 # be: the image's mean does not depend on how many of them the time allows.
                 remaining = timeout - (time.perf_counter() - self.start)
-                allowed = 1 + max(0, int(remaining / seconds))
+                allowed = 1 + max(0, int(remaining / max(seconds, 1e-3)))
                 if allowed > 1:
                     self._open_part()
                     self.parts[-1].planned = sum(passes[1:])

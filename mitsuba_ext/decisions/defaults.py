@@ -92,7 +92,9 @@ class SceneQuery:
     ) -> mi.PreliminaryIntersection3f:
         """The closest intersection. ``coherent`` is a hint that neighbouring rays are alike."""
         reorder = not coherent and dr.flag(dr.JitFlag.LoopRecord)
-        return scene.ray_intersect_preliminary(ray, coherent=coherent, reorder=reorder, active=active)
+        return scene.ray_intersect_preliminary(
+            ray, coherent=coherent, reorder=reorder, active=active
+        )
 
     def interaction(
         self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f

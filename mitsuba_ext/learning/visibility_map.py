@@ -91,8 +91,9 @@ class VisibilityMap:
             return
         entry = dr.compress(self.successes > 0)
         i, j = _row_and_column(entry)
-        lit = dr.gather(mi.UInt32, self._holds_light, i) | dr.gather(mi.UInt32, self._holds_light, j)
-        entry = dr.gather(mi.UInt32, entry, dr.compress(lit > 0))
+        lit = dr.gather(mi.UInt32, self._holds_light, i) > 0
+        lit |= dr.gather(mi.UInt32, self._holds_light, j) > 0
+        entry = dr.gather(mi.UInt32, entry, dr.compress(lit))
         if len(entry) == 0:
             return
         lane = dr.arange(mi.UInt32, len(entry) * test_count)

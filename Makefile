@@ -1,0 +1,49 @@
+# Needs: Debian or Ubuntu (others: see mitsuba_ext/llvm.py), make, apt, Python >= 3.9 with venv.
+#
+#   make demo    compares our integrator with `path` on one of our scenes, in about two minutes
+#   make test    runs the default tests
+#   make bench   runs the benchmarks on our scenes, and on ../shared/scenes where it exists
+#   make lint    checks the code's style
+#   make clean   removes what was built, `.venv` included; `out/` stays
+#
+# The first of them sets everything up in `.venv`; later ones start at once.
+
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+
+DEMO_OUT := out/demo
+DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml path neepp \
+        --spp 256 --seeds 3 --reference-spp 4096 --out $(DEMO_OUT)
+
+.PHONY: demo test bench lint setup clean
+
+demo: setup
+	$(DEMO)
+	@echo "Files written:" && find $(DEMO_OUT) -type f | sort
+
+test: setup
+	$(BIN)/python -m pytest -q
+
+bench: setup
+	$(BIN)/python examples/benchmark.py
+
+lint: setup
+	$(BIN)/python -m ruff check .
+
+# The package in its environment, and an LLVM library that works (a few milliseconds to confirm).
+setup: $(VENV)/.installed
+	@$(BIN)/python -I mitsuba_ext/llvm.py --ensure
+
+$(VENV)/.installed: pyproject.toml setup.py
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 9))' || \
+	    { echo "Python 3.9 or newer is needed: run make PYTHON=/path/to/python3 to name one." >&2; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || \
+	    { echo "$(PYTHON) cannot make virtual environments: run \`sudo apt install python3-venv\`." >&2; exit 1; }
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

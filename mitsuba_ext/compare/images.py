@@ -1,0 +1,143 @@
+"""Reading and writing images: never half a file, always with what made them.
+
+EXRs go through ``mi.Bitmap``, not the OpenEXR package: that one prints warnings of its own to the
+terminal when a file is damaged, and returns an empty image.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..scenes import InputError, one_line
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+#: What ``write_film`` can write.
+EXTENSIONS = (".exr", ".png", ".jpg", ".jpeg", ".hdr", ".pfm")
+
+
+def check_target(path: Path) -> None:
+    """Raises :class:`InputError` where ``path`` could not be written, before hours of rendering."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder")
+    if path.suffix.lower() not in EXTENSIONS:
+        found = f'the extension "{path.suffix}"' if path.suffix else "a name without extension"
+        raise InputError(f"{path}: {found} cannot be written ({' '.join(EXTENSIONS)} can)")
+    check_folder(path.parent)
+
+
+def check_folder(folder: Path) -> None:
+    """Raises :class:`InputError` if no file can be made in ``folder``."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder}: cannot write here ({error.strerror})") from error
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a name to write to; the finished file then takes the place of ``path`` in one step.
+
+    After an exception, what ``path`` held before is still there.
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def write_exr(
+    path: Path, pixels: np.ndarray, channels: Sequence[str], metadata: Mapping[str, object]
+) -> None:
+    """Writes 32-bit channels; ``pixels`` has the shape (height, width, number of channels)."""
+    import mitsuba as mi
+
+    pixels = np.ascontiguousarray(pixels, dtype=np.float32)
+    bitmap = mi.Bitmap(pixels, channel_names=list(channels))
+    _annotate(bitmap, metadata)
+    _save(bitmap, path)
+
+
+def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+    """The channels of an EXR as 32-bit arrays by name, and its metadata.
+
+    Raises:
+        InputError: The file is missing, damaged, or not an EXR.
+    """
+    import mitsuba as mi
+
+    if not path.is_file():
+        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+    try:
+        bitmap = mi.Bitmap(str(path))
+    except RuntimeError as error:
+        raise InputError(f"{path}: unreadable ({one_line(error)})") from error
+    metadata = bitmap.metadata()
+    if bitmap.component_format() not in (mi.Struct.Type.Float16, mi.Struct.Type.Float32):
+        raise InputError(f"{path}: not a floating-point image")
+    pixels = np.array(bitmap, dtype=np.float32)
+    pixels = pixels.reshape(pixels.shape[0], pixels.shape[1], -1)
+    names = [entry.name for entry in bitmap.struct_()]
+    return (
+        {name: pixels[:, :, index] for index, name in enumerate(names)},
+        {key: metadata[key] for key in metadata.keys()},
+    )
+
+
+def write_film(path: Path, film: mi.Film, metadata: Mapping[str, object]) -> None:
+    """Writes what a film holds: an EXR as it is, HDR and PFM as RGB, the others as 8-bit sRGB."""
+    import mitsuba as mi
+
+    bitmap = film.bitmap()
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        # The film's own bitmap may be of half precision
+        names = [entry.name for entry in bitmap.struct_()]
+        write_exr(path, np.array(film.develop()), names, metadata)
+        return
+    if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+        bitmap = bitmap.split()[0][1]  # the image without its AOVs
+    eight_bit = suffix not in (".hdr", ".pfm")
+    component = mi.Struct.Type.UInt8 if eight_bit else mi.Struct.Type.Float32
+    _save(bitmap.convert(mi.Bitmap.PixelFormat.RGB, component, eight_bit), path)
+
+
+def to_rgb(image: object) -> np.ndarray:
+    """A rendered tensor as an array (height, width, 3): alpha and AOVs go, grey is repeated."""
+    pixels = np.array(image, dtype=np.float32)
+    if pixels.shape[2] < 3:
+        return np.repeat(pixels[:, :, :1], 3, axis=2)
+    return pixels[:, :, :3]
+
+
+def _save(bitmap: mi.Bitmap, path: Path) -> None:
+    with replacing(path) as temporary:
+        try:
+            bitmap.write(str(temporary))
+        except RuntimeError as error:
+            raise OSError(f"{path}: {one_line(error)}") from error
+
+
+def _annotate(bitmap: mi.Bitmap, metadata: Mapping[str, object]) -> None:
+    """Header attributes: text and numbers as they are, everything else as JSON."""
+    attributes = bitmap.metadata()
+    for key, value in metadata.items():
+        plain = isinstance(value, (str, float)) or (
+            isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**31
+        )
+        attributes[key] = value if plain else json.dumps(value)

@@ -1,0 +1,51 @@
+"""What a measurement depends on besides the scene: versions of software, and the machine."""
+
+from __future__ import annotations
+
+import os
+import platform
+
+from .. import __version__
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that makes the image, and the active variant."""
+    import drjit
+    import mitsuba
+    import numpy
+
+    return {
+        "mitsuba_ext": __version__,
+        "mitsuba": mitsuba.__version__,
+        "drjit": drjit.__version__,
+        "variant": mitsuba.variant() or "",
+        "numpy": numpy.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def machine() -> dict[str, object]:
+    """The computer, as far as timings depend on it."""
+    return {
+        "system": platform.platform(),
+        "processor": _processor(),
+        "cores": _core_count(),
+    }
+
+
+def _core_count() -> int | None:
+    try:
+        return len(os.sched_getaffinity(0))  # what this process may use
+    except AttributeError:
+        return os.cpu_count()  # not Linux
+
+
+def _processor() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            for line in file:
+                if line.startswith("model name"):
+                    return line.partition(":")[2].strip()
+    except OSError:
+        pass  # not Linux
+    return platform.processor() or platform.machine()

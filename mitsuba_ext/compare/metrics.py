@@ -1,0 +1,113 @@
+"""How far an image is from a reference.
+
+All functions take images of shape (height, width, channels) and compute in double precision. Where
+the variance of the reference's own mean is known, its expected contribution is subtracted, so that
+a noisy reference does not put a floor under the errors. A subtracted error can come out zero or
+negative: then the image is closer to the truth than this reference can tell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Floor ε of the relative error, as a multiple of the square of the reference's mean.
+RELATIVE_FLOOR = 1e-2
+
+#: Share of the pixels, those with the largest errors, that the trimmed relMSE leaves out.
+TRIMMED_SHARE = 1e-3
+
+
+@dataclass(frozen=True)
+class Errors:
+    """The figures of one image; each is a mean over pixels and channels.
+
+    Attributes:
+        relmse: (I−R)² / (R² + ε), with ε = 10⁻² · mean(R)².
+        relmse_trimmed: The same without the 0.1 % of the pixels that have the largest errors. Much
+            smaller than ``relmse`` where a few fireflies decide.
+        mse: (I−R)².
+        rmse: √mse; NaN where the subtraction left no positive ``mse``.
+    """
+
+    relmse: float
+    relmse_trimmed: float
+    mse: float
+    rmse: float
+
+
+def errors(
+    image: np.ndarray, reference: np.ndarray, reference_variance: np.ndarray | None = None
+) -> Errors:
+    """All figures of ``image``, see :class:`Errors`.
+
+    Raises:
+        ValueError: The shapes differ, the reference is black, or a value is not finite.
+    """
+    squared, weight = _squared_and_weight(image, reference, reference_variance)
+    mse = float(squared.mean())
+    relative = squared * weight
+    # Which pixels to drop is decided by what is seen, before the expected variance is subtracted
+    seen = (np.asarray(image, np.float64) - reference) ** 2 * weight
+    return Errors(
+        relmse=float(relative.mean()),
+        relmse_trimmed=_trimmed_mean(relative.mean(axis=2), seen.mean(axis=2)),
+        mse=mse,
+        rmse=float(np.sqrt(mse)) if mse >= 0 else float("nan"),
+    )
+
+
+def relative_mse(
+    image: np.ndarray, reference: np.ndarray, reference_variance: np.ndarray | None = None
+) -> float:
+    """relMSE, see :class:`Errors`."""
+    return errors(image, reference, reference_variance).relmse
+
+
+def reference_noise(reference: np.ndarray, reference_variance: np.ndarray) -> float:
+    """The relMSE that the reference itself has: what is subtracted from every ``relmse``."""
+    return float((np.asarray(reference_variance, np.float64) * _weight(reference)).mean())
+
+
+def describe_non_finite(image: np.ndarray) -> str:
+    """Says how many pixels hold NaN or infinity, and where the first one is; empty if none do."""
+    bad = ~np.isfinite(image).all(axis=2)
+    count = int(bad.sum())
+    if count == 0:
+        return ""
+    y, x = np.argwhere(bad)[0]
+    return f"{count} of {bad.size} pixels not finite (first at x={x}, y={y})"
+
+
+def _squared_and_weight(
+    image: np.ndarray, reference: np.ndarray, reference_variance: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    if image.ndim != 3 or image.shape != reference.shape:
+        raise ValueError(f"an image of shape {image.shape} and a reference of {reference.shape}")
+    for name, values in (("image", image), ("reference", reference)):
+        if fault := describe_non_finite(values):
+            raise ValueError(f"{name}: {fault}")
+    squared = (np.asarray(image, np.float64) - reference) ** 2
+    if reference_variance is not None:
+        if reference_variance.shape != reference.shape:
+            raise ValueError(
+                f"a reference of shape {reference.shape}, its variance {reference_variance.shape}"
+            )
+        squared = squared - reference_variance
+    return squared, _weight(reference)
+
+
+def _weight(reference: np.ndarray) -> np.ndarray:
+    """1 / (R² + ε)."""
+    reference = np.asarray(reference, np.float64)
+    floor = RELATIVE_FLOOR * reference.mean() ** 2
+    if floor == 0:
+        raise ValueError("the reference is black: relative errors are undefined")
+    return 1 / (reference**2 + floor)
+
+
+def _trimmed_mean(values: np.ndarray, seen: np.ndarray) -> float:
+    dropped = int(np.ceil(TRIMMED_SHARE * seen.size)) if seen.size > 1 else 0
+    kept = np.argsort(seen, axis=None, kind="stable")[: seen.size - dropped]
+    return float(values.reshape(-1)[kept].mean())

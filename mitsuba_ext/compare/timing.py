@@ -1,0 +1,90 @@
+"""The clock around a render, and how many samples a time allows."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+#: More would not fit into the 2^32 samples of a wavefront even for a film of 16x16 pixels.
+_MAX_SPP = 2**24
+
+#: Below this many seconds, a hiccup of the machine can double the time of a render.
+_SHORT = 0.5
+
+
+class Timed(NamedTuple):
+    """A render and its cost.
+
+    Attributes:
+        seconds: Wall clock of the whole render, learning and compilation included.
+        compiled: Did a kernel have to be compiled, or loaded from the disk?
+        compile_seconds: How long that took (without tracing).
+        image: The developed image.
+    """
+
+    seconds: float
+    compiled: bool
+    compile_seconds: float
+    image: mi.TensorXf
+
+
+def timed_render(integrator: mi.Integrator, scene: mi.Scene, seed: int, spp: int) -> Timed:
+    """Renders (``spp`` 0: as many samples as the scene's sampler says) and waits for the image."""
+    import drjit as dr
+
+    # The history costs nothing that could be measured
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        start = time.perf_counter()
+        image = integrator.render(scene, sensor=0, seed=seed, spp=spp, develop=True, evaluate=True)
+        dr.eval(image)
+        dr.sync_thread()
+        seconds = time.perf_counter() - start
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+    compiled = [kernel for kernel in kernels if not kernel["cache_hit"]]
+    milliseconds = sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in compiled)
+    return Timed(seconds, bool(compiled), milliseconds / 1000, image)
+
+
+def samples_for(budget: float, integrator: mi.Integrator, scene: mi.Scene, seed: int) -> int:
+    """How many samples per pixel take ``budget`` seconds.
+
+    Mitsuba's own integrators ignore a ``timeout`` outside of the scalar variants, and those that
+    learn plan their pilot passes by the number of samples: so the speed is measured, and the number
+    follows from it. The renders become longer until one takes an eighth of the budget (or four
+    seconds); the last two tell the cost of a sample from that of a render.
+    """
+
+    def seconds_of(spp: int) -> float:
+        seconds, compiled, *_ = timed_render(integrator, scene, seed, spp)
+        if compiled or seconds < _SHORT:
+            seconds = min(seconds, timed_render(integrator, scene, seed, spp).seconds)
+        return seconds
+
+    # From 8 on: with fewer, an integrator may have none to learn from
+    spp = 8
+    shorter = seconds_of(spp)
+    if shorter > min(budget / 2, 4):
+        return max(1, int(budget / shorter * spp))
+    while True:
+        spp *= 2
+        seconds = seconds_of(spp)
+        if seconds >= min(budget / 8, 4) or spp >= _MAX_SPP:
+            break
+        shorter = seconds
+    # At least half the average: short renders are noisy, and a tiny slope would promise anything
+    per_sample = max((seconds - shorter) / (spp / 2), seconds / spp / 2)
+    fixed = max(0.0, seconds - per_sample * spp)
+    return min(_MAX_SPP, max(1, int((budget - fixed) / per_sample)))
+
+
+def sample_count(scene: mi.Scene, spp: int) -> int:
+    """Samples per pixel that an integrator of Mitsuba takes when asked for ``spp`` (0: as many as
+    the sampler says): stratified samplers round up."""
+    sampler = scene.sensors()[0].sampler().clone()
+    if spp:
+        sampler.set_sample_count(spp)
+    return int(sampler.sample_count())

@@ -1,0 +1,186 @@
+"""Refuses what cannot work (Mitsuba's version, the LLVM library) before it fails in a worse way.
+
+``import mitsuba_ext`` calls :func:`prepare` before it imports Mitsuba, and :func:`check` for every
+variant that is selected.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import sys
+from importlib import metadata
+from types import ModuleType
+
+from . import llvm
+
+#: The variants in which the plugins work.
+SUPPORTED_VARIANTS: tuple[str, ...] = (
+    "llvm_ad_rgb",
+    "llvm_ad_mono",
+    "llvm_ad_spectral",
+    "cuda_ad_rgb",
+    "cuda_ad_mono",
+    "cuda_ad_spectral",
+)
+
+#: Versions of Mitsuba that the package was written for: from the first up to, not including, the
+#: second (3.10 renames the parameters of meshes). ``pyproject.toml`` says the same.
+MITSUBA_VERSIONS = ((3, 9, 1), (3, 10))
+
+
+def prepare() -> None:
+    """Checks Mitsuba's version and chooses an LLVM library that works.
+
+    The choice is a value for ``DRJIT_LIBLLVM_PATH``, made only where the user has not set it,
+    Dr.Jit is not imported yet, and what Dr.Jit would take by itself does not work. A machine
+    without any usable library passes: CUDA variants need none, and :func:`check` refuses the rest.
+
+    Raises:
+        RuntimeError: Mitsuba's version is not supported, or Dr.Jit lacks a system library.
+    """
+    _check_mitsuba()
+    if "drjit" in sys.modules:
+        return
+    if sys.platform != "win32" and not os.environ.get(llvm.VARIABLE):
+        default = llvm.default_library()
+        if default is None or llvm.fault(default):
+            usable = llvm.usable_library()
+            if usable:
+                os.environ[llvm.VARIABLE] = usable.path
+    _import_drjit()
+
+
+def _import_drjit() -> None:
+    """Imports Dr.Jit, as Mitsuba is about to do, for the sake of a better message."""
+    try:
+        importlib.import_module("drjit")
+    except (ImportError, NameError) as error:  # NameError: of its own, on the way to its message
+        if llvm.lacks_system_library():
+            raise RuntimeError(
+                "Dr.Jit cannot be imported because libatomic.so.1 is missing. To fix this, "
+                f"{llvm.install_command(with_llvm=llvm.usable_library() is None)}."
+            ) from error
+        raise
+
+
+def check(variant: str) -> None:
+    """Refuses an LLVM variant where Dr.Jit's LLVM library does not work.
+
+    Args:
+        variant: A name such as ``"llvm_ad_rgb"``. Variants that need no LLVM pass.
+
+    Raises:
+        RuntimeError: The library found, why it will not do, and how to get one that does.
+    """
+    if variant.startswith("llvm_"):
+        problem = llvm_problem()
+        if problem:
+            raise RuntimeError(f"{variant}: {problem}")
+
+
+def guard(mitsuba: ModuleType) -> None:
+    """Where LLVM does not work, makes ``mi.set_variant`` say so as :func:`check` does.
+
+    Dr.Jit's own message for a library that it refuses is that there is none. Where LLVM works,
+    ``mi.set_variant`` is left alone.
+
+    Args:
+        mitsuba: The imported module.
+    """
+    if not llvm_problem():
+        return
+    original = mitsuba.set_variant
+
+    def set_variant(*variants: str) -> None:
+        try:
+            original(*variants)
+        except ImportError:
+            for variant in variants:
+                check(variant)
+            raise
+
+    mitsuba.set_variant = set_variant  # type: ignore[attr-defined]
+
+
+def llvm_problem() -> str:
+    """What is wrong with the LLVM library that Dr.Jit has loaded or will load, and what to do.
+
+    Returns:
+        Sentences for the user; empty if the library works.
+    """
+    if llvm.cpu_fault():
+        return f"{llvm.cpu_fault()}. Select a cuda_* variant."
+    loaded = "drjit" in sys.modules
+    library = loaded_library() if loaded else llvm.default_library()
+    if library is None:
+        found = "Dr.Jit found no LLVM library"
+    else:
+        reason = llvm.fault(library)
+        if loaded and not reason and not _loaded_version():
+            reason = "Dr.Jit did not accept"
+        if not reason:
+            return ""
+        found = f"Dr.Jit {'loaded' if loaded else 'would load'} {library}, which {reason}"
+    return f"{found}. To fix this, {_remedy(library, loaded)}."
+
+
+def loaded_library() -> llvm.Library | None:
+    """The LLVM library in this process, with its exact version where Dr.Jit knows it.
+
+    Where Dr.Jit could load none, the file that it was told to load by ``DRJIT_LIBLLVM_PATH``.
+    """
+    version = _loaded_version()
+    try:
+        with open("/proc/self/maps") as maps:
+            paths = re.findall(r"\s(/\S*libLLVM\S*)$", maps.read(), re.MULTILINE)
+    except OSError:  # not Linux
+        paths = []
+    if paths:
+        library = llvm.Library.at(paths[0])
+    elif os.environ.get(llvm.VARIABLE):
+        library = llvm.Library.at(os.environ[llvm.VARIABLE])
+    elif version:
+        library = llvm.Library("")
+    else:
+        return None
+    return llvm.Library(library.path, version or library.version)
+
+
+def _loaded_version() -> tuple[int, ...]:
+    """The version of the LLVM backend, empty where Dr.Jit could not start it."""
+    version = sys.modules["drjit"].detail.llvm_version()
+    return tuple(version) if version[0] >= 0 else ()
+
+
+def _remedy(library: llvm.Library | None, loaded: bool) -> str:
+    usable = llvm.usable_library()
+    set_by_user = os.environ.get(llvm.VARIABLE)
+    if usable and set_by_user and (library is None or usable.path != library.path):
+        return f"unset {llvm.VARIABLE}, or run `export {llvm.VARIABLE}={usable.path}`"
+    if usable and loaded:
+        return (
+            f"import mitsuba_ext before mitsuba and drjit (it chooses {usable.path}), "
+            f"or run `export {llvm.VARIABLE}={usable.path}`"
+        )
+    unset = f" and unset {llvm.VARIABLE}" if set_by_user else ""
+    return llvm.install_command() + unset
+
+
+def _check_mitsuba() -> None:
+    first, end = (".".join(map(str, version)) for version in MITSUBA_VERSIONS)
+    wanted = f'pip install "mitsuba>={first},<{end}"'
+    try:
+        found = metadata.version("mitsuba")
+    except metadata.PackageNotFoundError:
+        module = sys.modules.get("mitsuba")  # built from source, and on PYTHONPATH
+        found = getattr(module, "__version__", None)
+        if found is None:
+            return  # `import mitsuba` speaks for itself
+    numbers = tuple(map(int, re.findall(r"\d+", found)[:3]))
+    if not MITSUBA_VERSIONS[0] <= numbers < MITSUBA_VERSIONS[1]:
+        raise RuntimeError(
+            f"mitsuba_ext works with Mitsuba from {first} up to, not including, {end}, but "
+            f"{found} is installed: run `{wanted}`."
+        )

@@ -1,0 +1,62 @@
+"""Closed scenes with an exact answer: the sum over path lengths and all weights add up."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+
+import pytest
+from statistical import REFERENCE, SCENES, SEEDS, UNDER_TEST, UNUSUAL, UnderTest
+from statistical import assert_exact, batches, load
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def _furnaces():
+    specification = importlib.util.spec_from_file_location("furnaces", SCENES / "furnaces.py")
+    module = importlib.util.module_from_spec(specification)
+    sys.modules["furnaces"] = module
+    specification.loader.exec_module(module)
+    return {furnace.path.stem: furnace for furnace in module.FURNACES}
+
+
+FURNACES = _furnaces()
+DEPTHS = (1, 2, 3, 6, -1)
+SIZE = 32
+SPP = 32
+
+
+def _check(furnace: str, integrator: UnderTest, max_depth: int, precision: float = 0.002) -> None:
+    exact = [region.exact(max_depth) for region in FURNACES[furnace].regions]
+    if not integrator.can_render(max_depth) or all(value is None for value in exact):
+        pytest.skip("no exact answer, or a depth that the integrator does not render")
+    scene = load(furnace, width=SIZE, height=SIZE)
+    images = batches(scene, integrator.make(max_depth), SPP, SEEDS)
+    for region, value in zip(FURNACES[furnace].regions, exact):
+        if value is not None:
+            assert_exact(
+                images,
+                value,
+                region.pixels(SIZE, SIZE),
+                region.uniform(max_depth),
+                region.allowance,
+                precision,
+            )
+
+
+@pytest.mark.parametrize("max_depth", DEPTHS)
+@pytest.mark.parametrize("name", UNDER_TEST)
+@pytest.mark.parametrize("furnace", FURNACES)
+def test_furnace_has_the_exact_radiance(furnace: str, name: str, max_depth: int) -> None:
+    _check(furnace, UNDER_TEST[name], max_depth)
+
+
+@pytest.mark.parametrize("furnace", FURNACES)
+def test_path_has_the_exact_radiance(furnace: str) -> None:
+    """The answers themselves, checked once against Mitsuba."""
+    _check(furnace, REFERENCE, -1)
+
+
+@pytest.mark.parametrize("furnace", ["furnace_lamps", "furnace_isothermal"])
+def test_rejecting_nine_of_ten_shadow_rays_keeps_the_exact_radiance(furnace: str) -> None:
+    _check(furnace, UNUSUAL["neepp_floor"], -1, precision=0.01)
