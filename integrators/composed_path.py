@@ -84,8 +84,10 @@ class ComposedPath(WalkIntegrator):
         if self.shadow_test == "visibility_roulette":
             self.rejection = Rejection.from_properties(self, props)
 
-    def stage_samples(self, spp: int) -> list[int]:
-        return self.rejection.stage_samples(spp) if self.rejection else [spp]
+    def stage_samples(self, scene: mi.Scene, spp: int) -> list[int]:
+        if self.rejection:
+            return self.rejection.stage_samples(self, scene, spp)
+        return super().stage_samples(scene, spp)
 
     def stages(self, scene: mi.Scene, samples: list[int]) -> Iterator[Stage]:
         if self.rejection:

@@ -104,8 +104,8 @@ class NEEPlusPlus(WalkIntegrator):
         super().__init__(props)
         self.rejection = Rejection.from_properties(self, props)
 
-    def stage_samples(self, spp: int) -> list[int]:
-        return self.rejection.stage_samples(spp)
+    def stage_samples(self, scene: mi.Scene, spp: int) -> list[int]:
+        return self.rejection.stage_samples(self, scene, spp)
 
     def stages(self, scene: mi.Scene, samples: list[int]) -> Iterator[Stage]:
         return self.rejection.stages(self, scene, samples)

@@ -64,7 +64,7 @@ class WalkIntegrator(mi.SamplingIntegrator):
         walk = Walk(self.max_depth, self.rr_depth, self.hide_emitters, **decisions)
         return Stage(walk, learned)
 
-    def stage_samples(self, spp: int) -> list[int]:
+    def stage_samples(self, scene: mi.Scene, spp: int) -> list[int]:
         """The samples per pixel of each stage; they add up to ``spp``. Those of the last stage
         teach nothing."""
         return [spp]

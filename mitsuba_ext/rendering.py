@@ -148,7 +148,7 @@ class _Job:
         """Decides the samples of each stage and of each of its passes."""
         backend = dr.backend_v(mi.Float)
         limit = max(1, _PASS_SAMPLES[backend] // (self.width * self.height))
-        stages = self.integrator.stage_samples(self.spp)
+        stages = self.integrator.stage_samples(self.scene, self.spp)
         # Independent samples can be cut anywhere, and each pass gets a seed of its own. Samples
         # that are stratified over the whole render must come in passes of equal length.
         self.structured = self.sampler.class_name() != "IndependentSampler"

@@ -87,17 +87,19 @@ class Rejection:
             floor=get(props, "floor", 0.1, minimum=1e-6, maximum=1.0),
         )
 
-    def stage_samples(self, spp: int) -> list[int]:
-        """The pilot takes at most a quarter of the samples: beyond that there is little left to
-        save."""
+    def stage_samples(self, integrator: WalkIntegrator, scene: mi.Scene, spp: int) -> list[int]:
+        """The samples of the pilot and of the rest. The pilot takes at most a quarter of them:
+        beyond that there is little left to save. It is left out where there is nothing to learn."""
         pilot = min(self.pilot_spp, spp // 4)
-        return [pilot, spp - pilot] if pilot else [spp]
+        if pilot == 0 or integrator.max_depth < 2 or not _has_lights_at_points(scene):
+            return [spp]
+        return [pilot, spp - pilot]
 
     def stages(
         self, integrator: WalkIntegrator, scene: mi.Scene, samples: list[int]
     ) -> Iterator[Stage]:
-        """The pilot's walk, then the walk that rejects. Without a pilot nothing is known, and every
-        connection is tested; the same holds in a scene without lights that the map could cover."""
+        """The pilot's walk, then the walk that rejects. Without a pilot every connection is
+        tested."""
         if len(samples) == 1:
             yield integrator.stage()
             return
@@ -107,3 +109,9 @@ class Rejection:
         visibility.update()
         roulette = VisibilityRoulette(visibility, self.slope, self.floor, self.law)
         yield integrator.stage(str(visibility), shadow_test=roulette)
+
+
+def _has_lights_at_points(scene: mi.Scene) -> bool:
+    """Is there a light that the map can cover (none at infinity), and something that it lights?"""
+    flags = int(mi.EmitterFlags.Surface) | int(mi.EmitterFlags.DeltaPosition)
+    return len(scene.shapes()) > 0 and any(int(e.flags()) & flags for e in scene.emitters())

@@ -14,6 +14,12 @@ from .voxel_grid import VoxelGrid
 #: Two counters and the table that is made of them.
 _BYTES_PER_ENTRY = 12
 
+#: Above, the numbers of the entries would not fit into 32 bits while they are computed.
+MAX_VOXELS = 0xFFFF
+
+#: The grid's table of numbers, and the marks that it is made of.
+_BYTES_PER_CELL = 8
+
 #: Length of the test segments of :meth:`VisibilityMap.refine`, short of the end point.
 _SEGMENT = 1 - 1e-4
 
@@ -36,9 +42,13 @@ class VisibilityMap:
     """
 
     def __init__(self, scene: mi.Scene, grid: int, max_memory: int) -> None:
-        self.voxels = VoxelGrid(scene, grid)
-        while self._entry_count() * _BYTES_PER_ENTRY > max_memory and self.voxels.resolution > 1:
-            self.voxels = VoxelGrid(scene, max(1, int(self.voxels.resolution * 0.8)))
+        # The grid's own tables count too: they bound the resolution before anything is allocated
+        resolution = min(grid, max(1, int((max_memory / _BYTES_PER_CELL) ** (1 / 3))))
+        self.voxels = VoxelGrid(scene, resolution)
+        while self._memory() > max_memory or self.voxels.occupied_count > MAX_VOXELS:
+            if self.voxels.resolution == 1:
+                break
+            self.voxels = VoxelGrid(scene, int(0.8 * self.voxels.resolution))
         if self.voxels.resolution < grid:
             mi.Log(
                 mi.LogLevel.Warn,
@@ -54,6 +64,10 @@ class VisibilityMap:
     def _entry_count(self) -> int:
         n = self.voxels.occupied_count
         return n * (n + 1) // 2
+
+    def _memory(self) -> int:
+        cells = self.voxels.resolution**3
+        return self._entry_count() * _BYTES_PER_ENTRY + cells * _BYTES_PER_CELL
 
     def entry(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         """The index of the pair of voxels that hold ``p`` and ``q``, and whether both are known
@@ -87,9 +101,9 @@ class VisibilityMap:
         """Adds ``test_count`` random tests to the entries in which a success was seen (section
         3.2): segments between uniform random points of the two voxels. Only entries of a voxel
         with a light are refined, since next event estimation asks for no others."""
-        if test_count == 0:
-            return
         entry = dr.compress(self.successes > 0)
+        if test_count == 0 or len(entry) == 0:
+            return
         i, j = _row_and_column(entry)
         lit = dr.gather(mi.UInt32, self._holds_light, i) > 0
         lit |= dr.gather(mi.UInt32, self._holds_light, j) > 0
@@ -124,7 +138,7 @@ class VisibilityMap:
         return (
             f"visibility map: grid {self.voxels.resolution}, {self.voxels.occupied_count} occupied "
             f"voxels, {self._entry_count()} entries ({seen} seen, {succeeded} with a success), "
-            f"{self._entry_count() * _BYTES_PER_ENTRY / 2**20:.1f} MiB"
+            f"{self._memory() / 2**20:.1f} MiB"
         )
 
 

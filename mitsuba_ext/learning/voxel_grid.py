@@ -20,6 +20,9 @@ class VoxelGrid:
         scene: Its shapes, and its point-like emitters, occupy the voxels.
         resolution: Voxels along each axis.
 
+    Raises:
+        ValueError: The scene has no bounding box.
+
     Attributes:
         occupied_count (int): Voxels that hold geometry.
         cells (mi.UInt32): Their linear indices in the full grid; shape ``occupied_count``.
@@ -28,9 +31,11 @@ class VoxelGrid:
     def __init__(self, scene: mi.Scene, resolution: int) -> None:
         self.resolution = resolution
         bbox = scene.bbox()
+        if not bbox.valid():
+            raise ValueError("a scene without geometry has no voxels")
         extent = bbox.max - bbox.min
         # A flat scene still has voxels of some depth, and no point lies on the outer faces
-        padding = mi.ScalarVector3f(1e-4 * dr.max(extent) + 1e-30)
+        padding = mi.ScalarVector3f(1e-4 * dr.max(extent) or 1.0)
         self.origin = mi.Point3f(bbox.min - padding)
         self.size = mi.Vector3f((extent + 2 * padding) / resolution)
         dr.make_opaque(self.origin, self.size)

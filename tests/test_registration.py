@@ -1,0 +1,97 @@
+"""Plugins are there whatever comes first, the import or the variant, and in each variant."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from mitsuba_ext import registry, runtime
+
+LLVM_VARIANTS = [name for name in runtime.SUPPORTED_VARIANTS if name.startswith("llvm")]
+
+LOAD_ALL = """
+def load_all():
+    from mitsuba_ext import registry
+    for name in registry.plugin_names()["integrators"]:
+        integrator = mi.load_dict({"type": name, "max_depth": 3})
+        assert isinstance(integrator, mi.SamplingIntegrator), name
+        assert integrator.max_depth == 3 and str(integrator).startswith(name), str(integrator)
+"""
+
+
+def _run(code: str) -> str:
+    result = subprocess.run(
+        [sys.executable, "-c", LOAD_ALL + code], capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import mitsuba_ext, mitsuba as mi; mi.set_variant('llvm_ad_rgb'); load_all()",
+        "import mitsuba as mi; mi.set_variant('scalar_rgb'); import mitsuba_ext;"
+        "mi.set_variant('llvm_ad_rgb'); load_all()",
+        "import mitsuba_ext.runtime, mitsuba as mi; mi.set_variant('llvm_ad_rgb');"
+        "import mitsuba_ext; load_all()",
+    ],
+    ids=["import, variant", "scalar, import, variant", "runtime, variant, import"],
+)
+def test_the_import_may_come_before_or_after_the_variant(code):
+    _run(code)
+
+
+def test_plugins_work_in_every_variant_in_turn_and_render_there():
+    _run(f"""
+import mitsuba_ext, mitsuba as mi
+kept = {{}}
+for variant in {LLVM_VARIANTS!r} * 2:
+    mi.set_variant(variant)
+    load_all()
+    scene = mi.load_dict({{
+        "type": "scene", "e": {{"type": "constant"}}, "s": {{"type": "sphere"}},
+        "c": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 2, "height": 2}}}},
+        "i": {{"type": "neepp"}}}})
+    image = mi.render(scene, spp=4).numpy()
+    assert (image > 0).all(), image
+    kept[variant] = scene  # earlier variants' objects live on
+""")
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_mono_polarized"])
+def test_an_unsupported_variant_is_refused_in_a_sentence_that_names_those_that_work(variant):
+    for name in registry.plugin_names()["integrators"]:
+        output = _run(f"""
+import mitsuba_ext, mitsuba as mi
+mi.set_variant({variant!r})
+try:
+    mi.load_dict({{"type": {name!r}, "max_depth": 3}})
+except RuntimeError as error:
+    print(str(error).splitlines()[-1])
+""")
+        assert f'"{name}" does not work in the variant "{variant}"' in output
+        assert all(supported in output for supported in runtime.SUPPORTED_VARIANTS)
+
+
+def test_a_scene_names_every_parameter_in_xml():
+    _run("""
+import mitsuba_ext, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+neepp = '''<string name="law" value="paper"/> <float name="slope" value="4"/>
+    <integer name="refine" value="0"/> <float name="max_memory" value="8"/>
+    <integer name="grid" value="7"/> <integer name="pilot_spp" value="2"/>
+    <float name="floor" value="0.5"/> <integer name="max_depth" value="-1"/>
+    <integer name="rr_depth" value="9"/> <boolean name="hide_emitters" value="true"/>
+    <float name="timeout" value="5"/> <string name="aovs" value="d:depth"/>'''
+composed = neepp + '<string name="shadow_test" value="visibility_roulette"/>'
+for name, parameters in (("neepp", neepp), ("composed_path", composed)):
+    integrator = mi.load_string(
+        f'<scene version="3.0.0"><integrator type="{name}">{parameters}</integrator></scene>'
+    ).integrator()
+    for text in ("law = paper", "slope = 4.0", "refine = 0", "max_memory = 8.0", "grid = 7",
+                 "pilot_spp = 2", "floor = 0.5", "max_depth = -1", "rr_depth = 9",
+                 "hide_emitters = True", "timeout = 5.0", "aovs = d"):
+        assert text in str(integrator), (text, str(integrator))
+""")

@@ -1,0 +1,196 @@
+"""The random walk: its decisions can be replaced, and what a scene lacks is not in the kernel."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from mitsuba_ext.decisions import DirectionSamples, EmitterSampling, SceneQuery, ShadowTest
+from mitsuba_ext.walk import Walk
+
+BOUNCES = 4
+
+#: Some of them connect to the lamp at each bounce.
+LANES = 64
+
+
+class _Recorder:
+    """A table of what a decision saw: one row of numbers for each bounce."""
+
+    def __init__(self) -> None:
+        self.table = dr.zeros(mi.Float, BOUNCES)
+
+    def write(self, bounce: mi.UInt32, number: mi.Float, active: mi.Bool) -> None:
+        dr.scatter(self.table, number, bounce, active & (bounce < BOUNCES))
+
+
+class _RecordingDirections(DirectionSamples):
+    def __init__(self, recorder: _Recorder) -> None:
+        self.recorder = recorder
+
+    def begin(self, sampler, ray):
+        return mi.UInt32(0)
+
+    def draw(self, state, sampler, si, depth, active):
+        sample_1, sample_2, weight, _ = super().draw((), sampler, si, depth, active)
+        self.recorder.write(state, sample_2.x, active)
+        return sample_1, sample_2, weight, state + 1
+
+
+class _RecordingNextEvent(EmitterSampling):
+    def __init__(self, recorder: _Recorder) -> None:
+        self.recorder = recorder
+
+    def begin(self, sampler, ray):
+        return mi.UInt32(0)
+
+    def sample(self, state, scene, si, sample, active):
+        self.recorder.write(state, sample.x, active)
+        ds, weight, _ = super().sample((), scene, si, sample, active)
+        return ds, weight, state + 1
+
+    def pdf(self, state, scene, ref, ds, active):
+        pdf, _ = super().pdf((), scene, ref, ds, active)
+        return pdf, state
+
+
+class _RecordingShadowTest(ShadowTest):
+    def __init__(self, recorder: _Recorder) -> None:
+        self.recorder = recorder
+
+    def begin(self, sampler, ray):
+        return mi.UInt32(0)
+
+    def probability(self, state, si, ds, active):
+        self.recorder.write(state, ds.dist, active)
+        return mi.Float(1), state + 1
+
+
+class _RecordingQuery(SceneQuery):
+    """Has no state: what it is asked must differ from bounce to bounce."""
+
+    def __init__(self, recorder: _Recorder, occluded: _Recorder) -> None:
+        self.recorder, self.shadow = recorder, occluded
+
+    def closest(self, scene, ray, coherent, active):
+        self.recorder.write(mi.UInt32(0 if coherent else 1), ray.o.x, active)
+        return super().closest(scene, ray, coherent, active)
+
+    def occluded(self, scene, si, p, active):
+        self.shadow.write(mi.UInt32(0), p.x, active)
+        return super().occluded(scene, si, p, active)
+
+
+@pytest.fixture
+def box(variant: str) -> mi.Scene:
+    """A closed, lit, diffuse box: no path ends before the last bounce."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "box": {
+                "type": "cube",
+                "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.9}},
+            },
+            "lamp": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([0, 0, 0.9]).scale(0.3).rotate(
+                    [1, 0, 0], 180
+                ),
+                "emitter": {"type": "area", "radiance": 1.0},
+            },
+        }
+    )
+
+
+def _trace(scene: mi.Scene, **decisions):
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(1, LANES)
+    ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -0.5), dr.normalize(mi.Vector3f(0.3, 0.2, -1)))
+    ray.time = dr.zeros(mi.Float, LANES)
+    walk = Walk(max_depth=BOUNCES + 1, rr_depth=100, **decisions)
+    sample = walk(scene, sampler, ray, mi.Bool(True))
+    dr.eval(sample.L)
+    return sample
+
+
+@pytest.mark.parametrize(
+    "decision, recording",
+    [
+        ("directions", _RecordingDirections),
+        ("next_event", _RecordingNextEvent),
+        ("shadow_test", _RecordingShadowTest),
+    ],
+)
+def test_each_bounce_sees_another_number_and_another_state(box, decision, recording):
+    recorder = _Recorder()
+    _trace(box, **{decision: recording(recorder)})
+    numbers = recorder.table.numpy()
+    assert len(set(numbers)) == BOUNCES, numbers
+    assert (numbers != 0).all(), "the state did not advance"
+
+
+def test_a_replaced_query_is_asked_for_camera_scattered_and_shadow_rays(box):
+    closest, shadow = _Recorder(), _Recorder()
+    _trace(box, query=_RecordingQuery(closest, shadow))
+    camera, scattered = closest.table.numpy()[:2]
+    assert camera == pytest.approx(0.1) and scattered not in (0, camera)
+    assert shadow.table.numpy()[0] != 0
+
+
+def test_a_rejected_connection_traces_no_shadow_ray_and_survivors_weigh_more(box):
+    class Half(ShadowTest):
+        def probability(self, state, si, ds, active):
+            return mi.Float(0.5), state
+
+    def total(walk: Walk) -> tuple[float, float]:
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(0, 200_000)
+        ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -0.5), dr.normalize(mi.Vector3f(0.3, 0.2, -1)))
+        ray.time = dr.zeros(mi.Float, 200_000)
+        sample = walk(box, sampler, ray, mi.Bool(True))
+        return float(dr.mean(sample.L.x)[0]), float(dr.mean(mi.Float(sample.shadow_count))[0])
+
+    L, rays = total(Walk(3, 100))
+    L_half, rays_half = total(Walk(3, 100, shadow_test=Half()))
+    assert rays_half == pytest.approx(rays / 2, rel=0.02)
+    assert L_half == pytest.approx(L, rel=0.02)
+
+
+KERNEL_SIZE = """
+import mitsuba_ext, mitsuba as mi, drjit as dr
+mi.set_variant("llvm_ad_rgb")
+dr.set_flag(dr.JitFlag.KernelHistory, True)
+
+def size(integrator, *emitters):
+    scene = mi.load_dict({
+        "type": "scene",
+        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+        "sphere": {"type": "sphere"},
+        **{f"emitter{i}": emitter for i, emitter in enumerate(emitters)},
+    })
+    dr.kernel_history_clear()
+    mi.render(scene, integrator=mi.load_dict(integrator), spp=1).numpy()
+    sizes = [k["operation_count"] for k in dr.kernel_history() if "operation_count" in k]
+    return max(n for n in sizes if n)
+
+point = {"type": "point", "position": [0, 0, 3]}
+area = {"type": "rectangle", "emitter": {"type": "area"}}
+always = {"type": "composed_path"}
+print(size(always), size(always, point), size(always, area), size(always, area, area),
+      size(always, area, {"type": "constant"}))
+"""
+
+
+def test_what_the_scene_lacks_is_not_in_the_kernel():
+    """In a process of its own: Dr.Jit's calls reach the objects of all living scenes."""
+    output = subprocess.run(
+        [sys.executable, "-c", KERNEL_SIZE], capture_output=True, text=True, check=True
+    ).stdout
+    none, point, area, two_areas, environment = map(int, output.split()[-5:])
+    assert none < point < area, "no lights; lights that cannot be hit; lights that can"
+    assert area < two_areas, "the choice between lights"
+    assert area < environment, "the environment"
