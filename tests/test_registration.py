@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+
 from mitsuba_ext import registry, runtime
 
 LLVM_VARIANTS = [name for name in runtime.SUPPORTED_VARIANTS if name.startswith("llvm")]
@@ -51,7 +52,7 @@ for variant in {LLVM_VARIANTS!r} * 2:
     mi.set_variant(variant)
     load_all()
     scene = mi.load_dict({{
-        "type": "scene", "e": {{"type": "constant"}}, "s": {{"type": "sphere"}},
+        "type": "scene", "e": {{"type": "constant"}}, "s": {{"type": "sphere", "center": [0, 0, 3]}},
         "c": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 2, "height": 2}}}},
         "i": {{"type": "neepp"}}}})
     image = mi.render(scene, spp=4).numpy()
