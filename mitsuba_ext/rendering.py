@@ -24,9 +24,12 @@ from . import camera
 if TYPE_CHECKING:
     from .integrator import WalkIntegrator
 
-#: Samples per pass: about a second on two CPU cores, a few milliseconds on a GPU, which therefore
-#: gets longer passes to hide the cost of tracing them in Python.
-_PASS_SAMPLES = {dr.JitBackend.LLVM: 1 << 20, dr.JitBackend.CUDA: 1 << 24}
+#: Samples per pass. Tracing a pass in Python takes 5 to 70 ms (many materials take longest), the
+#: pass itself two or three seconds on two CPU cores. A GPU gets longer passes.
+_PASS_SAMPLES = {dr.JitBackend.LLVM: 1 << 21, dr.JitBackend.CUDA: 1 << 24}
+
+#: With a time budget, passes are shorter by this factor: they are what it is kept with.
+_TIMEOUT_PASS_DIVISOR = 4
 
 _MAX_WAVEFRONT = 1 << 32
 
@@ -146,8 +149,10 @@ class _Job:
 
     def _plan(self) -> None:
         """Decides the samples of each stage and of each of its passes."""
-        backend = dr.backend_v(mi.Float)
-        limit = max(1, _PASS_SAMPLES[backend] // (self.width * self.height))
+        limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // (self.width * self.height)
+        if self.integrator.timeout > 0:
+            limit //= _TIMEOUT_PASS_DIVISOR
+        limit = max(1, limit)
         stages = self.integrator.stage_samples(self.scene, self.spp)
         # Independent samples can be cut anywhere, and each pass gets a seed of its own. Samples
         # that are stratified over the whole render must come in passes of equal length.

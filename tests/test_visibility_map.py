@@ -110,10 +110,9 @@ def test_what_was_counted_becomes_the_table_and_the_roulette():
     lanes = dr.gather(mi.Point3f, p, dr.zeros(mi.UInt32, 90))
     for q, visible in ((across, False), (within, True)):
         visibility.shadow_ray(lanes, q, mi.Bool(visible), mi.Bool(True))
-    visibility.update()
 
     def V(q):
-        return float(dr.gather(mi.Float, visibility.visibility, visibility.entry(p, q, True)[0])[0])
+        return float(visibility.posterior_mean(visibility.entry(p, q, mi.Bool(True))[0])[0])
 
     # The prior is worth one test and expects half of them to succeed
     assert V(across) == pytest.approx(0.5 / 91) and V(within) == pytest.approx(90.5 / 91)
@@ -141,10 +140,11 @@ def test_refinement_tests_what_lies_between_the_voxels():
     for q in (across, within):
         visibility.shadow_ray(p, q, mi.Bool(True), mi.Bool(True))
     visibility.refine(scene, 200)
-    visibility.update()
-    table = visibility.visibility.numpy()
-    entries = [int(visibility.entry(p, q, mi.Bool(True))[0][0]) for q in (across, within)]
-    assert table[entries[0]] < 0.02 < 0.1 < table[entries[1]]
+    through, inside = (
+        float(visibility.ratio(visibility.entry(p, q, mi.Bool(True))[0])[0])
+        for q in (across, within)
+    )
+    assert through < 0.02 < 0.1 < inside
 
 
 @pytest.mark.parametrize("grid", [16, 200, 1024])

@@ -35,6 +35,8 @@ class Run:
         image: The image, (height, width, 3).
         errors: Against the reference.
         rays: Rays traced by kind (``camera``, ``scatter``, ``shadow``), empty if not known.
+        connections: Connections to lights that were considered (``path`` traces a shadow ray for
+            each), ``None`` if not known.
         zero_radiance: Share of the camera samples without radiance, ``None`` if not known.
         memory: Bytes, ``None`` if not known.
     """
@@ -45,6 +47,7 @@ class Run:
     image: np.ndarray
     errors: metrics.Errors
     rays: dict[str, int]
+    connections: int | None
     zero_radiance: float | None
     memory: int | None
 
@@ -189,6 +192,7 @@ class Experiment:
             image=pixels,
             errors=metrics.errors(pixels, reference.mean, reference.variance),
             rays=dict(report.rays) if report else {},
+            connections=report.connections if report else None,
             zero_radiance=report.zero_radiance if report else None,
             memory=report.memory if report else None,
         )

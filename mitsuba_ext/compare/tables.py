@@ -12,7 +12,8 @@
         error              why it failed; empty if it did not
         compile_seconds
         runs               a list: seed, spp, seconds, relmse, relmse_trimmed, mse, rmse,
-                           rays {camera, scatter, shadow}, zero_radiance, memory (bytes), image
+                           rays {camera, scatter, shadow}, connections, zero_radiance,
+                           memory (bytes), image
         summary            seconds, relmse, relmse_trimmed, mse, rmse: {mean, std, median}
         efficiency         1 / (mean relMSE · median seconds)
         efficiency_ratio   to the first integrator
@@ -51,14 +52,14 @@ def table(experiment: Experiment) -> Table:
         show_edge=False, padding=0,
     )
     result.add_column("integrator", overflow="fold", min_width=12)
-    for heading in ("relMSE", "trimmed", "rMSE", "seconds", "spp", "rays", "eff."):
+    for heading in ("relMSE", "trimmed", "rMSE", "seconds", "spp", "rays", "shadow", "eff."):
         result.add_column(heading, justify="right", no_wrap=True)
     for contender in experiment.contenders:
         label = Text(contender.label)
         if contender.error:
             label.append(f"\n{contender.error}", style="red")
         if not contender.runs:
-            result.add_row(label, *["–"] * 7)
+            result.add_row(label, *["–"] * 8)
             continue
         ratio = experiment.efficiency_ratio(contender)
         result.add_row(
@@ -67,6 +68,7 @@ def table(experiment: Experiment) -> Table:
             _spread(contender, "seconds", "median"),
             str(contender.runs[0].spp),
             _rays(contender),
+            _shadow_share(contender),
             "–" if ratio is None else f"{ratio:.2f}x",
         )
     return result
@@ -80,7 +82,7 @@ def footnote(experiment: Experiment) -> str:
     lines = [
         f"Mean ± standard deviation over {run_count} seed(s); median of the seconds "
         f"(compilation excluded, learning included); eff. = 1 / (relMSE · seconds), "
-        f"relative to the first.",
+        f"relative to the first; shadow = shadow rays traced, of those that 'path' would trace.",
         f"Reference: {reference.path}, "
         + (
             "variance unknown: its noise is part of the errors."
@@ -201,6 +203,12 @@ def _rays(contender: Contender) -> str:
     """Rays of one run, in millions; Mitsuba's own integrators do not count theirs."""
     rays = [sum(run.rays.values()) for run in contender.runs if run.rays]
     return f"{sum(rays) / len(rays) / 1e6:.3g} M" if rays else "–"
+
+
+def _shadow_share(contender: Contender) -> str:
+    """Shadow rays traced, in percent of the connections (of those that ``path`` traces)."""
+    shares = [run.rays["shadow"] / run.connections for run in contender.runs if run.connections]
+    return f"{sum(shares) / len(shares):.1%}" if shares else "–"
 
 
 def _without_nan(value: object) -> object:

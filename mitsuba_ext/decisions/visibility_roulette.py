@@ -14,7 +14,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..learning.visibility_map import VisibilityMap
-from .defaults import ShadowTest
+from ..learning.voxel_grid import EMPTY
+from .defaults import AlwaysTest, ShadowTest
 
 if TYPE_CHECKING:
     from ..integrator import Stage, WalkIntegrator
@@ -26,31 +27,44 @@ _PAPER_EPSILON = 1e-4
 class VisibilityRoulette(ShadowTest):
     """Tests a connection with a probability that grows with the visibility of its voxels.
 
-    Connections to points that the map does not know (at infinity, in voxels without geometry) are
-    always tested.
+    Connections to points that the map does not know (at infinity, in voxels without geometry, on
+    lights that the pilot did not sample) are always tested.
 
     Parameters:
-        visibility: The learned map, updated.
+        visibility: The learned map, which must have seen a light.
         slope, floor: p = min(1, slope · V + floor).
         law: ``affine`` for the above, ``paper`` for p = max(V, 1e-4) (Eq. 2).
     """
 
     def __init__(self, visibility: VisibilityMap, slope: float, floor: float, law: str) -> None:
-        self.map = visibility
-        V = visibility.visibility
+        self.voxels = visibility.voxels
+        # Connections end on lights: of the whole map, the columns of their voxels are enough, and
+        # stay in the cache.
+        lights = visibility.light_voxels()
+        voxel_count, light_count = self.voxels.occupied_count, len(lights)
+        self._column = dr.full(mi.UInt32, EMPTY, voxel_count)
+        dr.scatter(self._column, dr.arange(mi.UInt32, light_count), lights)
+        # Opaque: the number of columns differs from seed to seed, the kernel must not
+        self._light_count = dr.opaque(mi.UInt32, light_count)
+        index = dr.arange(mi.UInt32, voxel_count * light_count)
+        voxel = index // self._light_count
+        light = dr.gather(mi.UInt32, lights, index - voxel * self._light_count)
+        entry = visibility.entry_of(voxel, light)
         if law == "paper":
-            # The paper's map holds plain ratios, and ε where no success was seen
-            ratio = mi.Float(visibility.successes) / dr.maximum(mi.Float(visibility.tests), 1)
-            self.table = dr.maximum(ratio, _PAPER_EPSILON)
+            # The paper's map holds plain ratios, and ε where no success was seen (section 3.2)
+            self._p = dr.maximum(visibility.ratio(entry), _PAPER_EPSILON)
         else:
-            self.table = dr.minimum(1, slope * V + floor)
-        dr.eval(self.table)
+            self._p = dr.minimum(1, slope * visibility.posterior_mean(entry) + floor)
+        dr.eval(self._column, self._p)
 
     def probability(
         self, state: Any, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool
     ) -> tuple[mi.Float, Any]:
-        entry, known = self.map.entry(si.p, ds.p, active)
-        p = dr.gather(mi.Float, self.table, entry, known)
+        voxel, active = self.voxels.index(si.p, active)
+        light, active = self.voxels.index(ds.p, active)
+        column = dr.gather(mi.UInt32, self._column, light, active)
+        known = active & (column != EMPTY)
+        p = dr.gather(mi.Float, self._p, voxel * self._light_count + column, known)
         return dr.select(known, p, 1), state
 
 
@@ -106,9 +120,10 @@ class Rejection:
         visibility = VisibilityMap(scene, self.grid, int(self.max_memory * 2**20))
         yield integrator.stage(observer=visibility)
         visibility.refine(scene, self.refine)
-        visibility.update()
-        roulette = VisibilityRoulette(visibility, self.slope, self.floor, self.law)
-        yield integrator.stage(str(visibility), shadow_test=roulette)
+        shadow_test = AlwaysTest()
+        if len(visibility.light_voxels()) > 0:
+            shadow_test = VisibilityRoulette(visibility, self.slope, self.floor, self.law)
+        yield integrator.stage(str(visibility), shadow_test=shadow_test)
 
 
 def _has_lights_at_points(scene: mi.Scene) -> bool:

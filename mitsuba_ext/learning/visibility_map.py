@@ -11,8 +11,8 @@ import mitsuba as mi
 
 from .voxel_grid import VoxelGrid
 
-#: Two counters and the table that is made of them.
-_BYTES_PER_ENTRY = 12
+#: Two counters.
+_BYTES_PER_ENTRY = 8
 
 #: Above, the numbers of the entries would not fit into 32 bits while they are computed.
 MAX_VOXELS = 0xFFFF
@@ -37,8 +37,8 @@ class VisibilityMap:
             with a warning.
 
     Attributes:
-        visibility (mi.Float): What :meth:`update` made of the counters: the estimate of the
-            probability that two points of a pair of voxels see each other.
+        voxels: The grid.
+        tests, successes (mi.UInt32): The counters, one for each entry.
     """
 
     def __init__(self, scene: mi.Scene, grid: int, max_memory: int) -> None:
@@ -58,7 +58,6 @@ class VisibilityMap:
         entries = self._entry_count()
         self.tests = dr.zeros(mi.UInt32, entries)
         self.successes = dr.zeros(mi.UInt32, entries)
-        self.visibility = None
         self._holds_light = dr.zeros(mi.UInt32, self.voxels.occupied_count)
 
     def _entry_count(self) -> int:
@@ -74,8 +73,12 @@ class VisibilityMap:
         (points at infinity and in voxels without geometry are not)."""
         i, i_known = self.voxels.index(p, active)
         j, j_known = self.voxels.index(q, active)
+        return self.entry_of(i, j), i_known & j_known
+
+    def entry_of(self, i: mi.UInt32, j: mi.UInt32) -> mi.UInt32:
+        """The index of a pair of voxels, in either order."""
         row, column = dr.maximum(i, j), dr.minimum(i, j)
-        return row * (row + 1) // 2 + column, i_known & j_known
+        return row * (row + 1) // 2 + column
 
     # ---- Observer of the walk ----
 
@@ -123,15 +126,28 @@ class VisibilityMap:
         self._count(entry, ~scene.ray_test(ray), mi.Bool(True))
         dr.eval(self.tests, self.successes)
 
-    def update(self) -> None:
-        """Makes the table of the counters: the mean of a Beta posterior, whose prior is worth one
-        test and expects the share of all tests that succeeded."""
+    # ---- What was learned ----
+
+    def light_voxels(self) -> mi.UInt32:
+        """The voxels that shadow rays went to."""
+        return dr.compress(self._holds_light > 0)
+
+    def ratio(self, entry: mi.UInt32) -> mi.Float:
+        """The share of the tests that succeeded; 0 where there was none."""
+        tests = dr.gather(mi.UInt32, self.tests, entry)
+        successes = dr.gather(mi.UInt32, self.successes, entry)
+        return mi.Float(successes) / mi.Float(dr.maximum(tests, 1))
+
+    def posterior_mean(self, entry: mi.UInt32) -> mi.Float:
+        """The probability that two points of the pair of voxels see each other: the mean of a Beta
+        posterior, whose prior is worth one test and expects the share of successes of the whole
+        map."""
         tests, successes = (int(dr.sum(mi.UInt64(n))[0]) for n in (self.tests, self.successes))
-        # Half a success and half a failure more: the prior never claims certainty
-        prior = mi.Float((successes + 0.5) / (tests + 1))
-        dr.make_opaque(prior)
-        self.visibility = (mi.Float(self.successes) + prior) / (mi.Float(self.tests) + 1)
-        dr.eval(self.visibility)
+        # Half a success in one more test: the prior is never certain
+        prior = dr.opaque(mi.Float, (successes + 0.5) / (tests + 1))
+        tests = mi.Float(dr.gather(mi.UInt32, self.tests, entry))
+        successes = mi.Float(dr.gather(mi.UInt32, self.successes, entry))
+        return (successes + prior) / (tests + 1)
 
     def __str__(self) -> str:
         seen, succeeded = (int(dr.count(n > 0)[0]) for n in (self.tests, self.successes))

@@ -38,7 +38,8 @@ class VoxelGrid:
         padding = mi.ScalarVector3f(1e-4 * dr.max(extent) or 1.0)
         self.origin = mi.Point3f(bbox.min - padding)
         self.size = mi.Vector3f((extent + 2 * padding) / resolution)
-        dr.make_opaque(self.origin, self.size)
+        self._scale = 1 / self.size
+        dr.make_opaque(self.origin, self.size, self._scale)
         occupied = dr.zeros(mi.UInt32, resolution**3)
         for shape in scene.shapes():
             self._mark_shape(occupied, shape)
@@ -54,7 +55,7 @@ class VoxelGrid:
 
     def index(self, p: mi.Point3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         """The number of the occupied voxel that holds ``p``, and whether there is one."""
-        cell = mi.Vector3i(dr.floor((p - self.origin) / self.size))
+        cell = mi.Vector3i(dr.floor(self._relative(p)))
         inside = active & dr.all((cell >= 0) & (cell < self.resolution))
         index = dr.gather(mi.UInt32, self._index, self._linear(cell), inside)
         return index, inside & (index != EMPTY)
@@ -87,12 +88,12 @@ class VoxelGrid:
     def _mark_box(self, occupied: mi.UInt32, bbox: mi.ScalarBoundingBox3f) -> None:
         if not bbox.valid():
             return
-        low, high = self._relative(mi.Point3f(bbox.min)), self._relative(mi.Point3f(bbox.max))
+        low, high = (self._relative(mi.Point3f(p)) for p in (bbox.min, bbox.max))
         _mark_boxes(occupied, self.resolution, low, high, low, mi.Vector3f(0))
 
     def _relative(self, p: mi.Point3f) -> mi.Point3f:
         """In units of voxels from the grid's origin."""
-        return (mi.Point3f(p) - self.origin) / self.size
+        return (p - self.origin) * self._scale
 
 
 @dr.syntax
