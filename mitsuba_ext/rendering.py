@@ -71,7 +71,7 @@ class RenderStatistics:
 @dataclass
 class _Part:
     """Passes that share an image block. ``planned`` is the weight of the part in the film, in
-    samples per pixel; it is fixed beforehand, however many samples ``done`` becomes."""
+    samples per pixel, however many samples ``done`` becomes; 0 for the latter."""
 
     block: mi.ImageBlock
     planned: int = 0
@@ -196,32 +196,35 @@ class _Job:
 
     def _run_stage(self, stage, passes: list[int], is_last: bool, interrupt) -> None:
         timeout = self.integrator.timeout
+        is_timed = is_last and timeout > 0
         allowed = len(passes)
         seconds = 0.0
+        if is_timed:
+            # All passes, unless more of them are allowed below
+            self._open_part(planned=sum(passes))
         for index, spp in enumerate(passes):
             if index >= allowed or self._stopped(interrupt):
                 return
-            if index == 1 and is_last and timeout > 0:
+            if is_timed and index == 1:
                 # The number of the remaining passes is decided here, from the speed of the first.
-                # They get an image block of their own, whose weight stays what it was planned to
-                # be: the image's mean does not depend on how many of them the time allows.
+                # The weights stay what they were planned to be, so that the image's mean does not
+                # depend on how many of them the time allows.
                 remaining = timeout - (time.perf_counter() - self.start)
                 allowed = 1 + max(0, int(remaining / max(seconds, 1e-3)))
-                if allowed > 1:
-                    self._open_part()
-                    self.parts[-1].planned = sum(passes[1:])
+                if allowed == 1:
+                    return
+                self.parts[-1].planned = passes[0]
+                self._open_part(planned=sum(passes[1:]))
             seconds = self._run_pass(stage, spp)
             if self.integrator.progress is not None:
-                self.integrator.progress(self._fraction(allowed, passes, is_last, timeout))
+                self.integrator.progress(self._fraction(allowed, passes, is_timed))
 
-    def _fraction(self, allowed: int, passes: list[int], is_last: bool, timeout: float) -> float:
-        total = self.spp
-        if is_last and 0 < timeout:
-            total -= sum(passes[allowed:])
+    def _fraction(self, allowed: int, passes: list[int], is_timed: bool) -> float:
+        total = self.spp - (sum(passes[allowed:]) if is_timed else 0)
         return min(1.0, self.statistics.spp / total)
 
-    def _open_part(self) -> None:
-        self.parts.append(_Part(self.film.create_block()))
+    def _open_part(self, planned: int = 0) -> None:
+        self.parts.append(_Part(self.film.create_block(), planned))
 
     def _stopped(self, interrupt: threading.Event) -> bool:
         return interrupt.is_set() or self.integrator.is_cancelled

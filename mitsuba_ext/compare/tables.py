@@ -52,21 +52,20 @@ def table(experiment: Experiment) -> Table:
         show_edge=False, padding=0,
     )
     result.add_column("integrator", overflow="fold", min_width=12)
-    for heading in ("relMSE", "trimmed", "rMSE", "seconds", "spp", "rays", "shadow", "eff."):
+    for heading in ("relMSE", "trimmed", "rMSE", "seconds", "rays", "shadow", "eff."):
         result.add_column(heading, justify="right", no_wrap=True)
     for contender in experiment.contenders:
         label = Text(contender.label)
         if contender.error:
             label.append(f"\n{contender.error}", style="red")
         if not contender.runs:
-            result.add_row(label, *["–"] * 8)
+            result.add_row(label, *["–"] * 7)
             continue
         ratio = experiment.efficiency_ratio(contender)
         result.add_row(
             label,
             *(_spread(contender, name, "mean") for name in ("relmse", "relmse_trimmed", "rmse")),
             _spread(contender, "seconds", "median"),
-            str(contender.runs[0].spp),
             _rays(contender),
             _shadow_share(contender),
             "–" if ratio is None else f"{ratio:.2f}x",

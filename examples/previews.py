@@ -1,0 +1,41 @@
+"""Renders the pictures of the README: ``.venv/bin/python examples/previews.py`` (15 minutes)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
+
+import mitsuba as mi  # isort: skip
+
+SCENES = Path(__file__).parents[1] / "scenes"
+
+#: Scene → samples per pixel for a clean picture.
+PICTURES = {
+    "door_ajar": 2048,
+    "rooms": 2048,
+    "cornell_box": 512,
+    "open": 256,
+    "mirrors_and_glass": 2048,
+    "sunny_gloss": 1024,
+}
+
+
+def main() -> None:
+    """Writes ``scenes/previews/NAME.png`` for each picture, 180 pixels high."""
+    mi.set_variant("llvm_ad_rgb")
+    folder = SCENES / "previews"
+    folder.mkdir(exist_ok=True)
+    for name, spp in PICTURES.items():
+        width = 216 if name == "cornell_box" else 320
+        scene = mi.load_file(
+            str(SCENES / f"{name}.xml"), width=width, height=180, integrator="neepp"
+        )
+        mi.util.write_bitmap(str(folder / f"{name}.png"), mi.render(scene, spp=spp))
+        statistics = scene.integrator().statistics
+        print(f"{name}: {spp} spp, {statistics.seconds:.0f} s, {statistics.learned}", flush=True)
+    mi.Thread.wait_for_tasks()
+
+
+if __name__ == "__main__":
+    main()
