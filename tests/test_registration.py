@@ -52,7 +52,8 @@ for variant in {LLVM_VARIANTS!r} * 2:
     mi.set_variant(variant)
     load_all()
     scene = mi.load_dict({{
-        "type": "scene", "e": {{"type": "constant"}}, "s": {{"type": "sphere", "center": [0, 0, 3]}},
+        "type": "scene", "e": {{"type": "constant"}},
+        "s": {{"type": "sphere", "center": [0, 0, 3]}},
         "c": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 2, "height": 2}}}},
         "i": {{"type": "neepp"}}}})
     image = mi.render(scene, spp=4).numpy()
