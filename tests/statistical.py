@@ -83,13 +83,17 @@ REFERENCE_SEEDS = range(1001, 1017)
 _ROUNDING = 2e-6
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _load(name: str, variant: str, options: tuple[tuple[str, Any], ...]) -> mi.Scene:
     return mi.load_file(str(SCENES / f"{name}.xml"), **dict(options))
 
 
 def load(name: str, **options: Any) -> mi.Scene:
-    """One of our scenes, in the active variant, loaded once."""
+    """One of our scenes, in the active variant.
+
+    The last one is kept, for tests of one scene in a row; more would be costly, since Dr.Jit
+    compiles the methods of *all* objects that exist into each kernel.
+    """
     return _load(name, mi.variant(), tuple(sorted(options.items())))
 
 
@@ -108,6 +112,16 @@ def assert_images_are_sound(images: np.ndarray, tolerance: float = 0.0) -> None:
     """Finite and non-negative pixels. ``tolerance`` is for filters with negative lobes."""
     assert np.isfinite(images).all(), f"{(~np.isfinite(images)).sum()} values are not finite"
     assert images.min(initial=0.0) >= -tolerance, f"the least value is {images.min()}"
+
+
+def assert_same_image(a: np.ndarray, b: np.ndarray, share: float = 0.98) -> None:
+    """Two images of the same random numbers: equal to float precision in a ``share`` of all values
+    (a rounding error can send one path elsewhere), and in the mean. NaN and ∞ fail."""
+    scale = np.abs(b).mean()
+    assert a.shape == b.shape
+    same = np.isclose(a, b, rtol=1e-4, atol=1e-5 * scale)
+    assert same.mean() >= share, f"{1 - same.mean():.1%} of the values differ"
+    np.testing.assert_allclose(a.mean(), b.mean(), rtol=1e-3, atol=1e-7 * scale)
 
 
 def sidak(tests: int) -> float:

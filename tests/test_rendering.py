@@ -108,13 +108,15 @@ def test_pilots_and_passes_keep_the_sample_count(scene, sampler):
 
 
 @pytest.mark.usefixtures("small_passes")
-def test_the_timeout_stops_early_and_does_not_change_the_mean(scene, monkeypatch):
-    """On a clock that jumps by a second at each reading: only some passes fit, and the weights of
-    the stages remain what 100 samples would have given."""
+@pytest.mark.parametrize("timeout", [1.0, 60.0])
+def test_the_timeout_stops_early_and_does_not_change_the_mean(scene, monkeypatch, timeout):
+    """On a clock that jumps by a second at each reading: only some passes fit, or only the pilot
+    and one more, and the weights of the stages remain what 100 samples would have given."""
     clock = iter(range(10**9))
     monkeypatch.setattr(rendering.time, "perf_counter", lambda: float(next(clock)))
-    integrator = _TwoStages(pilot_spp=10, timeout=30.0)
+    integrator = _TwoStages(pilot_spp=10, timeout=timeout)
     image = integrator.render(scene, 100)
+    assert (integrator.statistics.spp == 11) == (timeout == 1.0)
     assert 10 < integrator.statistics.spp < 100
     assert image == pytest.approx((10 * 1 + 90 * 3) / 100)
 
