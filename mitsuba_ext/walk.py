@@ -94,7 +94,7 @@ class Walk:
 
         pi = self.query.closest(scene, ray, coherent=True, active=active)
         if dr.hint(self.hide_emitters, mode="scalar"):
-            pi = self._skip_emitters(scene, ray, pi, active)
+            ray, pi = self._skip_emitters(scene, ray, pi, active)
 
         while dr.hint(active, label="walk"):
             si = self.query.interaction(pi, ray)
@@ -195,15 +195,15 @@ class Walk:
 
     @dr.syntax
     def _skip_emitters(self, scene, ray, pi, active):
-        """The first surface behind the area lights that a camera ray meets."""
+        """The first surface behind the area lights that a camera ray meets, and the ray from the
+        last of these lights, to which that intersection belongs."""
         ray = mi.Ray3f(ray)
         on_emitter = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
         while on_emitter:
-            si = self.query.interaction(pi, ray)
-            ray = si.spawn_ray(ray.d)
+            ray = self.query.interaction(pi, ray).spawn_ray(ray.d)
             pi = self.query.closest(scene, ray, coherent=True, active=on_emitter)
             on_emitter &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
-        return pi
+        return ray, pi
 
 
 def _mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:

@@ -194,3 +194,29 @@ def test_what_the_scene_lacks_is_not_in_the_kernel():
     assert none < point < area, "no lights; lights that cannot be hit; lights that can"
     assert area < two_areas, "the choice between lights"
     assert area < environment, "the environment"
+
+
+@pytest.mark.usefixtures("variant")
+def test_what_lies_behind_a_hidden_emitter_is_seen_undistorted():
+    """Mitsuba 3.9.1 itself is wrong here: its ``path`` measures the distance to an analytic shape
+    behind the emitter from the camera, and renders it black."""
+    T = mi.ScalarTransform4f
+    scene = {
+        "type": "scene",
+        "sensor": {
+            "type": "perspective", "fov": 20, "to_world": T().look_at([0, 0, 9], [0] * 3, [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 8, "height": 8},
+        },
+        "sphere": {"type": "sphere", "radius": 2},
+        "sky": {"type": "point", "position": [5, 5, 20], "intensity": 100.0},
+    }
+    integrator = mi.load_dict({"type": "composed_path", "max_depth": 2, "hide_emitters": True})
+    bare = mi.render(mi.load_dict(scene), integrator=integrator, spp=64).numpy()
+    # Two lamps, one behind the other, that fill the view and cast no shadow on the sphere
+    for name, z in (("near", 8.9), ("far", 8.8)):
+        scene[name] = {
+            "type": "rectangle", "to_world": T().translate([0, 0, z]).scale(0.05),
+            "emitter": {"type": "area", "radiance": 1e-9},
+        }
+    behind = mi.render(mi.load_dict(scene), integrator=integrator, spp=64).numpy()
+    assert behind[..., :3].mean() == pytest.approx(bare[..., :3].mean(), rel=0.02)
