@@ -204,7 +204,9 @@ def test_what_lies_behind_a_hidden_emitter_is_seen_undistorted():
     scene = {
         "type": "scene",
         "sensor": {
-            "type": "perspective", "fov": 20, "to_world": T().look_at([0, 0, 9], [0] * 3, [0, 1, 0]),
+            "type": "perspective",
+            "fov": 20,
+            "to_world": T().look_at([0, 0, 9], [0, 0, 0], [0, 1, 0]),
             "film": {"type": "hdrfilm", "width": 8, "height": 8},
         },
         "sphere": {"type": "sphere", "radius": 2},
