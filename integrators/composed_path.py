@@ -20,9 +20,9 @@ class ComposedPath(WalkIntegrator):
     Composed path tracer (:monosp:`composed_path`)
     ----------------------------------------------
 
-    A path tracer whose decisions are chosen in the scene. With all defaults it draws the same
-    random numbers as Mitsuba's :monosp:`path` and returns the same image, but traces no shadow ray
-    for connections that cannot contribute.
+    A path tracer whose decisions are chosen in the scene. With all defaults it is Mitsuba's
+    :monosp:`path` (with the same random numbers and the same image, while one pass of two million
+    samples is enough), but traces no shadow ray for connections that cannot contribute.
 
     .. pluginparameters::
 
@@ -45,8 +45,9 @@ class ComposedPath(WalkIntegrator):
      * - timeout
        - |float|
        - Seconds after which to stop, 0 or less for no limit. The number of passes is fixed from the
-         speed of the first one, so that stopping does not bias the image; that pass is always
-         finished, and the rest is off by as much as the speed varies. (Default: -1)
+         speed of the first one, so that stopping does not prefer fast samples. That pass is always
+         finished (and one more, if it had to compile its kernel); beyond that the time is
+         kept as well as the speed is steady. (Default: -1)
      * - aovs
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as

@@ -39,7 +39,8 @@ class NEEPlusPlus(WalkIntegrator):
      * - pilot_spp
        - |int|
        - Samples per pixel from which visibility is learned, at most a quarter of all. They count
-         towards the image. With 0 nothing is learned and every shadow ray is traced. (Default: 4)
+         towards the image. With 0 nothing is learned and every shadow ray is traced. A sampler that
+         is stratified over all samples may need a longer pilot, up to a sixteenth. (Default: 4)
      * - law
        - |string|
        - How the probability of tracing a shadow ray follows from the learned visibility V:
@@ -64,9 +65,9 @@ class NEEPlusPlus(WalkIntegrator):
      * - timeout
        - |float|
        - Seconds after which to stop, 0 or less for no limit. The number of passes is fixed from the
-         speed of the first pass after learning, so that stopping does not bias the image; the pilot
-         and that pass are always finished, and the rest is off by as much as the speed varies.
-         (Default: -1)
+         speed of the first pass after learning, so that stopping does not prefer fast samples. The
+         pilot and that pass are always finished (and one more, if it had to compile its kernel);
+         beyond that the time is kept as well as the speed is steady. (Default: -1)
      * - aovs
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
@@ -76,11 +77,11 @@ class NEEPlusPlus(WalkIntegrator):
     lamps behind walls, and when a shadow ray is expensive. **Not when** the scene is open (it then
     costs the pilot's bookkeeping) or the difficulty lies elsewhere, in glossy or indirect light.
 
-    Visibility is learned towards points in the scene. Environment maps and directional lights are
-    always tested. Participating media are ignored, as by :monosp:`path`. Gradients are not
-    supported (use :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`aov` or
-    :monosp:`moment` there is no pilot, so every shadow ray is traced; use the parameter
-    :monosp:`aovs`.
+    Visibility is learned towards points in the scene's bounding box. Lights at infinity or outside
+    of it are always tested; where there are no others, nothing is learned. Participating media are
+    ignored, as by :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are scalar
+    and polarized variants. Nested in :monosp:`aov` or :monosp:`moment` there is no pilot, so every
+    shadow ray is traced; use the parameter :monosp:`aovs`.
 
     Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
     Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, sections 3 to 4.1.

@@ -5,24 +5,17 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
 
 from . import rendering
+from .rendering import Stage
 from .walk import Walk
 
 _NO_DEPTH_LIMIT = 0xFFFFFFFF
-
-
-@dataclass
-class Stage:
-    """One stage of a render: the walk that its samples take, and what had been learned before."""
-
-    walk: Walk
-    learned: str = ""
 
 
 class WalkIntegrator(mi.SamplingIntegrator):
@@ -49,9 +42,15 @@ class WalkIntegrator(mi.SamplingIntegrator):
         super().__init__(props)
         self.name = props.plugin_name()
         self.timeout = self.parameter(props, "timeout", -1.0)
-        max_depth = self.parameter(props, "max_depth", -1, minimum=-1)
+        max_depth = self.parameter(
+            props, "max_depth", -1, minimum=-1, maximum=_NO_DEPTH_LIMIT - 1
+        )
         self.max_depth = max_depth if max_depth >= 0 else _NO_DEPTH_LIMIT
-        self.rr_depth = self.parameter(props, "rr_depth", 5, minimum=1)
+        self.rr_depth = self.parameter(props, "rr_depth", 5, minimum=1, maximum=_NO_DEPTH_LIMIT)
+        # Deprecated by Mitsuba, which says so in the log
+        self.samples_per_pass = self.parameter(
+            props, "samples_per_pass", _NO_DEPTH_LIMIT, minimum=1
+        )
         self._aovs = self._aov_integrator(self.parameter(props, "aovs", ""))
         self.progress: Callable[[float], None] | None = None
         self.statistics = rendering.RenderStatistics()
@@ -105,10 +104,10 @@ class WalkIntegrator(mi.SamplingIntegrator):
         self.is_cancelled = True
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
-        raise self._no_gradients()
+        raise self.no_gradients()
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
-        raise self._no_gradients()
+        raise self.no_gradients()
 
     def to_string(self) -> str:
         parameters = {
@@ -147,6 +146,8 @@ class WalkIntegrator(mi.SamplingIntegrator):
         accepted = f"of type {kind.__name__}"
         if type(value) is not kind:
             raise TypeError(self._message(key, value, accepted))
+        if kind is float and not math.isfinite(value):
+            raise ValueError(self._message(key, value, "finite"))
         if choices and value not in choices:
             raise ValueError(self._message(key, value, f"one of {', '.join(choices)}"))
         if minimum is not None and not value >= minimum:
@@ -158,7 +159,8 @@ class WalkIntegrator(mi.SamplingIntegrator):
     def _message(self, key: str, value: Any, accepted: str) -> str:
         return f'"{self.name}": the parameter "{key}" is {value!r}; it must be {accepted}'
 
-    def _no_gradients(self) -> NotImplementedError:
+    def no_gradients(self) -> NotImplementedError:
+        """What to raise where gradients are asked for."""
         return NotImplementedError(
             f'"{self.name}" does not compute gradients: use an integrator made for that, such as '
             f'"prb".'

@@ -9,6 +9,7 @@ depend on the number of samples, and all passes of a stage run the same kernel.
 from __future__ import annotations
 
 import contextlib
+import operator
 import signal
 import threading
 import time
@@ -20,6 +21,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import camera
+from .walk import Walk
 
 if TYPE_CHECKING:
     from .integrator import WalkIntegrator
@@ -27,6 +29,9 @@ if TYPE_CHECKING:
 #: Samples per pass. Tracing a pass in Python takes 5 to 70 ms (many materials take longest), the
 #: pass itself two or three seconds on two CPU cores. A GPU gets longer passes.
 _PASS_SAMPLES = {dr.JitBackend.LLVM: 1 << 21, dr.JitBackend.CUDA: 1 << 24}
+
+#: Passes of a structured sampler that learns, at least: a pilot is one of them or more.
+_MIN_STRUCTURED_PASSES = 16
 
 #: With a time budget, passes are shorter by this factor: they are what it is kept with.
 _TIMEOUT_PASS_DIVISOR = 4
@@ -69,13 +74,11 @@ class RenderStatistics:
 
 
 @dataclass
-class _Part:
-    """Passes that share an image block. ``planned`` is the weight of the part in the film, in
-    samples per pixel, however many samples ``done`` becomes; 0 for the latter."""
+class Stage:
+    """One stage of a render: the walk that its samples take, and what had been learned before."""
 
-    block: mi.ImageBlock
-    planned: int = 0
-    done: int = 0
+    walk: Walk
+    learned: str = ""
 
 
 def render(
@@ -131,8 +134,9 @@ class _Job:
         self.integrator, self.scene, self.sensor, self.film = (
             integrator, scene, sensor, sensor.film(),
         )
-        self.seed = int(seed if isinstance(seed, int) else seed[0]) & 0xFFFFFFFF
-        self.sampler = sensor.sampler().clone()
+        seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
+        self.seed = seed & 0xFFFFFFFF
+        self.sampler = _own_sampler(sensor)
         if spp:
             self.sampler.set_sample_count(spp)
         self.spp = self.sampler.sample_count()
@@ -143,25 +147,36 @@ class _Job:
             )
         self.statistics = integrator.statistics = RenderStatistics()
         self.tally = dr.zeros(mi.UInt64, 4)
-        self.parts: list[_Part] = []
-        self.film.prepare(integrator.aov_names())
+        aovs = integrator.aov_names()
+        if aovs and mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
+            raise NotImplementedError(
+                f'"{integrator.name}": the parameter "aovs" does not work with the film '
+                f'"{self.film.class_name()}": use an "hdrfilm".'
+            )
+        self.film.prepare(aovs)
         self._plan()
+        self.block = self.film.create_block()
+        # One kernel for all passes: coalescing is decided once
+        longest = max(max(passes) for passes in self.plan)
+        self.block.set_coalesce(self.block.coalesce() and longest >= 4)
 
     def _plan(self) -> None:
         """Decides the samples of each stage and of each of its passes."""
         limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // (self.width * self.height)
         if self.integrator.timeout > 0:
             limit //= _TIMEOUT_PASS_DIVISOR
-        limit = max(1, limit)
+        limit = max(1, min(limit, self.integrator.samples_per_pass))
         stages = self.integrator.stage_samples(self.scene, self.spp)
         # Independent samples can be cut anywhere, and each pass gets a seed of its own. Samples
-        # that are stratified over the whole render must come in passes of equal length.
+        # that are stratified over the whole render must come in passes of equal length, to which
+        # the pilots are rounded.
         self.structured = self.sampler.class_name() != "IndependentSampler"
         if self.structured:
-            longest = min(limit, *stages)
-            length = max(d for d in range(1, longest + 1) if self.spp % d == 0)
-            stages = [length * (s // length) for s in stages]
-            stages[-1] += self.spp - sum(stages)
+            if len(stages) > 1:
+                limit = min(limit, max(*stages[:-1], self.spp // _MIN_STRUCTURED_PASSES))
+            length = max(d for d in range(1, limit + 1) if self.spp % d == 0)
+            stages = [length * max(1, s // length) for s in stages[:-1]]
+            stages.append(self.spp - sum(stages))
             self.sampler.set_samples_per_wavefront(length)
             self.sampler.seed(dr.opaque(mi.UInt32, self.seed), self._lanes(length))
         self.plan = []
@@ -182,7 +197,6 @@ class _Job:
             f"Starting render job ({self.width}x{self.height}, {self.spp} samples, "
             f"{len(self.plan)} stage(s), {pass_count} pass(es))",
         )
-        self._open_part()
         stages = self.integrator.stages(self.scene, stage_samples)
         for index, (stage, passes) in enumerate(zip(stages, self.plan)):
             is_last = index == len(self.plan) - 1
@@ -194,71 +208,61 @@ class _Job:
                 self.statistics.interrupted = True
                 return
 
-    def _run_stage(self, stage, passes: list[int], is_last: bool, interrupt) -> None:
+    def _run_stage(self, stage: Stage, passes: list[int], is_last: bool, interrupt) -> None:
+        """Runs the passes of a stage: all of them, or as many as the timeout allows.
+
+        Their number is fixed as soon as the speed is known, from the first pass that compiled
+        nothing, and not by looking at the clock later: an image that ends when the clock says so
+        prefers samples that are fast.
+        """
         timeout = self.integrator.timeout
-        is_timed = is_last and timeout > 0
+        is_open = is_last and timeout > 0  # is the number of passes still open?
         allowed = len(passes)
-        seconds = 0.0
-        if is_timed:
-            # All passes, unless more of them are allowed below
-            self._open_part(planned=sum(passes))
         for index, spp in enumerate(passes):
             if index >= allowed or self._stopped(interrupt):
                 return
-            if is_timed and index == 1:
-                # The number of the remaining passes is decided here, from the speed of the first.
-                # The weights stay what they were planned to be, so that the image's mean does not
-                # depend on how many of them the time allows.
-                remaining = timeout - (time.perf_counter() - self.start)
-                allowed = 1 + max(0, int(remaining / max(seconds, 1e-3)))
-                if allowed == 1:
-                    return
-                self.parts[-1].planned = passes[0]
-                self._open_part(planned=sum(passes[1:]))
-            seconds = self._run_pass(stage, spp)
+            begin = time.perf_counter()
+            compiled = self._run_pass(stage, spp)
+            end = time.perf_counter()
+            if is_open and not compiled:
+                remaining = timeout - (end - self.start)
+                allowed = min(allowed, index + 1 + max(0, int(remaining / (end - begin))))
+                is_open = False
             if self.integrator.progress is not None:
-                self.integrator.progress(self._fraction(allowed, passes, is_timed))
-
-    def _fraction(self, allowed: int, passes: list[int], is_timed: bool) -> float:
-        total = self.spp - (sum(passes[allowed:]) if is_timed else 0)
-        return min(1.0, self.statistics.spp / total)
-
-    def _open_part(self, planned: int = 0) -> None:
-        self.parts.append(_Part(self.film.create_block(), planned))
+                left = 0 if is_open else sum(passes[index + 1 : allowed])
+                done = self.statistics.spp
+                total = self.spp if is_open or not is_last else done + left
+                self.integrator.progress(done / total)
 
     def _stopped(self, interrupt: threading.Event) -> bool:
         return interrupt.is_set() or self.integrator.is_cancelled
 
-    def _run_pass(self, stage, spp: int) -> float:
-        """Renders ``spp`` samples per pixel into the current part; returns the seconds it took,
-        without those of compilation."""
+    def _run_pass(self, stage: Stage, spp: int) -> bool:
+        """Renders ``spp`` samples per pixel into the block; did it have to compile a kernel?"""
         begin = time.perf_counter()
+        misses = _kernel_cache_misses()
         sampler = self._pass_sampler(spp)
         ray, weight, position = camera.sample_rays(self.sensor, sampler, spp, self.spp)
         sample = stage.walk(self.scene, sampler, mi.Ray3f(ray), mi.Bool(True))
+        if dr.grad_enabled(sample.L):
+            raise self.integrator.no_gradients()
         aovs = self.integrator.sample_aovs(self.scene, sampler, ray)
-
-        part = self.parts[-1]
-        part.block.set_coalesce(part.block.coalesce() and spp >= 4)
         camera.splat(
-            self.film, part.block, position, sample.L * weight, sample.valid, ray.wavelengths, aovs
+            self.film, self.block, position, sample.L * weight, sample.valid, ray.wavelengths, aovs
         )
         self._count(sample)
         if self.structured:
             sampler.advance()
             sampler.schedule_state()
-        dr.eval(part.block.tensor(), self.tally)
-        launched = time.perf_counter()
+        dr.eval(self.block.tensor(), self.tally)
+        self.statistics.compile_seconds += time.perf_counter() - begin
         dr.sync_thread()
-        end = time.perf_counter()
 
-        part.done += spp
         self.pass_index += 1
         self.statistics.passes += 1
         self.statistics.spp += spp
         self.statistics.rays["camera"] += self._lanes(spp)
-        self.statistics.compile_seconds += launched - begin
-        return end - launched
+        return _kernel_cache_misses() > misses
 
     def _pass_sampler(self, spp: int) -> mi.Sampler:
         if self.structured:
@@ -282,14 +286,8 @@ class _Job:
             dr.scatter_add(self.tally, mi.UInt64(count), mi.UInt32(index))
 
     def fill_film(self) -> None:
-        """Merges the parts into the film, each with its planned weight."""
-        for part in self.parts:
-            if part.done == 0:
-                continue
-            tensor = part.block.tensor()
-            if part.planned:
-                tensor *= part.planned / part.done
-            self.film.put_block(part.block)
+        """Hands the samples of the finished passes to the film."""
+        self.film.put_block(self.block)
 
     def finish(self) -> None:
         statistics = self.statistics
@@ -313,6 +311,20 @@ def _even_length(samples: int, limit: int) -> int:
     return max(1, -(-samples // max(1, pass_count)))
 
 
+def _own_sampler(sensor: mi.Sensor) -> mi.Sampler:
+    """A copy of the sensor's sampler, or the sampler itself where it cannot be copied (samplers
+    written in Python need not have ``clone``)."""
+    try:
+        return sensor.sampler().clone()
+    except RuntimeError:
+        return sensor.sampler()
+
+
+def _kernel_cache_misses() -> int:
+    _launches, soft_misses, hard_misses = dr.detail.launch_stats()
+    return soft_misses + hard_misses
+
+
 @contextlib.contextmanager
 def _deferred_interrupt() -> Iterator[threading.Event]:
     """While active, the first Ctrl-C only sets the event, so that the running pass can finish; a
@@ -325,11 +337,11 @@ def _deferred_interrupt() -> Iterator[threading.Event]:
 
     def handler(_signum, _frame) -> None:
         event.set()
-        signal.signal(signal.SIGINT, previous)
+        signal.signal(signal.SIGINT, previous or signal.SIG_DFL)
         mi.Log(mi.LogLevel.Warn, "Interrupted: the running pass is being finished.")
 
     signal.signal(signal.SIGINT, handler)
     try:
         yield event
     finally:
-        signal.signal(signal.SIGINT, previous)
+        signal.signal(signal.SIGINT, previous or signal.SIG_DFL)

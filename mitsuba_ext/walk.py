@@ -1,9 +1,10 @@
 """The traced random walk that all unidirectional integrators share.
 
 The walk is Mitsuba's ``path``: next event estimation, multiple importance sampling with the power
-heuristic, Russian roulette. With the default decisions it draws the same random numbers in the same
-order and returns the same image. A technique replaces one decision (see ``decisions/``); Dr.Jit
-inlines Python while it traces, so a replaced decision costs what it does and a default one nothing.
+heuristic, Russian roulette. With the default decisions it draws the same random numbers in the
+same order, so that a render of one pass returns the same image. A technique replaces one decision
+(see ``decisions/``); Dr.Jit inlines Python while it traces, so a replaced decision costs what it
+does and a default one nothing.
 
 Dr.Jit's loops see local variables only. Whatever a decision changes from one bounce to the next is
 therefore a *state* that its methods take and return; its attributes are read-only during the walk.
@@ -82,7 +83,7 @@ class Walk:
         β = mi.Spectrum(1)                              # Path throughput weight
         η = mi.Float(1)                                 # Product of relative indices of refraction
         depth = mi.UInt32(0)                            # Depth of the current vertex
-        valid = mi.Bool(sees_environment)               # Has the path met anything?
+        valid = mi.Bool(sees_environment and self.max_depth > 0)  # Has the path met anything?
         prev_si = dr.zeros(mi.Interaction3f)            # Previous scattering event
         prev_bsdf_pdf = mi.Float(1)
         prev_bsdf_delta = mi.Bool(True)
@@ -175,7 +176,8 @@ class Walk:
     def _add_emission(self, state, scene, L, β, si, prev_si, prev_bsdf_pdf, prev_bsdf_delta):
         """Adds the light that the BSDF sample of the previous vertex ran into."""
         ds = mi.DirectionSample3f(scene, si, prev_si)
-        em_pdf, state = self.next_event.pdf(state, scene, prev_si, ds, ~prev_bsdf_delta)
+        is_connectable = ~prev_bsdf_delta & (ds.emitter != None)  # noqa: E711
+        em_pdf, state = self.next_event.pdf(state, scene, prev_si, ds, is_connectable)
         mis = _mis_weight(prev_bsdf_pdf, em_pdf)
         return dr.fma(β, ds.emitter.eval(si, prev_bsdf_pdf > 0) * mis, L), state
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mitsuba_ext import rendering
+from mitsuba_ext.rendering import Stage
 from mitsuba_ext.walk import PathSample
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -58,15 +59,13 @@ class _TwoStages:
     """Two stages of constants: a pilot worth 1 and a rest worth 3."""
 
     def __init__(self, pilot_spp: int, timeout: float = -1) -> None:
-        self.pilot_spp, self.timeout = pilot_spp, timeout
+        self.pilot_spp, self.timeout, self.samples_per_pass = pilot_spp, timeout, 2**32 - 1
         self.progress, self.is_cancelled = None, False
 
     def stage_samples(self, scene, spp):
         return [self.pilot_spp, spp - self.pilot_spp]
 
     def stages(self, scene, samples):
-        from mitsuba_ext.integrator import Stage
-
         yield Stage(_Constant(1.0))
         yield Stage(_Constant(3.0), "something")
 
@@ -108,17 +107,20 @@ def test_pilots_and_passes_keep_the_sample_count(scene, sampler):
 
 
 @pytest.mark.usefixtures("small_passes")
-@pytest.mark.parametrize("timeout", [1.0, 60.0])
-def test_the_timeout_stops_early_and_does_not_change_the_mean(scene, monkeypatch, timeout):
-    """On a clock that jumps by a second at each reading: only some passes fit, or only the pilot
-    and one more, and the weights of the stages remain what 100 samples would have given."""
+@pytest.mark.parametrize("timeout", [0.5, 90.0])
+def test_the_timeout_fixes_the_number_of_passes_from_the_speed_of_the_first(
+    scene, monkeypatch, timeout
+):
+    """On a clock that jumps by a second at each reading."""
+    _TwoStages(pilot_spp=10).render(scene, 100)  # compiles
     clock = iter(range(10**9))
     monkeypatch.setattr(rendering.time, "perf_counter", lambda: float(next(clock)))
     integrator = _TwoStages(pilot_spp=10, timeout=timeout)
     image = integrator.render(scene, 100)
-    assert (integrator.statistics.spp == 11) == (timeout == 1.0)
-    assert 10 < integrator.statistics.spp < 100
-    assert image == pytest.approx((10 * 1 + 90 * 3) / 100)
+    done = integrator.statistics.spp
+    assert integrator.statistics.passes == done, "a pass of one sample each"
+    assert (done == 11) if timeout < 1 else (11 < done < 100)
+    assert image == pytest.approx((10 * 1 + (done - 10) * 3) / done)
 
 
 @pytest.mark.usefixtures("small_passes")
@@ -162,13 +164,21 @@ def test_an_error_in_the_progress_callback_leaves_a_valid_film(scene):
 
 @pytest.mark.usefixtures("small_passes")
 def test_passes_share_kernels_and_memory(scene):
+    """With a filter that spreads samples, and with a shorter pass at the end."""
+    sensor = mi.load_dict(
+        {"type": "perspective",
+         "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT,
+                  "rfilter": {"type": "gaussian"}}}
+    )
     integrator = _path("neepp")
-    integrator.render(scene, spp=17)
-    few, compiled = integrator.statistics, dr.detail.launch_stats()[2]
-    integrator.render(scene, spp=67)
+    compiled: list[int] = []
+    integrator.progress = lambda _: compiled.append(sum(dr.detail.launch_stats()[1:]))
+    integrator.render(scene, sensor, spp=30)
+    few = integrator.statistics
+    assert compiled[1] == compiled[-1] and len(compiled) == few.passes > 5
+    integrator.render(scene, sensor, spp=69, seed=1)
     many = integrator.statistics
-    assert many.passes > 2 * few.passes
-    assert dr.detail.launch_stats()[2] == compiled, "a pass compiled a kernel of its own"
+    assert compiled[-1] == compiled[1] and many.passes > 2 * few.passes
     assert many.memory <= 1.05 * few.memory
 
 

@@ -93,7 +93,7 @@ class Rejection:
         get = integrator.parameter
         return cls(
             grid=get(props, "grid", 16, minimum=1, maximum=1024),
-            refine=get(props, "refine", 16, minimum=0),
+            refine=get(props, "refine", 16, minimum=0, maximum=1024),
             max_memory=get(props, "max_memory", 64.0, minimum=1e-3),
             pilot_spp=get(props, "pilot_spp", 4, minimum=0),
             law=get(props, "law", "affine", choices=("affine", "paper")),
@@ -123,10 +123,18 @@ class Rejection:
         shadow_test = AlwaysTest()
         if len(visibility.light_voxels()) > 0:
             shadow_test = VisibilityRoulette(visibility, self.slope, self.floor, self.law)
-        yield integrator.stage(str(visibility), shadow_test=shadow_test)
+        learned = str(visibility)
+        del visibility  # the counters: the final stage needs the roulette's table only
+        yield integrator.stage(learned, shadow_test=shadow_test)
 
 
 def _has_lights_at_points(scene: mi.Scene) -> bool:
-    """Is there a light that the map can cover (none at infinity), and something that it lights?"""
-    flags = int(mi.EmitterFlags.Surface) | int(mi.EmitterFlags.DeltaPosition)
-    return len(scene.shapes()) > 0 and any(int(e.flags()) & flags for e in scene.emitters())
+    """Is there a light that the map can cover: not at infinity, nor outside its voxels?"""
+    if not scene.shapes() or not scene.bbox().valid():
+        return False
+    at_point = int(mi.EmitterFlags.DeltaPosition)
+    return any(
+        mi.has_flag(e.flags(), mi.EmitterFlags.Surface)
+        or (int(e.flags()) & at_point and scene.bbox().contains(e.bbox().min))
+        for e in scene.emitters()
+    )

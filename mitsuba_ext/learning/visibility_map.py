@@ -11,8 +11,11 @@ import mitsuba as mi
 
 from .voxel_grid import VoxelGrid
 
-#: Two counters.
-_BYTES_PER_ENTRY = 8
+#: Two counters, and twice a number in the roulette's table if there were lights in all voxels.
+_BYTES_PER_ENTRY = 16
+
+#: Rays of a refinement, however many entries there are.
+_MAX_REFINEMENT = 1 << 22
 
 #: Above, the numbers of the entries would not fit into 32 bits while they are computed.
 MAX_VOXELS = 0xFFFF
@@ -103,15 +106,17 @@ class VisibilityMap:
     def refine(self, scene: mi.Scene, test_count: int) -> None:
         """Adds ``test_count`` random tests to the entries in which a success was seen (section
         3.2): segments between uniform random points of the two voxels. Only entries of a voxel
-        with a light are refined, since next event estimation asks for no others."""
+        with a light are refined, since next event estimation asks for no others. Where these are
+        very many, each gets fewer tests."""
         entry = dr.compress(self.successes > 0)
-        if test_count == 0 or len(entry) == 0:
+        if len(entry) == 0:
             return
         i, j = _row_and_column(entry)
         lit = dr.gather(mi.UInt32, self._holds_light, i) > 0
         lit |= dr.gather(mi.UInt32, self._holds_light, j) > 0
         entry = dr.gather(mi.UInt32, entry, dr.compress(lit))
-        if len(entry) == 0:
+        test_count = min(test_count, _MAX_REFINEMENT // max(1, len(entry)))
+        if test_count == 0 or len(entry) == 0:
             return
         lane = dr.arange(mi.UInt32, len(entry) * test_count)
         entry = dr.gather(mi.UInt32, entry, lane // test_count)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 #: Index of the voxels that hold nothing.
 EMPTY = 0xFFFFFFFF
@@ -41,11 +42,16 @@ class VoxelGrid:
         self._scale = 1 / self.size
         dr.make_opaque(self.origin, self.size, self._scale)
         occupied = dr.zeros(mi.UInt32, resolution**3)
+        boxes = [
+            e.bbox() for e in scene.emitters()
+            if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition)
+        ]
         for shape in scene.shapes():
-            self._mark_shape(occupied, shape)
-        for emitter in scene.emitters():
-            if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
-                self._mark_box(occupied, emitter.bbox())
+            if shape.is_mesh():
+                self._mark_mesh(occupied, shape)
+            else:
+                boxes.append(shape.bbox())
+        self._mark_boxes(occupied, [box for box in boxes if box.valid()])
         dr.eval(occupied)
         self.cells = dr.compress(occupied > 0)
         self.occupied_count = len(self.cells)
@@ -71,25 +77,49 @@ class VoxelGrid:
         r = self.resolution
         return mi.UInt32(cell.x + r * (cell.y + r * cell.z))
 
-    def _mark_shape(self, occupied: mi.UInt32, shape: mi.Shape) -> None:
-        if not shape.is_mesh():
-            self._mark_box(occupied, shape.bbox())
+    def _mark_mesh(self, occupied: mi.UInt32, mesh: mi.Mesh) -> None:
+        if mesh.face_count() == 0:
             return
-        if shape.face_count() == 0:
-            return
-        face = shape.face_indices(dr.arange(mi.UInt32, shape.face_count()))
-        a, b, c = (self._relative(shape.vertex_position(face[i])) for i in range(3))
-        normal = dr.cross(b - a, c - a)
-        _mark_boxes(
-            occupied, self.resolution, dr.minimum(a, dr.minimum(b, c)),
-            dr.maximum(a, dr.maximum(b, c)), a, normal,
+        face = mesh.face_indices(dr.arange(mi.UInt32, mesh.face_count()))
+        a, b, c = (self._relative(mesh.vertex_position(face[i])) for i in range(3))
+        first, last, inside = self._cells(
+            dr.minimum(a, dr.minimum(b, c)), dr.maximum(a, dr.maximum(b, c))
         )
+        normal = dr.cross(b - a, c - a)
+        _mark(occupied, dr.opaque(mi.Int32, self.resolution), first, last, a, normal, inside)
 
-    def _mark_box(self, occupied: mi.UInt32, bbox: mi.ScalarBoundingBox3f) -> None:
-        if not bbox.valid():
+    def _mark_boxes(self, occupied: mi.UInt32, boxes: list[mi.ScalarBoundingBox3f]) -> None:
+        """Shapes that are not meshes occupy their bounding boxes. A lane for each layer of each
+        box, in one launch for all: corners are data, not literals of a kernel."""
+        if not boxes:
             return
-        low, high = (self._relative(mi.Point3f(p)) for p in (bbox.min, bbox.max))
-        _mark_boxes(occupied, self.resolution, low, high, low, mi.Vector3f(0))
+        low, high = (
+            mi.Point3f(np.array([getattr(box, corner) for box in boxes], dtype=np.float32).T)
+            for corner in ("min", "max")
+        )
+        resolution = dr.opaque(mi.Int32, self.resolution)
+        lane = dr.arange(mi.Int32, len(boxes) * self.resolution)
+        box = mi.UInt32(lane // resolution)
+        layer = lane % resolution
+        first, last, inside = self._cells(
+            self._relative(dr.gather(mi.Point3f, low, box)),
+            self._relative(dr.gather(mi.Point3f, high, box)),
+        )
+        inside &= (first.z <= layer) & (layer <= last.z)
+        first.z, last.z = mi.Int32(layer), mi.Int32(layer)
+        _mark(occupied, resolution, first, last, mi.Point3f(0), mi.Vector3f(0), inside)
+
+    def _cells(
+        self, low: mi.Point3f, high: mi.Point3f
+    ) -> tuple[mi.Vector3i, mi.Vector3i, mi.Bool]:
+        """The first and the last voxel of a box in units of voxels, and whether it lies in the
+        grid (a box with NaN or infinite corners does not)."""
+        finite = dr.all(dr.isfinite(low) & dr.isfinite(high))
+        top = dr.opaque(mi.Int32, self.resolution) - 1
+        first = mi.Vector3i(dr.floor(dr.select(finite, low, 0) - _MARGIN))
+        last = mi.Vector3i(dr.floor(dr.select(finite, high, 0) + _MARGIN))
+        inside = finite & dr.all((last >= 0) & (first <= top))
+        return dr.clip(first, 0, top), dr.clip(last, 0, top), inside
 
     def _relative(self, p: mi.Point3f) -> mi.Point3f:
         """In units of voxels from the grid's origin."""
@@ -97,23 +127,15 @@ class VoxelGrid:
 
 
 @dr.syntax
-def _mark_boxes(occupied, resolution: int, low, high, p, normal):
-    """Marks the voxels between ``low`` and ``high`` that the plane through ``p`` crosses.
+def _mark(occupied, resolution, first, last, p, normal, active):
+    """Marks the voxels from ``first`` to ``last`` that the plane through ``p`` crosses.
 
-    For the bounding box of a triangle and the triangle's plane that is the triangle's voxelisation,
+    For the voxels around a triangle and the triangle's plane that is the triangle's voxelisation,
     up to voxels at its edges; a zero normal marks the whole box.
     """
-    finite = dr.all(dr.isfinite(low) & dr.isfinite(high))
-    first = mi.Vector3i(dr.floor(dr.select(finite, low, 0) - _MARGIN))
-    last = mi.Vector3i(dr.floor(dr.select(finite, high, 0) + _MARGIN))
-    outside = dr.any((last < 0) | (first >= resolution))
-    first = dr.clip(first, 0, resolution - 1)
-    last = dr.clip(last, 0, resolution - 1)
-    # Largest distance of a voxel's plane-crossing centre, times the length of the normal
+    # Largest distance of a voxel's centre from a plane that crosses it, times |normal|
     reach = (0.5 + _MARGIN) * dr.sum(dr.abs(normal))
-
     cell = mi.Vector3i(first)
-    active = finite & ~outside
     while active:
         distance = dr.abs(dr.dot(normal, mi.Point3f(cell) + 0.5 - p))
         linear = mi.UInt32(cell.x + resolution * (cell.y + resolution * cell.z))
