@@ -1,0 +1,208 @@
+"""Every integrator on every hard case: finite, non-negative pixels, and the mean of ``path``."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_cases import HARD_CASES, stage
+from statistical import (
+    REFERENCE,
+    REFERENCE_SEEDS,
+    SEEDS,
+    THRESHOLD,
+    UNDER_TEST,
+    assert_images_are_sound,
+    assert_same_image,
+    batches,
+    z_welch,
+)
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+#: A hard case needs few seeds: the large deviations of a failure, not the small ones of a bias.
+_SEED_COUNT = 6
+
+BOTH = pytest.mark.parametrize("name", UNDER_TEST)
+
+
+def _scene(case: str) -> mi.Scene:
+    """Not kept: Dr.Jit compiles the methods of all objects that exist into each kernel."""
+    return mi.load_dict(HARD_CASES[case].make())
+
+
+@functools.cache
+def _means_of_path(case: str) -> np.ndarray:
+    hard = HARD_CASES[case]
+    path = REFERENCE.make(hard.max_depth, **hard.parameters)
+    images = batches(_scene(case), path, hard.spp, REFERENCE_SEEDS[:_SEED_COUNT])
+    return images.mean(axis=(1, 2, 3))
+
+
+@BOTH
+@pytest.mark.parametrize("case", HARD_CASES)
+def test_hard_case_has_sound_pixels_and_the_mean_of_path(case: str, name: str) -> None:
+    """Where the integrator draws the numbers of ``path``: the image of ``path``."""
+    hard, under_test = HARD_CASES[case], UNDER_TEST[name]
+    if not under_test.can_render(hard.max_depth):
+        pytest.skip(f"{name} cannot render max_depth={hard.max_depth}")
+    integrator = under_test.make(hard.max_depth, **hard.parameters)
+    seeds = [SEEDS[0]] if under_test.draws_like_path else SEEDS[:_SEED_COUNT]
+    scene = _scene(case)
+    images = batches(scene, integrator, hard.spp, seeds)
+    assert_images_are_sound(images)
+    if hard.is_black:
+        assert not images.any()
+    elif under_test.draws_like_path:
+        # The same scene object: Mitsuba loads in parallel, so the order of the lights varies
+        path = REFERENCE.make(hard.max_depth, **hard.parameters)
+        assert_same_image(images[0], batches(scene, path, hard.spp, seeds)[0])
+    else:
+        _assert_same_mean(images.mean(axis=(1, 2, 3)), _means_of_path(case), hard.precision)
+
+
+def _assert_same_mean(a: np.ndarray, b: np.ndarray, precision: float) -> None:
+    z = z_welch(a[:, None], b[:, None])[0]
+    assert abs(z) < THRESHOLD, f"mean {a.mean():.6g}, path {b.mean():.6g}: z = {z:.2f}"
+    error = math.hypot(a.std(ddof=1), b.std(ddof=1)) / math.sqrt(_SEED_COUNT) / b.mean()
+    assert error <= precision, f"too noisy to say anything: relative standard error {error:.2%}"
+
+
+@BOTH
+@pytest.mark.parametrize("seed", [0, 2**32 - 1])
+def test_extreme_seeds_give_images_of_their_own(name: str, seed: int) -> None:
+    """The seed as a number and as a Dr.Jit value is the same seed, and no other one's twin."""
+    scene, integrator = _scene("plain"), UNDER_TEST[name].make(4)
+    image, other = batches(scene, integrator, 16, [seed, 1])
+    assert_images_are_sound(image)
+    assert abs(image.mean() / other.mean() - 1) < 0.2
+    assert np.abs(image - other).mean() > 0.01 * image.mean()
+    array = np.array(mi.render(scene, integrator=integrator, seed=mi.UInt32(seed), spp=16))
+    np.testing.assert_allclose(array, image, rtol=1e-5)
+
+
+@BOTH
+def test_passes_of_one_render_draw_different_numbers(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sixteen passes of one sample are as exact as one pass of sixteen, not as one sample."""
+    from mitsuba_ext import rendering
+
+    scene, integrator = _scene("plain"), UNDER_TEST[name].make(4)
+    in_one = batches(scene, integrator, 16, SEEDS)
+    limits = dict.fromkeys(rendering._PASS_SAMPLES, 16 * 16)
+    monkeypatch.setattr(rendering, "_PASS_SAMPLES", limits)
+    in_many = batches(scene, integrator, 16, SEEDS)
+    assert integrator.statistics.passes == 16
+    noise = [images.std(axis=0, ddof=1).mean() for images in (in_one, in_many)]
+    assert 0.8 < noise[1] / noise[0] < 1.25
+
+
+@BOTH
+def test_same_seed_gives_the_same_image(name: str) -> None:
+    scene = _scene("plain")
+    first, second = (batches(scene, UNDER_TEST[name].make(4), 64, [7])[0] for _ in range(2))
+    np.testing.assert_allclose(first, second, rtol=1e-5, atol=1e-5 * first.mean())
+
+
+@BOTH
+@pytest.mark.parametrize("first", ["closed_box", "empty", "constant_environment"])
+def test_nothing_learned_in_one_scene_is_left_in_the_next(name: str, first: str) -> None:
+    used, fresh = UNDER_TEST[name].make(4), UNDER_TEST[name].make(4)
+    batches(_scene(first), used, 16, [1])
+    scene = _scene("plain")
+    images = [batches(scene, integrator, 16, [2])[0] for integrator in (used, fresh)]
+    np.testing.assert_allclose(*images, rtol=1e-5, atol=1e-5 * images[0].mean())
+
+
+@BOTH
+def test_gradients_are_refused_with_a_hint_at_prb(name: str) -> None:
+    import drjit as dr
+
+    scene = mi.load_dict(stage())
+    parameters = mi.traverse(scene)
+    key = "light.emitter.radiance.value"
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    image = mi.render(scene, parameters, integrator=UNDER_TEST[name].make(3), spp=4)
+    with pytest.raises((NotImplementedError, RuntimeError)) as caught:
+        dr.backward(dr.sum(image))
+    assert _mentions(caught.value, NotImplementedError, name, "prb")
+    with pytest.raises((NotImplementedError, RuntimeError)) as caught:
+        dr.forward(parameters[key])
+        dr.forward_to(mi.render(scene, parameters, integrator=UNDER_TEST[name].make(3), spp=4))
+    assert _mentions(caught.value, NotImplementedError, name, "prb")
+
+
+def _mentions(error: BaseException | None, kind: type, *words: str) -> bool:
+    """Is there, in the chain of causes, an error of this kind (or a text that holds one, since
+    Mitsuba's C++ turns errors into text) that has all these words?"""
+    while error is not None:
+        text = str(error)
+        if (isinstance(error, kind) or kind.__name__ in text) and all(w in text for w in words):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+_WRONG = [
+    (TypeError, {"max_depth": "six"}),
+    (TypeError, {"max_depth": 3.5}),
+    (ValueError, {"max_depth": -2}),
+    (ValueError, {"rr_depth": 0}),
+    (TypeError, {"rr_depth": True}),
+    (TypeError, {"timeout": "long"}),
+    (TypeError, {"hide_emitters": 3}),
+    (TypeError, {"aovs": 1}),
+]
+_WRONG_REJECTION = [
+    (ValueError, {"grid": 0}),
+    (ValueError, {"grid": 100_000}),
+    (TypeError, {"grid": 4.5}),
+    (ValueError, {"refine": -1}),
+    (ValueError, {"pilot_spp": -1}),
+    (ValueError, {"max_memory": 0.0}),
+    (ValueError, {"max_memory": math.nan}),
+    (ValueError, {"max_memory": math.inf}),
+    (ValueError, {"law": "Paper"}),
+    (TypeError, {"law": 2}),
+    (ValueError, {"slope": -1.0}),
+    (ValueError, {"slope": math.nan}),
+    (ValueError, {"floor": 0.0}),
+    (ValueError, {"floor": 1.5}),
+    (ValueError, {"floor": math.nan}),
+]
+WRONG_VALUES = [(name, *wrong) for name in UNDER_TEST for wrong in _WRONG]
+WRONG_VALUES += [("neepp", *wrong) for wrong in _WRONG_REJECTION]
+WRONG_VALUES += [("composed_path", ValueError, {"shadow_test": "sometimes"})]
+
+
+@pytest.mark.parametrize(("name", "kind", "wrong"), WRONG_VALUES)
+def test_wrong_value_is_named_with_its_parameter_and_plugin(
+    name: str, kind: type, wrong: dict
+) -> None:
+    ((parameter, value),) = wrong.items()
+    with pytest.raises((TypeError, ValueError, RuntimeError)) as caught:
+        mi.load_dict({"type": UNDER_TEST[name].plugin, **wrong})
+    assert _mentions(caught.value, kind, f'"{UNDER_TEST[name].plugin}"', parameter, repr(value))
+
+
+@pytest.mark.parametrize(
+    ("plugin", "unknown"),
+    [
+        ("composed_path", "max_depht"),
+        ("composed_path", "grid"),  # known only with shadow_test=visibility_roulette
+        ("neepp", "voxels"),
+    ],
+)
+def test_unknown_parameter_is_refused(plugin: str, unknown: str) -> None:
+    with pytest.raises(RuntimeError, match=f'unreferenced.*"{plugin}"(.|\n)*{unknown}'):
+        mi.load_dict({"type": plugin, unknown: 4})
+
+
+def test_missing_sensor_is_named() -> None:
+    with pytest.raises(ValueError, match="there is no sensor 1: the scene has 1"):
+        UNDER_TEST["neepp"].make(2).render(_scene("plain"), sensor=1, spp=1)
