@@ -14,7 +14,7 @@ BIN    := $(VENV)/bin
 
 DEMO_OUT := out/demo
 DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml path neepp \
-        --spp 256 --seeds 3 --reference-spp 4096 --out $(DEMO_OUT)
+        --spp 64 --seeds 3 --reference-spp 1024 --out $(DEMO_OUT)
 
 .PHONY: demo test bench lint setup clean
 

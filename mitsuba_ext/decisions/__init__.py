@@ -1,8 +1,8 @@
 """The decisions of the random walk: the defaults, and what replaces them, one file each.
 
-Each decision has ``begin(sampler, ray) -> state``, called once per path before the loop (draw there
-what a whole path needs), and methods that take the state and return it. ``()`` is the state of a
-decision that remembers nothing. Attributes are read-only while the walk runs.
+Each decision but the query has ``begin(sampler, ray) -> state``, called once per path before the
+loop (draw there what a whole path needs), and methods that take the state and return it. ``()`` is
+the state of a decision that remembers nothing. Attributes are read-only while the walk runs.
 """
 
 from .defaults import AlwaysTest, DirectionSamples, EmitterSampling, SceneQuery, ShadowTest
