@@ -1,0 +1,103 @@
+"""Renders the references of the regression tests anew:
+
+    python tests/regenerate_references.py [NAME …]
+
+Do so only when images are *meant* to change, and look at the difference. Each reference holds, for
+a film of 32 × 18 pixels, the mean and the variance of independent renders such as the test makes:
+
+R, G, B                     mean
+variance.R, .G, .B          variance of one render, per pixel
+tile, image                 variance of the mean of the pixel's tile, and of the whole image
+                            (the filter makes neighbours depend on each other, so these do not
+                            follow from the variances of the pixels)
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import mitsuba_ext  # noqa: F401
+
+import mitsuba as mi  # isort: skip
+
+REFERENCES = Path(__file__).parent / "references"
+COMMAND = "python tests/regenerate_references.py"
+
+TILE = 8
+SEED_COUNT = 32
+CHANNELS = ["R", "G", "B", "variance.R", "variance.G", "variance.B", "tile", "image"]
+
+
+@dataclass(frozen=True)
+class Regression:
+    """An integrator on a scene that shows what it is for."""
+
+    integrator: str
+    scene: str
+    max_depth: int = 6
+    spp: int = 128
+
+    @property
+    def name(self) -> str:
+        return f"{self.integrator}_{self.scene}"
+
+    @property
+    def reference(self) -> Path:
+        return REFERENCES / f"{self.name}.exr"
+
+
+REGRESSIONS = {
+    regression.name: regression
+    for regression in (
+        Regression("composed_path", "cornell_box"),
+        Regression("composed_path", "mirrors_and_glass"),
+        Regression("composed_path", "sunny_gloss", max_depth=3),
+        Regression("neepp", "door_ajar"),
+        Regression("neepp", "rooms"),
+        Regression("neepp", "open"),
+    )
+}
+
+
+def render(regression: Regression, seeds: range) -> np.ndarray:
+    """Images of independent seeds: [seed, height, width, channel]."""
+    from statistical import batches, load
+
+    scene = load(regression.scene, width=32, height=18)
+    parameters = {"type": regression.integrator, "max_depth": regression.max_depth}
+    return batches(scene, mi.load_dict(parameters), regression.spp, seeds)
+
+
+def regenerate(regression: Regression) -> None:
+    images = render(regression, range(SEED_COUNT))
+    height, width = images.shape[1:3]
+    tile = np.empty((height, width, 1))
+    for y in range(0, height, TILE):
+        for x in range(0, width, TILE):
+            part = images[:, y : y + TILE, x : x + TILE]
+            tile[y : y + TILE, x : x + TILE] = part.mean(axis=(1, 2, 3)).var(ddof=1)
+    image = np.full_like(tile, images.mean(axis=(1, 2, 3)).var(ddof=1))
+    layers = [images.mean(axis=0), images.var(axis=0, ddof=1), tile, image]
+    data = np.concatenate(layers, axis=2).astype(np.float32)
+    bitmap = mi.Bitmap(data, mi.Bitmap.PixelFormat.MultiChannel, CHANNELS)
+    REFERENCES.mkdir(exist_ok=True)
+    bitmap.write(str(regression.reference))
+    print(f"{regression.reference}: mean {images.mean():.5g} ± {image[0, 0, 0] ** 0.5:.2g}")
+
+
+def main() -> None:
+    unknown = set(sys.argv[1:]) - set(REGRESSIONS)
+    if unknown:
+        sys.exit(f"no such reference: {', '.join(unknown)}; there are {', '.join(REGRESSIONS)}")
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Warn)
+    for name in sys.argv[1:] or REGRESSIONS:
+        regenerate(REGRESSIONS[name])
+
+
+if __name__ == "__main__":
+    main()
