@@ -39,9 +39,11 @@ class WalkIntegrator(mi.SamplingIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)
         self.name = props.plugin_name()
+        # Read before the base class reads them: its errors do not name the plugin
         self.timeout = self.parameter(props, "timeout", -1.0)
+        self.parameter(props, "hide_emitters", False)
+        super().__init__(props)
         max_depth = self.parameter(
             props, "max_depth", -1, minimum=-1, maximum=_NO_DEPTH_LIMIT - 1
         )
