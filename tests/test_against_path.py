@@ -126,6 +126,13 @@ def test_image_is_that_of_path(name: str, scene: str) -> None:
     _assert_image_of_path(name, load(scene, width=WIDTH, height=HEIGHT), max_depth=max_depth)
 
 
+@pytest.mark.parametrize("name", FOLLOWERS)
+def test_image_is_that_of_path_under_early_roulette(name: str) -> None:
+    """Long paths through glass: the roulette knows the indices of refraction."""
+    scene = load("mirrors_and_glass", width=WIDTH, height=HEIGHT)
+    _assert_image_of_path(name, scene, spp=64, max_depth=12, rr_depth=2)
+
+
 FILMS = {
     "gaussian": film(rfilter={"type": "gaussian"}),
     "tent": film(rfilter={"type": "tent"}),

@@ -137,6 +137,10 @@ class VisibilityMap:
         """The voxels that shadow rays went to."""
         return dr.compress(self._holds_light > 0)
 
+    def test_count(self, entry: mi.UInt32) -> mi.UInt32:
+        """How many segments were tested."""
+        return dr.gather(mi.UInt32, self.tests, entry)
+
     def ratio(self, entry: mi.UInt32) -> mi.Float:
         """The share of the tests that succeeded; 0 where there was none."""
         tests = dr.gather(mi.UInt32, self.tests, entry)
