@@ -81,8 +81,7 @@ class NEEPlusPlus(WalkIntegrator):
     of it are always tested; where there are no others, nothing is learned, and where hardly a
     shadow ray would be rejected, what was learned is not used. Participating media are ignored, as
     by :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized
-    variants. Nested in :monosp:`aov` or :monosp:`moment` there is no pilot, so every shadow ray is
-    traced; use the parameter :monosp:`aovs`.
+    variants. Nested in :monosp:`moment` there is no pilot, so every shadow ray is traced.
 
     Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
     Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, sections 3 to 4.1.

@@ -86,8 +86,9 @@ class WalkIntegrator(mi.SamplingIntegrator):
         return rendering.render(self, scene, sensor, seed, spp, develop, evaluate)
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """One sample, for integrators that nest this one (``aov``, ``moment``). Nothing is learned
-        there: each decision that needs a pilot falls back to its default."""
+        """One sample, for integrators that nest this one and draw its samples (``moment``; ``aov``
+        calls :meth:`render`). Nothing is learned there: each decision that needs a pilot falls
+        back to its default."""
         sample = self.stage().walk(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
         return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
 
