@@ -1,0 +1,67 @@
+"""The command ``mitsuba-ext``, one file per subcommand.
+
+Mitsuba's own command cannot load plugins written in Python. Exit codes: 0, 1 (a comparison in which
+an integrator failed, a problem that the doctor found), 2 (bad input: one line on stderr), 130
+(Ctrl-C).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import click
+
+from .. import __version__
+from .common import INTERRUPTED
+from .compare import compare
+from .plugins import list_plugins
+from .render import render
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="mitsuba-ext")
+def cli() -> None:
+    """Light transport techniques for Mitsuba 3."""
+
+
+@click.command(short_help="Check the installation.")
+def doctor() -> int:
+    """Check Mitsuba's version, the LLVM library, and a small render."""
+    from .. import doctor as doctor_module
+
+    return doctor_module.main()
+
+
+for command in (render, compare, list_plugins, doctor):
+    cli.add_command(command)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command and returns its exit code."""
+    from ..scenes import InputError
+
+    try:
+        code = cli.main(arguments, prog_name="mitsuba-ext", standalone_mode=False)
+    except click.Abort:
+        click.echo("interrupted", err=True)
+        return INTERRUPTED
+    except click.ClickException as error:
+        if not list(sys.argv[1:] if arguments is None else arguments):
+            error.show()  # the help: nothing was asked for
+        else:
+            _complain(error.format_message())
+        return 2
+    except InputError as error:
+        _complain(str(error))
+        return 2
+    except BrokenPipeError:
+        return 1
+    except OSError as error:  # a full disk, a folder that went away
+        _complain(str(error))
+        return 2
+    return code if isinstance(code, int) else 0
+
+
+def _complain(message: str) -> None:
+    click.echo(f"mitsuba-ext: {' '.join(message.split())}", err=True)

@@ -1,0 +1,43 @@
+"""``mitsuba-ext list``: the plugins and their pages."""
+
+from __future__ import annotations
+
+import click
+
+from .common import console_for_tables
+
+
+@click.command("list", short_help="Show the plugins, or the parameters of one.")
+@click.argument("name", required=False)
+def list_plugins(name: str | None) -> int:
+    """Show the plugins, or the page of the plugin NAME."""
+    from rich.table import Table
+
+    from .. import pages, registry
+
+    files = {kind: registry.plugin_files(kind) for kind in registry.plugin_names()}
+    console = console_for_tables()
+    if name is None:
+        overview = Table("plugin", "kind", "what it does")
+        for kind, paths in files.items():
+            for path in paths:
+                page = pages.read_page(path)
+                overview.add_row(page.name, kind[:-1], page.title or page.summary)
+        console.print(overview)
+        return 0
+    file = next((path for paths in files.values() for path in paths if path.stem == name), None)
+    if file is None:
+        known = ", ".join(sorted(path.stem for paths in files.values() for path in paths))
+        raise click.UsageError(f'no plugin "{name}" (there are: {known})')
+    page = pages.read_page(file)
+    if page.title:
+        console.print(page.title, style="bold", highlight=False, markup=False)
+    if page.parameters:
+        parameters = Table("parameter", "type", "default", "description")
+        for parameter in page.parameters:
+            parameters.add_row(
+                parameter.name, parameter.type, parameter.default or "–", parameter.description
+            )
+        console.print(parameters)
+    console.print(page.text, highlight=False, markup=False)
+    return 0
