@@ -5,13 +5,13 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import mitsuba as mi
 
 from . import rendering
+from .parameters import read_parameter
 from .rendering import Stage
 from .walk import Walk
 
@@ -142,25 +142,7 @@ class WalkIntegrator(mi.SamplingIntegrator):
             TypeError: The scene gives another type (an integer passes for a float).
             ValueError: The value is out of range, or not one of ``choices``.
         """
-        value = props.get(key, default)
-        kind = type(default)
-        if kind is float and type(value) is int:
-            value = float(value)
-        accepted = f"of type {kind.__name__}"
-        if type(value) is not kind:
-            raise TypeError(self._message(key, value, accepted))
-        if kind is float and not math.isfinite(value):
-            raise ValueError(self._message(key, value, "finite"))
-        if choices and value not in choices:
-            raise ValueError(self._message(key, value, f"one of {', '.join(choices)}"))
-        if minimum is not None and not value >= minimum:
-            raise ValueError(self._message(key, value, f"at least {minimum}"))
-        if maximum is not None and not value <= maximum:
-            raise ValueError(self._message(key, value, f"at most {maximum}"))
-        return value
-
-    def _message(self, key: str, value: Any, accepted: str) -> str:
-        return f'"{self.name}": the parameter "{key}" is {value!r}; it must be {accepted}'
+        return read_parameter(self.name, props, key, default, minimum, maximum, choices)
 
     def no_gradients(self) -> NotImplementedError:
         """What to raise where gradients are asked for."""

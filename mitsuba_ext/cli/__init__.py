@@ -15,8 +15,10 @@ import click
 from .. import __version__
 from .common import INTERRUPTED
 from .compare import compare
+from .diff import diff
 from .plugins import list_plugins
 from .render import render
+from .supervisor import SUPERVISED
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -33,7 +35,7 @@ def doctor() -> int:
     return doctor_module.main()
 
 
-for command in (render, compare, list_plugins, doctor):
+for command in (render, compare, diff, list_plugins, doctor):
     cli.add_command(command)
 
 
@@ -42,7 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from ..scenes import InputError
 
     try:
-        code = cli.main(arguments, prog_name="mitsuba-ext", standalone_mode=False)
+        # Called by the shell, and not from Python: the process is ours to divide
+        obj = SUPERVISED if arguments is None else None
+        code = cli.main(arguments, prog_name="mitsuba-ext", standalone_mode=False, obj=obj)
     except click.Abort:
         click.echo("interrupted", err=True)
         return INTERRUPTED

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,8 @@ import click
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
+
+    from ..compare.experiment import Step
 
 #: Exit code after Ctrl-C.
 INTERRUPTED = 130
@@ -32,6 +35,15 @@ class Size(click.ParamType):
         if not match or not int(match.group(1)) or not int(match.group(2)):
             self.fail(f'expected something like 640x360, found "{value}"', param, ctx)
         return int(match.group(1)), int(match.group(2))
+
+
+class Numbers(click.ParamType):
+    name = "numbers"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, ...]:
+        if not re.fullmatch(r"[1-9]\d*(,[1-9]\d*)*", value):
+            self.fail(f'expected something like 4,16,64, found "{value}"', param, ctx)
+        return tuple(map(int, value.split(",")))
 
 
 class Definition(click.ParamType):
@@ -56,15 +68,20 @@ def scene_options(command: Callable) -> Callable:
             help="A $KEY parameter of the scene file. Can be repeated.",
         ),
         click.option(
+            "--plugin", "plugins", multiple=True, metavar="MODULE",
+            help="A Python module, or its .py file, that registers integrators of your own. Can be "
+            "repeated.",
+        ),
+        click.option(
             "--variant", default="llvm_ad_rgb", show_default=True, help="Mitsuba's variant."
         ),
-        click.argument("scene", type=click.Path(path_type=Path)),
     ):
         command = decorator(command)
     return command
 
 
-def select_variant(variant: str) -> None:
+def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
+    """Selects a variant, then imports the modules: their classes bind to it."""
     import mitsuba as mi
 
     from ..scenes import InputError, one_line
@@ -75,15 +92,22 @@ def select_variant(variant: str) -> None:
         mi.set_variant(variant)
     except (ImportError, RuntimeError) as error:
         raise InputError(f'the variant "{variant}" does not start: {one_line(error)}') from error
+    sys.path.insert(0, "")  # as python -m does: modules beside the user
+    for name in plugins:
+        try:
+            _import_module(name)
+        except Exception as error:  # a module may raise anything
+            raise InputError(f'the plugin "{name}": {one_line(error)}') from error
 
 
-def make_folder(folder: Path) -> None:
-    from ..scenes import InputError
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot make this folder ({error.strerror})") from error
+def _import_module(name: str) -> None:
+    path = Path(name)
+    if path.suffix != ".py":
+        importlib.import_module(name)
+        return
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = sys.modules[path.stem] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
 
 
 @contextlib.contextmanager
@@ -104,6 +128,19 @@ def progress_bars() -> Iterator[Progress]:
         *columns, console=console, disable=not terminal, transient=True
     ) as progress:
         yield progress
+
+
+@contextlib.contextmanager
+def progress_line() -> Iterator[Callable[[Step], None]]:
+    """What ``Comparison.run`` reports to: a progress bar with an estimate of the time left."""
+    with progress_bars() as bars:
+        bar = bars.add_task("loading", total=None)
+
+        def show(step: Step) -> None:
+            total = None if step.left is None else max(step.done + step.left, 1e-9)
+            bars.update(bar, description=step.label, total=total, completed=step.done)
+
+        yield show
 
 
 def console_for_tables() -> Console:

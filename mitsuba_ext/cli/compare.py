@@ -2,102 +2,160 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import click
 
+from . import supervisor
 from .common import (
     INTERRUPTED,
+    Numbers,
     console_for_tables,
-    make_folder,
-    progress_bars,
+    progress_line,
     scene_options,
     select_variant,
 )
 
 
-@click.command(short_help="Measure the speed and the error of integrators on a scene.")
+@click.command(short_help="Measure the speed and the error of integrators on scenes.")
 @click.option(
-    "--spp", type=click.IntRange(min=1), required=True, metavar="N",
-    help="Samples per pixel of each run.",
+    "--spp", type=click.IntRange(min=1), metavar="N",
+    help="Equal samples: N per pixel for each run.",
+)
+@click.option(
+    "--time", "seconds", type=click.FloatRange(min=0, min_open=True), metavar="S",
+    help="Equal time: S seconds for each run, learning included, compilation excluded.",
+)
+@click.option(
+    "--sweep", type=Numbers(), metavar="N,N,…",
+    help="Several numbers of samples, for convergence plots and slopes.",
+)
+@click.option(
+    "--until", type=click.FloatRange(min=0, min_open=True), metavar="RELMSE",
+    help="Double the samples until the mean relMSE is reached: what does it cost?",
 )
 @click.option(
     "--seeds", type=click.IntRange(min=1), default=3, show_default=True, metavar="K",
-    help="Runs of each integrator, with the seeds 0, 1, 2, …",
+    help="Runs of each integrator at each level, each with a seed of its own.",
 )
 @click.option(
-    "--reference", "reference_file", type=click.Path(path_type=Path), metavar="FILE",
+    "--reference", type=click.Path(path_type=Path), metavar="FILE",
     help="EXR with mean.R/G/B and variance.R/G/B (of the mean), or with plain R/G/B.",
 )
 @click.option(
     "--reference-spp", type=click.IntRange(min=8), metavar="N",
-    help="Render the reference with 'path' and N samples; it is kept in DIR for the next time. "
-    "[default: 16 times --spp]",
+    help="Render the reference with N samples; it is kept in DIR for the next time. "
+    "[default: 16 times the longest run]",
+)
+@click.option(
+    "--reference-integrator", default="path", show_default=True, metavar="INTEGRATOR",
+    help="What renders the reference.",
 )
 @click.option(
     "--out", type=click.Path(path_type=Path), default=Path("out/compare"), show_default=True,
-    metavar="DIR", help="Folder for results.json, the images, and rendered references.",
+    metavar="DIR",
+    help="Folder for report.html, results.json, the images, and rendered references. What is there "
+    "already is not rendered again.",
 )
+@click.option("--worker", type=click.Choice(supervisor.JOBS), hidden=True)
 @scene_options
-@click.argument("integrators", nargs=-1, required=True, metavar="INTEGRATOR…")
+@click.argument("names", nargs=-1, required=True, metavar="SCENE… INTEGRATOR…")
+@click.pass_context
 def compare(
-    scene: Path,
-    integrators: Sequence[str],
-    spp: int,
+    context: click.Context,
+    names: Sequence[str],
+    spp: int | None,
+    seconds: float | None,
+    sweep: Sequence[int] | None,
+    until: float | None,
     seeds: int,
-    reference_file: Path | None,
+    reference: Path | None,
     reference_spp: int | None,
+    reference_integrator: str,
     out: Path,
+    worker: str | None,
     size: tuple[int, int] | None,
     definitions: Sequence[tuple[str, str]],
+    plugins: Sequence[str],
     variant: str,
 ) -> int:
-    """Render SCENE with each INTEGRATOR (NAME[:key=value,…]) and compare error and time.
+    """Render each SCENE with each INTEGRATOR and compare error and time.
 
-    All get max_depth and rr_depth of the scene's integrator unless they set their own. Kernels are
-    compiled beforehand, the integrators take turns, and learning is part of the time.
+    A SCENE is an XML file. An INTEGRATOR is a name, NAME:key=value,…, or an XML or JSON file that
+    holds one. All get max_depth and rr_depth of the scene's integrator unless they set their own.
+    Ratios are relative to the first integrator.
     """
-    from ..compare import Experiment, images, load_reference, render_reference, tables
-    from ..scenes import load_scene
+    from ..compare import Comparison, budgets, tables
 
-    if reference_file and reference_spp:
+    given = {
+        "--spp": spp and budgets.equal_samples(spp),
+        "--time": seconds and budgets.equal_time(seconds),
+        "--sweep": sweep and budgets.sweep(sweep),
+        "--until": until and budgets.until(until),
+    }
+    chosen = [budget for budget in given.values() if budget]
+    if len(chosen) != 1:
+        raise click.UsageError(f"give one of {', '.join(given)}")
+    if reference and reference_spp:
         raise click.UsageError("--reference and --reference-spp exclude each other")
-    select_variant(variant)
-    loaded = load_scene(scene, size, dict(definitions), keep_integrator=False)
-    experiment = Experiment(loaded, integrators, spp, range(seeds))
-    reference = load_reference(reference_file, loaded.size) if reference_file else None
-    make_folder(out)
-    images.check_folder(out)
-
-    interrupted = False
+    scenes, integrators = _sort_out(names)
+    if context.obj == supervisor.SUPERVISED and worker is None:
+        return supervisor.supervise(sys.argv[1:], out)
+    select_variant(variant, plugins)
+    comparison = Comparison(
+        scenes,
+        integrators,
+        chosen[0],
+        seeds=seeds,
+        folder=out,
+        reference=reference,
+        reference_spp=reference_spp,
+        reference_integrator=reference_integrator,
+        size=size,
+        parameters=dict(definitions),
+        command=shlex.join(["mitsuba-ext", *supervisor.without_job(sys.argv[1:])]),
+        only_stored=worker == supervisor.STORED,
+    )
+    interrupted = worker == supervisor.STORED
     try:
-        with progress_bars() as progress:
-            if reference is None:
-                bar = progress.add_task("reference", total=1.0)
-                reference = render_reference(
-                    loaded, reference_spp or max(8, 16 * spp), out,
-                    lambda done: progress.update(bar, completed=done),
-                )
-                progress.update(bar, completed=1.0)
-            bar = progress.add_task("comparing", total=experiment.step_count)
-            experiment.run(
-                reference,
-                progress=lambda label: progress.update(bar, advance=1, description=label),
-                finished=tables.image_writer(out, experiment),
-            )
+        with progress_line() as progress:
+            comparison.run(progress)
     except KeyboardInterrupt:
         interrupted = True
-        if not any(contender.runs for contender in experiment.contenders):
-            click.echo("interrupted before the first run: nothing written", err=True)
-            return INTERRUPTED
-
+    results = comparison.results()
+    if not results["scenes"]:
+        click.echo("interrupted before the first run: nothing written", err=True)
+        return INTERRUPTED
     console = console_for_tables()
-    console.print(tables.table(experiment))
-    console.print(tables.footnote(experiment), highlight=False, markup=False, soft_wrap=True)
-    tables.write_results(out / "results.json", experiment)
-    console.print(f"{out / 'results.json'}", highlight=False, markup=False, soft_wrap=True)
+    for part in tables(results):
+        console.print(part, highlight=False, soft_wrap=True)
+    for name in ("results.json", "report.html"):
+        console.print(f"{out / name}", highlight=False, markup=False, soft_wrap=True)
     if interrupted:
         click.echo("interrupted: the results are of the finished runs", err=True)
         return INTERRUPTED
-    return 1 if any(contender.error for contender in experiment.contenders) else 0
+    failed = (
+        scene["error"] or any(item["error"] for item in scene["integrators"])
+        for scene in results["scenes"]
+    )
+    return 1 if any(failed) else 0
+
+
+def _sort_out(names: Sequence[str]) -> tuple[list[Path], list[str]]:
+    """Which of the arguments are scenes: XML files, unless an <integrator> is their root."""
+    from ..specifications import is_fragment
+
+    paths = [Path(name) for name in names]
+    scenes = [
+        path for path in paths
+        if (path.suffix.lower() == ".xml" or path.exists()) and not is_fragment(path)
+    ]
+    integrators = [name for name, path in zip(names, paths) if path not in scenes]
+    if not scenes:
+        raise click.UsageError("no scene was given (an XML file)")
+    if not integrators:
+        raise click.UsageError("Missing argument 'INTEGRATOR…'")
+    return scenes, integrators

@@ -18,9 +18,9 @@ from .common import INTERRUPTED, MAX_SEED, progress_bars, scene_options, select_
     help="Image to write: .exr (float, with metadata), .png, .jpg, .hdr or .pfm.",
 )
 @click.option(
-    "--integrator", "specification", metavar="NAME[:key=value,…]",
-    help="Use this integrator instead of the scene's. It takes over max_depth and rr_depth "
-    "from there unless it sets them.",
+    "--integrator", "specification", metavar="INTEGRATOR",
+    help="Use this one instead of the scene's: NAME[:key=value,…], or an XML or JSON file. It "
+    "takes over max_depth and rr_depth from there unless it sets them.",
 )
 @click.option(
     "--spp", type=click.IntRange(min=1), metavar="N",
@@ -36,6 +36,7 @@ from .common import INTERRUPTED, MAX_SEED, progress_bars, scene_options, select_
     show_default=True, help="Seed of the random numbers.",
 )
 @scene_options
+@click.argument("scene", type=click.Path(path_type=Path))
 def render(
     scene: Path,
     output: Path,
@@ -45,20 +46,22 @@ def render(
     seed: int,
     size: tuple[int, int] | None,
     definitions: Sequence[tuple[str, str]],
+    plugins: Sequence[str],
     variant: str,
 ) -> int:
     """Render SCENE (an XML file) to an image."""
     from ..compare import images, machine, timing
-    from ..scenes import InputError, load_scene, make_integrator, one_line, parse_integrator
+    from ..scenes import InputError, load_scene, one_line
+    from ..specifications import make_named
 
     if spp is not None and seconds is not None:
         raise click.UsageError("--spp and --time exclude each other")
     images.check_target(output)
-    name, parameters = parse_integrator(specification) if specification else ("", {})
-    select_variant(variant)
+    select_variant(variant, plugins)
     loaded = load_scene(scene, size, dict(definitions), keep_integrator=not specification)
     if specification:
-        integrator, parameters = make_integrator(name, parameters, inherited=loaded.depth)
+        named = make_named(specification, loaded.depth)
+        integrator, name, parameters = named.integrator, named.name, named.parameters
     else:
         integrator, name = loaded.scene.integrator(), loaded.integrator_name
         parameters = dict(loaded.depth)

@@ -1,43 +1,66 @@
 """Comparing integrators by speed and error, from a notebook as from ``mitsuba-ext compare``::
 
-    import mitsuba as mi
     import mitsuba_ext
+    import mitsuba as mi
     from mitsuba_ext import compare
 
     mi.set_variant("llvm_ad_rgb")
-    scene = compare.load_scene("scene.xml", size=(180, 180), keep_integrator=False)
-    experiment = compare.Experiment(scene, ["path", "neepp:max_depth=6"], spp=64)
-    experiment.run(compare.load_reference("reference.exr", scene.size))
-    compare.results(experiment)  # or rich.print(compare.table(experiment))
+    comparison = compare.Comparison(
+        ["scenes/door_ajar.xml", "scenes/rooms.xml"],
+        ["path", "neepp:grid=32", {"type": "neepp", "law": "paper"}],
+        compare.equal_time(10),
+        folder="out/doors",
+    )
+    results = comparison.run()          # also out/doors/results.json and report.html
+    compare.show(results)               # tables
 """
 
 from __future__ import annotations
 
 from ..scenes import InputError, LoadedScene, load_scene
-from .experiment import Contender, Experiment, Run
+from ..specifications import NamedIntegrator, make_named
+from .budgets import Budget, equal_samples, equal_time, sweep, until
+from .comparison import Comparison
+from .experiment import Contender, Experiment, Step
+from .flip import mean_flip
 from .images import read_exr, write_exr
+from .intervals import Estimate
 from .metrics import Errors, errors, reference_noise, relative_mse
+from .reading import read_image
 from .references import Reference, load_reference, render_reference
-from .tables import image_writer, results, table, write_results
+from .report import write_report
+from .runs import Run
+from .tables import show, tables
 
 __all__ = [
+    "Budget",
+    "Comparison",
     "Contender",
     "Errors",
+    "Estimate",
     "Experiment",
     "InputError",
     "LoadedScene",
+    "NamedIntegrator",
     "Reference",
     "Run",
+    "Step",
+    "equal_samples",
+    "equal_time",
     "errors",
-    "image_writer",
     "load_reference",
     "load_scene",
+    "make_named",
+    "mean_flip",
     "read_exr",
+    "read_image",
     "reference_noise",
     "relative_mse",
     "render_reference",
-    "results",
-    "table",
+    "show",
+    "sweep",
+    "tables",
+    "until",
     "write_exr",
-    "write_results",
+    "write_report",
 ]

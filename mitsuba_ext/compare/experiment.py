@@ -1,55 +1,50 @@
-"""Speed against error: the same scene with several integrators, under equal conditions.
+"""Speed against error: one scene with several integrators, under equal conditions.
 
 - Every integrator gets the scene's ``max_depth`` and ``rr_depth`` unless its specification says
   otherwise: they solve the same problem.
 - Kernels are compiled beforehand, by a small render. A measured run that had to compile after all
   (a size of pass that the small one did not have) is thrown away and repeated.
-- The integrators take turns (A B C A B C …), one round per seed: a machine that becomes slower
-  becomes so for all of them.
+- The integrators take turns (A B C A B C …), round by round: a machine that becomes slower becomes
+  so for all of them. Each round and each level has a seed of its own, which the integrators share.
 - The clock runs around the whole of ``render()``, what it learns included, and stops when the
   image is there.
 """
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
 
-import numpy as np
-
-from ..scenes import InputError, LoadedScene, Value, make_integrator, one_line, parse_integrator
-from . import images, metrics
+from ..scenes import InputError, LoadedScene, one_line
+from ..specifications import NamedIntegrator, Specification, make_named
+from . import images, metrics, timing
+from .budgets import Budget
+from .machine import machine, versions
 from .references import Reference
-from .timing import Timed, sample_count, timed_render
+from .runs import Run, RunFolder
+
+#: How far the time of a run may be from what was asked for before it is repeated, and how often.
+_TIME_TOLERANCE = 0.03
+_TIME_ATTEMPTS = 3
+
+#: ``until`` goes no further than this where the reference does not say how many samples it has.
+_MAX_UNTIL_SPP = 1 << 16
 
 
-@dataclass
-class Run:
-    """One measured render.
+class Step(NamedTuple):
+    """Where a comparison is; what ``progress`` is called with.
 
     Attributes:
-        seed: Its seed.
-        spp: Samples per pixel that were taken.
-        seconds: Wall clock of the render, learning included, compilation excluded.
-        image: The image, (height, width, 3).
-        errors: Against the reference.
-        rays: Rays traced by kind (``camera``, ``scatter``, ``shadow``), empty if not known.
-        connections: Connections to lights that were considered (``path`` traces a shadow ray for
-            each), ``None`` if not known.
-        zero_radiance: Share of the camera samples without radiance, ``None`` if not known.
-        memory: Bytes, ``None`` if not known.
+        label: What is being done.
+        done: Seconds of work that are behind (measured ones, not the clock's).
+        left: Seconds that are estimated to be left; ``None`` while nothing is known.
     """
 
-    seed: int
-    spp: int
-    seconds: float
-    image: np.ndarray
-    errors: metrics.Errors
-    rays: dict[str, int]
-    connections: int | None
-    zero_radiance: float | None
-    memory: int | None
+    label: str
+    done: float
+    left: float | None
 
 
 @dataclass
@@ -57,37 +52,32 @@ class Contender:
     """An integrator of an experiment, and its runs.
 
     Attributes:
-        label: The specification as it was given.
-        name: Plugin name.
-        parameters: All parameters that it was made with, the scene's depth included.
-        runs: One per seed, in the order of the seeds.
+        named: The integrator, its label, name and parameters.
+        runs: In the order in which they were measured.
         compile_seconds: What the kernels cost to compile or to load, without tracing.
         error: Why there are no (more) runs; empty if all went well.
+        notes: What a reader of the figures should know.
     """
 
-    label: str
-    name: str
-    parameters: dict[str, Value]
-    integrator: object = field(repr=False)
+    named: NamedIntegrator
     runs: list[Run] = field(default_factory=list)
     compile_seconds: float = 0.0
     error: str = ""
-
-    def figures(self, name: str) -> list[float]:
-        """The values of one figure over the seeds: a field of :class:`metrics.Errors` or of
-        :class:`Run`."""
-        return [
-            getattr(run.errors if hasattr(run.errors, name) else run, name) for run in self.runs
-        ]
+    notes: list[str] = field(default_factory=list)
+    _pace: float | None = None  # seconds per sample per pixel
+    _is_prepared: bool = False
 
     @property
-    def efficiency(self) -> float | None:
-        """1 / (mean relMSE · median seconds); ``None`` where the error drowns in the reference's
-        noise, or something failed."""
-        if self.error or not self.runs:
-            return None
-        relmse = statistics.fmean(self.figures("relmse"))
-        return 1 / (relmse * statistics.median(self.figures("seconds"))) if relmse > 0 else None
+    def label(self) -> str:
+        return self.named.label
+
+    def levels(self) -> list[float]:
+        """The levels that have runs, ascending."""
+        return sorted({run.level for run in self.runs})
+
+    def at(self, level: float) -> list[Run]:
+        """The runs of a level, in the order of their rounds."""
+        return sorted((r for r in self.runs if r.level == level), key=lambda run: run.round)
 
 
 class Experiment:
@@ -95,9 +85,12 @@ class Experiment:
 
     Args:
         scene: The scene; its own integrator matters only for the depth that the others take over.
-        specifications: Integrators as ``name`` or ``name:key=value,key=value``.
-        spp: Samples per pixel of each run.
-        seeds: One run of each integrator per seed.
+        integrators: Specifications (:func:`mitsuba_ext.specifications.make_named`), or a mapping
+            of labels to them. Figures are given relative to the first.
+        budget: What each gets.
+        rounds: Runs of each integrator at each level.
+        folder: Keeps the images; runs that it holds already are not repeated.
+        only_stored: Take those, and render nothing.
 
     Raises:
         InputError: An integrator is unknown, rejects a parameter, or is given twice.
@@ -106,113 +99,255 @@ class Experiment:
     def __init__(
         self,
         scene: LoadedScene,
-        specifications: Sequence[str],
-        spp: int,
-        seeds: Iterable[int] = range(3),
+        integrators: Sequence[Specification] | Mapping[str, Specification],
+        budget: Budget,
+        rounds: int,
+        folder: Path,
+        only_stored: bool = False,
     ) -> None:
-        if len(set(specifications)) < len(specifications):
-            raise InputError("an integrator is given twice: more runs of it need more --seeds")
+        self.only_stored = only_stored
         self.scene = scene
-        self.spp = spp
-        self.seeds = list(seeds)
-        self._reference: Reference | None = None
-        self.contenders = []
-        for text in specifications:
-            name, own = parse_integrator(text)
-            integrator, parameters = make_integrator(name, own, inherited=scene.depth)
-            self.contenders.append(Contender(text, name, parameters, integrator))
-
-    @property
-    def reference(self) -> Reference:
-        """What :meth:`run` measured against."""
-        if self._reference is None:
-            raise ValueError("there is no reference before run() is called")
-        return self._reference
-
-    @property
-    def step_count(self) -> int:
-        """How often :meth:`run` calls ``progress``."""
-        return len(self.contenders) * (1 + len(self.seeds))
+        self.budget = budget
+        self.rounds = rounds
+        self.contenders = [
+            Contender(named) for named in make_all(integrators, inherited=scene.depth)
+        ]
+        self.reference: Reference | None = None
+        self._folder = RunFolder(
+            folder,
+            {
+                "scene": scene.content_hash,
+                "size": scene.size,
+                "versions": versions(),
+                "machine": machine(),
+            },
+        )
+        self._progress: Callable[[Step], None] = lambda _step: None
+        self._done = 0.0
 
     def run(
-        self,
-        reference: Reference,
-        progress: Callable[[str], None] = lambda _label: None,
-        finished: Callable[[int, Contender, Run], None] = lambda _index, _contender, _run: None,
+        self, reference: Reference, progress: Callable[[Step], None] = lambda _step: None
     ) -> None:
         """Measures everything. The results are in :attr:`contenders`, also after an interruption.
 
         Args:
             reference: What the errors are measured against.
-            progress: Called after each warm-up and each run, with the integrator's label.
-            finished: Called after each run, with the contender's index.
+            progress: Called before each run.
         """
-        self._reference = reference
-        # The kernel for one sample per pixel differs from that for many, and that for a power of
-        # two from that for other counts (Mitsuba divides the index of a sample by the count).
-        warm_up_spp = 1 if self.spp == 1 else 2 if self.spp & (self.spp - 1) == 0 else 3
+        self.reference = reference
+        self._progress = progress
+        schedule = self._schedule_until() if self.budget.target else self._schedule_levels()
+        for contender, index, round in schedule:
+            self._attempt(contender, lambda c=contender, i=index, r=round: self._take(c, i, r))
+
+    # ---- Which run is next ----
+
+    def _schedule_levels(self) -> Iterator[tuple[Contender, int, int]]:
+        indices = range(len(self.budget.values))
         for contender in self.contenders:
-            self._attempt(contender, lambda c=contender: self._timed(c, 0, warm_up_spp))
-            progress(contender.label)
-        for seed in self.seeds:
-            for index, contender in enumerate(self.contenders):
-                if not contender.error:
-                    run = self._attempt(contender, lambda c=contender, s=seed: self._measure(c, s))
-                    if run is not None:
-                        contender.runs.append(run)
-                        finished(index, contender, run)
-                progress(contender.label)
+            # All speeds are known before the first long run: the time that is left can be told
+            paths = (self._path(contender, i, r) for i in indices for r in range(self.rounds))
+            missing = next((path for path in paths if self._folder.load(path) is None), None)
+            if missing is not None and not self.only_stored:
+                self._attempt(contender, lambda c=contender, p=missing: self._prepare(c, p))
+        for round in range(self.rounds):
+            for index in indices:
+                for contender in self.contenders:
+                    if not contender.error:
+                        yield contender, index, round
 
-    def efficiency_ratio(self, contender: Contender) -> float | None:
-        """Efficiency relative to the first integrator."""
-        first, own = self.contenders[0].efficiency, contender.efficiency
-        return own / first if own is not None and first is not None else None
+    def _schedule_until(self) -> Iterator[tuple[Contender, int, int]]:
+        limit = self.reference.spp or _MAX_UNTIL_SPP
+        going = list(self.contenders)
+        index = 0
+        while going and self.budget.level(index) <= limit:
+            for round in range(self.rounds):
+                for contender in going:
+                    if not contender.error:
+                        yield contender, index, round
+            going = [c for c in going if not c.error and not self._is_done(c, index)]
+            index += 1
+        for contender in going:
+            runs = contender.at(self.budget.level(index - 1))
+            contender.notes.append(
+                f"not reached: relMSE {_mean_error(runs):.3g} with {runs[0].spp} spp, no more than "
+                f"the reference has"
+            )
 
-    def _attempt(self, contender: Contender, action: Callable[[], object]):
+    def _is_done(self, contender: Contender, index: int) -> bool:
+        """Has the error been reached? (Or there are no runs: only what is stored is asked for.)"""
+        runs = contender.at(self.budget.level(index))
+        return not runs or _mean_error(runs) <= self.budget.target
+
+    # ---- One run ----
+
+    def _attempt(self, contender: Contender, action: Callable[[], object]) -> None:
         """One integrator that fails must not take the others' results with it."""
         try:
-            return action()
-        except (ValueError, RuntimeError, TypeError) as error:
+            action()
+        except Exception as error:  # an integrator may raise anything
             contender.error = one_line(error)
-            return None
 
-    def _measure(self, contender: Contender, seed: int) -> Run:
-        timed = self._timed(contender, seed, self.spp)
-        if timed.compiled:
-            timed = self._timed(contender, seed, self.spp)
+    def _take(self, contender: Contender, index: int, round: int) -> None:
+        """Measures a run, or takes it from the folder."""
+        path = self._path(contender, index, round)
+        run = self._folder.load(path)
+        if run is None:
+            if self.only_stored:
+                return
+            self._prepare(contender, path)
+            self._progress(Step(contender.label, self._done, self._seconds_left()))
+            with self._folder.marked(path):
+                run = self._measure(contender, index, round, path)
+        reference = self.reference
+        run.errors = metrics.errors(run.image(), reference.mean, reference.variance)
+        contender.runs.append(run)
+        contender._pace = run.seconds / run.spp
+        self._done += run.seconds
+
+    def _measure(self, contender: Contender, index: int, round: int, path: Path) -> Run:
+        level, seed = self.budget.level(index), self._seed(index, round)
+        timed = self._render(contender, level, seed)
         pixels = images.to_rgb(timed.image)
         if fault := metrics.describe_non_finite(pixels):
             raise ValueError(f"seed {seed}: {fault}")
-        reference = self.reference
-        report = getattr(contender.integrator, "statistics", None)
-        return Run(
+        report = timing.own_statistics(contender.named.integrator)
+        run = Run(
+            level=level,
+            round=round,
             seed=seed,
-            spp=report.spp if report else sample_count(self.scene.scene, self.spp),
+            spp=timed.spp,
             seconds=timed.seconds,
-            image=pixels,
-            errors=metrics.errors(pixels, reference.mean, reference.variance),
             rays=dict(report.rays) if report else {},
             connections=report.connections if report else None,
             zero_radiance=report.zero_radiance if report else None,
-            memory=report.memory if report else None,
+            memory=timed.memory or None,
+            launches=timed.launches,
         )
+        metadata = {
+            "scene": self.scene.source,
+            "content_hash": self.scene.content_hash,
+            "integrator": contender.named.name,
+            "parameters": contender.named.parameters,
+            "versions": versions(),
+        }
+        return self._folder.save(run, pixels, path, metadata)
 
-    def _timed(self, contender: Contender, seed: int, spp: int) -> Timed:
-        timed = timed_render(contender.integrator, self.scene.scene, seed, spp)
+    def _render(self, contender: Contender, level: float, seed: int) -> timing.Timed:
+        """A render that compiled nothing and, where a time is to be filled, filled it."""
+        spp = self._samples(contender, level)
+        for attempt in range(_TIME_ATTEMPTS):
+            timed = self._timed(contender, spp, seed)
+            if timed.compiled:
+                timed = self._timed(contender, spp, seed)
+            deviation = timed.seconds / level - 1
+            is_last = attempt == _TIME_ATTEMPTS - 1
+            better = max(1, round(spp / (1 + deviation)))
+            if (
+                not self.budget.is_time
+                or abs(deviation) <= _TIME_TOLERANCE
+                or better == spp
+                or is_last
+            ):
+                return timed
+            spp = better
+        raise AssertionError("unreachable")
+
+    def _prepare(self, contender: Contender, path: Path) -> None:
+        """Compiles what the runs will need, of which ``path`` is the first, and finds out how fast
+        they will be."""
+        if contender._is_prepared:
+            return
+        with self._folder.marked(path):
+            self._warm_up(contender)
+        contender._is_prepared = True
+
+    def _warm_up(self, contender: Contender) -> None:
+        self._progress(Step(f"{contender.label}: compiling", self._done, None))
+        counts = () if self.budget.is_time else self._counts()
+        # The kernel for one sample per pixel differs from that for many, and that for a power of
+        # two from that for other counts (Mitsuba divides the index of a sample by the count).
+        for spp in sorted({1 if n == 1 else 2 if n & (n - 1) == 0 else 3 for n in counts}):
+            self._timed(contender, spp, seed=0)
+        if self.budget.is_time:
+            seconds = self.budget.values[0]
+            spp = timing.samples_for(
+                seconds, contender.named.integrator, self.scene.scene, self._seed(0, 0)
+            )
+            contender._pace = seconds / spp
+        else:
+            timed = self._timed(contender, spp, seed=0)
+            contender._pace = timed.seconds / timed.spp
+
+    def _timed(self, contender: Contender, spp: int, seed: int) -> timing.Timed:
+        timed = timing.timed_render(contender.named.integrator, self.scene.scene, seed, spp)
         contender.compile_seconds += timed.compile_seconds
         return timed
 
+    # ---- Numbers ----
 
-def spread(values: Sequence[float]) -> dict[str, float]:
-    """Mean, standard deviation (0 for one value) and median over the seeds."""
-    return {
-        "mean": statistics.fmean(values),
-        "std": statistics.stdev(values) if len(values) > 1 else 0.0,
-        "median": statistics.median(values),
-    }
+    def _counts(self) -> list[int]:
+        """Samples of the levels that are known beforehand."""
+        if self.budget.kind == "until":
+            return [int(self.budget.level(0))]
+        return [int(value) for value in self.budget.values]
+
+    def _samples(self, contender: Contender, level: float) -> int:
+        return max(1, round(level / contender._pace)) if self.budget.is_time else int(level)
+
+    def _seed(self, index: int, round: int) -> int:
+        return index * self.rounds + round
+
+    def _seconds_left(self) -> float | None:
+        """What the runs that are missing will take; unknown for ``until``."""
+        if self.budget.kind == "until":
+            return None
+        left = 0.0
+        for contender in self.contenders:
+            if contender.error or contender._pace is None:
+                continue
+            have = {(run.level, run.round) for run in contender.runs}
+            for level in self.budget.values:
+                missing = sum((level, round) not in have for round in range(self.rounds))
+                left += missing * (level if self.budget.is_time else level * contender._pace)
+        return left
+
+    # ---- The folder ----
+
+    def _path(self, contender: Contender, index: int, round: int) -> Path:
+        level = f"{self.budget.level(index):g}{'s' if self.budget.is_time else 'spp'}"
+        named = contender.named
+        return self._folder.path(
+            named.label, named.identity, level, round, self._seed(index, round)
+        )
 
 
-def run_record(run: Run) -> dict[str, object]:
-    """A run without its image, for JSON."""
-    record = {key: value for key, value in vars(run).items() if key not in ("image", "errors")}
-    return {**record, **asdict(run.errors)}
+def make_all(
+    integrators: Sequence[Specification] | Mapping[str, Specification],
+    inherited: Mapping[str, object] | None = None,
+) -> list[NamedIntegrator]:
+    """Makes the integrators of a comparison.
+
+    Raises:
+        InputError: There are none, one cannot be made, or two have the same label.
+    """
+    if isinstance(integrators, Mapping) and "type" not in integrators:
+        pairs = list(integrators.items())
+    elif isinstance(integrators, (str, Path, Mapping)):
+        pairs = [(None, integrators)]
+    else:
+        pairs = [(None, specification) for specification in integrators]
+    if not pairs:
+        raise InputError("no integrator was given")
+    made = [make_named(specification, inherited, label) for label, specification in pairs]
+    labels = [named.label for named in made]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise InputError(
+                f'the integrator "{label}" is given twice: more runs of it need more --seeds'
+            )
+    return made
+
+
+def _mean_error(runs: Sequence[Run]) -> float:
+    return sum(run.errors.relmse for run in runs) / len(runs) if runs else float("inf")

@@ -68,7 +68,8 @@ def write_exr(
     import mitsuba as mi
 
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
-    bitmap = mi.Bitmap(pixels, channel_names=list(channels))
+    # Without the format, up to four channels would be called R, G, B and A
+    bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, list(channels))
     _annotate(bitmap, metadata)
     _save(bitmap, path)
 
@@ -81,12 +82,7 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
     """
     import mitsuba as mi
 
-    if not path.is_file():
-        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
-    try:
-        bitmap = mi.Bitmap(str(path))
-    except RuntimeError as error:
-        raise InputError(f"{path}: unreadable ({one_line(error)})") from error
+    bitmap = open_bitmap(path)
     metadata = bitmap.metadata()
     if bitmap.component_format() not in (mi.Struct.Type.Float16, mi.Struct.Type.Float32):
         raise InputError(f"{path}: not a floating-point image")
@@ -97,6 +93,28 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
         {name: pixels[:, :, index] for index, name in enumerate(names)},
         {key: metadata[key] for key in metadata.keys()},
     )
+
+
+def open_bitmap(path: Path) -> mi.Bitmap:
+    """Any image that Mitsuba can read, whatever its extension says.
+
+    Raises:
+        InputError: The file is missing, damaged, or not an image.
+    """
+    import mitsuba as mi
+
+    check_file(path)
+    try:
+        return mi.Bitmap(str(path))
+    except RuntimeError as error:
+        reason = one_line(error).replace(f'"{path}": ', "")
+        raise InputError(f"{path}: unreadable ({reason})") from error
+
+
+def check_file(path: Path) -> None:
+    """Raises :class:`InputError` if there is no such file."""
+    if not path.is_file():
+        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
 
 
 def write_film(path: Path, film: mi.Film, metadata: Mapping[str, object]) -> None:

@@ -1,16 +1,23 @@
 """How far an image is from a reference.
 
-All functions take images of shape (height, width, channels) and compute in double precision. Where
-the variance of the reference's own mean is known, its expected contribution is subtracted, so that
-a noisy reference does not put a floor under the errors. A subtracted error can come out zero or
-negative: then the image is closer to the truth than this reference can tell.
+All functions take linear RGB of shape (height, width, 3) and compute in double precision. Where the
+variance of the reference's own mean is known, its expected contribution is subtracted from the
+squared errors, so that a noisy reference does not put a floor under them. A subtracted error can
+come out zero or negative: then the image is closer to the truth than this reference can tell.
+
+σ/μ and FLIP keep the noise of the reference, because they are built of absolute values: what to
+subtract depends on how the noise of the channels is correlated, which no reference records. A
+reference with K times the samples of the image raises σ/μ by a factor of √(1 + 1/K), 3 % at K = 16.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+
+from .flip import mean_flip
 
 #: Floor ε of the relative error, as a multiple of the square of the reference's mean.
 RELATIVE_FLOOR = 1e-2
@@ -18,10 +25,13 @@ RELATIVE_FLOOR = 1e-2
 #: Share of the pixels, those with the largest errors, that the trimmed relMSE leaves out.
 TRIMMED_SHARE = 1e-3
 
+#: What a channel contributes to a colour difference: its share of the luminance [Cline 2007].
+COLOR_WEIGHTS = (0.299, 0.587, 0.114)
+
 
 @dataclass(frozen=True)
 class Errors:
-    """The figures of one image; each is a mean over pixels and channels.
+    """The figures of one image. The first four are means over pixels and channels.
 
     Attributes:
         relmse: (I−R)² / (R² + ε), with ε = 10⁻² · mean(R)².
@@ -29,18 +39,35 @@ class Errors:
             smaller than ``relmse`` where a few fireflies decide.
         mse: (I−R)².
         rmse: √mse; NaN where the subtraction left no positive ``mse``.
+        sigma_mu: σ/μ, the coefficient of variation: the root of the mean squared colour difference,
+            divided by the mean luminance of the reference (Cline, *Sampling Methods in Light
+            Transport*, 2007, Eq. 4.13). NaN if that luminance is not positive.
+        flip: The perceived difference, from 0 to 1, see :func:`~.flip.mean_flip`. NaN if it was
+            not asked for, or if ``flip-evaluator`` is not installed.
     """
 
     relmse: float
     relmse_trimmed: float
     mse: float
     rmse: float
+    sigma_mu: float
+    flip: float
 
 
 def errors(
-    image: np.ndarray, reference: np.ndarray, reference_variance: np.ndarray | None = None
+    image: np.ndarray,
+    reference: np.ndarray,
+    reference_variance: np.ndarray | None = None,
+    flip: bool = True,
 ) -> Errors:
     """All figures of ``image``, see :class:`Errors`.
+
+    Args:
+        image: What is measured.
+        reference: What counts as the truth.
+        reference_variance: Variance of ``reference``, ``None`` if unknown.
+        flip: ``False`` leaves FLIP out, which takes more than 20 times as
+            long as the others together (on two cores 0.3 s at 320x180, 9 s at 1920x1080).
 
     Raises:
         ValueError: The shapes differ, the reference is black, or a value is not finite.
@@ -54,7 +81,9 @@ def errors(
         relmse=float(relative.mean()),
         relmse_trimmed=_trimmed_mean(relative.mean(axis=2), seen.mean(axis=2)),
         mse=mse,
-        rmse=float(np.sqrt(mse)) if mse >= 0 else float("nan"),
+        rmse=float(np.sqrt(mse)) if mse >= 0 else math.nan,
+        sigma_mu=_coefficient_of_variation(image, reference),
+        flip=mean_flip(image, reference) if flip else math.nan,
     )
 
 
@@ -62,7 +91,7 @@ def relative_mse(
     image: np.ndarray, reference: np.ndarray, reference_variance: np.ndarray | None = None
 ) -> float:
     """relMSE, see :class:`Errors`."""
-    return errors(image, reference, reference_variance).relmse
+    return errors(image, reference, reference_variance, flip=False).relmse
 
 
 def reference_noise(reference: np.ndarray, reference_variance: np.ndarray) -> float:
@@ -83,8 +112,10 @@ def describe_non_finite(image: np.ndarray) -> str:
 def _squared_and_weight(
     image: np.ndarray, reference: np.ndarray, reference_variance: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    if image.ndim != 3 or image.shape != reference.shape:
+    if image.shape != reference.shape:
         raise ValueError(f"an image of shape {image.shape} and a reference of {reference.shape}")
+    if image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"an image of shape {image.shape}: expected (height, width, 3)")
     for name, values in (("image", image), ("reference", reference)):
         if fault := describe_non_finite(values):
             raise ValueError(f"{name}: {fault}")
@@ -105,6 +136,13 @@ def _weight(reference: np.ndarray) -> np.ndarray:
     if floor == 0:
         raise ValueError("the reference is black: relative errors are undefined")
     return 1 / (reference**2 + floor)
+
+
+def _coefficient_of_variation(image: np.ndarray, reference: np.ndarray) -> float:
+    difference = np.abs(np.asarray(image, np.float64) - reference) @ COLOR_WEIGHTS  # Eq. 4.11
+    variance = np.mean(difference**2)  # Eq. 4.12
+    luminance = np.mean(np.asarray(reference, np.float64) @ COLOR_WEIGHTS)
+    return float(np.sqrt(variance) / luminance) if luminance > 0 else math.nan  # Eq. 4.13
 
 
 def _trimmed_mean(values: np.ndarray, seen: np.ndarray) -> float:

@@ -7,15 +7,21 @@ an EXR with plain ``R/G/B`` is accepted where no variance is known.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
+import math
+import tempfile
+import time
+import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from ..scenes import InputError, LoadedScene, make_integrator
+from ..scenes import InputError, LoadedScene, scene_name
+from ..specifications import Specification, make_named
 from . import images, metrics
 from .machine import versions
 
@@ -25,6 +31,9 @@ MIN_BATCH_COUNT = 8
 
 #: Seed of the first batch: far from those of the runs that are compared with it.
 FIRST_SEED = 7_000_000
+
+#: Samples from which the noise of a longer reference is foretold.
+_PILOT_SPP = 64
 
 _RGB = ("R", "G", "B")
 
@@ -49,6 +58,12 @@ class Reference:
     def noise(self) -> float | None:
         """relMSE of the reference itself; ``None`` if its variance is unknown."""
         return None if self.variance is None else metrics.reference_noise(self.mean, self.variance)
+
+    @property
+    def spp(self) -> int | None:
+        """Samples per pixel, if the file says."""
+        spp = self.metadata.get("spp")
+        return int(spp) if isinstance(spp, (int, float)) else None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -89,76 +104,130 @@ def render_reference(
     scene: LoadedScene,
     spp: int,
     folder: Path,
+    integrator: Specification = "path",
     progress: Callable[[float], None] | None = None,
+    enough: int | None = None,
 ) -> Reference:
-    """Renders a reference with ``path`` at the depth of the scene, or takes it from ``folder`` if
-    one is there that was rendered from the same files, size, parameters and versions.
+    """Renders a reference at the depth of the scene, or takes it from ``folder``.
+
+    One that is there is taken if it was rendered from the same files, at the same size, by the same
+    integrator and versions, with enough samples. One that was interrupted goes on where it was.
 
     Args:
         scene: The scene.
         spp: Samples per pixel of all batches together; rounded up to a multiple of the batches.
         folder: Where references are kept. It must exist.
+        integrator: What renders it; it must converge to the right image.
         progress: Called after each batch with the fraction that is done.
+        enough: A reference in ``folder`` with at least so many samples will do. Default: ``spp``.
+
+    Raises:
+        InputError: ``spp`` is below 8, or the image is black or holds NaN or infinity.
     """
     if spp < MIN_BATCH_COUNT:
         raise InputError(f"a reference needs at least {MIN_BATCH_COUNT} samples, found {spp}")
     batch_count = min(BATCH_COUNT, spp)
     batch_spp = -(-spp // batch_count)
-    integrator, parameters = make_integrator("path", inherited=scene.depth)
+    named = make_named(integrator, scene.depth)
     identity = {
-        "scene": str(scene.path.resolve()),
+        "scene": scene.source,
         "content_hash": scene.content_hash,
         "size": _times(scene.size),
-        "integrator": "path",
-        "parameters": parameters,
-        "spp": batch_spp * batch_count,
-        "seeds": f"{FIRST_SEED}..{FIRST_SEED + batch_count - 1}, {batch_spp} spp each",
+        "integrator": named.label,
+        "parameters": named.parameters,
         "versions": {name: versions()[name] for name in ("mitsuba", "drjit", "variant")},
     }
-    key = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
-    name = f"{scene.path.parent.name}_{scene.path.stem}_{_times(scene.size)}_{spp}spp_{key[:12]}"
-    path = folder / f"{name}.exr"
-    cached = _cached(path, key)
-    if cached is not None:
+    text = json.dumps({**identity, "made of": named.identity}, sort_keys=True, default=str)
+    key = hashlib.sha256(text.encode()).hexdigest()
+    stem = f"{scene_name(scene.path)}_{_times(scene.size)}_{key[:12]}"
+    cached = _best_cached(folder, stem, key)
+    if cached is not None and (cached.spp or 0) >= min(spp, enough or spp):
         return cached
 
-    # Welford's update: no batch has to be kept
-    mean = squares = 0.0
-    for index in range(batch_count):
-        rendered = integrator.render(
-            scene.scene, sensor=0, seed=FIRST_SEED + index, spp=batch_spp, develop=True
+    path = folder / f"{stem}_{batch_spp * batch_count}spp.exr"
+    partial = _Partial(path.with_suffix(".partial.npz"), batch_spp)
+    start = time.perf_counter()
+    while partial.count < batch_count:
+        rendered = named.integrator.render(
+            scene.scene, sensor=0, seed=FIRST_SEED + partial.count, spp=batch_spp, develop=True
         )
-        batch = images.to_rgb(rendered).astype(np.float64)
+        batch = images.to_rgb(rendered)
         if fault := metrics.describe_non_finite(batch):
-            raise InputError(f'{scene.path}: the reference of "path" has {fault}')
-        deviation = batch - mean
-        mean = mean + deviation / (index + 1)
-        squares = squares + deviation * (batch - mean)
+            raise InputError(f'{scene.source}: the reference of "{named.label}" has {fault}')
+        partial.add(batch)
         if progress is not None:
-            progress((index + 1) / batch_count)
-    if not mean.any():
-        raise InputError(f'{scene.path}: the reference of "path" is black')
-    variance = squares / (batch_count - 1) / batch_count
-    note = f"of the mean, from {batch_count} independent batches"
-    _write(path, mean, variance, {**identity, "variance": note, "key": key})
+            progress(partial.count / batch_count)
+    if not partial.mean.any():
+        raise InputError(f'{scene.source}: the reference of "{named.label}" is black')
+    metadata = {
+        **identity,
+        "spp": batch_spp * batch_count,
+        "seeds": f"{FIRST_SEED}..{FIRST_SEED + batch_count - 1}, {batch_spp} spp each",
+        "variance": f"of the mean, from {batch_count} independent batches",
+        "seconds": time.perf_counter() - start,
+        "key": key,
+    }
+    channels = [f"{name}.{color}" for name in ("mean", "variance") for color in _RGB]
+    pixels = np.concatenate([partial.mean, partial.variance], axis=2)
+    images.write_exr(path, pixels, channels, metadata)
+    partial.path.unlink(missing_ok=True)
     return load_reference(path, scene.size)
 
 
-def _write(
-    path: Path, mean: np.ndarray, variance: np.ndarray, metadata: Mapping[str, object]
-) -> None:
-    channels = [f"{name}.{color}" for name in ("mean", "variance") for color in _RGB]
-    images.write_exr(path, np.concatenate([mean, variance], axis=2), channels, metadata)
+def samples_for_noise(scene: LoadedScene, noise: float, integrator: Specification = "path") -> int:
+    """Samples per pixel (a power of two) after which a reference has at most the relMSE ``noise``,
+    judged from a few batches.
+
+    Raises:
+        InputError: The few batches are black.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        pilot = render_reference(scene, _PILOT_SPP, Path(folder), integrator)
+    needed = _PILOT_SPP * (pilot.noise or 0) / noise
+    return 1 << max(0, math.ceil(math.log2(max(needed, BATCH_COUNT))))
 
 
-def _cached(path: Path, key: str) -> Reference | None:
-    if not path.is_file():
-        return None
-    try:
-        reference = load_reference(path)
-    except InputError:
-        return None  # damaged: render it again
-    return reference if reference.metadata.get("key") == key else None
+class _Partial:
+    """Mean and variance of the batches so far, by Welford's update: none has to be kept.
+
+    After each batch the state goes to a file, from which an interrupted reference is continued.
+    """
+
+    def __init__(self, path: Path, batch_spp: int) -> None:
+        self.path = path
+        self.count = 0
+        self.mean = self._squares = np.zeros(())
+        with contextlib.suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):
+            with np.load(path) as stored:
+                if int(stored["batch_spp"]) == batch_spp:
+                    self.mean, self._squares = stored["mean"], stored["squares"]
+                    self.count = int(stored["count"])
+        self._batch_spp = batch_spp
+
+    @property
+    def variance(self) -> np.ndarray:
+        """Of the mean."""
+        return self._squares / (self.count - 1) / self.count
+
+    def add(self, batch: np.ndarray) -> None:
+        deviation = batch.astype(np.float64) - self.mean
+        self.count += 1
+        self.mean = self.mean + deviation / self.count
+        self._squares = self._squares + deviation * (batch - self.mean)
+        with images.replacing(self.path) as temporary, open(temporary, "wb") as file:
+            np.savez(file, mean=self.mean, squares=self._squares, count=self.count,
+                     batch_spp=self._batch_spp)
+
+
+def _best_cached(folder: Path, stem: str, key: str) -> Reference | None:
+    """The reference with the most samples that is there; damaged ones do not count."""
+    found = []
+    for path in folder.glob(f"{stem}_*spp.exr"):
+        with contextlib.suppress(InputError):
+            reference = load_reference(path)
+            if reference.metadata.get("key") == key:
+                found.append(reference)
+    return max(found, key=lambda reference: reference.spp or 0, default=None)
 
 
 def _stack(channels: Mapping[str, np.ndarray], prefix: str) -> np.ndarray | None:

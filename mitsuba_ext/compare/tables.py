@@ -1,219 +1,131 @@
-"""The results of an experiment as a table on the terminal and as ``results.json``.
-
-``results.json`` holds one object::
-
-    schema        1
-    date          ISO 8601, UTC
-    scene         path, parameters, content_hash, size [width, height], depth {max_depth, rr_depth}
-    spp, seeds    of the runs
-    reference     path, noise (its own relMSE, null if unknown), metadata
-    integrators   a list, in the order of the command line:
-        label, name, parameters
-        error              why it failed; empty if it did not
-        compile_seconds
-        runs               a list: seed, spp, seconds, relmse, relmse_trimmed, mse, rmse,
-                           rays {camera, scatter, shadow}, connections, zero_radiance,
-                           memory (bytes), image
-        summary            seconds, relmse, relmse_trimmed, mse, rmse: {mean, std, median}
-        efficiency         1 / (mean relMSE · median seconds)
-        efficiency_ratio   to the first integrator
-    versions      mitsuba_ext, mitsuba, drjit, variant, numpy, python
-    machine       system, processor, cores
-
-Seconds are wall clock without compilation, learning included. Unknown numbers are null.
-"""
+"""The results of a comparison on the terminal."""
 
 from __future__ import annotations
 
-import datetime
-import json
-import math
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from . import experiment as experiments
-from .experiment import Contender, Experiment, Run
-from .images import replacing, write_exr
-from .machine import machine, versions
-
-SCHEMA = 1
-
-_FIGURES = ("relmse", "relmse_trimmed", "mse", "rmse", "seconds")
+_LEGEND = (
+    "Means over the rounds (seconds: median), with 95 % confidence intervals over them (as a "
+    "factor: +50 % upwards is −33 % downwards); compilation excluded, learning included. "
+    "eff. = 1 / (relMSE · seconds), relative to the first; shadow = shadow rays traced, of those "
+    "that 'path' would trace."
+)
 
 
-def table(experiment: Experiment) -> Table:
-    """A row per integrator: mean over the seeds (seconds: median) ± standard deviation in %."""
-    result = Table(
-        title=_title(experiment), title_justify="left", title_style="", box=box.SIMPLE_HEAD,
-        show_edge=False, padding=0,
-    )
-    result.add_column("integrator", overflow="fold", min_width=12)
-    for heading in ("relMSE", "trimmed", "rMSE", "seconds", "rays", "shadow", "eff."):
-        result.add_column(heading, justify="right", no_wrap=True)
-    for contender in experiment.contenders:
-        label = Text(contender.label)
-        if contender.error:
-            label.append(f"\n{contender.error}", style="red")
-        if not contender.runs:
-            result.add_row(label, *["–"] * 7)
+def tables(results: Mapping[str, Any]) -> Iterator[Table | Text]:
+    """A table for each scene, with what a reader has to know to trust it.
+
+    Args:
+        results: The content of ``results.json``.
+    """
+    for scene in results["scenes"]:
+        if scene["error"]:
+            yield Text(f"{scene['name']}: {scene['error']}\n", style="red")
             continue
-        ratio = experiment.efficiency_ratio(contender)
-        result.add_row(
-            label,
-            *(_spread(contender, name, "mean") for name in ("relmse", "relmse_trimmed", "rmse")),
-            _spread(contender, "seconds", "median"),
-            _rays(contender),
-            _shadow_share(contender),
-            "–" if ratio is None else f"{ratio:.2f}x",
-        )
-    return result
+        yield _scene_table(scene, results["budget"])
+        yield Text("\n".join(_notes(scene)) + "\n")
+    yield Text(_LEGEND)
 
 
-def footnote(experiment: Experiment) -> str:
-    """What a reader has to know to trust the table."""
-    reference = experiment.reference
-    noise = reference.noise
-    run_count = max(len(contender.runs) for contender in experiment.contenders)
-    lines = [
-        f"Mean ± standard deviation over {run_count} seed(s); median of the seconds "
-        f"(compilation excluded, learning included); eff. = 1 / (relMSE · seconds), "
-        f"relative to the first; shadow = shadow rays traced, of those that 'path' would trace.",
-        f"Reference: {reference.path}, "
-        + (
-            "variance unknown: its noise is part of the errors."
-            if noise is None
-            else f"relMSE of its own {noise:.2g}, subtracted."
-        ),
-    ]
-    claimed = reference.metadata.get("max_depth")
-    actual = experiment.scene.depth.get("max_depth")
-    if isinstance(claimed, int) and actual is not None and claimed != actual:
-        lines.append(
-            f"Warning: the reference has max_depth {claimed}, the scene {actual}."
-        )
-    return "\n".join(lines)
+def show(results: Mapping[str, Any]) -> None:
+    """Prints the tables, in a terminal as in a notebook."""
+    from rich.console import Console
+
+    console = Console()
+    for part in tables(results):
+        console.print(part, highlight=False)
 
 
-def results(experiment: Experiment) -> dict[str, object]:
-    """The content of ``results.json``."""
-    scene, reference = experiment.scene, experiment.reference
-    return {
-        "schema": SCHEMA,
-        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
-        "scene": {
-            "path": str(scene.path),
-            "parameters": scene.parameters,
-            "content_hash": scene.content_hash,
-            "size": list(scene.size),
-            "depth": scene.depth,
-        },
-        "spp": experiment.spp,
-        "seeds": experiment.seeds,
-        "reference": {
-            "path": str(reference.path),
-            "noise": reference.noise,
-            "metadata": reference.metadata,
-        },
-        "integrators": [
-            _contender_record(experiment, index, contender)
-            for index, contender in enumerate(experiment.contenders)
-        ],
-        "versions": versions(),
-        "machine": machine(),
-    }
+def _scene_table(scene: Mapping[str, Any], budget: Mapping[str, Any]) -> Table:
+    table = Table(
+        title=_title(scene, budget), title_justify="left", title_style="", box=box.SIMPLE_HEAD,
+        show_edge=False, padding=(0, 1, 0, 0),
+    )
+    table.add_column("integrator", overflow="fold", min_width=12)
+    has_levels = budget["kind"] in ("sweep", "until")
+    headings = ["relMSE", "trimmed", "σ/μ", "FLIP", "spp", "seconds", "shadow", "eff."]
+    headings += ["slope"] if has_levels else []
+    headings += ["s to target"] if budget["kind"] == "until" else []
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for contender in scene["integrators"]:
+        label = Text(contender["label"])
+        if contender["error"]:
+            label.append(f"\n{contender['error']}", style="red")
+        if not contender["levels"]:
+            table.add_row(label, *["–"] * len(headings))
+            continue
+        level = contender["levels"][-1]
+        figures = level["figures"]
+        row = [
+            *(_number(figures[name]) for name in ("relmse", "relmse_trimmed", "sigma_mu", "flip")),
+            _number(figures["spp"], spread=False),
+            _number(figures["seconds"]),
+            _percent(figures["shadow_share"]),
+            _ratio(level["ratios"]["efficiency"]),
+        ]
+        if has_levels:
+            row.append(_difference(contender["slopes"]["spp"]))
+        if budget["kind"] == "until":
+            row.append(_number((contender["target"] or {}).get("seconds")))
+        table.add_row(label, *row)
+    return table
 
 
-def write_results(path: Path, experiment: Experiment) -> None:
-    """Writes ``results.json``."""
-    text = json.dumps(_without_nan(results(experiment)), indent=2, default=str)
-    with replacing(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+def _title(scene: Mapping[str, Any], budget: Mapping[str, Any]) -> str:
+    depth = ", ".join(f"{key} {value}" for key, value in scene["depth"].items())
+    values = ", ".join(f"{value:g}" for value in budget["values"])
+    unit = {"time": f"{values} s", "until": f"until relMSE {values}"}
+    size = "x".join(map(str, scene["size"]))
+    parts = [scene["path"] or scene["name"], size, unit.get(budget["kind"], f"{values} spp"), depth]
+    return ", ".join(filter(None, parts))
 
 
-def image_name(index: int, contender: Contender, run: Run) -> str:
-    """File name of a run's image: ``2_neepp_seed0.exr`` is of the second integrator."""
-    return f"{index + 1}_{contender.name}_seed{run.seed}.exr"
+def _notes(scene: Mapping[str, Any]) -> Iterator[str]:
+    reference = scene["reference"]
+    if reference:
+        noise = reference["noise"]
+        note = "" if noise is None else f", relMSE of its own {noise:.2g}, subtracted"
+        yield f"Reference: {reference['path']}{note}."
+    for warning in scene["warnings"]:
+        yield f"Warning: {warning}."
+    for contender in scene["integrators"]:
+        for note in contender["notes"]:
+            yield f"{contender['label']}: {note}."
+        for level in contender["levels"]:
+            if level["refused"]:
+                yield f"{contender['label']} at {level['level']:g}: {level['refused']}."
 
 
-def image_writer(
-    folder: Path, experiment: Experiment
-) -> Callable[[int, Contender, Run], None]:
-    """What to pass as ``finished`` to :meth:`Experiment.run` to keep the images in ``folder``."""
-
-    def write(index: int, contender: Contender, run: Run) -> None:
-        metadata = {
-            "scene": str(experiment.scene.path),
-            "content_hash": experiment.scene.content_hash,
-            "integrator": contender.name,
-            "parameters": contender.parameters,
-            "seed": run.seed,
-            "spp": run.spp,
-            "seconds": run.seconds,
-            "versions": versions(),
-        }
-        write_exr(folder / image_name(index, contender, run), run.image, "RGB", metadata)
-
-    return write
-
-
-def _title(experiment: Experiment) -> str:
-    scene = experiment.scene
-    depth = ", ".join(f"{key} {value}" for key, value in scene.depth.items())
-    size = "x".join(map(str, scene.size))
-    return ", ".join(filter(None, [str(scene.path), size, f"{experiment.spp} spp", depth]))
-
-
-def _contender_record(
-    experiment: Experiment, index: int, contender: Contender
-) -> dict[str, object]:
-    return {
-        "label": contender.label,
-        "name": contender.name,
-        "parameters": contender.parameters,
-        "error": contender.error,
-        "compile_seconds": contender.compile_seconds,
-        "runs": [
-            {**experiments.run_record(run), "image": image_name(index, contender, run)}
-            for run in contender.runs
-        ],
-        "summary": {
-            name: experiments.spread(contender.figures(name)) for name in _FIGURES
-        } if contender.runs else {},
-        "efficiency": contender.efficiency,
-        "efficiency_ratio": experiment.efficiency_ratio(contender),
-    }
-
-
-def _spread(contender: Contender, name: str, center: str) -> str:
-    values = experiments.spread(contender.figures(name))
-    if not math.isfinite(values[center]):
+def _number(estimate: Mapping[str, float] | None, spread: bool = True) -> str:
+    if estimate is None or estimate["value"] is None:
         return "–"
-    deviation = ""
-    if len(contender.runs) > 1 and values[center] != 0:
-        deviation = f" ±{abs(values['std'] / values[center]):.0%}"
-    return f"{values[center]:#.3g}{deviation}"
+    value, high = estimate["value"], estimate["high"]
+    if not spread:
+        return f"{value:.6g}"
+    factor = f" ±{high / value - 1:.0%}" if high is not None and value > 0 else ""
+    return f"{value:#.3g}{factor}"
 
 
-def _rays(contender: Contender) -> str:
-    """Rays of one run, in millions; Mitsuba's own integrators do not count theirs."""
-    rays = [sum(run.rays.values()) for run in contender.runs if run.rays]
-    return f"{sum(rays) / len(rays) / 1e6:.3g} M" if rays else "–"
+def _percent(estimate: Mapping[str, float] | None) -> str:
+    return "–" if estimate is None else f"{estimate['value']:.1%}"
 
 
-def _shadow_share(contender: Contender) -> str:
-    """Shadow rays traced, in percent of the connections (of those that ``path`` traces)."""
-    shares = [run.rays["shadow"] / run.connections for run in contender.runs if run.connections]
-    return f"{sum(shares) / len(shares):.1%}" if shares else "–"
+def _ratio(estimate: Mapping[str, float] | None) -> str:
+    if estimate is None:
+        return "–"
+    if estimate["low"] is None:
+        return f"{estimate['value']:.2f}x"
+    return f"{estimate['value']:.2f}x [{estimate['low']:.2f}, {estimate['high']:.2f}]"
 
 
-def _without_nan(value: object) -> object:
-    """JSON knows neither NaN nor infinity."""
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _difference(estimate: Mapping[str, float] | None) -> str:
+    if estimate is None:
+        return "–"
+    half = "" if estimate["high"] is None else f" ±{estimate['high'] - estimate['value']:.2f}"
+    return f"{estimate['value']:.2f}{half}"

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from ..rendering import RenderStatistics
+
 #: More would not fit into the 2^32 samples of a wavefront even for a film of 16x16 pixels.
 _MAX_SPP = 2**24
 
@@ -22,19 +24,27 @@ class Timed(NamedTuple):
         seconds: Wall clock of the whole render, learning and compilation included.
         compiled: Did a kernel have to be compiled, or loaded from the disk?
         compile_seconds: How long that took (without tracing).
+        launches: Kernels that were launched.
+        spp: Samples per pixel that were taken.
+        memory: Peak of the memory that Dr.Jit held, the scene included, in bytes.
         image: The developed image.
     """
 
     seconds: float
     compiled: bool
     compile_seconds: float
+    launches: int
+    spp: int
+    memory: int
     image: mi.TensorXf
 
 
 def timed_render(integrator: mi.Integrator, scene: mi.Scene, seed: int, spp: int) -> Timed:
     """Renders (``spp`` 0: as many samples as the scene's sampler says) and waits for the image."""
     import drjit as dr
+    import mitsuba as mi
 
+    dr.detail.malloc_clear_statistics()
     # The history costs nothing that could be measured
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
@@ -46,7 +56,25 @@ def timed_render(integrator: mi.Integrator, scene: mi.Scene, seed: int, spp: int
         kernels = dr.kernel_history([dr.KernelType.JIT])
     compiled = [kernel for kernel in kernels if not kernel["cache_hit"]]
     milliseconds = sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in compiled)
-    return Timed(seconds, bool(compiled), milliseconds / 1000, image)
+    memory = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
+    report = own_statistics(integrator)
+    return Timed(
+        seconds=seconds,
+        compiled=bool(compiled),
+        compile_seconds=milliseconds / 1000,
+        launches=len(kernels),
+        spp=report.spp if report else sample_count(scene, spp),
+        memory=memory,
+        image=image,
+    )
+
+
+def own_statistics(integrator: mi.Integrator) -> RenderStatistics | None:
+    """What an integrator of ours says about its last render; Mitsuba's say nothing."""
+    from ..rendering import RenderStatistics
+
+    report = getattr(integrator, "statistics", None)
+    return report if isinstance(report, RenderStatistics) else None
 
 
 def samples_for(budget: float, integrator: mi.Integrator, scene: mi.Scene, seed: int) -> int:

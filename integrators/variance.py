@@ -1,0 +1,257 @@
+"""The variance of each pixel, for any integrator, from independent batches."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from textwrap import indent
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_ext import registry
+from mitsuba_ext.batches import Batches, batch_seeds, each_batch, find_sensor, sample_count
+from mitsuba_ext.parameters import read_parameter
+from mitsuba_ext.rendering import RenderStatistics
+
+_PREFIX = "variance."
+
+
+# Not a SamplingIntegrator: "aov" and "moment" draw single samples from those that they nest, and
+# refuse any other when the scene is loaded.
+@registry.plugin
+class Variance(mi.AdjointIntegrator):
+    r"""
+    .. _integrator-variance:
+
+    Variance from batches (:monosp:`variance`)
+    ------------------------------------------
+
+    Renders the nested integrator in independent batches, each with a seed of its own. The image is
+    the mean of the batches, and the channels :monosp:`variance.R`, :monosp:`variance.G` and
+    :monosp:`variance.B` estimate the variance of this mean, that is, the squared standard error of
+    each pixel.
+
+    .. pluginparameters::
+
+     * - batches
+       - |int|
+       - Number of batches, at least 2. (Default: 16)
+     * - (Nested plugin)
+       - |integrator|
+       - The integrator to render with, exactly one. It may be any that renders an image.
+
+    **Use it when** you need error bars, a noise map for a denoiser, or weights for comparing
+    images, of an integrator that Mitsuba's :monosp:`moment` cannot take, such as :monosp:`ptracer`
+    or one that learns. **Not when** the nested integrator profits from one long render: learning
+    begins anew in each batch (with a sixteenth of the samples, at the defaults), and a sampler is
+    stratified in each batch only. Otherwise the cost is that of the nested integrator, plus
+    reading each batch back: choose batches of some samples per pixel.
+
+    **What the numbers say.** The variance is that of the image: of the mean of all samples, not of
+    one sample (for an independent sampler and the box filter, that is variance · spp). A variance
+    that is estimated from n batches has itself a relative standard error of about √(2 / (n - 1)):
+    37 % from 16 batches, 13 % from 128; more where the noise has heavy tails. Average it over
+    pixels before relying on it. With a reconstruction filter wider than a pixel, the errors of
+    neighbouring pixels depend on each other: the variance of a mean over pixels is then larger
+    than the sum of their variances says. Each batch divides by the filter weights of its own
+    samples, which slightly smooths or sharpens edges in batches of only a few samples; the box
+    filter is free of this.
+
+    **Samples.** Each batch takes spp / batches samples per pixel, rounded up (by stratified
+    samplers to a number that they can take), and as many batches are rendered as it takes to reach
+    spp, at least 2. So there can be fewer batches than asked for, and the excess is less than one
+    batch where there are more than two. At least 2 samples per pixel are needed. A
+    :monosp:`timeout` of the nested integrator is one for each batch.
+
+    **Channels.** Names follow the film: for the pixel format :monosp:`luminance` and in monochrome
+    variants there is only :monosp:`variance.Y`, for :monosp:`xyz` there are :monosp:`variance.X`,
+    :monosp:`variance.Y` and :monosp:`variance.Z`; alpha has none. AOVs of the nested integrator
+    are passed on before them, as means. Set the film's :monosp:`component_format` to
+    :monosp:`float32`: variances below 6e-8 do not survive the default, half precision, in a file
+    that :monosp:`film.write` makes.
+
+    Ctrl-C, and :monosp:`cancel()` after the running batch, keep the image of the finished batches
+    (after a single one, its variance is NaN: unknown). :monosp:`progress` is called after each
+    batch; :monosp:`nested` is the integrator inside. :monosp:`statistics` adds up those of the
+    batches where the nested integrator keeps some. Gradients are not supported, nor are
+    :monosp:`specfilm`, and scalar and polarized variants. It cannot be nested in :monosp:`aov` or
+    :monosp:`moment`; nest those in it.
+
+    Source: batch means are textbook statistics; the update is that of B. P. Welford, *Note on a
+    Method for Calculating Corrected Sums of Squares and Products*, Technometrics 4(3), 1962.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="variance">
+                <integer name="batches" value="32"/>
+                <integrator type="ptracer">
+                    <integer name="max_depth" value="8"/>
+                </integrator>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'variance',
+            'batches': 32,
+            'nested': {
+                'type': 'ptracer',
+                'max_depth': 8
+            }
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        # Nothing for the base class to read: what it would accept has no effect here
+        super().__init__(mi.Properties(props.plugin_name()))
+        self.name = props.plugin_name()
+        self.batch_count = read_parameter(self.name, props, "batches", 16, minimum=2)
+        self.nested = self._nested(props)
+        self.progress: Callable[[float], None] | None = None
+        self.statistics = RenderStatistics()
+        self.is_cancelled = False
+        self._aov_names = [
+            *self.nested.aov_names(),
+            *(_PREFIX + color for color in ("Y" if mi.is_monochromatic else "RGB")),
+        ]
+
+    def _nested(self, props: mi.Properties) -> mi.Integrator:
+        children = [child for _, child in props.objects()]
+        if len(children) != 1 or not isinstance(children[0], mi.Integrator):
+            found = ", ".join(child.class_name() for child in children) or "none"
+            raise ValueError(
+                f'"{self.name}": exactly one integrator must be nested in it; found {found}'
+            )
+        if isinstance(children[0], Variance):
+            raise ValueError(f'"{self.name}": cannot be nested in another "{self.name}"')
+        taken = {_PREFIX + color for color in "RGBXYZ"} & set(children[0].aov_names())
+        if taken:
+            raise ValueError(
+                f'"{self.name}": the nested integrator has an AOV of the name "{min(taken)}"'
+            )
+        return children[0]
+
+    # ---- What Mitsuba calls ----
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        start = time.perf_counter()
+        self.is_cancelled = False
+        self.statistics = RenderStatistics()
+        sensor = find_sensor(scene, sensor)
+        film = sensor.film()
+        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+            raise NotImplementedError(
+                f'"{self.name}": does not work with the film "{film.class_name()}": use an '
+                f'"hdrfilm".'
+            )
+        batch_count, batch_spp = self._plan(sensor, spp)
+        seeds = batch_seeds(seed, batch_count)
+        batches = None
+        try:
+            for batches in each_batch(self.nested, scene, sensor, batch_spp, seeds):
+                self._count(batch_spp)
+                if self.progress is not None:
+                    self.progress(batches.count / batch_count)
+                if self.is_cancelled:
+                    break
+        finally:
+            # Also after an exception, the film holds the batches that were finished
+            if batches is not None:
+                self._fill(film, batches)
+            self.statistics.interrupted = batches is None or batches.count < batch_count
+            self.statistics.seconds = time.perf_counter() - start
+        image = film.develop() if develop else mi.TensorXf()
+        if not develop:
+            film.schedule_storage()
+        if evaluate:
+            dr.eval(image) if develop else dr.eval()
+            dr.sync_thread()
+        return image
+
+    def aov_names(self) -> list[str]:
+        """Of the last render; before the first, of a film that takes RGB (or is monochrome)."""
+        return self._aov_names
+
+    def cancel(self) -> None:
+        """Ends the running render after the current batch (call it from ``progress`` or from
+        another thread); the image of the finished batches is returned."""
+        self.is_cancelled = True
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        raise self._no_gradients()
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        raise self._no_gradients()
+
+    def to_string(self) -> str:
+        nested = indent(str(self.nested), "  ").lstrip()
+        return f"{self.name}[\n  batches = {self.batch_count},\n  integrator = {nested}\n]"
+
+    # ---- Helpers ----
+
+    def _plan(self, sensor: mi.Sensor, spp: int) -> tuple[int, int]:
+        """The number of batches, and the samples per pixel of each."""
+        spp = spp or sample_count(sensor, 0)
+        if spp < 2:
+            raise ValueError(
+                f'"{self.name}": a variance needs at least 2 samples per pixel, found spp = {spp}; '
+                f'set "spp", or "sample_count" of the sampler'
+            )
+        batch_spp = sample_count(sensor, -(-spp // self.batch_count))
+        return max(2, -(-spp // batch_spp)), batch_spp
+
+    def _fill(self, film: mi.Film, batches: Batches) -> None:
+        """Makes the film hold mean and variance as if it had been rendered to."""
+        base = batches.image_channel_count
+        names, aovs = list(batches.channels[:base]), list(batches.channels[base:])
+        has_alpha = names[-1] == "A"
+        colors = names[:-1] if has_alpha else names
+        variances = [_PREFIX + color for color in colors]
+        self._aov_names = [*aovs, *variances]
+
+        image = batches.mean[..., : len(colors)]
+        layers = [
+            _as_rgb(image, colors),
+            batches.mean[..., base - 1 : base] if has_alpha else None,
+            np.ones_like(image[..., :1]),  # the weight that the film divides by
+            batches.mean[..., base:],
+            batches.variance[..., : len(colors)],
+        ]
+        pixels = np.concatenate([layer for layer in layers if layer is not None], axis=2)
+        film.prepare(self._aov_names)
+        tensor = mi.TensorXf(pixels.astype(np.float32))
+        film.put_block(mi.ImageBlock(tensor, offset=film.crop_offset()))
+
+    def _count(self, batch_spp: int) -> None:
+        """Adds a batch to the statistics."""
+        total, batch = self.statistics, getattr(self.nested, "statistics", None)
+        memory = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
+        total.memory = max(total.memory, memory)
+        if not isinstance(batch, RenderStatistics):
+            total.passes += 1
+            total.spp += batch_spp
+            return
+        black = total.zero_radiance * total.spp + batch.zero_radiance * batch.spp
+        for key in ("passes", "spp", "compile_seconds", "learning_seconds", "connections"):
+            setattr(total, key, getattr(total, key) + getattr(batch, key))
+        total.rays = {key: total.rays[key] + batch.rays[key] for key in total.rays}
+        total.zero_radiance = black / max(1, total.spp)
+        total.learned = batch.learned
+
+    def _no_gradients(self) -> NotImplementedError:
+        return NotImplementedError(
+            f'"{self.name}" does not compute gradients: use an integrator made for that, such as '
+            f'"prb", without it.'
+        )
+
+
+def _as_rgb(image: np.ndarray, colors: list[str]) -> np.ndarray:
+    """What the film has to store, so that it develops ``image``: it stores RGB, whatever it is
+    going to make of that."""
+    if colors == ["R", "G", "B"]:
+        return image
+    if colors == ["Y"]:
+        return np.repeat(image, 3, axis=2)  # the weights of the luminance add up to 1
+    to_xyz = mi.srgb_to_xyz(mi.Color3f(np.eye(3, dtype=np.float32))).numpy().astype(np.float64)
+    return image @ np.linalg.inv(to_xyz).T

@@ -1,0 +1,230 @@
+"""Several scenes with several integrators: references, runs, ``results.json`` and report in one
+folder, in which a second run continues what a first one left."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import math
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Union
+
+from ..scenes import InputError, LoadedScene, load_scene, scene_name
+from ..specifications import Specification, make_named
+from . import images, references, report, results, timing
+from .budgets import Budget
+from .experiment import Experiment, Step, make_all
+from .machine import machine, versions
+from .references import Reference
+
+SceneSource = Union[str, Path, Mapping[str, Any]]
+
+#: How much longer than the longest run a reference is.
+_REFERENCE_FACTOR = 16
+
+
+class Comparison:
+    """Compares integrators on scenes.
+
+    Args:
+        scenes: XML files, or dicts as ``mi.load_dict`` takes them. Their integrators are replaced.
+        integrators: Specifications (:func:`mitsuba_ext.specifications.make_named`), or a mapping
+            of labels to them. Ratios are given relative to the first.
+        budget: What each run gets: see :mod:`.budgets`.
+        seeds: Runs of each integrator at each level.
+        folder: For ``results.json``, ``report.html``, images and references; made if missing. A
+            comparison in the same folder takes up what is there. Default: a temporary one, which
+            goes when the object does.
+        reference: A file to measure against. Default: one is rendered for each scene.
+        reference_spp: Samples per pixel of rendered references. Default: 16 times those of the
+            longest run (of as many seconds, for a time; enough for the error, for ``until``).
+        reference_integrator: What renders them.
+        size: Width and height that replace those of the films.
+        parameters: Values for the ``$name`` placeholders of the scene files.
+        command: The command line, for the report.
+        only_stored: Render nothing: figures and report of what is in the folder.
+
+    Raises:
+        InputError: No scene was given, an integrator cannot be made, or the folder cannot.
+    """
+
+    def __init__(
+        self,
+        scenes: SceneSource | Sequence[SceneSource],
+        integrators: Sequence[Specification] | Mapping[str, Specification],
+        budget: Budget,
+        seeds: int = 3,
+        folder: str | Path | None = None,
+        reference: str | Path | None = None,
+        reference_spp: int | None = None,
+        reference_integrator: Specification = "path",
+        size: tuple[int, int] | None = None,
+        parameters: Mapping[str, object] | None = None,
+        command: str | None = None,
+        only_stored: bool = False,
+    ) -> None:
+        self.only_stored = only_stored
+        self.scenes = [scenes] if isinstance(scenes, (str, Path, Mapping)) else list(scenes)
+        if not self.scenes:
+            raise InputError("no scene was given")
+        if reference and len(self.scenes) > 1:
+            raise InputError("one reference file cannot serve several scenes")
+        if seeds < 1:
+            raise InputError(f"at least 1 seed is needed, found {seeds}")
+        for scene in self.scenes:
+            if not isinstance(scene, Mapping) and not Path(scene).is_file():
+                raise InputError(f"{scene}: no such scene")
+        make_all(integrators)  # an unknown name must not wait for the end of a reference
+        self.integrators = integrators
+        self.budget = budget
+        self.seeds = seeds
+        self.size, self.parameters, self.command = size, parameters, command
+        self._reference_file = reference
+        self._reference_spp = reference_spp
+        self._reference_integrator = reference_integrator
+        self._temporary = None
+        if folder is None:
+            self._temporary = tempfile.TemporaryDirectory(prefix="mitsuba_ext_")
+            folder = self._temporary.name
+        self.folder = Path(folder)
+        self._records: list[dict[str, object]] = []
+        self._running: tuple[str, Experiment] | None = None
+        self.is_finished = False
+
+    def run(self, progress: Callable[[Step], None] = lambda _step: None) -> dict[str, object]:
+        """Measures everything, writes ``results.json`` and ``report.html``, returns the results.
+
+        After Ctrl-C both are written with what is finished before the exception goes on.
+
+        Args:
+            progress: Called before each piece of work.
+
+        Raises:
+            InputError: The only scene cannot be used, or its reference cannot. (Of several, one
+                that cannot is an entry of the results.)
+        """
+        _make_folder(self.folder)
+        try:
+            for source in self.scenes:
+                name = self._unique_name(source)
+                try:
+                    self._run_scene(source, name, progress)
+                except InputError as error:
+                    if len(self.scenes) == 1:
+                        raise
+                    self._records.append(_failed_record(name, source, str(error)))
+                self.write()
+            self.is_finished = not self.only_stored
+        finally:
+            if self._running:
+                self._keep_record()
+            if self._records:
+                self.write()
+        return self.results()
+
+    def results(self) -> dict[str, object]:
+        """What ``results.json`` holds; see :mod:`.results`."""
+        content = {
+            "schema": results.SCHEMA,
+            "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+            "command": self.command,
+            "state": "finished" if self.is_finished else "interrupted",
+            "budget": {"kind": self.budget.kind, "values": self.budget.values},
+            "seeds": self.seeds,
+            "scenes": self._records,
+            "versions": versions(),
+            "machine": machine(),
+        }
+        return results.clean(content)
+
+    def write(self) -> None:
+        """Writes ``results.json`` and ``report.html``."""
+        text = json.dumps(self.results(), indent=2)
+        with images.replacing(self.folder / "results.json") as temporary:
+            temporary.write_text(text + "\n", encoding="utf-8")
+        report.write_report(self.folder)
+
+    def _run_scene(self, source: SceneSource, name: str, progress: Callable[[Step], None]) -> None:
+        scene = load_scene(source, self.size, self.parameters, keep_integrator=False)
+        experiment = Experiment(
+            scene, self.integrators, self.budget, self.seeds, self.folder / name, self.only_stored
+        )
+
+        def report_step(step: Step) -> None:
+            progress(step._replace(label=f"{name}: {step.label}"))
+
+        reference = self._make_reference(scene, report_step)
+        self._running = (name, experiment)
+        experiment.run(reference, report_step)
+        self._keep_record()
+
+    def _keep_record(self) -> None:
+        """The figures of the running scene; the scene itself is let go."""
+        name, experiment = self._running
+        self._running = None
+        record = {"name": name, **results.scene_record(experiment, self.folder)}
+        if any(contender.runs or contender.error for contender in experiment.contenders):
+            self._records.append(record)
+
+    def _make_reference(
+        self, scene: LoadedScene, progress: Callable[[Step], None]
+    ) -> Reference:
+        if self._reference_file:
+            return references.load_reference(self._reference_file, scene.size)
+        progress(Step("reference", 0.0, None))
+        asked = self._reference_spp
+        spp = asked or self._derived_spp(scene)
+        folder = self.folder / "references"
+        folder.mkdir(exist_ok=True)
+        return references.render_reference(
+            scene,
+            spp,
+            folder,
+            self._reference_integrator,
+            lambda done: progress(Step(f"reference {done:.0%}", 0.0, None)),
+            # What was measured comes out differently each time: half of it will do
+            enough=asked or spp // 2,
+        )
+
+    def _derived_spp(self, scene: LoadedScene) -> int:
+        if self.budget.target:
+            noise = self.budget.target / _REFERENCE_FACTOR
+            return references.samples_for_noise(scene, noise, self._reference_integrator)
+        if self.budget.is_time:
+            integrator = make_named(self._reference_integrator, scene.depth).integrator
+            seconds = _REFERENCE_FACTOR * self.budget.values[0]
+            spp = timing.samples_for(seconds, integrator, scene.scene, references.FIRST_SEED)
+            return max(references.MIN_BATCH_COUNT, 1 << round(math.log2(spp)))
+        longest = int(max(self.budget.values))
+        return max(references.MIN_BATCH_COUNT, _REFERENCE_FACTOR * longest)
+
+    def _unique_name(self, source: SceneSource) -> str:
+        name = scene_name(source)
+        taken = {record["name"] for record in self._records} | {"references"}
+        candidates = [name] + [f"{name}-{number}" for number in range(2, len(self.scenes) + 3)]
+        return next(candidate for candidate in candidates if candidate not in taken)
+
+
+def _failed_record(name: str, source: SceneSource, error: str) -> dict[str, object]:
+    return {
+        "name": name,
+        "path": None if isinstance(source, Mapping) else str(source),
+        "parameters": {},
+        "content_hash": "",
+        "size": None,
+        "depth": {},
+        "error": error,
+        "warnings": [],
+        "reference": None,
+        "integrators": [],
+    }
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot make this folder ({error.strerror})") from error
+    images.check_folder(folder)

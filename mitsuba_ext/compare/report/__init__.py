@@ -1,0 +1,37 @@
+"""The report of a comparison: one HTML file with everything in it.
+
+It opens from the disk without a network, and can be sent to somebody as it is: images, plots,
+style sheet and script are inside. What it shows comes from the folder that the comparison wrote
+(``results.json`` and the EXRs that it names), so that it can be written again at any time.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..images import replacing
+from .page import render_page
+from .reading import read_results
+
+__all__ = ["write_report"]
+
+NAME = "report.html"
+
+
+def write_report(folder: str | Path) -> Path:
+    """Writes ``report.html`` next to ``results.json``, and returns its path.
+
+    Args:
+        folder: Where a comparison has left its ``results.json``. Images that are missing or
+            damaged are named in the report; everything else in it is still there.
+
+    Raises:
+        InputError: There is no ``results.json``, or it cannot be read.
+        OSError: The report cannot be written; one that was there before stays.
+    """
+    folder = Path(folder)
+    page = render_page(read_results(folder), folder)
+    path = folder / NAME
+    with replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return path

@@ -1,0 +1,78 @@
+"""Where to look closely: the windows in which the methods differ most."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+#: More than three would be looked at by nobody.
+COUNT = 3
+
+#: Side of a window: an eighth of the image's width, but large enough to show something and small
+#: enough to be enlarged on the page.
+SHARE, SMALLEST, LARGEST = 1 / 8, 16, 96
+
+
+class Window(NamedTuple):
+    """A square part of an image, in pixels."""
+
+    x: int
+    y: int
+    side: int
+
+    def cut(self, pixels: np.ndarray) -> np.ndarray:
+        """That part of an image."""
+        return pixels[self.y : self.y + self.side, self.x : self.x + self.side]
+
+    def overlaps(self, other: Window) -> bool:
+        return max(abs(self.x - other.x), abs(self.y - other.y)) < self.side
+
+
+def choose_windows(errors: Sequence[np.ndarray], floor: float) -> list[Window]:
+    """Windows that do not overlap, those first in which the integrators' errors differ most.
+
+    In every window the logarithm of the error is averaged, so that a firefly is one pixel among
+    many; what counts is the variance of that average over the integrators. Of a single integrator,
+    the windows with the largest errors are taken.
+
+    Args:
+        errors: The error maps of the integrators, all of one shape.
+        floor: Errors below are as good as none (they would have no logarithm).
+    """
+    if not errors:
+        return []
+    height, width = errors[0].shape
+    side = int(np.clip(round(width * SHARE), SMALLEST, LARGEST))
+    if 2 * side > max(width, height) or side > min(width, height):
+        return []  # a window would be most of the image
+    logarithms = np.stack([np.log10(np.maximum(error, floor)) for error in errors])
+    step = max(1, side // 4)
+    rows = np.arange(0, height - side + 1, step)
+    columns = np.arange(0, width - side + 1, step)
+    means = np.stack([_window_means(one, side, rows, columns) for one in logarithms])
+    scores = means.var(axis=0) if len(errors) > 1 else means[0]
+    chosen: list[Window] = []
+    # Stable: equal scores stay in reading order, so that the same images give the same windows
+    for index in np.argsort(-scores, axis=None, kind="stable"):
+        row, column = np.unravel_index(index, scores.shape)
+        window = Window(int(columns[column]), int(rows[row]), side)
+        if not any(window.overlaps(other) for other in chosen):
+            chosen.append(window)
+            if len(chosen) == COUNT:
+                break
+    return chosen
+
+
+def _window_means(
+    values: np.ndarray, side: int, rows: np.ndarray, columns: np.ndarray
+) -> np.ndarray:
+    """Means over the windows that begin at ``rows`` × ``columns``, by a summed-area table."""
+    sums = np.zeros((values.shape[0] + 1, values.shape[1] + 1))
+    sums[1:, 1:] = values.cumsum(axis=0).cumsum(axis=1)
+    top, left = rows[:, None], columns[None, :]
+    bottom, right = top + side, left + side
+    total = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    # The table's cancellation error would decide between equal windows
+    return np.round(total / side**2, 9)

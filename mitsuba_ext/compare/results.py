@@ -1,0 +1,249 @@
+"""The figures of a comparison as one JSON object, ``results.json``; tables and reports read it.
+
+Paths are relative to the folder of ``results.json`` where they are inside it. ``F`` stands for
+``{"value", "low", "high"}``: an estimate with its 95 % confidence interval over the rounds (the
+bounds are null for a single one), or null where there is none. Other unknown numbers are null too::
+
+    schema     2
+    date       ISO 8601, UTC
+    command    the command line; null from the API
+    state      "finished", or "interrupted": some runs are missing
+    budget     kind ("spp", "time", "sweep" or "until"), values
+    seeds      runs wanted for each integrator and level
+    scenes     a list:
+        name, path (null for a scene from a dict), parameters, content_hash, size [width, height],
+        depth {max_depth, rr_depth}
+        error      why the scene could not be measured; empty if it could
+        warnings   a list
+        reference  path, noise (its own relMSE), spp, integrator, seconds, metadata; or null
+        integrators  a list, in the order of the command line:
+            label, name, parameters
+            error            why it failed; empty if it did not
+            notes            a list
+            compile_seconds
+            runs             a list: level (samples, or seconds), round, seed, spp, seconds,
+                             relmse, relmse_trimmed, mse, rmse, sigma_mu, flip,
+                             rays {camera, scatter, shadow}, connections, zero_radiance,
+                             memory (bytes), launches, image
+            levels           a list:
+                level, run_count
+                refused      why the errors are not given: the reference is too noisy for them
+                figures      F of spp, seconds (median), relmse, relmse_trimmed, mse, rmse,
+                             sigma_mu, flip, rays, shadow_share (of those that path traces),
+                             zero_radiance, memory, launches,
+                             efficiency (1 / (mean relMSE · median seconds))
+                ratios       F of seconds, relmse, relmse_trimmed, efficiency, to the first
+                             integrator at the same level
+            slopes           F of log relMSE against log spp ("spp") and log seconds ("seconds")
+            target           F of the spp and seconds that the relMSE of "until" costs; else null
+    versions   mitsuba_ext, mitsuba, drjit, variant, numpy, python
+    machine    system, processor, cores
+
+Seconds are wall clock without compilation, learning included.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from . import intervals
+from .experiment import Contender, Experiment
+from .intervals import Estimate
+from .references import Reference
+from .runs import Run
+
+SCHEMA = 2
+
+#: A reference whose own relMSE is more than this share of an error is too noisy to measure it.
+_NOISE_LIMIT = 0.5
+
+#: Levels, from the last one back, that tell what an error costs.
+_FITTED_LEVELS = 4
+
+_ERRORS = ("relmse", "relmse_trimmed", "mse", "rmse", "sigma_mu", "flip")
+_COSTS = ("spp", "ray_count", "shadow_share", "zero_radiance", "memory", "launches")
+_NAMES = {"ray_count": "rays"}
+
+
+def scene_record(experiment: Experiment, folder: Path) -> dict[str, object]:
+    """All figures of one scene."""
+    scene, reference = experiment.scene, experiment.reference
+    return {
+        "path": None if scene.path is None else str(scene.path),
+        "parameters": scene.parameters,
+        "content_hash": scene.content_hash,
+        "size": list(scene.size),
+        "depth": scene.depth,
+        "error": "",
+        "warnings": _warnings(experiment),
+        "reference": None if reference is None else _reference_record(reference, folder),
+        "integrators": [
+            _contender_record(experiment, contender, folder)
+            for contender in experiment.contenders
+        ],
+    }
+
+
+def clean(value: object) -> object:
+    """``value`` as JSON can hold it, which knows neither NaN nor infinity."""
+    if isinstance(value, Estimate):
+        return clean(value._asdict())
+    if isinstance(value, dict):
+        return {str(key): clean(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [clean(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, (str, bool, int, float, type(None))) else str(value)
+
+
+def _reference_record(reference: Reference, folder: Path) -> dict[str, object]:
+    metadata = reference.metadata
+    return {
+        "path": _relative(reference.path, folder),
+        "noise": reference.noise,
+        "spp": reference.spp,
+        "integrator": metadata.get("integrator"),
+        "seconds": metadata.get("seconds"),
+        "metadata": metadata,
+    }
+
+
+def _warnings(experiment: Experiment) -> list[str]:
+    reference = experiment.reference
+    if reference is None:
+        return []
+    warnings = []
+    claimed = reference.metadata.get("max_depth")
+    actual = experiment.scene.depth.get("max_depth")
+    if isinstance(claimed, int) and actual is not None and claimed != actual:
+        warnings.append(f"the reference has max_depth {claimed}, the scene {actual}")
+    if reference.variance is None:
+        warnings.append("the variance of the reference is unknown: its noise is part of the errors")
+    return warnings
+
+
+def _contender_record(
+    experiment: Experiment, contender: Contender, folder: Path
+) -> dict[str, object]:
+    levels = [_level_record(experiment, contender, level) for level in contender.levels()]
+    refused = {record["level"] for record in levels if record["refused"]}
+    trusted = [run for run in contender.runs if run.level not in refused]
+    errors = [run.errors.relmse for run in trusted]
+    costs = {name: [getattr(run, name) for run in trusted] for name in ("spp", "seconds")}
+    target = experiment.budget.target
+    is_reached = any(
+        record["figures"]["relmse"] and record["figures"]["relmse"].value <= target
+        for record in levels
+    ) if target else False
+    last = _FITTED_LEVELS * experiment.rounds
+    return {
+        "label": contender.label,
+        "name": contender.named.name,
+        "parameters": contender.named.parameters,
+        "error": contender.error,
+        "notes": contender.notes,
+        "compile_seconds": contender.compile_seconds,
+        "runs": [_run_record(run, folder) for run in contender.runs],
+        "levels": levels,
+        "slopes": {
+            # Runs of equal time differ in their samples by chance only: there is no slope in that
+            name: intervals.slope(values, errors) if len(levels) > 1 else None
+            for name, values in costs.items()
+        },
+        "target": {
+            # The line through the last levels: near the target it need not bend
+            name: intervals.cost_of(target, values[-last:], errors[-last:])
+            for name, values in costs.items()
+        } if is_reached else None,
+    }
+
+
+def _run_record(run: Run, folder: Path) -> dict[str, object]:
+    errors = {name: getattr(run.errors, name) for name in _ERRORS}
+    return {**run.record(), **errors, "image": _relative(run.path, folder)}
+
+
+def _level_record(
+    experiment: Experiment, contender: Contender, level: float
+) -> dict[str, object]:
+    runs = contender.at(level)
+    refused = _refusal(experiment.reference, runs)
+    first = experiment.contenders[0].at(level)
+    is_measured = not refused and not _refusal(experiment.reference, first)
+    figures = _figures(runs, bool(refused))
+    of_first = _figures(first, not is_measured) if first else {}
+    own_rounds = {run.round: run for run in runs}
+    pairs = [(own_rounds[run.round], run) for run in first if run.round in own_rounds]
+
+    def ratio(name: str, value) -> Estimate | None:
+        return intervals.ratio(
+            figures.get(name), of_first.get(name), [(value(a), value(b)) for a, b in pairs]
+        )
+
+    return {
+        "level": level,
+        "run_count": len(runs),
+        "refused": refused,
+        "figures": figures,
+        "ratios": {
+            "seconds": ratio("seconds", lambda run: run.seconds),
+            "relmse": ratio("relmse", lambda run: run.errors.relmse),
+            "relmse_trimmed": ratio("relmse_trimmed", lambda run: run.errors.relmse_trimmed),
+            "efficiency": ratio("efficiency", _efficiency),
+        },
+    }
+
+
+def _figures(runs: Sequence[Run], is_refused: bool) -> dict[str, Estimate | None]:
+    figures: dict[str, Estimate | None] = {
+        "seconds": intervals.median([run.seconds for run in runs])
+    }
+    for name in _COSTS:
+        figures[_NAMES.get(name, name)] = _mean([getattr(run, name) for run in runs])
+    for name in _ERRORS:
+        values = [getattr(run.errors, name) for run in runs]
+        figures[name] = None if is_refused else _mean(values)
+    figures["efficiency"] = None
+    relmse, seconds = figures["relmse"], figures["seconds"]
+    if relmse is not None and seconds is not None and relmse.value > 0:
+        figures["efficiency"] = intervals.ratio(
+            Estimate(1.0),
+            Estimate(relmse.value * seconds.value),
+            [(_efficiency(run), 1.0) for run in runs],
+        )
+    return figures
+
+
+def _efficiency(run: Run) -> float:
+    return 1 / (run.errors.relmse * run.seconds) if run.errors.relmse > 0 else 0.0
+
+
+def _mean(values: Sequence[float | None]) -> Estimate | None:
+    return None if any(value is None for value in values) else intervals.mean(values)
+
+
+def _refusal(reference: Reference | None, runs: Sequence[Run]) -> str:
+    """Why the errors of a level cannot be told with this reference; empty if they can."""
+    noise = reference.noise if reference else None
+    if noise is None or not runs:
+        return ""
+    error = sum(run.errors.relmse for run in runs) / len(runs)
+    if noise <= _NOISE_LIMIT * error:
+        return ""
+    text = f"the reference is too noisy: its own relMSE is {noise:.2g}, "
+    text += f"the error {error:.2g}" if error > 0 else "the error less than that"
+    if reference.spp:
+        # Sixteen times less noise than error; an error that is not known is at most the noise
+        needed = reference.spp * 16 * noise / max(error, noise / 16)
+        text += f"; needs --reference-spp {1 << math.ceil(math.log2(needed))}"
+    return text
+
+
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return path.resolve().relative_to(folder.resolve()).as_posix()
+    except ValueError:
+        return str(path.resolve())

@@ -1,0 +1,95 @@
+"""What identifies a scene or an integrator: the bytes of everything that it is made of."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import registry
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+_PACKAGE = Path(__file__).parent
+
+
+def hash_parsed_scene(
+    state: mi.parser.ParserState, parameters: Mapping[str, str], source: object = None
+) -> str:
+    """SHA-256 over a scene's XML files, its parameters, and all files that it names.
+
+    Args:
+        state: The parsed scene, before any transformation.
+        parameters: Values of the ``$name`` placeholders.
+        source: The dict that the scene was made from, if it was not a file.
+    """
+    import mitsuba as mi
+
+    files = {Path(str(file)).resolve() for file in state.files}
+    for node in state.nodes:
+        properties = node.props
+        for key in properties.keys():
+            if properties.type(key) == mi.Properties.Type.String and properties[key]:
+                file = Path(str(mi.file_resolver().resolve(properties[key])))
+                if file.is_file():
+                    files.add(file.resolve())
+    digest = hashlib.sha256(repr(sorted(parameters.items())).encode())
+    for file in sorted(files):
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    if source is not None:
+        _feed(digest, source)
+    return digest.hexdigest()
+
+
+def hash_code(integrator: type) -> str:
+    """SHA-256 over the Python files that define a class of integrators and, since any of ours may
+    be nested in it, over all files of ours that take part in a render."""
+    files = {
+        path
+        for path in _PACKAGE.rglob("*.py")
+        if path.relative_to(_PACKAGE).parts[0] not in ("compare", "cli")
+    }
+    for kind in registry.plugin_names():
+        files.update(registry.plugin_files(kind))
+    for base in integrator.__mro__:
+        try:
+            files.add(Path(inspect.getfile(base)))
+        except (TypeError, OSError):
+            pass  # written in C++, or in an interactive session
+    digest = hashlib.sha256()
+    for file in sorted({file.resolve() for file in files}):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _feed(digest: Any, value: object) -> None:
+    """Feeds a value of a scene's dict: nested dicts, numbers, arrays, transformations, objects."""
+    import mitsuba as mi
+
+    if isinstance(value, Mapping):
+        for key in value:  # in the scene's order: it decides the order of the emitters
+            digest.update(f"{key}={{".encode())
+            _feed(digest, value[key])
+            digest.update(b"}")
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            _feed(digest, item)
+            digest.update(b",")
+    elif isinstance(value, mi.Object):
+        digest.update(str(value).encode())
+        traversed = mi.traverse(value)
+        for key in sorted(traversed.keys()):
+            digest.update(key.encode())
+            _feed(digest, traversed[key])
+    elif hasattr(value, "matrix"):  # a transformation
+        digest.update(np.array(value.matrix).tobytes())
+    elif isinstance(value, (str, bool, int, float)) or value is None:
+        digest.update(repr(value).encode())
+    else:  # arrays of NumPy, Dr.Jit and others
+        array = np.array(value)
+        digest.update(repr(value).encode() if array.dtype == object else array.tobytes())

@@ -1,0 +1,54 @@
+"""Reading the parameters of a plugin, with errors that speak to the scene's author."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+
+def read_parameter(
+    plugin: str,
+    props: mi.Properties,
+    key: str,
+    default: Any,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: Sequence[str] = (),
+) -> Any:
+    """A parameter of the scene, checked. Its type is that of ``default``.
+
+    Args:
+        plugin: What errors call the plugin.
+        props: The parameters.
+        key: The parameter's name.
+        default: Its value where the scene gives none.
+        minimum, maximum: The least and the greatest value that is accepted.
+        choices: The values that are accepted, if only some are.
+
+    Raises:
+        TypeError: The scene gives another type (an integer passes for a float).
+        ValueError: The value is out of range, or not one of ``choices``.
+    """
+    value = props.get(key, default)
+    kind = type(default)
+    if kind is float and type(value) is int:
+        value = float(value)
+
+    def message(accepted: str) -> str:
+        return f'"{plugin}": the parameter "{key}" is {value!r}; it must be {accepted}'
+
+    if type(value) is not kind:
+        raise TypeError(message(f"of type {kind.__name__}"))
+    if kind is float and not math.isfinite(value):
+        raise ValueError(message("finite"))
+    if choices and value not in choices:
+        raise ValueError(message(f"one of {', '.join(choices)}"))
+    if minimum is not None and not value >= minimum:
+        raise ValueError(message(f"at least {minimum}"))
+    if maximum is not None and not value <= maximum:
+        raise ValueError(message(f"at most {maximum}"))
+    return value
