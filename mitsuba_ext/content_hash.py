@@ -32,7 +32,7 @@ def hash_parsed_scene(
 
     files = {Path(str(file)).resolve() for file in state.files}
     for node in state.nodes:
-        properties = node.props
+        properties = mi.Properties(node.props)  # a copy: what is read counts as known to a plugin
         for key in properties.keys():
             if properties.type(key) == mi.Properties.Type.String and properties[key]:
                 file = Path(str(mi.file_resolver().resolve(properties[key])))

@@ -189,6 +189,7 @@ def _depth(node: mi.parser.SceneNode | None) -> dict[str, int]:
 
     if node is None:
         return {}
+    own = mi.Properties(node.props)  # a copy: what is read counts as known to the plugin
     text = ""
     with contextlib.suppress(Exception):  # a wrapper or an unknown plugin: no defaults to know
         properties = mi.Properties(node.props.plugin_name())
@@ -196,8 +197,8 @@ def _depth(node: mi.parser.SceneNode | None) -> dict[str, int]:
     depth = {}
     for key in DEPTH_PARAMETERS:
         printed = re.search(rf"\b{key} = (-?\d+)", text)
-        if key in node.props:
-            depth[key] = int(node.props[key])
+        if key in own:
+            depth[key] = int(own[key])
         elif printed:
             value = int(printed.group(1))
             depth[key] = -1 if value == _UNLIMITED else value

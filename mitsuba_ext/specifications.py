@@ -205,7 +205,7 @@ def _from_parser(
             for key, value in (inherited or {}).items():
                 if key not in node.props and _knows(node.props.plugin_name(), key, value):
                     node.props[key] = value
-        root = state.root.props
+        root = mi.Properties(state.root.props)  # a copy: what is read counts as known to the plugin
         name = root.plugin_name()
         parameters = {
             key: root[key] for key in root.keys() if isinstance(root[key], (bool, int, float, str))

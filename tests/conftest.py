@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import gc
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before drjit and mitsuba)
+from mitsuba_ext import cli
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -50,3 +53,58 @@ def _clean_up() -> None:
     dr.sync_thread()
     dr.flush_kernel_cache()
     dr.flush_malloc_cache()
+
+
+# ---- The command line ----
+
+SCENE = """<scene version="3.0.0">
+  <default name="spp" value="4"/>
+  {integrator}
+  <sensor type="perspective">
+    <float name="fov" value="45"/>
+    <film type="hdrfilm">
+      <integer name="width" value="8"/>
+      <integer name="height" value="6"/>
+      <rfilter type="box"/>
+      {film}
+    </film>
+    <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
+  </sensor>
+  <emitter type="constant"/>
+  {body}
+</scene>
+"""
+
+SPHERE = """<shape type="sphere">
+    <transform name="to_world"><translate z="5"/></transform>
+    <bsdf type="diffuse"/>
+  </shape>"""
+
+PATH = '<integrator type="path"><integer name="max_depth" value="3"/></integrator>'
+
+
+@pytest.fixture
+def make_scene(tmp_path):
+    def make(name="scene.xml", integrator=PATH, film="", body=SPHERE) -> Path:
+        path = tmp_path / name
+        path.write_text(SCENE.format(integrator=integrator, film=film, body=body))
+        return path
+
+    return make
+
+
+@pytest.fixture
+def run(capsys):
+    """Runs the command in this process; returns the exit code, stdout and stderr."""
+
+    def command(*arguments) -> tuple[int, str, str]:
+        code = cli.main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return command
+
+
+def in_subprocess(*arguments, **options) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "mitsuba_ext.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)

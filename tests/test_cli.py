@@ -4,69 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import PATH, in_subprocess
 
-from mitsuba_ext import cli, pages
-from mitsuba_ext.compare import InputError, load_reference, load_scene, read_exr, write_exr
-from mitsuba_ext.scenes import make_integrator, parse_integrator
-
-SCENE = """<scene version="3.0.0">
-  <default name="spp" value="4"/>
-  {integrator}
-  <sensor type="perspective">
-    <float name="fov" value="45"/>
-    <film type="hdrfilm">
-      <integer name="width" value="8"/>
-      <integer name="height" value="6"/>
-      <rfilter type="box"/>
-      {film}
-    </film>
-    <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
-  </sensor>
-  <emitter type="constant"/>
-  {body}
-</scene>
-"""
-
-SPHERE = """<shape type="sphere">
-    <transform name="to_world"><translate z="5"/></transform>
-    <bsdf type="diffuse"/>
-  </shape>"""
-
-PATH = '<integrator type="path"><integer name="max_depth" value="3"/></integrator>'
-
-
-@pytest.fixture
-def make_scene(tmp_path):
-    def make(name="scene.xml", integrator=PATH, film="", body=SPHERE) -> Path:
-        path = tmp_path / name
-        path.write_text(SCENE.format(integrator=integrator, film=film, body=body))
-        return path
-
-    return make
-
-
-@pytest.fixture
-def run(capsys):
-    """Runs the command in this process; returns the exit code, stdout and stderr."""
-
-    def command(*arguments) -> tuple[int, str, str]:
-        code = cli.main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return command
-
-
-def in_subprocess(*arguments, **options) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "mitsuba_ext.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
-
+from mitsuba_ext import pages
+from mitsuba_ext.compare import load_scene, read_exr, write_exr
 
 # ---- render ----
 
@@ -233,7 +177,14 @@ BAD_INPUT = [
         '"max_depth" must be',
     ),
     (["compare", "{scene}", "--spp", "1"], "Missing argument 'INTEGRATOR"),
-    (["compare", "{scene}", "path"], "Missing option '--spp'"),
+    (["compare", "{scene}", "path"], "give one of --spp, --time, --sweep, --until"),
+    (["compare", "{scene}", "path", "--spp", "1", "--time", "1"], "give one of"),
+    (["compare", "{scene}", "path", "--sweep", "4,x"], 'found "4,x"'),
+    (["compare", "{scene}", "path", "--until", "0"], "'--until': 0"),
+    (["compare", "path", "--spp", "1"], "no scene was given"),
+    (["compare", "{scene}", "{tmp}/none.xml", "path", "--spp", "1"], "none.xml: no such scene"),
+    (["compare", "{scene}", "{tmp}/none.json", "--spp", "1"], "none.json: no such file"),
+    (["compare", "{scene}", "path", "--spp", "1", "--plugin", "no_such_module"], "no_such_module"),
     (["compare", "{scene}", "path", "--spp", "0"], "'--spp': 0"),
     (["compare", "{scene}", "path", "--spp", "1", "--seeds", "0"], "'--seeds': 0"),
     (["compare", "{scene}", "path", "path", "--spp", "1"], "given twice"),
@@ -268,6 +219,7 @@ def test_bad_input_is_one_line_and_exit_code_2(run, make_scene, tmp_path, argume
         ('type="sphere"', 'type="sphre"', 'Plugin "sphre" not found'),
         ('type="sphere"', 'type="ply"', "filename"),
         ('<float name="fov"', '<float name="fovv"', "unreferenced"),
+        ('<rfilter type="box"/>', '<string name="filtre" value="box"/>', "unreferenced"),
         ('name="width" value="8"', 'name="width" value="$none"', "$none"),
         (PATH, "", "no integrator"),
     ],
@@ -304,129 +256,7 @@ def test_no_traceback_from_the_process(tmp_path):
     assert result.stderr.count("\n") == 1 and "none.xml" in result.stderr
 
 
-# ---- compare ----
-
-
-def test_compare_writes_table_results_and_images(run, make_scene, tmp_path):
-    out = tmp_path / "results"
-    arguments = ("compare", make_scene(), "path", "prb:rr_depth=9", "--spp", 4, "--out", out)
-    code, text, err = run(*arguments, "--seeds", 2, "--reference-spp", 256)
-    assert (code, err) == (0, "")
-    assert "prb:rr_depth=9" in text and "1.00x" in text
-
-    results = json.loads((out / "results.json").read_text())
-    assert results["schema"] == 1
-    assert results["seeds"] == [0, 1]
-    assert results["scene"]["size"] == [8, 6]
-    first, second = results["integrators"]
-    assert first["parameters"] == {"max_depth": 3, "rr_depth": 5}
-    assert second["parameters"] == {"max_depth": 3, "rr_depth": 9}
-    assert first["efficiency_ratio"] == pytest.approx(1)
-    assert len(second["runs"]) == 2
-    assert second["runs"][1]["spp"] == 4
-    # prb is path with other roulette, which a depth of 3 does not reach: the same numbers
-    assert second["summary"]["relmse"]["mean"] == pytest.approx(
-        first["summary"]["relmse"]["mean"], rel=0.05
-    )
-    assert results["reference"]["noise"] > 0
-
-    channels, metadata = read_exr(out / second["runs"][1]["image"])
-    assert channels["G"].shape == (6, 8)
-    assert (metadata["integrator"], metadata["seed"], metadata["spp"]) == ("prb", 1, 4)
-
-
-def test_rendered_reference_is_kept_until_the_scene_changes(run, make_scene, tmp_path):
-    out = tmp_path / "results"
-    scene = make_scene()
-
-    def references() -> dict[str, int]:
-        run("compare", scene, "path", "--spp", 1, "--seeds", 1, "--reference-spp", 32, "--out", out)
-        return {path.name: path.stat().st_mtime_ns for path in out.glob("*32spp*.exr")}
-
-    first = references()
-    assert len(first) == 1
-    assert references() == first
-    scene.write_text(scene.read_text().replace('z="5"', 'z="6"'))
-    assert len(references()) == 2
-
-
-def test_rendered_reference_has_the_mean_and_its_variance(run, make_scene, tmp_path):
-    scene = make_scene()
-    command = ("compare", scene, "path", "--spp", 1, "--seeds", 1, "--out", tmp_path)
-    assert run(*command, "--reference-spp", 512)[0] == 0
-    reference = load_reference(next(tmp_path.glob("*512spp*.exr")))
-    # The background is exact; the sphere is not
-    assert reference.mean[0, 0] == pytest.approx(1)
-    assert reference.variance[0, 0] == pytest.approx(0, abs=1e-10)
-    assert reference.variance.max() > 1e-6
-
-
-def test_plain_rgb_reference_is_accepted(run, make_scene, tmp_path):
-    path = tmp_path / "plain.exr"
-    write_exr(path, np.ones((6, 8, 3)), "RGB", {})
-    command = ("compare", make_scene(), "path", "--spp", 4, "--seeds", 1, "--out", tmp_path / "o")
-    code, out, _ = run(*command, "--reference", path)
-    assert code == 0 and "variance unknown" in out
-
-
-@pytest.mark.parametrize(
-    "pixels, channels, message",
-    [
-        (np.ones((5, 8, 3)), "RGB", "8x5, but the scene renders 8x6"),
-        (np.ones((6, 8, 1)), "Y", "found Y"),
-        (np.zeros((6, 8, 3)), "RGB", "black"),
-        (np.full((6, 8, 3), np.nan), "RGB", "48 of 48 pixels not finite"),
-    ],
-)
-def test_unfit_reference_is_refused(run, make_scene, tmp_path, pixels, channels, message):
-    path = tmp_path / "reference.exr"
-    write_exr(path, pixels, channels, {})
-    out = tmp_path / "o"
-    code, _, err = run(
-        "compare", make_scene(), "path", "--spp", 4, "--reference", path, "--out", out
-    )
-    assert code == 2
-    assert message in err and str(path) in err and err.count("\n") == 1
-    assert not out.exists()
-
-
-def test_truncated_reference_is_one_line(make_scene, tmp_path):
-    path = tmp_path / "reference.exr"
-    write_exr(path, np.random.default_rng(0).random((6, 8, 3)), "RGB", {})
-    path.write_bytes(path.read_bytes()[:-200])
-    scene = make_scene()
-    # In a process of its own: libraries write to the terminal past Python
-    result = in_subprocess(
-        "compare", scene, "path", "--spp", "1", "--reference", path, "--out", tmp_path / "o"
-    )
-    assert result.returncode == 2
-    assert result.stdout == "" and result.stderr.count("\n") == 1
-    assert f"{path}: unreadable" in result.stderr
-
-
-def test_failing_integrator_is_a_row_and_does_not_stop_the_others(run, make_scene, tmp_path):
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    prb = type(mi.load_dict({"type": "prb"}))
-
-    class Fails(prb):
-        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-            image = super().render(scene, sensor, seed, spp, develop, evaluate)
-            return image * float("nan") if seed == 1 else image
-
-    mi.register_integrator("fails_at_seed_1", lambda props: Fails(props))
-    code, out, _ = run(
-        "compare", make_scene(), "path", "fails_at_seed_1", "--spp", 2, "--out", tmp_path
-    )
-    assert code == 1
-    assert "seed 1: 48 of 48 pixels not finite" in out
-    path, fails = json.loads((tmp_path / "results.json").read_text())["integrators"]
-    assert (len(path["runs"]), len(fails["runs"])) == (3, 1)
-    assert fails["error"] and fails["efficiency"] is None
-
-
-# ---- list, specifications, pages ----
+# ---- list, pages ----
 
 
 def test_list_and_help_need_neither_variant_nor_llvm():
@@ -495,31 +325,3 @@ def test_page_of_a_plugin_without_docstring_is_empty():
     assert pages.parse_page("bare", "") == pages.Page("bare", "", (), "")
 
 
-def test_integrator_specification():
-    assert parse_integrator("path") == ("path", {})
-    name, parameters = parse_integrator("x:a=1,b=0.5,c=true,d=false,e=1e-3,f=mean")
-    assert name == "x"
-    assert parameters == {"a": 1, "b": 0.5, "c": True, "d": False, "e": 1e-3, "f": "mean"}
-    assert [type(value) for value in parameters.values()] == [int, float, bool, bool, float, str]
-
-
-@pytest.mark.parametrize(
-    "text", ["", ":", "path:", "path:a", "path:=1", "path:a=", "a b", "x:a=1,a=2"]
-)
-def test_malformed_specification_is_refused(text):
-    with pytest.raises(InputError, match="integrator"):
-        parse_integrator(text)
-
-
-def test_depth_is_inherited_where_the_integrator_knows_it(make_scene):
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    loaded = load_scene(make_scene())
-    assert loaded.depth == {"max_depth": 3, "rr_depth": 5}
-    assert make_integrator("prb", {"max_depth": 7}, loaded.depth)[1]["max_depth"] == 7
-    assert make_integrator("direct", {}, loaded.depth)[1] == {}
-    unlimited = load_scene(make_scene("b.xml", integrator='<integrator type="path"/>'))
-    assert unlimited.depth["max_depth"] == -1
-    nested = f'<integrator type="aov"><string name="aovs" value="d:depth"/>{PATH}</integrator>'
-    assert load_scene(make_scene("c.xml", integrator=nested)).depth["max_depth"] == 3

@@ -88,7 +88,7 @@ def compare(
     holds one. All get max_depth and rr_depth of the scene's integrator unless they set their own.
     Ratios are relative to the first integrator.
     """
-    from ..compare import Comparison, budgets, tables
+    from ..compare import Comparison, SceneSetup, budgets, tables
 
     given = {
         "--spp": spp and budgets.equal_samples(spp),
@@ -104,18 +104,17 @@ def compare(
     scenes, integrators = _sort_out(names)
     if context.obj == supervisor.SUPERVISED and worker is None:
         return supervisor.supervise(sys.argv[1:], out)
+    if reference and len(scenes) > 1:
+        raise click.UsageError("one --reference cannot serve several scenes")
     select_variant(variant, plugins)
     comparison = Comparison(
-        scenes,
+        [SceneSetup(scene, size, dict(definitions), reference) for scene in scenes],
         integrators,
         chosen[0],
         seeds=seeds,
         folder=out,
-        reference=reference,
         reference_spp=reference_spp,
         reference_integrator=reference_integrator,
-        size=size,
-        parameters=dict(definitions),
         command=shlex.join(["mitsuba-ext", *supervisor.without_job(sys.argv[1:])]),
         only_stored=worker == supervisor.STORED,
     )

@@ -20,7 +20,7 @@ from __future__ import annotations
 from ..scenes import InputError, LoadedScene, load_scene
 from ..specifications import NamedIntegrator, make_named
 from .budgets import Budget, equal_samples, equal_time, sweep, until
-from .comparison import Comparison
+from .comparison import Comparison, SceneSetup
 from .experiment import Contender, Experiment, Step
 from .flip import mean_flip
 from .images import read_exr, write_exr
@@ -44,6 +44,7 @@ __all__ = [
     "NamedIntegrator",
     "Reference",
     "Run",
+    "SceneSetup",
     "Step",
     "equal_samples",
     "equal_time",

@@ -8,6 +8,7 @@ import json
 import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Union
 
@@ -21,6 +22,23 @@ from .references import Reference
 
 SceneSource = Union[str, Path, Mapping[str, Any]]
 
+
+@dataclass(frozen=True)
+class SceneSetup:
+    """A scene of a comparison, and what applies to it alone.
+
+    Attributes:
+        source: An XML file, or a dict as ``mi.load_dict`` takes it. Its integrator is replaced.
+        size: Width and height that replace those of the film.
+        parameters: Values for the ``$name`` placeholders of the file.
+        reference: A file to measure against. Default: one is rendered.
+    """
+
+    source: SceneSource
+    size: tuple[int, int] | None = None
+    parameters: Mapping[str, object] | None = None
+    reference: str | Path | None = None
+
 #: How much longer than the longest run a reference is.
 _REFERENCE_FACTOR = 16
 
@@ -29,7 +47,7 @@ class Comparison:
     """Compares integrators on scenes.
 
     Args:
-        scenes: XML files, or dicts as ``mi.load_dict`` takes them. Their integrators are replaced.
+        scenes: XML files, dicts, or :class:`SceneSetup` of them.
         integrators: Specifications (:func:`mitsuba_ext.specifications.make_named`), or a mapping
             of labels to them. Ratios are given relative to the first.
         budget: What each run gets: see :mod:`.budgets`.
@@ -37,12 +55,9 @@ class Comparison:
         folder: For ``results.json``, ``report.html``, images and references; made if missing. A
             comparison in the same folder takes up what is there. Default: a temporary one, which
             goes when the object does.
-        reference: A file to measure against. Default: one is rendered for each scene.
         reference_spp: Samples per pixel of rendered references. Default: 16 times those of the
             longest run (of as many seconds, for a time; enough for the error, for ``until``).
         reference_integrator: What renders them.
-        size: Width and height that replace those of the films.
-        parameters: Values for the ``$name`` placeholders of the scene files.
         command: The command line, for the report.
         only_stored: Render nothing: figures and report of what is in the folder.
 
@@ -52,36 +67,25 @@ class Comparison:
 
     def __init__(
         self,
-        scenes: SceneSource | Sequence[SceneSource],
+        scenes: SceneSource | SceneSetup | Sequence[SceneSource | SceneSetup],
         integrators: Sequence[Specification] | Mapping[str, Specification],
         budget: Budget,
         seeds: int = 3,
         folder: str | Path | None = None,
-        reference: str | Path | None = None,
         reference_spp: int | None = None,
         reference_integrator: Specification = "path",
-        size: tuple[int, int] | None = None,
-        parameters: Mapping[str, object] | None = None,
         command: str | None = None,
         only_stored: bool = False,
     ) -> None:
         self.only_stored = only_stored
-        self.scenes = [scenes] if isinstance(scenes, (str, Path, Mapping)) else list(scenes)
-        if not self.scenes:
-            raise InputError("no scene was given")
-        if reference and len(self.scenes) > 1:
-            raise InputError("one reference file cannot serve several scenes")
+        self.scenes = _setups(scenes)
         if seeds < 1:
             raise InputError(f"at least 1 seed is needed, found {seeds}")
-        for scene in self.scenes:
-            if not isinstance(scene, Mapping) and not Path(scene).is_file():
-                raise InputError(f"{scene}: no such scene")
         make_all(integrators)  # an unknown name must not wait for the end of a reference
         self.integrators = integrators
         self.budget = budget
         self.seeds = seeds
-        self.size, self.parameters, self.command = size, parameters, command
-        self._reference_file = reference
+        self.command = command
         self._reference_spp = reference_spp
         self._reference_integrator = reference_integrator
         self._temporary = None
@@ -105,16 +109,16 @@ class Comparison:
             InputError: The only scene cannot be used, or its reference cannot. (Of several, one
                 that cannot is an entry of the results.)
         """
-        _make_folder(self.folder)
         try:
-            for source in self.scenes:
-                name = self._unique_name(source)
+            for setup in self.scenes:
+                name = self._unique_name(setup.source)
                 try:
-                    self._run_scene(source, name, progress)
+                    self._run_scene(setup, name, progress)
                 except InputError as error:
                     if len(self.scenes) == 1:
                         raise
-                    self._records.append(_failed_record(name, source, str(error)))
+                    self._records.append(_failed_record(name, setup.source, str(error)))
+                _make_folder(self.folder)
                 self.write()
             self.is_finished = not self.only_stored
         finally:
@@ -146,8 +150,8 @@ class Comparison:
             temporary.write_text(text + "\n", encoding="utf-8")
         report.write_report(self.folder)
 
-    def _run_scene(self, source: SceneSource, name: str, progress: Callable[[Step], None]) -> None:
-        scene = load_scene(source, self.size, self.parameters, keep_integrator=False)
+    def _run_scene(self, setup: SceneSetup, name: str, progress: Callable[[Step], None]) -> None:
+        scene = load_scene(setup.source, setup.size, setup.parameters, keep_integrator=False)
         experiment = Experiment(
             scene, self.integrators, self.budget, self.seeds, self.folder / name, self.only_stored
         )
@@ -155,7 +159,11 @@ class Comparison:
         def report_step(step: Step) -> None:
             progress(step._replace(label=f"{name}: {step.label}"))
 
-        reference = self._make_reference(scene, report_step)
+        if setup.reference:
+            reference = references.load_reference(setup.reference, scene.size)
+        _make_folder(self.folder)
+        if not setup.reference:
+            reference = self._render_reference(scene, report_step)
         self._running = (name, experiment)
         experiment.run(reference, report_step)
         self._keep_record()
@@ -168,11 +176,9 @@ class Comparison:
         if any(contender.runs or contender.error for contender in experiment.contenders):
             self._records.append(record)
 
-    def _make_reference(
+    def _render_reference(
         self, scene: LoadedScene, progress: Callable[[Step], None]
     ) -> Reference:
-        if self._reference_file:
-            return references.load_reference(self._reference_file, scene.size)
         progress(Step("reference", 0.0, None))
         asked = self._reference_spp
         spp = asked or self._derived_spp(scene)
@@ -207,13 +213,25 @@ class Comparison:
         return next(candidate for candidate in candidates if candidate not in taken)
 
 
+def _setups(scenes: Any) -> list[SceneSetup]:
+    if isinstance(scenes, (str, Path, Mapping, SceneSetup)):
+        scenes = [scenes]
+    setups = [s if isinstance(s, SceneSetup) else SceneSetup(s) for s in scenes]
+    if not setups:
+        raise InputError("no scene was given")
+    for setup in setups:
+        if not isinstance(setup.source, Mapping) and not Path(setup.source).is_file():
+            raise InputError(f"{setup.source}: no such scene")
+    return setups
+
+
 def _failed_record(name: str, source: SceneSource, error: str) -> dict[str, object]:
     return {
         "name": name,
         "path": None if isinstance(source, Mapping) else str(source),
         "parameters": {},
         "content_hash": "",
-        "size": None,
+        "size": [],
         "depth": {},
         "error": error,
         "warnings": [],

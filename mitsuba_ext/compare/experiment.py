@@ -148,7 +148,7 @@ class Experiment:
             # All speeds are known before the first long run: the time that is left can be told
             paths = (self._path(contender, i, r) for i in indices for r in range(self.rounds))
             missing = next((path for path in paths if self._folder.load(path) is None), None)
-            if missing is not None and not self.only_stored:
+            if missing and not self._folder.has_crashed(missing) and not self.only_stored:
                 self._attempt(contender, lambda c=contender, p=missing: self._prepare(c, p))
         for round in range(self.rounds):
             for index in indices:

@@ -7,7 +7,8 @@ come out zero or negative: then the image is closer to the truth than this refer
 
 σ/μ and FLIP keep the noise of the reference, because they are built of absolute values: what to
 subtract depends on how the noise of the channels is correlated, which no reference records. A
-reference with K times the samples of the image raises σ/μ by a factor of √(1 + 1/K), 3 % at K = 16.
+reference by the same method with K times the samples of the image raises σ/μ by a factor of
+√(1 + 1/K), 3 % at K = 16.
 """
 
 from __future__ import annotations

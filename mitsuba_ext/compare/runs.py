@@ -116,6 +116,10 @@ class RunFolder:
         except (InputError, KeyError, TypeError, ValueError):
             return None
 
+    def has_crashed(self, path: Path) -> bool:
+        """Did an earlier process die during this run?"""
+        return path.with_suffix(_CRASHED).exists()
+
     @contextlib.contextmanager
     def marked(self, path: Path) -> Iterator[None]:
         """Leaves a mark beside ``path`` while the run is being made. A mark that stays tells a
@@ -124,9 +128,8 @@ class RunFolder:
         Raises:
             RuntimeError: The process died during this run before.
         """
-        crashed = path.with_suffix(_CRASHED)
-        if crashed.exists():
-            raise RuntimeError(crashed.read_text(encoding="utf-8"))
+        if self.has_crashed(path):
+            raise RuntimeError(path.with_suffix(_CRASHED).read_text(encoding="utf-8"))
         mark = path.with_suffix(_RUNNING)
         mark.parent.mkdir(parents=True, exist_ok=True)
         mark.touch()

@@ -10,8 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..images import replacing
-from .page import render_page
-from .reading import read_results
+from .records import read_results
 
 __all__ = ["write_report"]
 
@@ -29,6 +28,8 @@ def write_report(folder: str | Path) -> Path:
         InputError: There is no ``results.json``, or it cannot be read.
         OSError: The report cannot be written; one that was there before stays.
     """
+    from .page import render_page  # what it needs is only loaded where a report is written
+
     folder = Path(folder)
     page = render_page(read_results(folder), folder)
     path = folder / NAME

@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from . import formats, plots
 from .formats import Text
-from .reading import Record, levels
+from .records import Record, levels
 
 
 @dataclass(frozen=True)

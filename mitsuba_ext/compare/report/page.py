@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -14,10 +15,10 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from . import crops, formats, pictures, plots, reading, tables
+from . import crops, formats, pictures, plots, records, tables
 from .charts import make_charts
 from .pictures import Picture, Pictures
-from .reading import Record
+from .records import Record
 
 _FOLDER = Path(__file__).parent
 
@@ -77,9 +78,15 @@ def _environment() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     environment.filters["number"] = formats.number
+    environment.filters["breakable"] = _breakable
     environment.filters["short"] = formats.short
     environment.filters["seconds"] = partial(formats.quantity, unit=formats.seconds)
     return environment
+
+
+def _breakable(label: str) -> Markup:
+    """A label that may be broken where its parts meet: ``neepp:`` ``max_depth=`` ``6,`` …"""
+    return Markup("<wbr>").join(re.split(r"(?<=[:,=/])", label))
 
 
 def _scene(
@@ -87,7 +94,7 @@ def _scene(
 ) -> dict[str, Any]:
     budget = results["budget"]
     target = budget["values"][0] if budget["kind"] == "until" and budget["values"] else None
-    level = reading.main_level(scene)
+    level = records.main_level(scene)
     found = pictures.load_pictures(scene, level, folder)
     windows = _windows(found)
     return {
@@ -95,7 +102,7 @@ def _scene(
         "anchor": anchor,
         "facts": _scene_facts(scene),
         "problems": [
-            *reading.problems(scene), *(("warning", fault) for fault in found.faults)
+            *records.problems(scene), *(("warning", fault) for fault in found.faults)
         ],
         "integrators": {one["label"]: one for one in scene["integrators"]},
         "efficiency": {
@@ -106,7 +113,7 @@ def _scene(
         "table": tables.make_table(scene, level, target),
         "other_tables": [
             (_level(budget, other), tables.make_table(scene, other))
-            for other in reversed(reading.levels(scene))
+            for other in reversed(records.levels(scene))
             if other != level
         ],
         "charts": make_charts(scene, anchor, series_of, target),
@@ -130,7 +137,7 @@ def _facts(results: Record) -> list[tuple[str, str]]:
     cores = machine.get("cores")
     facts = [
         ("Budget", _budget(results)),
-        ("Date", str(results["date"]).replace("T", " ")),
+        ("Date", str(results["date"]).replace("T", " ").replace("+00:00", " UTC")),
         ("Command", results["command"] or "(from Python)"),
         ("Machine", ", ".join(
             str(part) for part in (
@@ -212,5 +219,5 @@ def _color_ticks(limits: tuple[float, float] | None) -> list[tuple[str, float]]:
     every = int(np.ceil((high - low) / 6))
     powers = [10.0**power for power in range(int(np.ceil(low)), int(high) + 1, every)]
     between = [(value, 100 * (np.log10(value) - low) / (high - low)) for value in powers]
-    ticks = [(limits[0], 0.0), *((v, p) for v, p in between if 12 < p < 88), (limits[1], 100.0)]
+    ticks = [(limits[0], 0.0), *((v, p) for v, p in between if 20 < p < 85), (limits[1], 100.0)]
     return [(formats.short(value), round(float(position), 2)) for value, position in ticks]

@@ -16,8 +16,8 @@ import numpy as np
 from PIL import Image
 
 from ...scenes import InputError
-from .. import images, metrics
-from .reading import Record, pictured_runs
+from .. import metrics, reading
+from .records import Record, pictured_runs
 
 #: The brightest 5 % of the reference may be lost in white …
 EXPOSURE_PERCENTILE = 95
@@ -195,15 +195,8 @@ def png(pixels: np.ndarray, palette: np.ndarray | None = None) -> str:
 
 
 def _read(path: Path, shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """The colours of an EXR in double precision: of a render, or the mean of a reference."""
-    channels, _ = images.read_exr(path)
-    for prefix in ("mean.", ""):
-        names = [prefix + color for color in "RGB"]
-        if all(name in channels for name in names):
-            pixels = np.stack([channels[name] for name in names], axis=2).astype(np.float64)
-            break
-    else:
-        raise InputError(f"{path}: has no channels R, G, B")
+    """An image in double precision; of a reference, its mean."""
+    pixels = reading.read_image(path)[0].astype(np.float64)
     if shape is not None and pixels.shape != shape:
         sizes = [f"{width}x{height}" for height, width, _ in (pixels.shape, shape)]
         raise InputError(f"{path}: is {sizes[0]}, the other images are {sizes[1]}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from . import formats
 from .formats import Text, Unit
-from .reading import Record, at_level
+from .records import Record, at_level
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,7 @@ def make_table(scene: Record, level: float | None, target: float | None = None) 
     """The table of one level. ``target`` is the relMSE that was asked for, if one was."""
     integrators = scene["integrators"]
     rows = [(integrator, at_level(integrator, level)) for integrator in integrators]
-    columns = [*_ratios(integrators), *_ERRORS, *_COSTS]
-    if target is not None:
-        columns += _target(target)
+    columns = [*_ratios(integrators), *_target(target), *_RUN, *_ERRORS, *_WORK]
     used = [
         column
         for column in columns
@@ -126,7 +124,9 @@ def _ratios(integrators: list[Record]) -> list[Column]:
     ]
 
 
-def _target(target: float) -> list[Column]:
+def _target(target: float | None) -> list[Column]:
+    if target is None:
+        return []
     group = f"to reach relMSE {formats.short(target)}"
 
     def cost(heading: str, key: str, unit: Unit) -> Column:
@@ -143,6 +143,11 @@ def _compilation(integrator: Record, _level: Record) -> Mapping[str, float | Non
     return None if seconds is None else {"value": seconds, "low": None, "high": None}
 
 
+_RUN = [
+    _figure("time", formats.seconds, "seconds", "Learning included, compilation not", "run"),
+    _figure("samples", formats.plain, "spp", "Samples per pixel", "run"),
+]
+
 _ERRORS = [
     _figure("relMSE", formats.plain, "relmse", "Mean of (I − R)² / (R² + ε)", "error"),
     _figure(
@@ -154,21 +159,19 @@ _ERRORS = [
     _figure("FLIP", formats.plain, "flip", "Perceived difference (HDR), from 0 to 1", "error"),
 ]
 
-_COSTS = [
-    _figure("time", formats.seconds, "seconds", "Learning included, compilation not", "cost"),
-    _figure("samples", formats.plain, "spp", "Samples per pixel", "cost"),
-    _figure("rays", formats.count, "rays", "Camera, scatter and shadow rays of one run", "cost"),
+_WORK = [
+    _figure("rays", formats.count, "rays", "Camera, scatter and shadow rays of one run", "work"),
     _figure(
         "shadow rays", formats.percent, "shadow_share",
-        "Shadow rays traced, in percent of the connections to lights", "cost",
+        "Shadow rays traced, in percent of the connections to lights", "work",
     ),
     _figure(
-        "zero", formats.percent, "zero_radiance", "Camera samples that brought no light", "cost"
+        "zero", formats.percent, "zero_radiance", "Camera samples that brought no light", "work"
     ),
-    _figure("memory", formats.byte_count, "memory", "Peak of one run", "cost"),
-    _figure("launches", formats.plain, "launches", "Kernel launches of one run", "cost"),
+    _figure("memory", formats.byte_count, "memory", "Peak of one run", "work"),
+    _figure("launches", formats.plain, "launches", "Kernel launches of one run", "work"),
     Column(
         "compilation", formats.seconds, _compilation,
-        "Before the measured runs, not part of their time", "cost",
+        "Before the measured runs, not part of their time", "work",
     ),
 ]

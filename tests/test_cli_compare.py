@@ -1,0 +1,204 @@
+"""The command ``compare``: what it writes, and what it says about bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from conftest import in_subprocess
+
+from mitsuba_ext.compare import load_reference, read_exr, write_exr
+
+
+def test_compare_writes_table_results_and_images(run, make_scene, tmp_path):
+    out = tmp_path / "results"
+    arguments = ("compare", make_scene(), "path", "prb:rr_depth=9", "--spp", 4, "--out", out)
+    code, text, err = run(*arguments, "--seeds", 2, "--reference-spp", 256)
+    assert (code, err) == (0, "")
+    assert "prb:rr_depth=9" in text and "1.00x" in text
+
+    results = json.loads((out / "results.json").read_text())
+    assert results["schema"] == 2
+    assert (results["seeds"], results["state"]) == (2, "finished")
+    scene = results["scenes"][0]
+    assert (scene["name"], scene["size"]) == (make_scene().parent.name, [8, 6])
+    first, second = scene["integrators"]
+    assert first["parameters"] == {"max_depth": 3, "rr_depth": 5}
+    assert second["parameters"] == {"max_depth": 3, "rr_depth": 9}
+    assert first["levels"][0]["ratios"]["efficiency"]["value"] == pytest.approx(1)
+    assert len(second["runs"]) == 2
+    assert second["runs"][1]["spp"] == 4
+    # prb is path with other roulette, which a depth of 3 does not reach: the same numbers
+    errors = [record["levels"][0]["figures"]["relmse"]["value"] for record in (first, second)]
+    assert errors[0] == pytest.approx(errors[1], rel=0.05)
+    assert scene["reference"]["noise"] > 0
+
+    channels, metadata = read_exr(out / second["runs"][1]["image"])
+    assert channels["G"].shape == (6, 8)
+    assert (metadata["integrator"], metadata["seed"], metadata["spp"]) == ("prb", 1, 4)
+
+
+def test_rendered_reference_is_kept_until_the_scene_changes(run, make_scene, tmp_path):
+    out = tmp_path / "results"
+    scene = make_scene()
+
+    def references() -> dict[str, int]:
+        run("compare", scene, "path", "--spp", 1, "--seeds", 1, "--reference-spp", 32, "--out", out)
+        return {path.name: path.stat().st_mtime_ns for path in out.glob("references/*32spp.exr")}
+
+    first = references()
+    assert len(first) == 1
+    assert references() == first
+    scene.write_text(scene.read_text().replace('z="5"', 'z="6"'))
+    assert len(references()) == 2
+
+
+def test_rendered_reference_has_the_mean_and_its_variance(run, make_scene, tmp_path):
+    scene = make_scene()
+    command = ("compare", scene, "path", "--spp", 1, "--seeds", 1, "--out", tmp_path)
+    assert run(*command, "--reference-spp", 512)[0] == 0
+    reference = load_reference(next(tmp_path.glob("references/*512spp.exr")))
+    # The background is exact; the sphere is not
+    assert reference.mean[0, 0] == pytest.approx(1)
+    assert reference.variance[0, 0] == pytest.approx(0, abs=1e-10)
+    assert reference.variance.max() > 1e-6
+
+
+def test_plain_rgb_reference_is_accepted(run, make_scene, tmp_path):
+    path = tmp_path / "plain.exr"
+    write_exr(path, np.ones((6, 8, 3)), "RGB", {})
+    command = ("compare", make_scene(), "path", "--spp", 4, "--seeds", 1, "--out", tmp_path / "o")
+    code, out, _ = run(*command, "--reference", path)
+    assert code == 0 and "variance of the reference is unknown" in out
+
+
+@pytest.mark.parametrize(
+    "pixels, channels, message",
+    [
+        (np.ones((5, 8, 3)), "RGB", "8x5, but the scene renders 8x6"),
+        (np.ones((6, 8, 1)), "Y", "found Y"),
+        (np.zeros((6, 8, 3)), "RGB", "black"),
+        (np.full((6, 8, 3), np.nan), "RGB", "48 of 48 pixels not finite"),
+    ],
+)
+def test_unfit_reference_is_refused(run, make_scene, tmp_path, pixels, channels, message):
+    path = tmp_path / "reference.exr"
+    write_exr(path, pixels, channels, {})
+    out = tmp_path / "o"
+    code, _, err = run(
+        "compare", make_scene(), "path", "--spp", 4, "--reference", path, "--out", out
+    )
+    assert code == 2
+    assert message in err and str(path) in err and err.count("\n") == 1
+    assert not out.exists()
+
+
+def test_truncated_reference_is_one_line(make_scene, tmp_path):
+    path = tmp_path / "reference.exr"
+    write_exr(path, np.random.default_rng(0).random((6, 8, 3)), "RGB", {})
+    path.write_bytes(path.read_bytes()[:-200])
+    scene = make_scene()
+    # In a process of its own: libraries write to the terminal past Python
+    result = in_subprocess(
+        "compare", scene, "path", "--spp", "1", "--reference", path, "--out", tmp_path / "o"
+    )
+    assert result.returncode == 2
+    assert result.stdout == "" and result.stderr.count("\n") == 1
+    assert f"{path}: unreadable" in result.stderr
+
+
+def test_failing_integrator_is_a_row_and_does_not_stop_the_others(run, make_scene, tmp_path):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    prb = type(mi.load_dict({"type": "prb"}))
+
+    class Fails(prb):
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            image = super().render(scene, sensor, seed, spp, develop, evaluate)
+            return image * float("nan") if seed == 1 else image
+
+    mi.register_integrator("fails_at_seed_1", lambda props: Fails(props))
+    code, out, _ = run(
+        "compare", make_scene(), "path", "fails_at_seed_1", "--spp", 2, "--out", tmp_path
+    )
+    assert code == 1
+    assert "seed 1: 48 of 48 pixels not finite" in out
+    path, fails = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["integrators"]
+    assert (len(path["runs"]), len(fails["runs"])) == (3, 1)
+    assert fails["error"] and not path["error"]
+
+
+
+
+# ---- Processes that are interrupted, or die ----
+
+TROUBLE = """
+import os, time
+import mitsuba as mi
+
+class Trouble(type(mi.load_dict({"type": "prb"}))):
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        if seed == 1 and os.environ["TROUBLE"] == "abort":
+            os.abort()
+        if seed == 1 and os.environ["TROUBLE"] == "hang":
+            print("hanging", flush=True)
+            while True:  # as native code, it does not hear Ctrl-C
+                try:
+                    time.sleep(60)
+                except KeyboardInterrupt:
+                    pass
+        return super().render(scene, sensor, seed, spp, develop, evaluate)
+
+mi.register_integrator("trouble", lambda props: Trouble(props))
+"""
+
+
+def troubled(scene, folder, kind: str, **options) -> subprocess.Popen:
+    """A comparison of ``path`` with an integrator that makes trouble in the second round."""
+    plugin = folder / "trouble.py"
+    plugin.write_text(TROUBLE)
+    arguments = ["compare", scene, "path", "trouble", "--spp", "2", "--out", folder / "out"]
+    command = [sys.executable, "-m", "mitsuba_ext.cli", *map(str, arguments), f"--plugin={plugin}"]
+    return subprocess.Popen(
+        command, env={**os.environ, "TROUBLE": kind}, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, **options,
+    )
+
+
+def stored_runs(folder) -> list[int]:
+    results = json.loads((folder / "out" / "results.json").read_text())
+    return [len(record["runs"]) for record in results["scenes"][0]["integrators"]]
+
+
+def test_integrator_that_takes_the_process_down_is_a_failed_row(make_scene, tmp_path):
+    process = troubled(make_scene(), tmp_path, "abort")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert "the process died of SIGABRT in this render" in out
+    assert "going on with the others" in err
+    assert stored_runs(tmp_path) == [3, 1]
+    # Forgiven the next time, and what is there is taken up
+    process = troubled(make_scene(), tmp_path, "none")
+    process.communicate(timeout=120)
+    assert process.returncode == 0
+    assert stored_runs(tmp_path) == [3, 3]
+
+
+def test_second_interrupt_gives_up_the_running_render_and_reports_the_others(make_scene, tmp_path):
+    process = troubled(make_scene(), tmp_path, "hang", start_new_session=True)
+    assert process.stdout.readline() == "hanging\n"
+    for _ in range(2):  # as the terminal does: to the whole group
+        os.killpg(process.pid, signal.SIGINT)
+        time.sleep(0.5)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "waiting for the running render" in err and "given up" in err
+    assert stored_runs(tmp_path) == [2, 1]
+    assert "report.html" in out

@@ -1,0 +1,349 @@
+"""Comparisons: figures that are known beforehand, and what becomes of trouble.
+
+Times come from a clock that the integrators under test move themselves.
+"""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from mitsuba_ext import compare
+from mitsuba_ext.compare import InputError, experiment, timing
+
+import mitsuba as mi  # isort: skip
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+#: A scene whose image is 1 everywhere, whatever the integrator.
+WHITE = {
+    "type": "scene",
+    "integrator": {"type": "path", "max_depth": 3},
+    "sensor": {
+        "type": "perspective",
+        "film": {"type": "hdrfilm", "width": 32, "height": 24, "rfilter": {"type": "box"}},
+    },
+    "emitter": {"type": "constant"},
+}
+
+
+class Clock:
+    """Stands in for the module ``time``."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(timing, "time", clock)
+    return clock
+
+
+def noisy_integrator(clock, sigma=1.0, cost=0.01, fixed=0.0, fails_at=None, mean=1.0, calls=None):
+    """Adds noise of variance σ²/spp to the truth, and takes ``fixed + cost · spp`` seconds."""
+
+    class Noisy(type(mi.load_dict({"type": "prb"}))):
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            if calls is not None:
+                calls.append((int(seed), spp))
+            if fails_at is not None and seed == fails_at and spp > 3:
+                raise ZeroDivisionError("no\nlight")
+            clock.now += fixed + cost * spp
+            width, height = scene.sensors()[0].film().crop_size()
+            noise = np.random.default_rng([int(seed), spp, int(sigma * 1e6)])
+            shape = (int(height), int(width), 3)
+            return mi.TensorXf(mean + sigma * spp**-0.5 * noise.standard_normal(shape))
+
+        def to_string(self):
+            return f"Noisy[{sigma}, {cost}, {fixed}, {mean}]"
+
+    return Noisy(mi.Properties("prb"))
+
+
+def compare_noisy(budget, integrators, tmp_path, **options):
+    options = {"reference_spp": 16, "seeds": 3, **options}
+    comparison = compare.Comparison(WHITE, integrators, budget, folder=tmp_path, **options)
+    return comparison.run()["scenes"][0]
+
+
+# ---- Known figures ----
+
+
+def test_error_slope_and_efficiency_of_a_known_noise_are_found(clock, tmp_path):
+    integrators = {
+        "first": noisy_integrator(clock, sigma=1.0, cost=0.01),
+        "better": noisy_integrator(clock, sigma=0.5, cost=0.02),
+    }
+    scene = compare_noisy(compare.sweep([4, 16, 64]), integrators, tmp_path)
+    first, better = scene["integrators"]
+    for record, sigma in ((first, 1.0), (better, 0.5)):
+        for level in record["levels"]:
+            # 2304 values, 3 seeds: standard deviation of their mean square 1.7 %
+            expected = sigma**2 / level["level"] / 1.01
+            assert level["figures"]["relmse"]["value"] == pytest.approx(expected, rel=0.07)
+            assert level["figures"]["mse"]["value"] == pytest.approx(expected * 1.01, rel=0.07)
+        for name in ("spp", "seconds"):
+            slope = record["slopes"][name]
+            assert slope["value"] == pytest.approx(-1, abs=0.05)
+            assert slope["low"] <= -1 <= slope["high"]
+        last = record["levels"][-1]
+        cost = 0.01 if sigma == 1 else 0.02
+        efficiency = 1.01 / (sigma**2 * cost)
+        assert last["figures"]["efficiency"]["value"] == pytest.approx(efficiency, rel=0.07)
+    # A quarter of the variance in twice the time
+    ratios = better["levels"][-1]["ratios"]
+    assert ratios["efficiency"]["value"] == pytest.approx(2, rel=0.1)
+    assert ratios["efficiency"]["low"] <= 2 <= ratios["efficiency"]["high"]
+    assert ratios["seconds"]["value"] == pytest.approx(2)
+    assert first["levels"][-1]["ratios"]["efficiency"]["value"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("fixed, cost", [(0.0, 0.01), (3.0, 0.01), (0.0, 1.7), (0.1, 0.0003)])
+def test_equal_time_is_used_fully(clock, tmp_path, fixed, cost):
+    integrators = {
+        "first": noisy_integrator(clock, cost=0.05),
+        "other": noisy_integrator(clock, cost=cost, fixed=fixed),
+    }
+    scene = compare_noisy(compare.equal_time(40), integrators, tmp_path)
+    for record in scene["integrators"]:
+        for run in record["runs"]:
+            assert run["seconds"] == pytest.approx(40, rel=0.05)
+
+
+def test_until_stops_at_the_error_and_says_what_it_costs(clock, tmp_path):
+    integrators = {
+        "first": noisy_integrator(clock, cost=0.01),
+        "faster": noisy_integrator(clock, cost=0.002, sigma=0.5),
+    }
+    budget = compare.until(0.01)
+    scene = compare_noisy(budget, integrators, tmp_path, reference_spp=4096)
+    first, faster = scene["integrators"]
+    # σ² / spp / 1.01 ≤ 0.01 after 99 samples and after 25
+    assert [level["level"] for level in first["levels"]] == [8, 16, 32, 64, 128]
+    assert [level["level"] for level in faster["levels"]] == [8, 16, 32]
+    assert first["target"]["spp"]["value"] == pytest.approx(99, rel=0.1)
+    assert first["target"]["seconds"]["value"] == pytest.approx(0.99, rel=0.1)
+    assert faster["target"]["spp"]["value"] == pytest.approx(24.75, rel=0.15)
+    assert first["target"]["spp"]["low"] < 99 < first["target"]["spp"]["high"]
+
+
+def test_until_ends_where_a_biased_integrator_never_arrives(clock, tmp_path):
+    biased = {"first": noisy_integrator(clock), "biased": noisy_integrator(clock, mean=1.5)}
+    scene = compare_noisy(compare.until(0.02), biased, tmp_path, reference_spp=128)
+    first, biased = scene["integrators"]
+    assert first["target"] and not first["notes"]
+    assert biased["target"] is None
+    assert biased["levels"][-1]["level"] == 128
+    assert "not reached: relMSE 0.2" in biased["notes"][0]
+
+
+def test_each_level_and_round_has_a_seed_of_its_own_which_integrators_share(clock, tmp_path):
+    scene = compare_noisy(
+        compare.sweep([16, 4]),
+        {"first": noisy_integrator(clock), "second": noisy_integrator(clock, sigma=2.0)},
+        tmp_path,
+    )
+    first, second = ([(run["level"], run["round"], run["seed"]) for run in record["runs"]]
+                     for record in scene["integrators"])
+    assert first == second
+    assert len({seed for _, _, seed in first}) == 6
+
+
+def test_integrators_take_turns(clock, tmp_path):
+    calls = []
+    integrators = {
+        name: noisy_integrator(clock, sigma=sigma, calls=calls)
+        for name, sigma in (("a", 1.0), ("b", 2.0))
+    }
+    compare_noisy(compare.equal_samples(64), integrators, tmp_path, seeds=2)
+    assert [call for call in calls if call[1] == 64] == [(0, 64), (0, 64), (1, 64), (1, 64)]
+
+
+# ---- The reference ----
+
+
+def test_reference_too_noisy_for_an_error_is_refused(clock, tmp_path):
+    reference = tmp_path / "reference.exr"
+    rng = np.random.default_rng(1)
+    mean = 1 + 0.1 * rng.standard_normal((24, 32, 3))
+    channels = [f"{name}.{color}" for name in ("mean", "variance") for color in "RGB"]
+    pixels = np.concatenate([mean, np.full_like(mean, 0.01)], axis=2)
+    compare.write_exr(reference, pixels, channels, {"spp": 100})
+    comparison = compare.Comparison(
+        compare.SceneSetup(WHITE, reference=reference),
+        {"first": noisy_integrator(clock)},
+        compare.sweep([4, 4000]),
+        folder=tmp_path / "out",
+    )
+    scene = comparison.run()["scenes"][0]
+    coarse, fine = scene["integrators"][0]["levels"]
+    assert not coarse["refused"]
+    assert coarse["figures"]["relmse"]["value"] == pytest.approx(1 / 4 / 1.01, rel=0.1)
+    assert "too noisy: its own relMSE is 0.01" in fine["refused"]
+    assert "--reference-spp" in fine["refused"]
+    assert fine["figures"]["relmse"] is None and fine["figures"]["efficiency"] is None
+    assert fine["ratios"]["efficiency"] is None
+
+
+def test_reference_that_is_longer_than_needed_is_taken(clock, tmp_path):
+    scene = compare.load_scene(WHITE, keep_integrator=False)
+    long = compare.render_reference(scene, 64, tmp_path)
+    assert compare.render_reference(scene, 16, tmp_path).path == long.path
+    assert compare.render_reference(scene, 128, tmp_path).path != long.path
+    assert compare.render_reference(scene, 200, tmp_path, enough=100).spp == 128
+
+
+def test_interrupted_reference_goes_on_where_it_was(tmp_path):
+    ball = {"type": "sphere", "to_world": mi.ScalarTransform4f().translate([0, 0, 5])}
+    sphere = compare.load_scene({**WHITE, "ball": ball}, keep_integrator=False)
+    whole = compare.render_reference(sphere, 32, tmp_path)
+
+    class StopError(Exception):
+        pass
+
+    done = []
+
+    def stop(fraction):
+        done.append(fraction)
+        if fraction == 0.5:
+            raise StopError
+
+    other = tmp_path / "other"
+    other.mkdir()
+    with pytest.raises(StopError):
+        compare.render_reference(sphere, 32, other, progress=stop)
+    resumed = compare.render_reference(sphere, 32, other, progress=done.append)
+    assert len(done) == 16  # of 16 batches in all
+    assert np.array_equal(resumed.mean, whole.mean)
+    assert np.array_equal(resumed.variance, whole.variance)
+    assert [path.suffix for path in other.iterdir()] == [".exr"]
+
+
+# ---- Trouble ----
+
+
+def test_failing_integrator_is_a_row_with_its_earlier_runs(clock, tmp_path):
+    integrators = {
+        "first": noisy_integrator(clock),
+        "fails": noisy_integrator(clock, sigma=2.0, fails_at=1),
+    }
+    scene = compare_noisy(compare.equal_samples(8), integrators, tmp_path)
+    first, fails = scene["integrators"]
+    assert (len(first["runs"]), len(fails["runs"])) == (3, 1)
+    assert fails["error"] == "no light"
+    assert first["error"] == ""
+
+
+def test_scene_that_fails_is_an_entry_and_does_not_stop_the_others(clock, tmp_path):
+    broken = {**WHITE, "shape": {"type": "sphere", "radiu": 1.0}}
+    comparison = compare.Comparison(
+        [broken, WHITE], {"noisy": noisy_integrator(clock)}, compare.equal_samples(4),
+        folder=tmp_path, reference_spp=16,
+    )
+    first, second = comparison.run()["scenes"]
+    assert "radiu" in first["error"] and not second["error"]
+    assert first["name"] != second["name"]
+    assert (tmp_path / "report.html").is_file()
+    with pytest.raises(InputError, match="radiu"):
+        compare.Comparison(broken, ["path"], compare.equal_samples(4)).run()
+
+
+def test_second_comparison_takes_up_what_is_there(clock, tmp_path):
+    calls = []
+    integrators = {"noisy": noisy_integrator(clock, calls=calls)}
+
+    def run(**options) -> dict:
+        calls.clear()
+        return compare_noisy(compare.equal_samples(8), integrators, tmp_path, **options)
+
+    once = run(seeds=2)
+    again = run(seeds=2)
+    assert calls == []
+    assert again["integrators"] == once["integrators"]
+    more = run(seeds=3)
+    assert [call for call in calls if call[1] == 8] == [(2, 8)]
+    assert more["integrators"][0]["runs"][:2] == once["integrators"][0]["runs"]
+
+
+def test_damaged_and_foreign_runs_are_rendered_again(clock, tmp_path):
+    calls = []
+    integrators = {"noisy": noisy_integrator(clock, calls=calls)}
+    scene = compare_noisy(compare.equal_samples(8), integrators, tmp_path, seeds=1)
+    path = tmp_path / scene["integrators"][0]["runs"][0]["image"]
+    path.write_bytes(path.read_bytes()[:100])
+    calls.clear()
+    compare_noisy(compare.equal_samples(8), integrators, tmp_path, seeds=1)
+    assert (0, 8) in calls
+    calls.clear()
+    others = {"noisy": noisy_integrator(clock, sigma=3.0, calls=calls)}
+    compare_noisy(compare.equal_samples(8), others, tmp_path, seeds=1)
+    assert (0, 8) in calls
+
+
+def test_interruption_keeps_what_is_finished_and_says_so(clock, tmp_path, monkeypatch):
+    integrators = {"noisy": noisy_integrator(clock)}
+    comparison = compare.Comparison(
+        WHITE, integrators, compare.equal_samples(8), folder=tmp_path, reference_spp=16
+    )
+    measure = experiment.Experiment._measure
+
+    def interrupted(self, contender, index, round, path):
+        if round == 2:
+            raise KeyboardInterrupt
+        return measure(self, contender, index, round, path)
+
+    monkeypatch.setattr(experiment.Experiment, "_measure", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        comparison.run()
+    stored = json.loads((tmp_path / "results.json").read_text())
+    assert stored["state"] == "interrupted"
+    assert len(stored["scenes"][0]["integrators"][0]["runs"]) == 2
+    assert "nterrupted" in (tmp_path / "report.html").read_text()
+    monkeypatch.undo()
+
+
+def test_temporary_folder_serves_where_none_is_given(clock):
+    comparison = compare.Comparison(
+        WHITE, {"noisy": noisy_integrator(clock)}, compare.equal_samples(4), reference_spp=16
+    )
+    comparison.run()
+    assert (comparison.folder / "report.html").is_file()
+
+
+@pytest.mark.parametrize(
+    "scenes, integrators, options, message",
+    [
+        ([], ["path"], {}, "no scene"),
+        (WHITE, [], {}, "no integrator"),
+        (WHITE, ["path", "path"], {}, "given twice"),
+        (WHITE, ["path"], {"seeds": 0}, "seed"),
+        ("none.xml", ["path"], {}, "no such scene"),
+    ],
+)
+def test_bad_input_is_refused_at_once(scenes, integrators, options, message):
+    with pytest.raises(InputError, match=message):
+        compare.Comparison(scenes, integrators, compare.equal_samples(4), **options)
+
+
+@pytest.mark.parametrize(
+    "make, value",
+    [
+        (compare.equal_samples, 0),
+        (compare.equal_samples, 1.5),
+        (compare.equal_time, 0),
+        (compare.equal_time, float("nan")),
+        (compare.sweep, []),
+        (compare.sweep, [0, 1]),
+        (compare.until, -1),
+    ],
+)
+def test_budgets_refuse_what_makes_no_sense(make, value):
+    with pytest.raises(InputError):
+        make(value)

@@ -1,0 +1,524 @@
+"""The integrator ``variance`` and the batches below it: mean, variance, film, and hard input."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import weakref
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_cases import film, sensor, stage
+from statistical import THRESHOLD, z_exact
+
+from mitsuba_ext.batches import Batches, batch_seeds, render_batches
+from mitsuba_ext.compare import read_exr
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+#: Some of each family: paths, light tracing, adjoint, volumes, ours, ours with learning.
+NESTED = ["path", "direct", "ptracer", "prb", "volpath", "composed_path", "neepp"]
+
+FORMATS = {
+    "rgb": ["R", "G", "B"],
+    "rgba": ["R", "G", "B", "A"],
+    "luminance": ["Y"],
+    "luminance_alpha": ["Y", "A"],
+    "xyz": ["X", "Y", "Z"],
+    "xyza": ["X", "Y", "Z", "A"],
+}
+
+
+def _variance(nested: str | dict = "path", batches: int = 4, **parameters) -> mi.Integrator:
+    inner = {"type": nested} if isinstance(nested, str) else nested
+    return mi.load_dict({"type": "variance", "batches": batches, "nested": inner, **parameters})
+
+
+def _scene(*size: int, sampler: str = "independent", **changes) -> mi.Scene:
+    return mi.load_dict(stage(camera=sensor(film=film(*size, **changes), sampler=sampler)))
+
+
+def _film_channels(scene: mi.Scene) -> dict[str, np.ndarray]:
+    bitmap = scene.sensors()[0].film().bitmap()
+    pixels = np.array(bitmap)
+    return {field.name: pixels[..., index] for index, field in enumerate(bitmap.struct_())}
+
+
+# ---- Mean and variance ----
+
+
+@pytest.mark.parametrize("nested", NESTED)
+def test_mean_and_variance_are_those_of_the_batches(nested):
+    scene, inner = _scene(9, 7), mi.load_dict({"type": nested})
+    image = mi.render(scene, integrator=_variance(nested), spp=32, seed=5).numpy()
+    images = [
+        inner.render(scene, seed=seed, spp=8).numpy().astype(np.float64)
+        for seed in batch_seeds(5, 4)
+    ]
+    scale = np.max(images)
+    np.testing.assert_allclose(image[..., :3], np.mean(images, 0), rtol=1e-5, atol=1e-6 * scale)
+    variance = np.var(images, axis=0, ddof=1) / 4
+    np.testing.assert_allclose(image[..., 3:], variance, rtol=1e-3, atol=1e-8 * scale**2)
+    assert (image[..., 3:] > 0).mean() > 0.5, "constant batches prove nothing"
+
+
+def test_constant_environment_has_no_variance():
+    scene = mi.load_dict({"type": "scene", "c": sensor(film=film(8, 8)), "e": {"type": "constant"}})
+    image = mi.render(scene, integrator=_variance(), spp=16).numpy()
+    np.testing.assert_allclose(image[..., :3], 1, rtol=1e-6)
+    assert not image[..., 3:].any()
+
+
+@pytest.fixture
+def lattice(variant: str) -> mi.Scene:
+    """Each of 24 × 24 pixels is lit to 30 %: a sample is worth 1 with this probability, else 0."""
+    pixels = np.zeros((240, 240, 3), dtype=np.float32)
+    pixels[:, np.arange(240) % 10 < 3] = 1
+    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True,
+                "filter_type": "nearest"}  # fmt: skip
+    view = mi.ScalarTransform4f().look_at([0, 0, 1], [0, 0, 0], [0, 1, 0])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "camera": sensor("orthographic", view, film=film(24, 24)),
+            "screen": {"type": "rectangle", "emitter": {"type": "area", "radiance": radiance}},
+        }
+    )
+
+
+@pytest.mark.parametrize("batches", [2, 16])
+def test_variance_is_that_of_the_mean_of_all_samples(lattice, batches):
+    """Bernoulli: p (1 − p) / spp. The pixels are independent."""
+    spp, p = 64, 0.3
+    image = mi.render(lattice, integrator=_variance("direct", batches), spp=spp, seed=1).numpy()
+    mean, variance = (image[..., c].ravel().astype(np.float64) for c in (0, 3))
+    exact = p * (1 - p) / spp
+    assert abs(z_exact(variance, exact)[0]) < THRESHOLD
+    assert z_exact(variance, exact)[1] < 0.07
+    assert abs(z_exact((mean - p) ** 2, exact)[0]) < THRESHOLD
+    # What a user does: the errors against the truth are those that were announced
+    assert abs(z_exact((mean - p) ** 2 - variance, 0.0)[0]) < THRESHOLD
+
+
+@pytest.mark.parametrize("nested", ["path", "ptracer", "neepp"])
+@pytest.mark.parametrize("sampler", ["independent", "ldsampler"])
+def test_variance_announces_the_differences_of_independent_renders(nested, sampler):
+    """E[(a − b)²] = Var a + Var b, for a wide filter too."""
+    scene = _scene(12, 12, sampler=sampler, rfilter={"type": "gaussian"})
+    integrator = _variance({"type": nested, "max_depth": 3}, batches=8)
+    images = [
+        mi.render(scene, integrator=integrator, spp=128, seed=seed).numpy().astype(np.float64)
+        for seed in range(24)
+    ]
+    a, b = np.array(images[::2]), np.array(images[1::2])
+    squares = ((a - b)[..., :3] ** 2).mean(axis=(1, 2, 3))
+    announced = (a + b)[..., 3:].mean(axis=(1, 2, 3))
+    assert abs(z_exact(squares - announced, 0.0)[0]) < THRESHOLD
+    error = (squares - announced).std(ddof=1) / math.sqrt(len(a))
+    assert error < 0.2 * announced.mean(), "too noisy to say anything"
+
+
+def test_update_keeps_small_variances_of_large_means():
+    """Where a difference of sums of squares would have no digit left."""
+    random = np.random.default_rng(1)
+    images = 1e9 + random.normal(size=(50, 4, 4, 1))
+    batches = Batches(["Y"], 1)
+    for image in images:
+        batches.add(image, 2)
+    assert (batches.count, batches.spp) == (50, 100)
+    np.testing.assert_allclose(batches.mean, images.mean(axis=0), rtol=1e-15)
+    np.testing.assert_allclose(batches.variance, images.var(axis=0, ddof=1) / 50, rtol=1e-5)
+
+
+# ---- Batches ----
+
+
+def test_seeds_of_batches_are_not_shared():
+    """Neither by neighbouring seeds nor with the passes of our integrators (see rendering.py)."""
+    seeds = [batch_seeds(seed, 64) for seed in (0, 1, 2, 2**32 - 1)]
+    assert len({seed for group in seeds for seed in group}) == 4 * 64
+    assert batch_seeds(2**32 - 1, 64) == batch_seeds(mi.UInt32(2**32 - 1), 64) == seeds[3]
+    assert batch_seeds(0, 3) == seeds[0][:3]
+    passes = mi.sample_tea_32(mi.UInt32(seeds[0][0]), dr.arange(mi.UInt32, 64))[0].numpy()
+    assert not set(passes.tolist()) & set(seeds[0])
+    assert not set(mi.sample_tea_32(mi.UInt32(0), dr.arange(mi.UInt32, 64))[0]) & set(seeds[0])
+
+
+def test_render_batches_takes_seeds_and_reports_after_each():
+    scene, path = _scene(6, 5), mi.load_dict({"type": "path"})
+    fractions, counts = [], []
+    batches = render_batches(
+        path, scene, 0, 4, [7, 8, 9, 10], fractions.append, lambda b: counts.append(b.count)
+    )
+    assert fractions == [0.25, 0.5, 0.75, 1.0] and counts == [1, 2, 3, 4]
+    assert batches.channels == ("R", "G", "B") and batches.spp == 16
+    images = [path.render(scene, seed=seed, spp=4).numpy() for seed in (7, 8, 9, 10)]
+    np.testing.assert_allclose(batches.mean, np.mean(images, axis=0), rtol=1e-5)
+    assert batches.mean.dtype == batches.variance.dtype == np.float64
+
+
+def test_non_finite_batch_can_be_reported_and_is_not_averaged_away():
+    scene = _scene(6, 5)
+
+    class Broken(mi.SamplingIntegrator):
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            image = mi.load_dict({"type": "path"}).render(scene, sensor, seed, spp)
+            return image if seed != 2 else image * mi.Float(math.inf) * 0
+
+    def check(batches: Batches) -> None:
+        if not np.isfinite(batches.mean).all():
+            raise ValueError(f"batch {batches.count}")
+
+    broken = Broken(mi.Properties())
+    with pytest.raises(ValueError, match="batch 2"):
+        render_batches(broken, scene, 0, 4, [1, 2, 3], check=check)
+    batches = render_batches(broken, scene, 0, 4, [1, 2, 3])
+    assert np.isnan(batches.mean).all() and np.isnan(batches.variance).all()
+
+
+def test_no_batch_is_kept(monkeypatch):
+    """Neither the images nor the tensors."""
+    kept: list[weakref.ref] = []
+    add = Batches.add
+
+    def watched(self, image, spp):
+        kept.append(weakref.ref(image))
+        add(self, image, spp)
+
+    monkeypatch.setattr(Batches, "add", watched)
+    mi.render(_scene(6, 5), integrator=_variance(batches=8), spp=8)
+    assert len(kept) == 8 and not any(image() is not None for image in kept)
+
+
+# ---- Samples ----
+
+
+@pytest.mark.parametrize(
+    ("sampler", "spp", "expected"),
+    [
+        ("independent", 64, (16, 4)),
+        ("independent", 17, (9, 2)),
+        ("independent", 100, (15, 7)),
+        ("independent", 5, (5, 1)),
+        ("independent", 2, (2, 1)),
+        ("stratified", 64, (16, 4)),
+        ("stratified", 100, (12, 9)),
+        ("ldsampler", 256, (16, 16)),
+        ("ldsampler", 2, (2, 4)),
+        ("orthogonal", 1000, (9, 121)),
+    ],
+)
+def test_samples_exceed_those_asked_for_by_less_than_a_batch(sampler, spp, expected):
+    scene, integrator = _scene(3, 2, sampler=sampler), _variance("direct", 16)
+    integrator.render(scene, spp=spp)
+    count, batch_spp = expected
+    assert (integrator.statistics.passes, integrator.statistics.spp) == (count, count * batch_spp)
+
+
+def test_one_sample_is_refused():
+    with pytest.raises(ValueError, match='"variance".* at least 2 samples.* spp = 1'):
+        _variance().render(_scene(4, 4), spp=1)
+
+
+def test_the_samplers_count_is_used_and_left_as_it_was():
+    scene = mi.load_dict(stage(camera=sensor(film=film(4, 4))))
+    sampler = scene.sensors()[0].sampler()
+    sampler.set_sample_count(12)
+    for nested in ("path", "prb", "neepp"):
+        integrator = _variance(nested)
+        integrator.render(scene)
+        assert integrator.statistics.spp == 12, "spp=0 means the sampler's count"
+        integrator.render(scene, spp=8)
+        assert integrator.statistics.spp == 8 and sampler.sample_count() == 12
+
+
+# ---- The film ----
+
+
+@pytest.mark.parametrize("pixel_format", FORMATS)
+@pytest.mark.parametrize("nested", ["path", "ptracer"])
+def test_film_develops_the_mean_in_every_pixel_format(pixel_format, nested):
+    scene = _scene(7, 5, pixel_format=pixel_format, rfilter={"type": "gaussian"})
+    integrator = _variance(nested)
+    image = mi.render(scene, integrator=integrator, spp=16, seed=2).numpy()
+    names = FORMATS[pixel_format]
+    colors = [name for name in names if name != "A"]
+    assert integrator.aov_names() == [f"variance.{color}" for color in colors]
+    channels = _film_channels(scene)
+    assert list(channels) == names + integrator.aov_names()
+    np.testing.assert_allclose(np.stack(list(channels.values()), 2), image, rtol=1e-6)
+    batches = render_batches(integrator.nested, scene, 0, 4, batch_seeds(2, 4))
+    scale = batches.mean.max()
+    np.testing.assert_allclose(image[..., : len(names)], batches.mean, rtol=1e-5, atol=1e-6 * scale)
+    variance = batches.variance[..., : len(colors)]
+    np.testing.assert_allclose(
+        image[..., len(names) :], variance, rtol=1e-3, atol=1e-8 * scale**2
+    )
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"width": 1, "height": 1},
+        {"width": 1, "height": 1, "rfilter": {"type": "gaussian"}},
+        {"width": 31, "height": 29, "crop_offset_x": 5, "crop_offset_y": 9, "crop_width": 13,
+         "crop_height": 11, "rfilter": {"type": "gaussian"}, "sample_border": True},
+        {"width": 9, "height": 7, "rfilter": {"type": "mitchell"}, "pixel_format": "rgba"},
+        {"width": 9, "height": 7, "component_format": "float16"},
+    ],
+    ids=["one pixel", "one pixel, gaussian", "crop and border", "mitchell", "float16"],
+)  # fmt: skip
+@pytest.mark.parametrize("nested", ["path", "ptracer", "neepp"])
+def test_odd_films_hold_what_is_returned(changes, nested):
+    scene = _scene(**changes)
+    image = mi.render(scene, integrator=_variance(nested), spp=64).numpy()
+    crop = scene.sensors()[0].film().crop_size()
+    assert image.shape[:2] == (crop[1], crop[0])
+    assert np.isfinite(image).all() and image.any() and (image[..., -3:] >= 0).all()
+    channels = _film_channels(scene)
+    np.testing.assert_allclose(np.stack(list(channels.values()), 2), image, rtol=1e-6)
+    plain = mi.load_dict({"type": nested}).render(scene, spp=256).numpy()
+    error = np.sqrt(image[..., -3:].mean())
+    assert abs(image[..., :3].mean() - plain[..., :3].mean()) < 4 * error + 1e-3 * plain.mean()
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"], indirect=True)
+def test_other_variants(variant):
+    colors = ["Y"] if mi.is_monochromatic else ["R", "G", "B"]
+    scene = _scene(6, 5, pixel_format="luminance" if mi.is_monochromatic else "rgb")
+    for nested in ("path", "ptracer", "neepp"):
+        integrator = _variance(nested)
+        assert integrator.aov_names() == [f"variance.{color}" for color in colors]
+        image = mi.render(scene, integrator=integrator, spp=64).numpy()
+        assert image.shape == (5, 6, 2 * len(colors))
+        assert np.isfinite(image).all() and (image[..., len(colors) :] > 0).any()
+        assert list(_film_channels(scene)) == colors + integrator.aov_names()
+
+
+def test_aovs_of_the_nested_integrator_are_passed_on_as_means():
+    scene = _scene(8, 6)
+    ours = _variance({"type": "neepp", "aovs": "d:depth,n:sh_normal"})
+    image = mi.render(scene, integrator=ours, spp=16).numpy()
+    assert ours.aov_names()[:4] == ["d.T", "n.X", "n.Y", "n.Z"]
+    channels = _film_channels(scene)
+    assert list(channels) == ["R", "G", "B", *ours.aov_names()]
+    np.testing.assert_allclose(np.stack(list(channels.values()), 2), image, rtol=1e-6)
+
+    aov = {"type": "aov", "aovs": "d:depth,n:sh_normal", "img": {"type": "path"}}
+    mitsubas = _variance(aov)
+    wrapped = mi.render(scene, integrator=mitsubas, spp=16).numpy()
+    assert mitsubas.aov_names() == [
+        "img.R", "img.G", "img.B", "img.A", "d.T", "n.X", "n.Y", "n.Z",
+        "variance.R", "variance.G", "variance.B",
+    ]  # fmt: skip
+    assert list(_film_channels(scene)) == ["R", "G", "B", *mitsubas.aov_names()]
+    # Both see the same camera rays; the image is that of the nested integrator
+    np.testing.assert_allclose(wrapped[..., 7:11], image[..., 3:7], rtol=1e-3, atol=1e-4)
+    plain = mi.render(scene, integrator=_variance("path"), spp=16).numpy()
+    np.testing.assert_allclose(wrapped[..., :3], plain[..., :3], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(wrapped[..., -3:], plain[..., -3:], rtol=1e-2, atol=1e-6)
+
+
+def test_moment_can_be_nested():
+    scene = _scene(6, 5)
+    integrator = _variance({"type": "moment", "m": {"type": "path"}})
+    mi.render(scene, integrator=integrator, spp=16)
+    assert "m2_m.X" in _film_channels(scene) and "variance.R" in _film_channels(scene)
+
+
+def test_films_that_are_not_rgb_are_refused():
+    mi.set_variant("llvm_ad_spectral")
+    try:
+        special = {"type": "specfilm", "width": 4, "height": 4,
+                   "band": {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]}}  # fmt: skip
+        scene = mi.load_dict(stage(camera=sensor(film=special)))
+        with pytest.raises(NotImplementedError, match='"variance".*hdrfilm'):
+            _variance().render(scene, spp=4)
+    finally:
+        mi.set_variant("llvm_ad_rgb")
+
+
+def test_command_line_writes_the_channels(run, make_scene, tmp_path):
+    xml = """<integrator type="variance"><integer name="batches" value="5"/>
+             <integrator type="ptracer"><integer name="max_depth" value="3"/></integrator>
+             </integrator>"""
+    code, _, err = run(
+        "render", make_scene(integrator=xml), "-o", tmp_path / "a.exr", "--spp", 20
+    )
+    assert (code, err) == (0, "")
+    channels, metadata = read_exr(tmp_path / "a.exr")
+    assert set(channels) == {"R", "G", "B", "variance.R", "variance.G", "variance.B"}
+    assert metadata["spp"] == 20 and np.isfinite(list(channels.values())).all()
+    assert run("render", make_scene(integrator=xml), "-o", tmp_path / "a.png", "--spp", 20)[0] == 0
+
+
+# ---- Calls ----
+
+
+def test_render_takes_the_arguments_that_mitsuba_takes():
+    scene, integrator = _scene(6, 5), _variance()
+    sensor_, same = scene.sensors()[0], dict(rtol=1e-5, atol=1e-6)
+    image = integrator.render(scene, sensor=sensor_, seed=mi.UInt32(2**32 - 1), spp=8).numpy()
+    np.testing.assert_allclose(integrator.render(scene, 0, 2**32 - 1, 8).numpy(), image, **same)
+    lazy = integrator.render(scene, seed=2**32 - 1, spp=8, evaluate=False).numpy()
+    np.testing.assert_allclose(lazy, image, **same)
+    other = integrator.render(scene, seed=0, spp=8).numpy()
+    assert np.abs(other - image).max() > 0.01 * image.max()
+    assert integrator.render(scene, seed=2**32 - 1, spp=8, develop=False).shape == (0,)
+    np.testing.assert_allclose(np.array(sensor_.film().bitmap()), image, **same)
+    with pytest.raises(ValueError, match="there is no sensor 1: the scene has 1"):
+        integrator.render(scene, sensor=1, spp=4)
+
+
+def test_scene_with_the_integrator_in_xml():
+    scene = mi.load_string(
+        """<scene version="3.0.0">
+        <integrator type="variance"><integer name="batches" value="3"/>
+            <integrator type="path"><integer name="max_depth" value="2"/></integrator>
+        </integrator>
+        <emitter type="constant"/><shape type="sphere"/>
+        <sensor type="perspective"><sampler type="independent"/>
+            <transform name="to_world"><lookat origin="0, 0, 5" target="0, 0, 0" up="0, 1, 0"/>
+            </transform><film type="hdrfilm"><integer name="width" value="4"/>
+            <integer name="height" value="3"/><string name="pixel_format" value="rgb"/></film>
+        </sensor></scene>"""
+    )
+    assert mi.render(scene, spp=6).shape == (3, 4, 6)
+    text = str(scene.integrator())
+    assert text.startswith("variance[") and "batches = 3" in text and "max_depth = 2" in text
+
+
+def test_statistics_are_summed_over_the_batches():
+    scene, integrator = _scene(6, 5), _variance("neepp")
+    integrator.render(scene, spp=32)
+    statistics = integrator.statistics
+    assert statistics.spp == 32 and statistics.passes >= 4 and statistics.seconds > 0
+    assert statistics.rays["camera"] == 6 * 5 * 32 and statistics.rays["shadow"] > 0
+    assert 0 < statistics.zero_radiance < 1 and not statistics.interrupted
+
+
+# ---- Stopping ----
+
+
+def test_cancelling_returns_the_image_of_the_finished_batches():
+    scene, integrator = _scene(6, 5), _variance(batches=8)
+    fractions = []
+
+    def progress(fraction: float) -> None:
+        fractions.append(fraction)
+        if fraction >= 0.5:
+            integrator.cancel()
+
+    integrator.progress = progress
+    image = integrator.render(scene, spp=32, seed=3).numpy()
+    assert fractions == [0.125, 0.25, 0.375, 0.5]
+    assert integrator.statistics.interrupted and integrator.statistics.spp == 16
+    batches = render_batches(integrator.nested, scene, 0, 4, batch_seeds(3, 4))
+    np.testing.assert_allclose(image[..., :3], batches.mean, rtol=1e-5, atol=1e-7)
+    integrator.progress = None
+    integrator.render(scene, spp=32)
+    assert integrator.statistics.spp == 32, "a later render is not cancelled"
+
+
+@pytest.mark.parametrize("nested", ["path", "neepp"])
+def test_ctrl_c_leaves_the_finished_batches_in_the_film(nested):
+    scene, integrator = _scene(6, 5), _variance(nested)
+    integrator.progress = lambda fraction: fraction < 0.5 or os.kill(os.getpid(), signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        integrator.render(scene, spp=64)
+    assert integrator.statistics.interrupted and integrator.statistics.spp in (32, 48)
+    channels = _film_channels(scene)
+    assert "variance.R" in channels and np.isfinite(list(channels.values())).all()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_inside_of_a_batch_drops_it():
+    """Ours finish the pass and raise."""
+    scene, integrator = _scene(6, 5), _variance("neepp")
+    whole = integrator.render(scene, spp=64)
+    count = []
+
+    def interrupt(fraction: float) -> None:
+        count.append(fraction)
+        if integrator.statistics.spp == 32:  # in the third batch
+            os.kill(os.getpid(), signal.SIGINT)
+
+    integrator.nested.progress = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        integrator.render(scene, spp=64)
+    assert integrator.statistics.spp == 32
+    assert _film_channels(scene)["variance.R"].shape == whole.shape[:2]
+
+
+def test_variance_after_a_single_batch_is_unknown():
+    scene, integrator = _scene(6, 5), _variance()
+    integrator.progress = lambda _: integrator.cancel()
+    image = integrator.render(scene, spp=16).numpy()
+    assert np.isfinite(image[..., :3]).all() and np.isnan(image[..., 3:]).all()
+
+
+def test_an_error_in_the_progress_callback_leaves_a_valid_film():
+    scene, integrator = _scene(6, 5), _variance()
+
+    def fail(fraction: float) -> None:
+        if fraction > 0.5:
+            raise OSError("no terminal")
+
+    integrator.progress = fail
+    with pytest.raises(OSError, match="no terminal"):
+        integrator.render(scene, spp=16)
+    assert np.isfinite(list(_film_channels(scene).values())).all()
+
+
+# ---- Errors ----
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({}, "exactly one integrator must be nested in it; found none"),
+        ({"a": {"type": "path"}, "b": {"type": "path"}}, "exactly one .*Path.*, Path"),
+        ({"a": {"type": "sphere"}}, "exactly one integrator.*Sphere"),
+        ({"a": {"type": "path"}, "batches": 1}, '"batches" is 1; it must be at least 2'),
+        ({"a": {"type": "path"}, "batches": 2.5}, '"batches" is 2.5; .* type int'),
+        ({"a": {"type": "variance", "n": {"type": "path"}}}, "nested in another"),
+        ({"a": {"type": "neepp", "aovs": "variance:albedo"}}, 'AOV of the name "variance.B"'),
+    ],
+)
+def test_wrong_use_is_explained(parameters, message):
+    with pytest.raises((TypeError, ValueError, RuntimeError), match=f'"variance".*{message}'):
+        mi.load_dict({"type": "variance", **parameters})
+
+
+@pytest.mark.parametrize("unknown", ["max_depth", "hide_emitters", "timeout", "spp"])
+def test_parameters_of_the_nested_integrator_are_refused(unknown):
+    with pytest.raises(RuntimeError, match=f'unreferenced.*"variance"(.|\n)*{unknown}'):
+        _variance(**{unknown: 4})
+
+
+@pytest.mark.parametrize("outer", [{"type": "moment"}, {"type": "aov", "aovs": "d:depth"}])
+def test_integrators_that_draw_single_samples_refuse_to_nest_it(outer):
+    with pytest.raises(RuntimeError, match="Child objects must be of type 'SamplingIntegrator'"):
+        mi.load_dict({**outer, "x": {"type": "variance", "nested": {"type": "path"}}})
+
+
+def test_gradients_are_refused_with_a_hint_at_prb():
+    scene = _scene(4, 4)
+    parameters = mi.traverse(scene)
+    key = "light.emitter.radiance.value"
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    integrator = _variance("prb")
+    image = mi.render(scene, parameters, integrator=integrator, spp=4)
+    with pytest.raises((NotImplementedError, RuntimeError)) as caught:
+        dr.backward(dr.sum(image))
+    error, texts = caught.value, ""
+    while error is not None:
+        texts, error = texts + str(error), error.__cause__ or error.__context__
+    assert '"variance" does not compute gradients' in texts and '"prb"' in texts
+    for method, arguments in (("render_forward", ()), ("render_backward", (None,))):
+        with pytest.raises(NotImplementedError, match='"variance".*"prb"'):
+            getattr(integrator, method)(scene, parameters, *arguments)
