@@ -1,8 +1,9 @@
 # Needs: Debian or Ubuntu (others: see mitsuba_ext/llvm.py), make, apt, Python >= 3.9 with venv.
 #
-#   make demo    compares our integrator with `path` on one of our scenes, in about two minutes
+#   make demo    compares our integrator with `path` on two of our scenes, in about three minutes
 #   make test    runs the default tests
-#   make bench   runs the benchmarks on our scenes, and on ../shared/scenes where it exists
+#   make bench   runs the benchmarks on our scenes, and on ../shared/scenes where it exists; writes a
+#                report, and the figures of the README
 #   make lint    checks the code's style
 #   make clean   removes what was built, `.venv` included; `out/` stays
 #
@@ -13,14 +14,14 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 
 DEMO_OUT := out/demo
-DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml path neepp \
-        --spp 64 --seeds 3 --reference-spp 1024 --out $(DEMO_OUT)
+DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml scenes/rooms.xml path neepp \
+        --sweep 4,16,64 --seeds 3 --reference-spp 1024 --out $(DEMO_OUT)
 
 .PHONY: demo test bench lint setup clean
 
 demo: setup
 	$(DEMO)
-	@echo "Files written:" && find $(DEMO_OUT) -type f | sort
+	@echo "Open $(DEMO_OUT)/report.html in a browser."
 
 test: setup
 	$(BIN)/python -m pytest -q

@@ -1,15 +1,19 @@
 """Speed against error of our integrators and ``path``, on our scenes and on those of the papers.
 
-``make bench`` runs all of it (about an hour on two cores); ``examples/benchmark.py open kitchen``
-runs some scenes. Every table of figures in the README comes from here.
+``make bench`` runs all of it (about 50 minutes on two cores), writes one report, and puts its
+figures into the README; ``examples/benchmark.py open kitchen`` runs some scenes, and leaves the
+README alone. What ``out/benchmark`` holds already is not rendered again.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import click
-from rich.console import Console
+from rich.progress import Progress
 
 from mitsuba_ext import compare
 
@@ -34,6 +38,9 @@ THEIRS = {
 #: Depth of the stored references, and of everything that is compared with them.
 DEPTH = {"max_depth": 6}
 
+README = ROOT / "README.md"
+FIGURE = ROOT / "examples" / "figures" / "efficiency.svg"
+
 
 @click.command()
 @click.argument("names", nargs=-1)
@@ -56,30 +63,93 @@ def main(
     unknown = set(names) - set(available)
     if unknown:
         raise click.UsageError(f"no scene {', '.join(sorted(unknown))}: {', '.join(available)}")
-    for name in names or available:
-        folder = out / name
-        folder.mkdir(parents=True, exist_ok=True)
-        scene, reference = _load(name, folder, reference_spp)
-        experiment = compare.Experiment(scene, integrators or INTEGRATORS, spp, range(seeds))
-        experiment.run(reference, finished=compare.image_writer(folder, experiment))
-        compare.write_results(folder / "results.json", experiment)
-        Console().print(compare.table(experiment))
-        print(f"{folder / 'results.json'}\n", flush=True)
+    comparison = compare.Comparison(
+        [_setup(name) for name in names or available],
+        integrators or INTEGRATORS,
+        compare.equal_samples(spp),
+        seeds=seeds,
+        folder=out,
+        reference_spp=reference_spp,
+        command="examples/benchmark.py",
+    )
+    with Progress() as progress:
+        bar = progress.add_task("")
+        results = comparison.run(
+            lambda step: progress.update(
+                bar, description=step.label, completed=step.done, total=step.done + (step.left or 0)
+            )
+        )
+    compare.show(results)
+    print(out / "report.html")
+    if not names and not integrators:
+        _write_table(results)
+        _write_figure(results)
 
 
-def _load(
-    name: str, folder: Path, reference_spp: int
-) -> tuple[compare.LoadedScene, compare.Reference]:
-    """The scene and what to measure it against."""
+def _setup(name: str) -> compare.SceneSetup:
     if name in OURS:
-        path = ROOT / "scenes" / f"{name}.xml"
-        scene = compare.load_scene(path, parameters=DEPTH, keep_integrator=False)
-        return scene, compare.render_reference(scene, reference_spp, folder)
+        return compare.SceneSetup(ROOT / "scenes" / f"{name}.xml", parameters=DEPTH)
     width, height = THEIRS[name]
-    path = SHARED / name / "scene.xml"
-    scene = compare.load_scene(path, THEIRS[name], DEPTH, keep_integrator=False)
-    reference = SHARED / name / f"reference_path_depth6_{width}x{height}.exr"
-    return scene, compare.load_reference(reference, scene.size)
+    return compare.SceneSetup(
+        SHARED / name / "scene.xml",
+        (width, height),
+        DEPTH,
+        SHARED / name / f"reference_path_depth6_{width}x{height}.exr",
+    )
+
+
+def _write_table(results: dict[str, Any]) -> None:
+    """Replaces the table between the marks in the README."""
+    text = README.read_text(encoding="utf-8")
+    marks = "<!-- benchmark: begin -->", "<!-- benchmark: end -->"
+    pattern = f"(?<={marks[0]}\n).*(?={marks[1]})"
+    table = "\n".join(_table(results)) + "\n"
+    README.write_text(re.sub(pattern, lambda _: table, text, flags=re.DOTALL), encoding="utf-8")
+
+
+def _table(results: dict[str, Any]) -> Iterator[str]:
+    columns = ["scene", "`path`"]
+    for label in INTEGRATORS[1:]:
+        columns += [f"`{label}` time", "error", "shadow rays", "efficiency"]
+    yield "| " + " | ".join(columns) + " |"
+    yield "|" + "---|" * len(columns)
+    for scene in results["scenes"]:
+        first, *others = (record["levels"][-1] for record in scene["integrators"])
+        cells = [scene["name"], f"{first['figures']['seconds']['value']:.1f} s"]
+        for level in others:
+            ratios, share = level["ratios"], level["figures"]["shadow_share"]
+            cells += [
+                f"{ratios['seconds']['value']:.2f}",
+                f"{ratios['relmse_trimmed']['value']:.2f}",
+                f"{share['value']:.0%}",
+                "{value:.2f} [{low:.2f}, {high:.2f}]".format(**ratios["efficiency"]),
+            ]
+        yield "| " + " | ".join(cells) + " |"
+
+
+def _write_figure(results: dict[str, Any]) -> None:
+    """Efficiency relative to ``path`` with its intervals, a row per scene."""
+    from matplotlib.figure import Figure
+
+    scenes = results["scenes"]
+    figure = Figure(figsize=(7, 0.5 + 0.42 * len(scenes)), layout="constrained")
+    axes = figure.subplots()
+    for number, label in enumerate(INTEGRATORS[1:]):
+        ratios = [scene["integrators"][number + 1]["levels"][-1]["ratios"]["efficiency"]
+                  for scene in scenes]
+        values = [ratio["value"] for ratio in ratios]
+        errors = [[ratio["value"] - ratio["low"] for ratio in ratios],
+                  [ratio["high"] - ratio["value"] for ratio in ratios]]
+        rows = [row + 0.2 * (number - 0.5) for row in range(len(scenes))]
+        axes.errorbar(values, rows, xerr=errors, fmt="os"[number], capsize=3, label=label)
+    axes.axvline(1, color="gray", linewidth=0.8)
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(scenes)), [scene["name"] for scene in scenes])
+    axes.invert_yaxis()
+    axes.set_xlabel("efficiency relative to path (95 % interval)")
+    axes.legend()
+    FIGURE.parent.mkdir(exist_ok=True)
+    figure.savefig(FIGURE, metadata={"Date": None})
 
 
 if __name__ == "__main__":

@@ -123,7 +123,8 @@ class Variance(mi.AdjointIntegrator):
             raise ValueError(
                 f'"{self.name}": exactly one integrator must be nested in it; found {found}'
             )
-        if isinstance(children[0], Variance):
+        # Not by name: once another variant is selected, the module's name is that one's class
+        if isinstance(children[0], type(self)):
             raise ValueError(f'"{self.name}": cannot be nested in another "{self.name}"')
         taken = {_PREFIX + color for color in "RGBXYZ"} & set(children[0].aov_names())
         if taken:

@@ -166,6 +166,25 @@ def test_integrators_take_turns(clock, tmp_path):
     assert [call for call in calls if call[1] == 64] == [(0, 64), (0, 64), (1, 64), (1, 64)]
 
 
+def test_costs_of_real_integrators_are_known_as_far_as_they_can_be(tmp_path):
+    ball = {"type": "sphere", "to_world": mi.ScalarTransform4f().translate([0, 0, 5]),
+            "bsdf": {"type": "diffuse", "reflectance": 0.0}}
+    comparison = compare.Comparison(
+        {**WHITE, "ball": ball}, ["composed_path", "path", "prb"], compare.equal_samples(16),
+        seeds=1, folder=tmp_path, reference_spp=64,
+    )
+    ours, path, prb = comparison.run()["scenes"][0]["integrators"]
+    ours, path, prb = (record["levels"][0]["figures"] for record in (ours, path, prb))
+    # The black ball brings nothing back, the sky does
+    assert path["zero_radiance"]["value"] == pytest.approx(ours["zero_radiance"]["value"], abs=0.02)
+    assert 0.05 < path["zero_radiance"]["value"] < 0.5
+    assert prb["zero_radiance"] is None  # no single samples without gradients
+    assert ours["rays"]["value"] >= 16 * 32 * 24 and path["rays"] is None
+    for figures in (ours, path, prb):
+        assert figures["memory"]["value"] > 1000 and figures["launches"]["value"] >= 1
+        assert figures["spp"]["value"] == 16 and figures["seconds"]["value"] > 0
+
+
 # ---- The reference ----
 
 

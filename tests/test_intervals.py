@@ -60,6 +60,7 @@ def test_slope_and_cost_of_an_exact_law():
     assert slope == pytest.approx((-1, -1, -1))
     assert intervals.cost_of(0.25, spp, error) == pytest.approx((32, 32, 32))
     assert intervals.cost_of(0.25, spp, spp) is None  # the error grows
+    assert intervals.cost_of(0.25, [4, 8, 16], [1, 3, 0.9]).low is None  # it may not fall
     assert intervals.slope([4, 4], [1, 2]) is None
     assert intervals.slope([4, 8], [1, 0.5]) == Estimate(pytest.approx(-1))
 

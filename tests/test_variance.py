@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hard_cases import film, sensor, stage
+from hard_cases import film, lookat, sensor, stage
 from statistical import THRESHOLD, z_exact
 
 from mitsuba_ext.batches import Batches, batch_seeds, render_batches
@@ -103,14 +103,20 @@ def test_variance_is_that_of_the_mean_of_all_samples(lattice, batches):
     assert abs(z_exact((mean - p) ** 2 - variance, 0.0)[0]) < THRESHOLD
 
 
-@pytest.mark.parametrize("nested", ["path", "ptracer", "neepp"])
-@pytest.mark.parametrize("sampler", ["independent", "ldsampler"])
+@pytest.mark.parametrize(
+    ("nested", "sampler"),
+    [("path", "independent"), ("path", "ldsampler"), ("ptracer", "independent"),
+     ("neepp", "independent")],
+)  # fmt: skip
 def test_variance_announces_the_differences_of_independent_renders(nested, sampler):
     """E[(a − b)²] = Var a + Var b, for a wide filter too."""
-    scene = _scene(12, 12, sampler=sampler, rfilter={"type": "gaussian"})
-    integrator = _variance({"type": nested, "max_depth": 3}, batches=8)
+    # Below the lamp: its edge would decide everything
+    view = lookat([0, -4, 1.2], [0, 0, -0.2], [0, 0, 1])
+    wide = film(12, 12, rfilter={"type": "gaussian"})
+    scene = mi.load_dict(stage(camera=sensor(to_world=view, film=wide, sampler=sampler)))
+    integrator = _variance({"type": nested, "max_depth": 3}, batches=4)
     images = [
-        mi.render(scene, integrator=integrator, spp=128, seed=seed).numpy().astype(np.float64)
+        mi.render(scene, integrator=integrator, spp=64, seed=seed).numpy().astype(np.float64)
         for seed in range(24)
     ]
     a, b = np.array(images[::2]), np.array(images[1::2])
@@ -118,7 +124,7 @@ def test_variance_announces_the_differences_of_independent_renders(nested, sampl
     announced = (a + b)[..., 3:].mean(axis=(1, 2, 3))
     assert abs(z_exact(squares - announced, 0.0)[0]) < THRESHOLD
     error = (squares - announced).std(ddof=1) / math.sqrt(len(a))
-    assert error < 0.2 * announced.mean(), "too noisy to say anything"
+    assert error < 0.1 * announced.mean(), "too noisy to say anything"
 
 
 def test_update_keeps_small_variances_of_large_means():
@@ -166,7 +172,7 @@ def test_non_finite_batch_can_be_reported_and_is_not_averaged_away():
     class Broken(mi.SamplingIntegrator):
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             image = mi.load_dict({"type": "path"}).render(scene, sensor, seed, spp)
-            return image if seed != 2 else image * mi.Float(math.inf) * 0
+            return image if seed != 2 else image * math.nan
 
     def check(batches: Batches) -> None:
         if not np.isfinite(batches.mean).all():
@@ -238,9 +244,10 @@ def test_the_samplers_count_is_used_and_left_as_it_was():
 # ---- The film ----
 
 
-@pytest.mark.parametrize("pixel_format", FORMATS)
-@pytest.mark.parametrize("nested", ["path", "ptracer"])
-def test_film_develops_the_mean_in_every_pixel_format(pixel_format, nested):
+@pytest.mark.parametrize(
+    ("nested", "pixel_format"), [*(("path", name) for name in FORMATS), ("ptracer", "xyza")]
+)
+def test_film_develops_the_mean_in_every_pixel_format(nested, pixel_format):
     scene = _scene(7, 5, pixel_format=pixel_format, rfilter={"type": "gaussian"})
     integrator = _variance(nested)
     image = mi.render(scene, integrator=integrator, spp=16, seed=2).numpy()
@@ -300,7 +307,7 @@ def test_other_variants(variant):
 
 def test_aovs_of_the_nested_integrator_are_passed_on_as_means():
     scene = _scene(8, 6)
-    ours = _variance({"type": "neepp", "aovs": "d:depth,n:sh_normal"})
+    ours = _variance({"type": "composed_path", "aovs": "d:depth,n:sh_normal"})
     image = mi.render(scene, integrator=ours, spp=16).numpy()
     assert ours.aov_names()[:4] == ["d.T", "n.X", "n.Y", "n.Z"]
     channels = _film_channels(scene)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 import importlib.util
 import re
 import sys
@@ -14,7 +15,7 @@ import click
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import Progress, ProgressColumn
 
     from ..compare.experiment import Step
 
@@ -111,8 +112,12 @@ def _import_module(name: str) -> None:
 
 
 @contextlib.contextmanager
-def progress_bars() -> Iterator[Progress]:
-    """A progress bar on stderr, if that is a terminal."""
+def progress_bars(*columns: ProgressColumn) -> Iterator[Progress]:
+    """Progress bars on stderr, if that is a terminal.
+
+    Args:
+        columns: What follows the label, the bar and the time; default: rich's estimate of the rest.
+    """
     from rich import progress as bars
     from rich.console import Console
 
@@ -122,7 +127,7 @@ def progress_bars() -> Iterator[Progress]:
         bars.TextColumn("{task.description}", markup=False),
         bars.BarColumn(),
         bars.TimeElapsedColumn(),
-        bars.TimeRemainingColumn(),
+        *(columns or [bars.TimeRemainingColumn()]),
     )
     with bars.Progress(
         *columns, console=console, disable=not terminal, transient=True
@@ -133,12 +138,19 @@ def progress_bars() -> Iterator[Progress]:
 @contextlib.contextmanager
 def progress_line() -> Iterator[Callable[[Step], None]]:
     """What ``Comparison.run`` reports to: a progress bar with an estimate of the time left."""
-    with progress_bars() as bars:
-        bar = bars.add_task("loading", total=None)
+    from rich.progress import TextColumn
+
+    with progress_bars(TextColumn("{task.fields[left]}", markup=False)) as bars:
+        bar = bars.add_task("loading", total=None, left="")
 
         def show(step: Step) -> None:
-            total = None if step.left is None else max(step.done + step.left, 1e-9)
-            bars.update(bar, description=step.label, total=total, completed=step.done)
+            total = left = None
+            if step.left is not None:
+                total = max(step.done + step.left, 1e-9)
+                left = f"about {datetime.timedelta(seconds=round(step.left))} left"
+            bars.update(
+                bar, description=step.label, total=total, completed=step.done, left=left or ""
+            )
 
         yield show
 

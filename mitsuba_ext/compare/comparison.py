@@ -157,7 +157,8 @@ class Comparison:
         )
 
         def report_step(step: Step) -> None:
-            progress(step._replace(label=f"{name}: {step.label}"))
+            count = f" ({len(self._records) + 1} of {len(self.scenes)})" * (len(self.scenes) > 1)
+            progress(step._replace(label=f"{name}{count}: {step.label}"))
 
         if setup.reference:
             reference = references.load_reference(setup.reference, scene.size)

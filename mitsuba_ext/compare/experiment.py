@@ -24,9 +24,10 @@ from .budgets import Budget
 from .machine import machine, versions
 from .references import Reference
 from .runs import Run, RunFolder
+from .zero_radiance import zero_radiance_share
 
 #: How far the time of a run may be from what was asked for before it is repeated, and how often.
-_TIME_TOLERANCE = 0.03
+_TIME_TOLERANCE = 0.05
 _TIME_ATTEMPTS = 3
 
 #: ``until`` goes no further than this where the reference does not say how many samples it has.
@@ -64,6 +65,7 @@ class Contender:
     compile_seconds: float = 0.0
     error: str = ""
     notes: list[str] = field(default_factory=list)
+    _zero_radiance: float | None = None  # where the integrator does not count it
     _pace: float | None = None  # seconds per sample per pixel
     _is_prepared: bool = False
 
@@ -220,7 +222,7 @@ class Experiment:
             seconds=timed.seconds,
             rays=dict(report.rays) if report else {},
             connections=report.connections if report else None,
-            zero_radiance=report.zero_radiance if report else None,
+            zero_radiance=report.zero_radiance if report else contender._zero_radiance,
             memory=timed.memory or None,
             launches=timed.launches,
         )
@@ -236,22 +238,19 @@ class Experiment:
     def _render(self, contender: Contender, level: float, seed: int) -> timing.Timed:
         """A render that compiled nothing and, where a time is to be filled, filled it."""
         spp = self._samples(contender, level)
-        for attempt in range(_TIME_ATTEMPTS):
+        attempts: list[timing.Timed] = []
+        while len(attempts) < _TIME_ATTEMPTS:
             timed = self._timed(contender, spp, seed)
             if timed.compiled:
                 timed = self._timed(contender, spp, seed)
-            deviation = timed.seconds / level - 1
-            is_last = attempt == _TIME_ATTEMPTS - 1
-            better = max(1, round(spp / (1 + deviation)))
-            if (
-                not self.budget.is_time
-                or abs(deviation) <= _TIME_TOLERANCE
-                or better == spp
-                or is_last
-            ):
+            if not self.budget.is_time:
                 return timed
+            attempts.append(timed)
+            better = max(1, round(spp * level / timed.seconds))
+            if abs(timed.seconds / level - 1) <= _TIME_TOLERANCE or better == spp:
+                break
             spp = better
-        raise AssertionError("unreachable")
+        return min(attempts, key=lambda timed: abs(timed.seconds - level))
 
     def _prepare(self, contender: Contender, path: Path) -> None:
         """Compiles what the runs will need, of which ``path`` is the first, and finds out how fast
@@ -264,6 +263,7 @@ class Experiment:
 
     def _warm_up(self, contender: Contender) -> None:
         self._progress(Step(f"{contender.label}: compiling", self._done, None))
+        integrator = contender.named.integrator
         counts = () if self.budget.is_time else self._counts()
         # The kernel for one sample per pixel differs from that for many, and that for a power of
         # two from that for other counts (Mitsuba divides the index of a sample by the count).
@@ -272,12 +272,14 @@ class Experiment:
         if self.budget.is_time:
             seconds = self.budget.values[0]
             spp = timing.samples_for(
-                seconds, contender.named.integrator, self.scene.scene, self._seed(0, 0)
+                seconds, integrator, self.scene.scene, self._seed(0, 0)
             )
             contender._pace = seconds / spp
         else:
             timed = self._timed(contender, spp, seed=0)
             contender._pace = timed.seconds / timed.spp
+        if timing.own_statistics(integrator) is None:
+            contender._zero_radiance = zero_radiance_share(integrator, self.scene.scene, seed=0)
 
     def _timed(self, contender: Contender, spp: int, seed: int) -> timing.Timed:
         timed = timing.timed_render(contender.named.integrator, self.scene.scene, seed, spp)

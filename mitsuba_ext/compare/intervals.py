@@ -65,7 +65,8 @@ def slope(x: Sequence[float], y: Sequence[float]) -> Estimate | None:
 
 def cost_of(target: float, x: Sequence[float], y: Sequence[float]) -> Estimate | None:
     """The ``x`` at which the line through log y against log x reaches ``target`` (inverse
-    prediction, by the delta method); ``None`` if y does not fall."""
+    prediction, by the delta method); ``None`` if y does not fall, and without an interval where it
+    may not."""
     fit = _log_fit(x, y)
     if fit is None or not fit.slope < 0:
         return None
@@ -73,8 +74,11 @@ def cost_of(target: float, x: Sequence[float], y: Sequence[float]) -> Estimate |
     count = len(fit.x)
     if count < 3:
         return Estimate(math.exp(at))
+    uncertainty = _student(count - 2) * fit.deviation
+    if fit.slope + uncertainty / math.sqrt(fit.spread) >= 0:
+        return Estimate(math.exp(at))
     leverage = 1 / count + (at - fit.mean_x) ** 2 / fit.spread
-    half = _student(count - 2) * fit.deviation / -fit.slope * math.sqrt(leverage)
+    half = uncertainty / -fit.slope * math.sqrt(leverage)
     return Estimate(math.exp(at), math.exp(at - half), math.exp(at + half))
 
 

@@ -26,8 +26,10 @@ class Window(NamedTuple):
         """That part of an image."""
         return pixels[self.y : self.y + self.side, self.x : self.x + self.side]
 
-    def overlaps(self, other: Window) -> bool:
-        return max(abs(self.x - other.x), abs(self.y - other.y)) < self.side
+    def distance(self, other: Window) -> int:
+        """Of the corners, along the axis on which it is larger; from ``side`` on, windows do not
+        overlap."""
+        return max(abs(self.x - other.x), abs(self.y - other.y))
 
 
 def choose_windows(errors: Sequence[np.ndarray], floor: float) -> list[Window]:
@@ -53,15 +55,18 @@ def choose_windows(errors: Sequence[np.ndarray], floor: float) -> list[Window]:
     columns = np.arange(0, width - side + 1, step)
     means = np.stack([_window_means(one, side, rows, columns) for one in logarithms])
     scores = means.var(axis=0) if len(errors) > 1 else means[0]
-    chosen: list[Window] = []
     # Stable: equal scores stay in reading order, so that the same images give the same windows
-    for index in np.argsort(-scores, axis=None, kind="stable"):
-        row, column = np.unravel_index(index, scores.shape)
-        window = Window(int(columns[column]), int(rows[row]), side)
-        if not any(window.overlaps(other) for other in chosen):
-            chosen.append(window)
-            if len(chosen) == COUNT:
-                break
+    order = np.argsort(-scores, axis=None, kind="stable")
+    candidates = [
+        Window(int(columns[index % len(columns)]), int(rows[index // len(columns)]), side)
+        for index in order.tolist()
+    ]
+    chosen: list[Window] = []
+    # First with room between them: three windows on one edge show one thing three times
+    for distance in (2 * side, side):
+        for window in candidates:
+            if len(chosen) < COUNT and all(window.distance(one) >= distance for one in chosen):
+                chosen.append(window)
     return chosen
 
 

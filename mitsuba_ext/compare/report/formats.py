@@ -49,7 +49,7 @@ def figure(estimate: Mapping[str, float | None] | None, unit: Unit) -> Text:
     if low is None or high is None:
         return Text(value)
     factor, _ = unit(estimate["value"])
-    ends = digits(low / factor), digits(high / factor)
+    ends = number(low / factor), number(high / factor)
     if ends[0] == ends[1]:
         return Text(value)  # a count that is the same in all runs, or nearly
     # A dash next to a minus sign would be hard to read

@@ -9,9 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
@@ -19,6 +18,9 @@ from . import crops, formats, pictures, plots, records, tables
 from .charts import make_charts
 from .pictures import Picture, Pictures
 from .records import Record
+
+if TYPE_CHECKING:
+    import jinja2
 
 _FOLDER = Path(__file__).parent
 
@@ -70,6 +72,8 @@ def render_page(results: Record, folder: Path) -> str:
 
 
 def _environment() -> jinja2.Environment:
+    import jinja2
+
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_FOLDER, encoding="utf-8"),
         autoescape=True,
@@ -85,8 +89,8 @@ def _environment() -> jinja2.Environment:
 
 
 def _breakable(label: str) -> Markup:
-    """A label that may be broken where its parts meet: ``neepp:`` ``max_depth=`` ``6,`` …"""
-    return Markup("<wbr>").join(re.split(r"(?<=[:,=/])", label))
+    """A label that may be broken where its parts meet: ``neepp:`` ``max_depth=6,`` ``grid=8``."""
+    return Markup("<wbr>").join(re.split(r"(?<=[:,])", label))
 
 
 def _scene(

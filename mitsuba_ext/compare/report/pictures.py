@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from ...scenes import InputError
 from .. import metrics, reading
@@ -186,6 +185,8 @@ def color_table() -> np.ndarray:
 
 def png(pixels: np.ndarray, palette: np.ndarray | None = None) -> str:
     """A PNG as ``data:`` URI; with a palette, ``pixels`` are its indices."""
+    from PIL import Image
+
     image = Image.fromarray(np.ascontiguousarray(pixels))
     if palette is not None:
         image.putpalette(palette.tobytes())

@@ -128,9 +128,9 @@ def _draw(axes, series: Series) -> None:
         [point.x[0] for point in points], [point.y[0] for point in points], linestyle="none",
         marker=marker, markersize=6.5, color=color, markeredgewidth=0,
     )
-    if series.slope is not None and len(points) > 1:
-        # Through the centre of the points, as every least-squares line is
-        x, y = (np.log([getattr(point, axis)[0] for point in points]) for axis in "xy")
+    if series.slope is not None and len(runs) > 1:
+        # Through the centre of the runs, as every least-squares line is
+        x, y = np.log(runs).T
         line = np.array([x.min(), x.max()])
         axes.plot(
             np.exp(line), np.exp(y.mean() + series.slope * (line - x.mean())), color=color, lw=1.2

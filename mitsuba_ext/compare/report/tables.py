@@ -77,7 +77,7 @@ def make_table(scene: Record, level: float | None, target: float | None = None) 
             (one, [_cell(column, one, record) for column in used] if record else [])
             for one, record in rows
         ],
-        unrecorded=[column.heading for column in columns if column not in used],
+        unrecorded=[one.heading for one in (*_RUN, *_ERRORS, *_WORK) if one not in used],
     )
 
 

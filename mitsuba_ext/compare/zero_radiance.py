@@ -1,0 +1,36 @@
+"""The share of samples that bring nothing back, of integrators that do not count it themselves."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+#: About so many samples tell the share to a tenth of a percent.
+_SAMPLES = 1 << 18
+
+
+def zero_radiance_share(integrator: mi.Integrator, scene: mi.Scene, seed: int) -> float | None:
+    """The share of camera samples whose radiance is zero; ``None`` if the integrator cannot be
+    asked for single samples (a light tracer, or one that needs gradients)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from .. import camera
+
+    if not isinstance(integrator, mi.SamplingIntegrator) or not dr.is_jit_v(mi.Float):
+        return None
+    sensor = scene.sensors()[0]
+    width, height = camera.film_extent(sensor.film())
+    spp = max(1, _SAMPLES // (width * height))
+    try:
+        sampler = sensor.sampler().clone()
+        sampler.set_sample_count(spp)
+        spp = sampler.sample_count()
+        sampler.seed(seed, width * height * spp)
+        ray, _weight, _position = camera.sample_rays(sensor, sampler, spp, spp)
+        L = integrator.sample(scene, sampler, ray, None, mi.Bool(True))[0]
+    except (TypeError, RuntimeError):
+        return None  # another signature, or a sampler that cannot be copied
+    return float(dr.mean(dr.select(dr.max(dr.abs(L)) == 0, mi.Float(1), mi.Float(0)))[0])
