@@ -7,7 +7,8 @@ Metropolis) or whose samples depend on each other (learning), since it looks at 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -43,6 +44,28 @@ class Batches:
         self._state = (count + 1, mean, squares)
         self.spp += spp
 
+    def save(self, path: Path) -> None:
+        """Writes everything to a file, from which :meth:`load` makes an equal object."""
+        count, mean, squares = self._state
+        with open(path, "wb") as file:
+            np.savez(
+                file, channels=self.channels, image_channel_count=self.image_channel_count,
+                spp=self.spp, count=count, mean=mean, squares=squares,
+            )
+
+    @classmethod
+    def load(cls, path: Path) -> Batches:
+        """Reads what :meth:`save` wrote.
+
+        Raises:
+            OSError, ValueError, KeyError, zipfile.BadZipFile: The file is missing or damaged.
+        """
+        with np.load(path) as stored:
+            batches = cls(stored["channels"].tolist(), int(stored["image_channel_count"]))
+            batches.spp = int(stored["spp"])
+            batches._state = (int(stored["count"]), stored["mean"], stored["squares"])
+        return batches
+
     @property
     def count(self) -> int:
         return self._state[0]
@@ -62,51 +85,28 @@ class Batches:
         return squares / (count - 1) / count
 
 
-def render_batches(
-    integrator: mi.Integrator,
-    scene: mi.Scene,
-    sensor: int | mi.Sensor,
-    batch_spp: int,
-    seeds: Sequence[int],
-    progress: Callable[[float], None] | None = None,
-    check: Callable[[Batches], None] | None = None,
-) -> Batches:
-    """Renders one batch per seed.
-
-    Args:
-        integrator, scene, sensor: What to render; a sensor may be given by its index.
-        batch_spp: Samples per pixel of each batch; stratified samplers round up.
-        seeds: Of the batches. All different, and such that the integrator's own use of a seed does
-            not make images depend on each other: :func:`batch_seeds`.
-        progress: Called after each batch with the fraction that is done.
-        check: Called after each batch, before ``progress``, with the batches so far. It may raise,
-            for instance where the mean holds NaN.
-    """
-    batches = None
-    for batches in each_batch(integrator, scene, sensor, batch_spp, seeds):
-        if check is not None:
-            check(batches)
-        if progress is not None:
-            progress(batches.count / len(seeds))
-    if batches is None:
-        raise ValueError("there must be at least one seed")
-    return batches
-
-
 def each_batch(
     integrator: mi.Integrator,
     scene: mi.Scene,
     sensor: int | mi.Sensor,
     batch_spp: int,
     seeds: Iterable[int],
+    batches: Batches | None = None,
 ) -> Iterator[Batches]:
-    """As :func:`render_batches`, in steps: yields, after each batch, one and the same object. The
-    caller may stop at any time, and keeps the finished batches after an exception."""
+    """Renders one batch per seed, in steps: yields, after each batch, one and the same object. The
+    caller may stop at any time, and keeps the finished batches after an exception.
+
+    Args:
+        integrator, scene, sensor: What to render; a sensor may be given by its index.
+        batch_spp: Samples per pixel of each batch; stratified samplers round up.
+        seeds: Of the batches. All different, and such that the integrator's own use of a seed does
+            not make images depend on each other: :func:`batch_seeds`.
+        batches: Earlier ones, to go on from.
+    """
     sensor = find_sensor(scene, sensor)
     batch_spp = sample_count(sensor, batch_spp)
     # Whatever AOVs an earlier render left there
     sensor.film().prepare([])
-    batches = None
     for seed in seeds:
         image = _render(integrator, scene, sensor, batch_spp, seed)
         if batches is None:

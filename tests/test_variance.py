@@ -14,7 +14,7 @@ import pytest
 from hard_cases import film, lookat, sensor, stage
 from statistical import THRESHOLD, z_exact
 
-from mitsuba_ext.batches import Batches, batch_seeds, render_batches
+from mitsuba_ext.batches import Batches, batch_seeds, each_batch
 from mitsuba_ext.compare import read_exr
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -153,20 +153,25 @@ def test_seeds_of_batches_are_not_shared():
     assert not set(mi.sample_tea_32(mi.UInt32(0), dr.arange(mi.UInt32, 64))[0]) & set(seeds[0])
 
 
-def test_render_batches_takes_seeds_and_reports_after_each():
+def render_batches(*arguments) -> Batches:
+    *_, batches = each_batch(*arguments)
+    return batches
+
+
+def test_batches_come_one_by_one_and_can_be_gone_on_with(tmp_path):
     scene, path = _scene(6, 5), mi.load_dict({"type": "path"})
-    fractions, counts = [], []
-    batches = render_batches(
-        path, scene, 0, 4, [7, 8, 9, 10], fractions.append, lambda b: counts.append(b.count)
-    )
-    assert fractions == [0.25, 0.5, 0.75, 1.0] and counts == [1, 2, 3, 4]
-    assert batches.channels == ("R", "G", "B") and batches.spp == 16
+    counts = [batches.count for batches in each_batch(path, scene, 0, 4, [7, 8])]
+    assert counts == [1, 2]
+    render_batches(path, scene, 0, 4, [7, 8]).save(tmp_path / "batches")
+    stored = Batches.load(tmp_path / "batches")
+    batches = render_batches(path, scene, 0, 4, [9, 10], stored)
+    assert batches.channels == ("R", "G", "B") and (batches.count, batches.spp) == (4, 16)
     images = [path.render(scene, seed=seed, spp=4).numpy() for seed in (7, 8, 9, 10)]
     np.testing.assert_allclose(batches.mean, np.mean(images, axis=0), rtol=1e-5)
     assert batches.mean.dtype == batches.variance.dtype == np.float64
 
 
-def test_non_finite_batch_can_be_reported_and_is_not_averaged_away():
+def test_non_finite_batch_is_not_averaged_away():
     scene = _scene(6, 5)
 
     class Broken(mi.SamplingIntegrator):
@@ -174,15 +179,9 @@ def test_non_finite_batch_can_be_reported_and_is_not_averaged_away():
             image = mi.load_dict({"type": "path"}).render(scene, sensor, seed, spp)
             return image if seed != 2 else image * math.nan
 
-    def check(batches: Batches) -> None:
-        if not np.isfinite(batches.mean).all():
-            raise ValueError(f"batch {batches.count}")
-
     broken = Broken(mi.Properties())
-    with pytest.raises(ValueError, match="batch 2"):
-        render_batches(broken, scene, 0, 4, [1, 2, 3], check=check)
-    batches = render_batches(broken, scene, 0, 4, [1, 2, 3])
-    assert np.isnan(batches.mean).all() and np.isnan(batches.variance).all()
+    finite = [np.isfinite(b.mean).all() for b in each_batch(broken, scene, 0, 4, [1, 2, 3])]
+    assert finite == [True, False, False]
 
 
 def test_no_batch_is_kept(monkeypatch):

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..batches import Batches, batch_seeds, each_batch
 from ..scenes import InputError, LoadedScene, scene_name
 from ..specifications import Specification, make_named
 from . import images, metrics
@@ -29,7 +30,7 @@ from .machine import versions
 BATCH_COUNT = 16
 MIN_BATCH_COUNT = 8
 
-#: Seed of the first batch: far from those of the runs that are compared with it.
+#: Seed of references, from which those of the batches follow: not one that a run has.
 FIRST_SEED = 7_000_000
 
 #: Samples from which the noise of a longer reference is foretold.
@@ -145,32 +146,31 @@ def render_reference(
         return cached
 
     path = folder / f"{stem}_{batch_spp * batch_count}spp.exr"
-    partial = _Partial(path.with_suffix(".partial.npz"), batch_spp)
+    partial = path.with_suffix(".partial.npz")
+    batches = unfinished = _unfinished(partial)
+    seeds = batch_seeds(FIRST_SEED, batch_count)[unfinished.count if unfinished else 0 :]
     start = time.perf_counter()
-    while partial.count < batch_count:
-        rendered = named.integrator.render(
-            scene.scene, sensor=0, seed=FIRST_SEED + partial.count, spp=batch_spp, develop=True
-        )
-        batch = images.to_rgb(rendered)
-        if fault := metrics.describe_non_finite(batch):
+    for batches in each_batch(named.integrator, scene.scene, 0, batch_spp, seeds, unfinished):
+        if fault := metrics.describe_non_finite(images.to_rgb(batches.mean)):
             raise InputError(f'{scene.source}: the reference of "{named.label}" has {fault}')
-        partial.add(batch)
+        with images.replacing(partial) as temporary:
+            batches.save(temporary)
         if progress is not None:
-            progress(partial.count / batch_count)
-    if not partial.mean.any():
+            progress(batches.count / batch_count)
+    mean, variance = images.to_rgb(batches.mean), images.to_rgb(batches.variance)
+    if not mean.any():
         raise InputError(f'{scene.source}: the reference of "{named.label}" is black')
     metadata = {
         **identity,
-        "spp": batch_spp * batch_count,
-        "seeds": f"{FIRST_SEED}..{FIRST_SEED + batch_count - 1}, {batch_spp} spp each",
+        "spp": batches.spp,
+        "seeds": f"{batch_count} batches of {batches.spp // batch_count} spp",
         "variance": f"of the mean, from {batch_count} independent batches",
         "seconds": time.perf_counter() - start,
         "key": key,
     }
     channels = [f"{name}.{color}" for name in ("mean", "variance") for color in _RGB]
-    pixels = np.concatenate([partial.mean, partial.variance], axis=2)
-    images.write_exr(path, pixels, channels, metadata)
-    partial.path.unlink(missing_ok=True)
+    images.write_exr(path, np.concatenate([mean, variance], axis=2), channels, metadata)
+    partial.unlink(missing_ok=True)
     return load_reference(path, scene.size)
 
 
@@ -187,36 +187,12 @@ def samples_for_noise(scene: LoadedScene, noise: float, integrator: Specificatio
     return 1 << max(0, math.ceil(math.log2(max(needed, BATCH_COUNT))))
 
 
-class _Partial:
-    """Mean and variance of the batches so far, by Welford's update: none has to be kept.
-
-    After each batch the state goes to a file, from which an interrupted reference is continued.
-    """
-
-    def __init__(self, path: Path, batch_spp: int) -> None:
-        self.path = path
-        self.count = 0
-        self.mean = self._squares = np.zeros(())
-        with contextlib.suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):
-            with np.load(path) as stored:
-                if int(stored["batch_spp"]) == batch_spp:
-                    self.mean, self._squares = stored["mean"], stored["squares"]
-                    self.count = int(stored["count"])
-        self._batch_spp = batch_spp
-
-    @property
-    def variance(self) -> np.ndarray:
-        """Of the mean."""
-        return self._squares / (self.count - 1) / self.count
-
-    def add(self, batch: np.ndarray) -> None:
-        deviation = batch.astype(np.float64) - self.mean
-        self.count += 1
-        self.mean = self.mean + deviation / self.count
-        self._squares = self._squares + deviation * (batch - self.mean)
-        with images.replacing(self.path) as temporary, open(temporary, "wb") as file:
-            np.savez(file, mean=self.mean, squares=self._squares, count=self.count,
-                     batch_spp=self._batch_spp)
+def _unfinished(path: Path) -> Batches | None:
+    """The batches of a reference that was interrupted; what is damaged is begun anew."""
+    try:
+        return Batches.load(path)
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        return None
 
 
 def _best_cached(folder: Path, stem: str, key: str) -> Reference | None:
