@@ -11,7 +11,8 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_ext import registry
-from mitsuba_ext.batches import Batches, batch_seeds, each_batch, find_sensor, sample_count
+from mitsuba_ext.batches import Batches, batch_seeds, each_batch, sample_count
+from mitsuba_ext.camera import find_sensor
 from mitsuba_ext.parameters import read_parameter
 from mitsuba_ext.rendering import RenderStatistics
 

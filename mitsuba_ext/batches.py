@@ -14,6 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .camera import find_sensor
+
 
 class Batches:
     """Mean and variance of the batches so far. Neither memory nor cost per batch grow with their
@@ -127,20 +129,6 @@ def batch_seeds(seed: int | mi.UInt32, count: int) -> list[int]:
         seed = seed[0]
     seed = operator.index(seed) & 0xFFFFFFFF
     return mi.sample_tea_32(mi.UInt32(seed), dr.arange(mi.UInt32, count))[1].numpy().tolist()
-
-
-def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
-    """The sensor that ``render(sensor=…)`` means.
-
-    Raises:
-        ValueError: There is no sensor of this index.
-    """
-    if not isinstance(sensor, int):
-        return sensor
-    sensors = scene.sensors()
-    if not 0 <= sensor < len(sensors):
-        raise ValueError(f"there is no sensor {sensor}: the scene has {len(sensors)} sensor(s)")
-    return sensors[sensor]
 
 
 def sample_count(sensor: mi.Sensor, spp: int) -> int:

@@ -6,6 +6,20 @@ import drjit as dr
 import mitsuba as mi
 
 
+def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
+    """The sensor that ``render(sensor=…)`` means.
+
+    Raises:
+        ValueError: There is no sensor of this index.
+    """
+    if not isinstance(sensor, int):
+        return sensor
+    sensors = scene.sensors()
+    if not 0 <= sensor < len(sensors):
+        raise ValueError(f"there is no sensor {sensor}: the scene has {len(sensors)} sensor(s)")
+    return sensors[sensor]
+
+
 def film_extent(film: mi.Film) -> tuple[int, int]:
     """Width and height of the sampled pixels: the crop window, plus the filter's border where the
     film wants it sampled."""

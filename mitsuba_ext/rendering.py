@@ -99,12 +99,7 @@ def render(
         ValueError: There is no such sensor, or the film has more pixels than a wavefront can hold.
         KeyboardInterrupt: Ctrl-C; the film then holds the image of the finished passes.
     """
-    if isinstance(sensor, int):
-        if not 0 <= sensor < len(scene.sensors()):
-            raise ValueError(
-                f"there is no sensor {sensor}: the scene has {len(scene.sensors())} sensor(s)"
-            )
-        sensor = scene.sensors()[sensor]
+    sensor = camera.find_sensor(scene, sensor)
     job = _Job(integrator, scene, sensor, seed, spp)
     try:
         with _deferred_interrupt() as interrupt:

@@ -14,6 +14,7 @@ import pytest
 from conftest import in_subprocess
 
 from mitsuba_ext.compare import load_reference, read_exr, write_exr
+from mitsuba_ext.compare.experiment import run_seed
 
 
 def test_compare_writes_table_results_and_images(run, make_scene, tmp_path):
@@ -41,7 +42,7 @@ def test_compare_writes_table_results_and_images(run, make_scene, tmp_path):
 
     channels, metadata = read_exr(out / second["runs"][1]["image"])
     assert channels["G"].shape == (6, 8)
-    assert (metadata["integrator"], metadata["seed"], metadata["spp"]) == ("prb", 1, 4)
+    assert (metadata["integrator"], metadata["seed"], metadata["spp"]) == ("prb", run_seed(0, 1), 4)
 
 
 def test_rendered_reference_is_kept_until_the_scene_changes(run, make_scene, tmp_path):
@@ -122,14 +123,14 @@ def test_failing_integrator_is_a_row_and_does_not_stop_the_others(run, make_scen
     class Fails(prb):
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             image = super().render(scene, sensor, seed, spp, develop, evaluate)
-            return image * float("nan") if seed == 1 else image
+            return image * float("nan") if seed == run_seed(0, 1) else image
 
-    mi.register_integrator("fails_at_seed_1", lambda props: Fails(props))
+    mi.register_integrator("fails_in_round_1", lambda props: Fails(props))
     code, out, _ = run(
-        "compare", make_scene(), "path", "fails_at_seed_1", "--spp", 2, "--out", tmp_path
+        "compare", make_scene(), "path", "fails_in_round_1", "--spp", 2, "--out", tmp_path
     )
     assert code == 1
-    assert "seed 1: 48 of 48 pixels not finite" in out
+    assert f"seed {run_seed(0, 1)}: 48 of 48 pixels not finite" in out
     path, fails = json.loads((tmp_path / "results.json").read_text())["scenes"][0]["integrators"]
     assert (len(path["runs"]), len(fails["runs"])) == (3, 1)
     assert fails["error"] and not path["error"]
@@ -142,12 +143,13 @@ def test_failing_integrator_is_a_row_and_does_not_stop_the_others(run, make_scen
 TROUBLE = """
 import os, time
 import mitsuba as mi
+from mitsuba_ext.compare.experiment import run_seed
 
 class Trouble(type(mi.load_dict({"type": "prb"}))):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        if seed == 1 and os.environ["TROUBLE"] == "abort":
+        if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "abort":
             os.abort()
-        if seed == 1 and os.environ["TROUBLE"] == "hang":
+        if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "hang":
             print("hanging", flush=True)
             while True:  # as native code, it does not hear Ctrl-C
                 try:

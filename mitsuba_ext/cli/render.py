@@ -50,6 +50,7 @@ def render(
     variant: str,
 ) -> int:
     """Render SCENE (an XML file) to an image."""
+    from ..batches import sample_count
     from ..compare import images, machine, timing
     from ..scenes import InputError, load_scene, one_line
     from ..specifications import make_named
@@ -101,7 +102,7 @@ def render(
         "integrator": name,
         "parameters": parameters,
         "seed": seed,
-        "spp": report.spp if report else timing.sample_count(loaded.scene, spp or 0),
+        "spp": report.spp if report else sample_count(loaded.scene.sensors()[0], spp or 0),
         "seconds": elapsed,
         "versions": machine.versions(),
     }

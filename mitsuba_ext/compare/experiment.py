@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -208,7 +209,7 @@ class Experiment:
         self._done += run.seconds
 
     def _measure(self, contender: Contender, index: int, round: int, path: Path) -> Run:
-        level, seed = self.budget.level(index), self._seed(index, round)
+        level, seed = self.budget.level(index), run_seed(index, round)
         timed = self._render(contender, level, seed)
         pixels = images.to_rgb(timed.image)
         if fault := metrics.describe_non_finite(pixels):
@@ -272,7 +273,7 @@ class Experiment:
         if self.budget.is_time:
             seconds = self.budget.values[0]
             spp = timing.samples_for(
-                seconds, integrator, self.scene.scene, self._seed(0, 0)
+                seconds, integrator, self.scene.scene, run_seed(0, 0)
             )
             contender._pace = seconds / spp
         else:
@@ -297,9 +298,6 @@ class Experiment:
     def _samples(self, contender: Contender, level: float) -> int:
         return max(1, round(level / contender._pace)) if self.budget.is_time else int(level)
 
-    def _seed(self, index: int, round: int) -> int:
-        return index * self.rounds + round
-
     def _seconds_left(self) -> float | None:
         """What the runs that are missing will take; unknown for ``until``."""
         if self.budget.kind == "until":
@@ -320,8 +318,14 @@ class Experiment:
         level = f"{self.budget.level(index):g}{'s' if self.budget.is_time else 'spp'}"
         named = contender.named
         return self._folder.path(
-            named.label, named.identity, level, round, self._seed(index, round)
+            named.label, named.identity, level, round, run_seed(index, round)
         )
+
+
+def run_seed(index: int, round: int) -> int:
+    """The seed of a run of the ``index``-th level. Scattered, since Mitsuba's stratified samplers
+    repeat themselves, a pixel aside, at seeds that are ``spp`` apart; 31 bits fit into an EXR."""
+    return zlib.crc32(f"level {index}, round {round}".encode()) >> 1
 
 
 def make_all(

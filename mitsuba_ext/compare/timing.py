@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, NamedTuple
 
+from ..batches import sample_count
+
 if TYPE_CHECKING:
     import mitsuba as mi
 
@@ -63,7 +65,7 @@ def timed_render(integrator: mi.Integrator, scene: mi.Scene, seed: int, spp: int
         compiled=bool(compiled),
         compile_seconds=milliseconds / 1000,
         launches=len(kernels),
-        spp=report.spp if report else sample_count(scene, spp),
+        spp=report.spp if report else sample_count(scene.sensors()[0], spp),
         memory=memory,
         image=image,
     )
@@ -107,12 +109,3 @@ def samples_for(budget: float, integrator: mi.Integrator, scene: mi.Scene, seed:
     per_sample = max((seconds - shorter) / (spp / 2), seconds / spp / 2)
     fixed = max(0.0, seconds - per_sample * spp)
     return min(_MAX_SPP, max(1, int((budget - fixed) / per_sample)))
-
-
-def sample_count(scene: mi.Scene, spp: int) -> int:
-    """Samples per pixel that an integrator of Mitsuba takes when asked for ``spp`` (0: as many as
-    the sampler says): stratified samplers round up."""
-    sampler = scene.sensors()[0].sampler().clone()
-    if spp:
-        sampler.set_sample_count(spp)
-    return int(sampler.sample_count())
