@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import in_subprocess
+from conftest import SPHERE, in_subprocess
 
 from mitsuba_ext.compare import load_reference, read_exr, write_exr
 from mitsuba_ext.compare.experiment import run_seed
@@ -43,6 +43,41 @@ def test_compare_writes_table_results_and_images(run, make_scene, tmp_path):
     channels, metadata = read_exr(out / second["runs"][1]["image"])
     assert channels["G"].shape == (6, 8)
     assert (metadata["integrator"], metadata["seed"], metadata["spp"]) == ("prb", run_seed(0, 1), 4)
+
+
+@pytest.mark.parametrize(
+    "budget, kind, levels",
+    [
+        (["--sweep", "8,2"], "sweep", [2, 8]),
+        (["--time", "0.2"], "time", [0.2]),
+        (["--until", "0.02"], "until", None),
+    ],
+)
+def test_every_budget_works_on_several_scenes(run, make_scene, tmp_path, budget, kind, levels):
+    nearer = make_scene("nearer.xml", body=SPHERE.replace('z="5"', 'z="4"'))
+    fragment = tmp_path / "mine.xml"
+    fragment.write_text('<integrator type="direct"/>')
+    out = tmp_path / "results"
+    arguments = ["compare", nearer, make_scene(), "path", fragment, *budget, "--seeds", "2"]
+    code, text, err = run(*arguments, "--reference-spp", "20000", "--out", out)
+    assert err == ""
+    # How many samples fit into a time, and whether the reference is good enough, is luck
+    assert code == 0 or kind == "time"
+    results = json.loads((out / "results.json").read_text())
+    assert results["budget"]["kind"] == kind
+    assert [scene["name"] for scene in results["scenes"]] == ["nearer", tmp_path.name]
+    for scene in results["scenes"]:
+        for record in scene["integrators"]:
+            assert record["error"] == ""
+            found = [level["level"] for level in record["levels"]]
+            assert found == levels if levels else found[0] == 8
+    assert (out / "report.html").stat().st_size > 10_000
+
+
+def test_reference_that_is_too_noisy_ends_with_exit_code_1(run, make_scene, tmp_path):
+    arguments = ("compare", make_scene(), "path", "--spp", 4096, "--seeds", 1, "--out", tmp_path)
+    code, text, _ = run(*arguments, "--reference-spp", 64)
+    assert code == 1 and "the reference is too noisy" in text
 
 
 def test_rendered_reference_is_kept_until_the_scene_changes(run, make_scene, tmp_path):

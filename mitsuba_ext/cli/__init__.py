@@ -1,8 +1,8 @@
 """The command ``mitsuba-ext``, one file per subcommand.
 
 Mitsuba's own command cannot load plugins written in Python. Exit codes: 0, 1 (a comparison in which
-an integrator failed, a problem that the doctor found), 2 (bad input: one line on stderr), 130
-(Ctrl-C).
+an integrator failed or a reference was too noisy, a problem that the doctor found), 2 (bad input:
+one line on stderr), 130 (Ctrl-C).
 """
 
 from __future__ import annotations

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -136,11 +137,15 @@ def compare(
     if interrupted:
         click.echo("interrupted: the results are of the finished runs", err=True)
         return INTERRUPTED
-    failed = (
-        scene["error"] or any(item["error"] for item in scene["integrators"])
-        for scene in results["scenes"]
+    return 1 if any(map(_has_trouble, results["scenes"])) else 0
+
+
+def _has_trouble(scene: Mapping[str, Any]) -> bool:
+    """Did something fail, or is an error not known?"""
+    return bool(scene["error"]) or any(
+        item["error"] or any(level["refused"] for level in item["levels"])
+        for item in scene["integrators"]
     )
-    return 1 if any(failed) else 0
 
 
 def _sort_out(names: Sequence[str]) -> tuple[list[Path], list[str]]:
