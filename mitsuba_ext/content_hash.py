@@ -46,9 +46,10 @@ def hash_parsed_scene(
     return digest.hexdigest()
 
 
-def hash_code(integrator: type) -> str:
+def hash_code(integrator: type) -> str | None:
     """SHA-256 over the Python files that define a class of integrators and, since any of ours may
-    be nested in it, over all files of ours that take part in a render."""
+    be nested in it, over all files of ours that take part in a render. ``None`` for a class that
+    has no file (it was written in a notebook)."""
     files = {
         path
         for path in _PACKAGE.rglob("*.py")
@@ -57,10 +58,14 @@ def hash_code(integrator: type) -> str:
     for kind in registry.plugin_names():
         files.update(registry.plugin_files(kind))
     for base in integrator.__mro__:
+        if base.__module__ in ("builtins", "mitsuba", "drjit.detail"):
+            continue  # written in C++
         try:
             files.add(Path(inspect.getfile(base)))
         except (TypeError, OSError):
-            pass  # written in C++, or in an interactive session
+            return None
+    if not all(file.is_file() for file in files):
+        return None
     digest = hashlib.sha256()
     for file in sorted({file.resolve() for file in files}):
         digest.update(file.read_bytes())
@@ -80,6 +85,8 @@ def _feed(digest: Any, value: object) -> None:
         for item in value:
             _feed(digest, item)
             digest.update(b",")
+    elif isinstance(value, (mi.Bitmap, mi.VolumeGrid)):
+        digest.update(np.array(value).tobytes())
     elif isinstance(value, mi.Object):
         digest.update(str(value).encode())
         traversed = mi.traverse(value)

@@ -19,8 +19,9 @@ from .content_hash import hash_parsed_scene
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: What a comparison has to keep equal: how long paths may be, and when roulette may end them.
-DEPTH_PARAMETERS = ("max_depth", "rr_depth")
+#: What integrators must agree on to render the same image: how long paths may be, when roulette may
+#: end them, and what the camera sees of the lights.
+SETTINGS = ("max_depth", "rr_depth", "hide_emitters")
 
 #: How Mitsuba's integrators print a depth without limit.
 _UNLIMITED = 2**32 - 1
@@ -47,7 +48,8 @@ class LoadedScene:
         path: The XML file; ``None`` for a scene made from a dict.
         parameters: The ``$name`` parameters that were passed to it.
         content_hash: SHA-256 over the XML or dict, its parameters, and all files that it names.
-        depth: ``max_depth`` and ``rr_depth`` of the scene's own integrator, as far as it has them.
+        settings: ``max_depth`` and ``rr_depth`` of the scene's own integrator, as far as it has
+            them, and ``hide_emitters`` where it is set.
         integrator_name: Plugin name of the scene's own integrator; empty if there is none.
         size: Width and height of the image in pixels (of the crop window, if there is one).
     """
@@ -56,7 +58,7 @@ class LoadedScene:
     path: Path | None
     parameters: dict[str, str]
     content_hash: str
-    depth: dict[str, int]
+    settings: dict[str, int | bool]
     integrator_name: str
     size: tuple[int, int]
 
@@ -115,7 +117,7 @@ def load_scene(
             integrator = _integrator_node(state)
             # Now: a node must not be touched after a transformation (it may be freed memory)
             integrator_name = integrator.props.plugin_name() if integrator else ""
-            depth = _depth(integrator)
+            settings = _settings(integrator)
             if not keep_integrator:
                 _drop_integrators(state)
             if size is not None:
@@ -140,7 +142,7 @@ def load_scene(
         path=path,
         parameters=strings,
         content_hash=content_hash,
-        depth=depth,
+        settings=settings,
         integrator_name=integrator_name,
         size=(int(film.crop_size()[0]), int(film.crop_size()[1])),
     )
@@ -178,13 +180,13 @@ def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None
         if node.type == mi.ObjectType.Integrator
         or (node.type == mi.ObjectType.Unknown and _is_integrator(node, ""))
     ]
-    with_depth = [node for node in nodes if DEPTH_PARAMETERS[0] in node.props]
+    with_depth = [node for node in nodes if SETTINGS[0] in node.props]
     return (with_depth or nodes or [None])[0]
 
 
-def _depth(node: mi.parser.SceneNode | None) -> dict[str, int]:
-    """``max_depth`` and ``rr_depth`` of an integrator: what the file sets, else its defaults,
-    which are only known from how it prints itself."""
+def _settings(node: mi.parser.SceneNode | None) -> dict[str, int | bool]:
+    """The :data:`SETTINGS` of an integrator: what the file sets, else the default depths, which are
+    only known from how the integrator prints itself."""
     import mitsuba as mi
 
     if node is None:
@@ -194,15 +196,15 @@ def _depth(node: mi.parser.SceneNode | None) -> dict[str, int]:
     with contextlib.suppress(Exception):  # a wrapper or an unknown plugin: no defaults to know
         properties = mi.Properties(node.props.plugin_name())
         text = str(mi.PluginManager.instance().create_object(properties))
-    depth = {}
-    for key in DEPTH_PARAMETERS:
+    settings: dict[str, int | bool] = {}
+    for key in SETTINGS:
         printed = re.search(rf"\b{key} = (-?\d+)", text)
         if key in own:
-            depth[key] = int(own[key])
+            settings[key] = own[key]
         elif printed:
             value = int(printed.group(1))
-            depth[key] = -1 if value == _UNLIMITED else value
-    return depth
+            settings[key] = -1 if value == _UNLIMITED else value
+    return settings
 
 
 def _drop_integrators(state: mi.parser.ParserState) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +34,8 @@ class NamedIntegrator:
         integrator: The integrator.
         identity: Text that changes whenever the integrator could render other images or take other
             time: its plugins, its parameters, and the code of those that are written in Python.
+            Where these cannot be known (an integrator that exists already, code without a file), it
+            is never the same again.
     """
 
     label: str
@@ -53,7 +56,7 @@ def make_named(
         specification: ``name`` or ``name:key=value,key=value``; the path of an XML file whose root
             is an ``<integrator>``, or of a JSON file with what ``mi.load_dict`` takes; such a dict;
             or an integrator that exists already (nothing is inherited then).
-        inherited: Parameters (a :attr:`LoadedScene.depth`) that apply to each integrator, nested
+        inherited: Parameters (a :attr:`LoadedScene.settings`) that apply to each integrator, nested
             ones included, that knows them and does not set them.
         label: Instead of one made from the specification.
 
@@ -78,10 +81,34 @@ def make_named(
     name, parameters, integrator = parts
     if label is None:
         label = name if isinstance(specification, mi.Integrator) else str(specification)
+    identity = _identity(specification, name, parameters, integrator)
+    return NamedIntegrator(label, name, parameters, integrator, identity)
+
+
+def _identity(
+    specification: Specification, name: str, parameters: dict[str, Any], integrator: mi.Integrator
+) -> str:
+    unique = uuid.uuid4().hex
+    if _is_alive(specification):
+        return unique
+    try:
+        state = str(integrator)
+    except Exception:  # a class in Python without to_string()
+        return unique
     is_builtin = isinstance(specification, str) and type(integrator).__module__ == "mitsuba"
     code = "" if is_builtin else hash_code(type(integrator))
-    identity = json.dumps([name, parameters, str(integrator), code], sort_keys=True, default=repr)
-    return NamedIntegrator(label, name, parameters, integrator, identity)
+    if code is None:
+        return unique
+    return json.dumps([name, parameters, state, code], sort_keys=True, default=repr)
+
+
+def _is_alive(specification: object) -> bool:
+    """Is it, or does it hold, an object whose state can change?"""
+    import mitsuba as mi
+
+    if isinstance(specification, Mapping):
+        return any(map(_is_alive, specification.values()))
+    return isinstance(specification, mi.Object)
 
 
 def is_fragment(path: Path) -> bool:
@@ -127,7 +154,7 @@ def make_integrator(
         name: The plugin's name.
         parameters: Its parameters; it is an error if the plugin does not know one of them.
         inherited: Parameters that apply where ``parameters`` does not set them and the plugin
-            knows them (a :attr:`LoadedScene.depth`).
+            knows them (a :attr:`LoadedScene.settings`).
 
     Returns:
         The integrator, and the parameters that it was made with.
@@ -151,6 +178,7 @@ def make_integrator(
         raise InputError(f'integrator "{name}": {one_line(error)}') from error
     if not isinstance(integrator, mi.Integrator):
         raise InputError(f'"{name}" is a plugin of Mitsuba, but not an integrator')
+    integrator = (integrator.expand() or [integrator])[0]  # "volpathmis" is made in two steps
     unknown = set(properties.unqueried())
     for key in own:
         if key in unknown:

@@ -184,6 +184,8 @@ class Trouble(type(mi.load_dict({"type": "prb"}))):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "abort":
             os.abort()
+        if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "exit":
+            os._exit(3)
         if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "hang":
             print("hanging", flush=True)
             while True:  # as native code, it does not hear Ctrl-C
@@ -214,11 +216,12 @@ def stored_runs(folder) -> list[int]:
     return [len(record["runs"]) for record in results["scenes"][0]["integrators"]]
 
 
-def test_integrator_that_takes_the_process_down_is_a_failed_row(make_scene, tmp_path):
-    process = troubled(make_scene(), tmp_path, "abort")
+@pytest.mark.parametrize("kind, end", [("abort", "died of SIGABRT"), ("exit", "ended with exit")])
+def test_integrator_that_takes_the_process_down_is_a_failed_row(make_scene, tmp_path, kind, end):
+    process = troubled(make_scene(), tmp_path, kind)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 1
-    assert "the process died of SIGABRT in this render" in out
+    assert f"the process {end}" in out
     assert "going on with the others" in err
     assert stored_runs(tmp_path) == [3, 1]
     # Forgiven the next time, and what is there is taken up
@@ -229,13 +232,21 @@ def test_integrator_that_takes_the_process_down_is_a_failed_row(make_scene, tmp_
 
 
 def test_second_interrupt_gives_up_the_running_render_and_reports_the_others(make_scene, tmp_path):
-    process = troubled(make_scene(), tmp_path, "hang", start_new_session=True)
+    process = troubled(make_scene(), tmp_path, "hang")
     assert process.stdout.readline() == "hanging\n"
-    for _ in range(2):  # as the terminal does: to the whole group
-        os.killpg(process.pid, signal.SIGINT)
+    for _ in range(2):
+        process.send_signal(signal.SIGINT)
         time.sleep(0.5)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 130
     assert "waiting for the running render" in err and "given up" in err
     assert stored_runs(tmp_path) == [2, 1]
     assert "report.html" in out
+
+
+def test_end_of_the_supervisor_is_the_end_of_its_worker(make_scene, tmp_path):
+    process = troubled(make_scene(), tmp_path, "hang")
+    assert process.stdout.readline() == "hanging\n"
+    process.terminate()
+    process.communicate(timeout=60)  # waits until the worker too has closed the pipe
+    assert process.returncode == -signal.SIGTERM

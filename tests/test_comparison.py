@@ -5,13 +5,14 @@ Times come from a clock that the integrators under test move themselves.
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
 import pytest
 
 from mitsuba_ext import compare
-from mitsuba_ext.compare import InputError, experiment, timing
+from mitsuba_ext.compare import InputError, experiment, runs, timing
 from mitsuba_ext.compare.experiment import run_seed
 
 import mitsuba as mi  # isort: skip
@@ -28,6 +29,10 @@ WHITE = {
     },
     "emitter": {"type": "constant"},
 }
+
+
+#: Numbers the integrators under test.
+COUNT = itertools.count()
 
 
 class Clock:
@@ -65,7 +70,9 @@ def noisy_integrator(clock, sigma=1.0, cost=0.01, fixed=0.0, fails_in=None, mean
         def to_string(self):
             return f"Noisy[{sigma}, {cost}, {fixed}, {mean}]"
 
-    return Noisy(mi.Properties("prb"))
+    name = f"noisy{next(COUNT)}"
+    mi.register_integrator(name, Noisy)
+    return name
 
 
 def compare_noisy(budget, integrators, tmp_path, **options):
@@ -232,25 +239,96 @@ def test_interrupted_reference_goes_on_where_it_was(tmp_path):
     sphere = compare.load_scene({**WHITE, "ball": ball}, keep_integrator=False)
     whole = compare.render_reference(sphere, 32, tmp_path)
 
-    class StopError(Exception):
-        pass
-
     done = []
 
     def stop(fraction):
         done.append(fraction)
         if fraction == 0.5:
-            raise StopError
+            raise KeyboardInterrupt
 
     other = tmp_path / "other"
     other.mkdir()
-    with pytest.raises(StopError):
+    with pytest.raises(KeyboardInterrupt):
         compare.render_reference(sphere, 32, other, progress=stop)
     resumed = compare.render_reference(sphere, 32, other, progress=done.append)
     assert len(done) == 16  # of 16 batches in all
     assert np.array_equal(resumed.mean, whole.mean)
     assert np.array_equal(resumed.variance, whole.variance)
     assert [path.suffix for path in other.iterdir()] == [".exr"]
+
+
+def test_failing_reference_is_an_input_error_that_names_it(clock, tmp_path):
+    def fail(props):
+        class Fails(type(mi.load_dict({"type": "prb"}))):
+            def render(self, *_, **__):
+                raise ZeroDivisionError("no light")
+
+        return Fails(props)
+
+    mi.register_integrator("fails", fail)
+    comparison = compare.Comparison(
+        WHITE, ["path"], compare.equal_samples(4), folder=tmp_path, reference_integrator="fails"
+    )
+    with pytest.raises(InputError, match='the reference of "fails" failed: no light'):
+        comparison.run()
+
+
+def test_reference_of_another_scene_or_depth_is_warned_of(clock, tmp_path):
+    reference = compare.render_reference(
+        compare.load_scene(WHITE, keep_integrator=False), 16, tmp_path
+    )
+    deeper = {**WHITE, "integrator": {"type": "path", "max_depth": 5}}
+    comparison = compare.Comparison(
+        compare.SceneSetup(deeper, reference=reference.path),
+        {"noisy": noisy_integrator(clock)},
+        compare.equal_samples(4),
+    )
+    another, depth = comparison.run()["scenes"][0]["warnings"]
+    assert "another scene" in another
+    assert depth == "the reference has max_depth 3, the scene 5"
+
+
+# ---- Scenes, films and integrators of all kinds ----
+
+
+@pytest.mark.parametrize("pixel_format", ["luminance", "luminance_alpha", "rgb", "rgba"])
+def test_aovs_and_alpha_are_not_taken_for_colours(tmp_path, pixel_format):
+    sensor = {**WHITE["sensor"], "film": {**WHITE["sensor"]["film"], "pixel_format": pixel_format}}
+    ball = {"type": "sphere", "to_world": mi.ScalarTransform4f().translate([0, 0, 5])}
+    aov = {"type": "aov", "aovs": "d:depth", "image": {"type": "path"}}
+    comparison = compare.Comparison(
+        {**WHITE, "sensor": sensor, "ball": ball}, {"path": "path", "aov": aov},
+        compare.equal_samples(4), seeds=1, folder=tmp_path, reference_spp=64,
+    )
+    path, aov = comparison.run()["scenes"][0]["integrators"]
+    errors = [record["runs"][0]["relmse"] for record in (path, aov)]
+    assert errors[1] == pytest.approx(errors[0], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "film, message",
+    [
+        ({"type": "hdrfilm", "pixel_format": "xyz"}, "xyz"),
+        ({"type": "specfilm", "band": {"type": "uniform"}}, "no RGB image"),
+    ],
+)
+def test_films_without_rgb_are_refused(film, message):
+    variant = "llvm_ad_spectral" if film["type"] == "specfilm" else "llvm_ad_rgb"
+    mi.set_variant(variant)
+    if film["type"] == "specfilm":
+        film = {"type": "specfilm", "band": {"type": "regular", "wavelength_min": 400,
+                                             "wavelength_max": 700, "values": "1, 1"}}
+    scene = {**WHITE, "sensor": {"type": "perspective", "film": film}}
+    with pytest.raises(InputError, match=message):
+        compare.Comparison(scene, ["path"], compare.equal_samples(4)).run()
+    mi.set_variant("llvm_ad_rgb")
+
+
+def test_scalar_variants_are_refused():
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(InputError, match="scalar_rgb"):
+        compare.Comparison(WHITE, ["path"], compare.equal_samples(4))
+    mi.set_variant("llvm_ad_rgb")
 
 
 # ---- Trouble ----
@@ -266,6 +344,41 @@ def test_failing_integrator_is_a_row_with_its_earlier_runs(clock, tmp_path):
     assert (len(first["runs"]), len(fails["runs"])) == (3, 1)
     assert fails["error"] == "no light"
     assert first["error"] == ""
+
+
+def test_integrator_that_ends_the_process_politely_is_a_failed_row(clock, tmp_path):
+    def leave(props):
+        class Leaves(type(mi.load_dict({"type": "prb"}))):
+            def render(self, *_, **__):
+                raise SystemExit(5)
+
+        return Leaves(props)
+
+    mi.register_integrator("leaves", leave)
+    integrators = {"first": noisy_integrator(clock), "leaves": "leaves"}
+    first, leaves = compare_noisy(compare.equal_samples(8), integrators, tmp_path)["integrators"]
+    assert len(first["runs"]) == 3 and leaves["error"] == "5"
+
+
+def test_time_that_cannot_be_met_is_noted(clock, tmp_path):
+    slow = {"slow": noisy_integrator(clock, cost=50.0)}
+    record = compare_noisy(compare.equal_time(20), slow, tmp_path)["integrators"][0]
+    assert record["runs"][0]["spp"] == 1
+    assert "3 of 3 runs took another time than 20 s" in record["notes"][0]
+
+
+def test_fireflies_are_noted(clock, tmp_path):
+    class Fireflies(type(mi.load_dict({"type": "prb"}))):
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            clock.now += spp
+            image = np.full((24, 32, 3), 1.1)
+            image[3, 4] = 50
+            return mi.TensorXf(image)
+
+    mi.register_integrator("fireflies", Fireflies)
+    scene = compare_noisy(compare.equal_samples(8), ["fireflies"], tmp_path)
+    (note,) = scene["integrators"][0]["notes"]
+    assert "0.1 % of the pixels make up 100% of relMSE" in note
 
 
 def test_scene_that_fails_is_an_entry_and_does_not_stop_the_others(clock, tmp_path):
@@ -312,6 +425,26 @@ def test_damaged_and_foreign_runs_are_rendered_again(clock, tmp_path):
     others = {"noisy": noisy_integrator(clock, sigma=3.0, calls=calls)}
     compare_noisy(compare.equal_samples(8), others, tmp_path, seeds=1)
     assert (run_seed(0, 0), 8) in calls
+
+
+def test_runs_of_a_live_object_are_not_taken_up(clock, tmp_path):
+    calls = []
+    integrator = mi.load_dict({"type": noisy_integrator(clock, calls=calls)})
+    for _ in range(2):
+        calls.clear()
+        compare_noisy(compare.equal_samples(8), {"live": integrator}, tmp_path, seeds=1)
+        assert (run_seed(0, 0), 8) in calls
+
+
+def test_times_of_different_sessions_are_not_paired(clock, tmp_path, monkeypatch):
+    integrators = {name: noisy_integrator(clock) for name in ("first", "second")}
+    compare_noisy(compare.equal_samples(8), {"first": integrators["first"]}, tmp_path)
+    monkeypatch.setattr(runs, "SESSION", "tomorrow")
+    scene = compare_noisy(compare.equal_samples(8), integrators, tmp_path)
+    assert any("different sessions" in warning for warning in scene["warnings"])
+    ratios = scene["integrators"][1]["levels"][0]["ratios"]
+    assert ratios["efficiency"]["low"] is None and ratios["seconds"]["low"] is None
+    assert ratios["relmse"]["low"] is not None
 
 
 def test_interruption_keeps_what_is_finished_and_says_so(clock, tmp_path, monkeypatch):

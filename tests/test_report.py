@@ -87,7 +87,7 @@ def make_scene(
     write_exr(folder / f"references/{name}.exr", reference, "RGB", {})
     return {
         "name": name, "path": f"/scenes/{name}.xml", "parameters": {}, "content_hash": "0",
-        "size": [width, height], "depth": {"max_depth": 6}, "error": "", "warnings": [],
+        "size": [width, height], "settings": {"max_depth": 6}, "error": "", "warnings": [],
         "reference": {
             "path": f"references/{name}.exr", "noise": None, "spp": None, "integrator": None,
             "seconds": None, "metadata": {},

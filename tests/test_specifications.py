@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 from conftest import PATH
 
@@ -32,13 +33,13 @@ def test_malformed_specification_is_refused(text):
 def test_depth_is_inherited_where_the_integrator_knows_it(make_scene):
     mi.set_variant("llvm_ad_rgb")
     loaded = load_scene(make_scene())
-    assert loaded.depth == {"max_depth": 3, "rr_depth": 5}
-    assert make_integrator("prb", {"max_depth": 7}, loaded.depth)[1]["max_depth"] == 7
-    assert make_integrator("direct", {}, loaded.depth)[1] == {}
+    assert loaded.settings == {"max_depth": 3, "rr_depth": 5}
+    assert make_integrator("prb", {"max_depth": 7}, loaded.settings)[1]["max_depth"] == 7
+    assert make_integrator("direct", {}, loaded.settings)[1] == {}
     unlimited = load_scene(make_scene("b.xml", integrator='<integrator type="path"/>'))
-    assert unlimited.depth["max_depth"] == -1
+    assert unlimited.settings["max_depth"] == -1
     nested = f'<integrator type="aov"><string name="aovs" value="d:depth"/>{PATH}</integrator>'
-    assert load_scene(make_scene("c.xml", integrator=nested)).depth["max_depth"] == 3
+    assert load_scene(make_scene("c.xml", integrator=nested)).settings["max_depth"] == 3
 
 
 DEPTH = {"max_depth": 3, "rr_depth": 7}
@@ -68,6 +69,31 @@ def test_dicts_and_integrators_are_accepted(variant):
     named = make_named(made, DEPTH, label="mine")
     assert named.label == "mine" and named.integrator is made
     assert make_named(named.integrator).label == "PathIntegrator"
+
+
+def test_plugins_that_are_made_in_two_steps_are_known_by_name(variant):
+    assert "max_depth = 3" in str(make_named("volpathmis", DEPTH).integrator)
+
+
+def test_hidden_emitters_are_inherited(variant):
+    integrator = {"type": "path", "hide_emitters": True, "max_depth": 2}
+    loaded = load_scene({**SPHERE_SCENE, "integrator": integrator})
+    assert loaded.settings == {"max_depth": 2, "rr_depth": 5, "hide_emitters": True}
+    assert make_named("neepp", loaded.settings).integrator.hide_emitters
+    assert make_named("direct", loaded.settings).parameters == {"hide_emitters": True}
+
+
+def test_code_without_a_file_and_live_objects_are_never_the_same_again(variant):
+    def identity(specification):
+        return make_named(specification, DEPTH).identity
+
+    namespace = {"Base": type(mi.load_dict({"type": "prb"})), "__name__": "notebook"}
+    exec("class InNotebook(Base): pass", namespace)
+    mi.register_integrator("in_notebook", namespace["InNotebook"])
+    live = mi.load_dict({"type": "path"})
+    nested = {"type": "aov", "aovs": "d:depth", "image": live}
+    for specification in ("in_notebook", live, nested):
+        assert identity(specification) != identity(specification)
 
 
 def test_identity_tells_parameters_and_plugins_apart(variant):
@@ -113,7 +139,7 @@ SPHERE_SCENE = {
 
 def test_scene_from_a_dict(variant):
     loaded = load_scene(SPHERE_SCENE, keep_integrator=False)
-    assert (loaded.path, loaded.size, loaded.depth["max_depth"]) == (None, (8, 6), 4)
+    assert (loaded.path, loaded.size, loaded.settings["max_depth"]) == (None, (8, 6), 4)
     assert not isinstance(loaded.scene.integrator(), type(make_named("neepp").integrator))
     with pytest.raises(InputError, match="no \\$parameters"):
         load_scene(SPHERE_SCENE, parameters={"x": 1})
@@ -132,6 +158,12 @@ def test_hash_of_a_dict_follows_its_content(variant):
     texture, other = (
         mi.load_dict({"type": "bitmap", "data": mi.TensorXf([grey] * 12, (2, 2, 3)), "raw": True})
         for grey in (0.5, 0.6)
+    )
+    bitmaps = [mi.Bitmap(np.full((2, 2, 3), grey, np.float32)) for grey in (0.5, 0.6)]
+    bsdfs = [{"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}
+             for bitmap in bitmaps]
+    assert hash_of(shape={"type": "sphere", "bsdf": bsdfs[0]}) != hash_of(
+        shape={"type": "sphere", "bsdf": bsdfs[1]}
     )
     hashes = {
         hash_of(),

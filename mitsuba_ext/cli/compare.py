@@ -103,7 +103,9 @@ def compare(
     if reference and reference_spp:
         raise click.UsageError("--reference and --reference-spp exclude each other")
     scenes, integrators = _sort_out(names)
-    if context.obj == supervisor.SUPERVISED and worker is None:
+    if worker is not None:
+        supervisor.follow_parent()
+    elif context.obj == supervisor.SUPERVISED:
         return supervisor.supervise(sys.argv[1:], out)
     if reference and len(scenes) > 1:
         raise click.UsageError("one --reference cannot serve several scenes")
@@ -155,7 +157,7 @@ def _sort_out(names: Sequence[str]) -> tuple[list[Path], list[str]]:
     paths = [Path(name) for name in names]
     scenes = [
         path for path in paths
-        if (path.suffix.lower() == ".xml" or path.exists()) and not is_fragment(path)
+        if (path.suffix.lower() == ".xml" or path.is_file()) and not is_fragment(path)
     ]
     integrators = [name for name, path in zip(names, paths) if path not in scenes]
     if not scenes:

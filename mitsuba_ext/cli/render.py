@@ -61,11 +61,11 @@ def render(
     select_variant(variant, plugins)
     loaded = load_scene(scene, size, dict(definitions), keep_integrator=not specification)
     if specification:
-        named = make_named(specification, loaded.depth)
+        named = make_named(specification, loaded.settings)
         integrator, name, parameters = named.integrator, named.name, named.parameters
     else:
         integrator, name = loaded.scene.integrator(), loaded.integrator_name
-        parameters = dict(loaded.depth)
+        parameters = dict(loaded.settings)
     if integrator is None:
         raise InputError(f"{scene}: the scene has no integrator: name one with --integrator")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 
 from ..scenes import InputError
 
@@ -68,12 +69,12 @@ def until(relmse: float) -> Budget:
 
 
 def _count(value: int) -> int:
-    if isinstance(value, bool) or int(value) != value or value < 1:
+    if isinstance(value, bool) or not isinstance(value, Real) or value != value // 1 or value < 1:
         raise InputError(f"samples per pixel must be whole and at least 1, found {value!r}")
     return int(value)
 
 
 def _positive(value: float, name: str) -> float:
-    if not (math.isfinite(value) and value > 0):
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < value < math.inf:
         raise InputError(f"{name} must be positive, found {value!r}")
     return float(value)

@@ -12,6 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Union
 
+import drjit as dr
+import mitsuba as mi
+
 from ..scenes import InputError, LoadedScene, load_scene, scene_name
 from ..specifications import Specification, make_named
 from . import images, references, report, results, timing
@@ -79,8 +82,13 @@ class Comparison:
     ) -> None:
         self.only_stored = only_stored
         self.scenes = _setups(scenes)
-        if seeds < 1:
-            raise InputError(f"at least 1 seed is needed, found {seeds}")
+        if not isinstance(seeds, int) or seeds < 1:
+            raise InputError(f"at least 1 seed is needed, found {seeds!r}")
+        if not dr.is_jit_v(mi.Float):
+            raise InputError(
+                f'comparisons do not work in the variant "{mi.variant()}": select one that starts '
+                f'with "llvm" or "cuda"'
+            )
         make_all(integrators)  # an unknown name must not wait for the end of a reference
         self.integrators = integrators
         self.budget = budget
@@ -118,8 +126,9 @@ class Comparison:
                     if len(self.scenes) == 1:
                         raise
                     self._records.append(_failed_record(name, setup.source, str(error)))
-                _make_folder(self.folder)
-                self.write()
+                if self._records:
+                    _make_folder(self.folder)
+                    self.write()
             self.is_finished = not self.only_stored
         finally:
             if self._running:
@@ -160,11 +169,17 @@ class Comparison:
             count = f" ({len(self._records) + 1} of {len(self.scenes)})" * (len(self.scenes) > 1)
             progress(step._replace(label=f"{name}{count}: {step.label}"))
 
+        try:
+            images.check_film(scene.scene.sensors()[0].film())
+        except InputError as error:
+            raise InputError(f"{scene.source}: {error}") from error
         if setup.reference:
             reference = references.load_reference(setup.reference, scene.size)
         _make_folder(self.folder)
         if not setup.reference:
             reference = self._render_reference(scene, report_step)
+        if reference is None:
+            return
         self._running = (name, experiment)
         experiment.run(reference, report_step)
         self._keep_record()
@@ -179,12 +194,14 @@ class Comparison:
 
     def _render_reference(
         self, scene: LoadedScene, progress: Callable[[Step], None]
-    ) -> Reference:
+    ) -> Reference | None:
+        folder = self.folder / "references"
+        folder.mkdir(exist_ok=True)
+        if self.only_stored:
+            return references.stored_reference(scene, folder, self._reference_integrator)
         progress(Step("reference", 0.0, None))
         asked = self._reference_spp
         spp = asked or self._derived_spp(scene)
-        folder = self.folder / "references"
-        folder.mkdir(exist_ok=True)
         return references.render_reference(
             scene,
             spp,
@@ -198,9 +215,10 @@ class Comparison:
     def _derived_spp(self, scene: LoadedScene) -> int:
         if self.budget.target:
             noise = self.budget.target / _REFERENCE_FACTOR
-            return references.samples_for_noise(scene, noise, self._reference_integrator)
+            needed = references.samples_for_noise(scene, noise, self._reference_integrator)
+            return max(needed, _REFERENCE_FACTOR * int(self.budget.level(0)))
         if self.budget.is_time:
-            integrator = make_named(self._reference_integrator, scene.depth).integrator
+            integrator = make_named(self._reference_integrator, scene.settings).integrator
             seconds = _REFERENCE_FACTOR * self.budget.values[0]
             spp = timing.samples_for(seconds, integrator, scene.scene, references.FIRST_SEED)
             return max(references.MIN_BATCH_COUNT, 1 << round(math.log2(spp)))
@@ -233,7 +251,7 @@ def _failed_record(name: str, source: SceneSource, error: str) -> dict[str, obje
         "parameters": {},
         "content_hash": "",
         "size": [],
-        "depth": {},
+        "settings": {},
         "error": error,
         "warnings": [],
         "reference": None,

@@ -24,11 +24,11 @@ from . import images, metrics, timing
 from .budgets import Budget
 from .machine import machine, versions
 from .references import Reference
-from .runs import Run, RunFolder
+from .runs import Run, RunFolder, has_crashed, marked
 from .zero_radiance import zero_radiance_share
 
 #: How far the time of a run may be from what was asked for before it is repeated, and how often.
-_TIME_TOLERANCE = 0.05
+TIME_TOLERANCE = 0.05
 _TIME_ATTEMPTS = 3
 
 #: ``until`` goes no further than this where the reference does not say how many samples it has.
@@ -113,9 +113,11 @@ class Experiment:
         self.budget = budget
         self.rounds = rounds
         self.contenders = [
-            Contender(named) for named in make_all(integrators, inherited=scene.depth)
+            Contender(named) for named in make_all(integrators, inherited=scene.settings)
         ]
         self.reference: Reference | None = None
+        self._film = scene.scene.sensors()[0].film()
+        self.sensor_count = len(scene.scene.sensors())
         self._folder = RunFolder(
             folder,
             {
@@ -151,7 +153,7 @@ class Experiment:
             # All speeds are known before the first long run: the time that is left can be told
             paths = (self._path(contender, i, r) for i in indices for r in range(self.rounds))
             missing = next((path for path in paths if self._folder.load(path) is None), None)
-            if missing and not self._folder.has_crashed(missing) and not self.only_stored:
+            if missing and not has_crashed(missing) and not self.only_stored:
                 self._attempt(contender, lambda c=contender, p=missing: self._prepare(c, p))
         for round in range(self.rounds):
             for index in indices:
@@ -188,7 +190,7 @@ class Experiment:
         """One integrator that fails must not take the others' results with it."""
         try:
             action()
-        except Exception as error:  # an integrator may raise anything
+        except (Exception, SystemExit) as error:  # an integrator may raise anything
             contender.error = one_line(error)
 
     def _take(self, contender: Contender, index: int, round: int) -> None:
@@ -200,7 +202,7 @@ class Experiment:
                 return
             self._prepare(contender, path)
             self._progress(Step(contender.label, self._done, self._seconds_left()))
-            with self._folder.marked(path):
+            with marked(path):
                 run = self._measure(contender, index, round, path)
         reference = self.reference
         run.errors = metrics.errors(run.image(), reference.mean, reference.variance)
@@ -211,7 +213,7 @@ class Experiment:
     def _measure(self, contender: Contender, index: int, round: int, path: Path) -> Run:
         level, seed = self.budget.level(index), run_seed(index, round)
         timed = self._render(contender, level, seed)
-        pixels = images.to_rgb(timed.image)
+        pixels = images.to_rgb(timed.image, images.film_channels(self._film))
         if fault := metrics.describe_non_finite(pixels):
             raise ValueError(f"seed {seed}: {fault}")
         report = timing.own_statistics(contender.named.integrator)
@@ -248,7 +250,7 @@ class Experiment:
                 return timed
             attempts.append(timed)
             better = max(1, round(spp * level / timed.seconds))
-            if abs(timed.seconds / level - 1) <= _TIME_TOLERANCE or better == spp:
+            if abs(timed.seconds / level - 1) <= TIME_TOLERANCE or better == spp:
                 break
             spp = better
         return min(attempts, key=lambda timed: abs(timed.seconds - level))
@@ -258,7 +260,7 @@ class Experiment:
         they will be."""
         if contender._is_prepared:
             return
-        with self._folder.marked(path):
+        with marked(path):
             self._warm_up(contender)
         contender._is_prepared = True
 

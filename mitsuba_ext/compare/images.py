@@ -135,12 +135,35 @@ def write_film(path: Path, film: mi.Film, metadata: Mapping[str, object]) -> Non
     _save(bitmap.convert(mi.Bitmap.PixelFormat.RGB, component, eight_bit), path)
 
 
-def to_rgb(image: object) -> np.ndarray:
-    """A rendered tensor as an array (height, width, 3): alpha and AOVs go, grey is repeated."""
+def to_rgb(image: object, channels: Sequence[str]) -> np.ndarray:
+    """A rendered tensor as an array (height, width, 3): alpha and AOVs go, grey is repeated.
+
+    Args:
+        image: The tensor; its first channels are those of the film's image.
+        channels: Their names: :func:`film_channels`.
+    """
     pixels = np.array(image, dtype=np.float32)
-    if pixels.shape[2] < 3:
+    if channels[0] == "Y":
         return np.repeat(pixels[:, :, :1], 3, axis=2)
     return pixels[:, :, :3]
+
+
+def check_film(film: mi.Film) -> None:
+    """Raises :class:`InputError` for a film whose image has no RGB (or grey) channels."""
+    import mitsuba as mi
+
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        raise InputError(
+            f'the film "{film.class_name()}" has no RGB image to compare: use an "hdrfilm"'
+        )
+    film.prepare([])
+    if film_channels(film)[0] == "X":
+        raise InputError('the film\'s "pixel_format" is "xyz": only "rgb" can be compared')
+
+
+def film_channels(film: mi.Film) -> list[str]:
+    """The names of the channels that a film holds, once it has been rendered to."""
+    return [field.name for field in film.bitmap().struct_()]
 
 
 def _save(bitmap: mi.Bitmap, path: Path) -> None:

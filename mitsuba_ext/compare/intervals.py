@@ -82,6 +82,21 @@ def cost_of(target: float, x: Sequence[float], y: Sequence[float]) -> Estimate |
     return Estimate(math.exp(at), math.exp(at - half), math.exp(at + half))
 
 
+def follow(at: Estimate | None, x: Sequence[float], y: Sequence[float]) -> Estimate | None:
+    """The y of an estimated x, by the line through log y against log x. The interval is that of x:
+    y is taken for known where x is."""
+    fit = _log_fit(x, y)
+    if at is None or fit is None:
+        return None
+
+    def value(x: float | None) -> float | None:
+        if x is None:
+            return None
+        return math.exp(fit.mean_y + fit.slope * (math.log(x) - fit.mean_x))
+
+    return Estimate(*map(value, at))
+
+
 class _Fit(NamedTuple):
     x: list[float]
     mean_x: float

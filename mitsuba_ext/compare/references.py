@@ -8,6 +8,7 @@ an EXR with plain ``R/G/B`` is accepted where no variance is known.
 from __future__ import annotations
 
 import contextlib
+import glob
 import hashlib
 import json
 import math
@@ -21,10 +22,11 @@ from pathlib import Path
 import numpy as np
 
 from ..batches import Batches, batch_seeds, each_batch
-from ..scenes import InputError, LoadedScene, scene_name
-from ..specifications import Specification, make_named
+from ..scenes import InputError, LoadedScene, one_line, scene_name
+from ..specifications import NamedIntegrator, Specification, make_named
 from . import images, metrics
 from .machine import versions
+from .runs import marked
 
 #: Batches of a rendered reference. Their spread gives the variance.
 BATCH_COUNT = 16
@@ -123,13 +125,73 @@ def render_reference(
         enough: A reference in ``folder`` with at least so many samples will do. Default: ``spp``.
 
     Raises:
-        InputError: ``spp`` is below 8, or the image is black or holds NaN or infinity.
+        InputError: ``spp`` is below 8, the integrator fails, or the image is black or holds NaN or
+            infinity.
     """
     if spp < MIN_BATCH_COUNT:
         raise InputError(f"a reference needs at least {MIN_BATCH_COUNT} samples, found {spp}")
+    named = make_named(integrator, scene.settings)
+    cached = _best_cached(folder, _identity(scene, named))
+    if cached is not None and (cached.spp or 0) >= min(spp, enough or spp):
+        return cached
+    try:
+        return _render(scene, spp, folder, named, progress)
+    except InputError as error:
+        raise InputError(f'{scene.source}: the reference of "{named.label}" {error}') from error
+    except Exception as error:  # an integrator may raise anything
+        message = f'the reference of "{named.label}" failed: {one_line(error)}'
+        raise InputError(f"{scene.source}: {message}") from error
+
+
+def stored_reference(
+    scene: LoadedScene, folder: Path, integrator: Specification = "path"
+) -> Reference | None:
+    """The reference with the most samples that ``folder`` holds for the scene."""
+    return _best_cached(folder, _identity(scene, make_named(integrator, scene.settings)))
+
+
+def _render(
+    scene: LoadedScene,
+    spp: int,
+    folder: Path,
+    named: NamedIntegrator,
+    progress: Callable[[float], None] | None,
+) -> Reference:
     batch_count = min(BATCH_COUNT, spp)
     batch_spp = -(-spp // batch_count)
-    named = make_named(integrator, scene.depth)
+    identity = _identity(scene, named)
+    path = folder / f"{identity['stem']}_{batch_spp * batch_count}spp.exr"
+    partial = path.with_suffix(".partial.npz")
+    batches = unfinished = _unfinished(partial)
+    seeds = batch_seeds(FIRST_SEED, batch_count)[unfinished.count if unfinished else 0 :]
+    start = time.perf_counter()
+    with marked(path):
+        for batches in each_batch(named.integrator, scene.scene, 0, batch_spp, seeds, unfinished):
+            if fault := metrics.describe_non_finite(images.to_rgb(batches.mean, batches.channels)):
+                raise InputError(f"has {fault}")
+            with images.replacing(partial) as temporary:
+                batches.save(temporary)
+            if progress is not None:
+                progress(batches.count / batch_count)
+    mean = images.to_rgb(batches.mean, batches.channels)
+    variance = images.to_rgb(batches.variance, batches.channels)
+    if not mean.any():
+        raise InputError("is black")
+    metadata = {
+        **identity,
+        "spp": batches.spp,
+        "seeds": f"{batch_count} batches of {batches.spp // batch_count} spp",
+        "variance": f"of the mean, from {batch_count} independent batches",
+        "seconds": time.perf_counter() - start,
+    }
+    channels = [f"{name}.{color}" for name in ("mean", "variance") for color in _RGB]
+    images.write_exr(path, np.concatenate([mean, variance], axis=2), channels, metadata)
+    partial.unlink(missing_ok=True)
+    return load_reference(path, scene.size)
+
+
+def _identity(scene: LoadedScene, named: NamedIntegrator) -> dict[str, object]:
+    """What a reference is of, with a hash of all that as ``key``, and a file name."""
     identity = {
         "scene": scene.source,
         "content_hash": scene.content_hash,
@@ -141,37 +203,7 @@ def render_reference(
     text = json.dumps({**identity, "made of": named.identity}, sort_keys=True, default=str)
     key = hashlib.sha256(text.encode()).hexdigest()
     stem = f"{scene_name(scene.path)}_{_times(scene.size)}_{key[:12]}"
-    cached = _best_cached(folder, stem, key)
-    if cached is not None and (cached.spp or 0) >= min(spp, enough or spp):
-        return cached
-
-    path = folder / f"{stem}_{batch_spp * batch_count}spp.exr"
-    partial = path.with_suffix(".partial.npz")
-    batches = unfinished = _unfinished(partial)
-    seeds = batch_seeds(FIRST_SEED, batch_count)[unfinished.count if unfinished else 0 :]
-    start = time.perf_counter()
-    for batches in each_batch(named.integrator, scene.scene, 0, batch_spp, seeds, unfinished):
-        if fault := metrics.describe_non_finite(images.to_rgb(batches.mean)):
-            raise InputError(f'{scene.source}: the reference of "{named.label}" has {fault}')
-        with images.replacing(partial) as temporary:
-            batches.save(temporary)
-        if progress is not None:
-            progress(batches.count / batch_count)
-    mean, variance = images.to_rgb(batches.mean), images.to_rgb(batches.variance)
-    if not mean.any():
-        raise InputError(f'{scene.source}: the reference of "{named.label}" is black')
-    metadata = {
-        **identity,
-        "spp": batches.spp,
-        "seeds": f"{batch_count} batches of {batches.spp // batch_count} spp",
-        "variance": f"of the mean, from {batch_count} independent batches",
-        "seconds": time.perf_counter() - start,
-        "key": key,
-    }
-    channels = [f"{name}.{color}" for name in ("mean", "variance") for color in _RGB]
-    images.write_exr(path, np.concatenate([mean, variance], axis=2), channels, metadata)
-    partial.unlink(missing_ok=True)
-    return load_reference(path, scene.size)
+    return {**identity, "key": key, "stem": stem}
 
 
 def samples_for_noise(scene: LoadedScene, noise: float, integrator: Specification = "path") -> int:
@@ -195,13 +227,13 @@ def _unfinished(path: Path) -> Batches | None:
         return None
 
 
-def _best_cached(folder: Path, stem: str, key: str) -> Reference | None:
+def _best_cached(folder: Path, identity: Mapping[str, object]) -> Reference | None:
     """The reference with the most samples that is there; damaged ones do not count."""
     found = []
-    for path in folder.glob(f"{stem}_*spp.exr"):
+    for path in folder.glob(f"{glob.escape(str(identity['stem']))}_*spp.exr"):
         with contextlib.suppress(InputError):
             reference = load_reference(path)
-            if reference.metadata.get("key") == key:
+            if reference.metadata.get("key") == identity["key"]:
                 found.append(reference)
     return max(found, key=lambda reference: reference.spp or 0, default=None)
 

@@ -12,7 +12,8 @@ bounds are null for a single one), or null where there is none. Other unknown nu
     seeds      runs wanted for each integrator and level
     scenes     a list:
         name, path (null for a scene from a dict), parameters, content_hash, size [width, height],
-        depth {max_depth, rr_depth}
+        settings {max_depth, rr_depth,
+        hide_emitters}: what the integrators took over from the scene's own
         error      why the scene could not be measured; empty if it could
         warnings   a list
         reference  path, noise (its own relMSE), spp, integrator, seconds, metadata; or null
@@ -20,11 +21,12 @@ bounds are null for a single one), or null where there is none. Other unknown nu
             label, name, parameters
             error            why it failed; empty if it did not
             notes            a list
-            compile_seconds
+            compile_seconds  of this session: little where a kernel was compiled before, for
+                             another integrator or an earlier session
             runs             a list: level (samples, or seconds), round, seed, spp, seconds,
                              relmse, relmse_trimmed, mse, rmse, sigma_mu, flip,
                              rays {camera, scatter, shadow}, connections, zero_radiance,
-                             memory (bytes), launches, image
+                             memory (bytes), launches, session, image
             levels           a list:
                 level, run_count
                 refused      why the errors are not given: the reference is too noisy for them
@@ -35,7 +37,9 @@ bounds are null for a single one), or null where there is none. Other unknown nu
                 ratios       F of seconds, relmse, relmse_trimmed, efficiency, to the first
                              integrator at the same level
             slopes           F of log relMSE against log spp ("spp") and log seconds ("seconds")
-            target           F of the spp and seconds that the relMSE of "until" costs; else null
+            target           F of the spp and seconds that the relMSE of "until" costs; else null.
+                             (It stops at the first level whose mean is small enough, which luck
+                             makes a little too early.)
     versions   mitsuba_ext, mitsuba, drjit, variant, numpy, python
     machine    system, processor, cores
 
@@ -45,10 +49,11 @@ Seconds are wall clock without compilation, learning included.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from . import intervals
+from . import intervals, remarks
 from .experiment import Contender, Experiment
 from .intervals import Estimate
 from .references import Reference
@@ -56,15 +61,13 @@ from .runs import Run
 
 SCHEMA = 2
 
-#: A reference whose own relMSE is more than this share of an error is too noisy to measure it.
-_NOISE_LIMIT = 0.5
-
 #: Levels, from the last one back, that tell what an error costs.
 _FITTED_LEVELS = 4
 
 _ERRORS = ("relmse", "relmse_trimmed", "mse", "rmse", "sigma_mu", "flip")
 _COSTS = ("spp", "ray_count", "shadow_share", "zero_radiance", "memory", "launches")
 _NAMES = {"ray_count": "rays"}
+_EFFORTS = ("spp", "seconds")
 
 
 def scene_record(experiment: Experiment, folder: Path) -> dict[str, object]:
@@ -75,9 +78,9 @@ def scene_record(experiment: Experiment, folder: Path) -> dict[str, object]:
         "parameters": scene.parameters,
         "content_hash": scene.content_hash,
         "size": list(scene.size),
-        "depth": scene.depth,
+        "settings": scene.settings,
         "error": "",
-        "warnings": _warnings(experiment),
+        "warnings": remarks.warnings(experiment),
         "reference": None if reference is None else _reference_record(reference, folder),
         "integrators": [
             _contender_record(experiment, contender, folder)
@@ -111,20 +114,6 @@ def _reference_record(reference: Reference, folder: Path) -> dict[str, object]:
     }
 
 
-def _warnings(experiment: Experiment) -> list[str]:
-    reference = experiment.reference
-    if reference is None:
-        return []
-    warnings = []
-    claimed = reference.metadata.get("max_depth")
-    actual = experiment.scene.depth.get("max_depth")
-    if isinstance(claimed, int) and actual is not None and claimed != actual:
-        warnings.append(f"the reference has max_depth {claimed}, the scene {actual}")
-    if reference.variance is None:
-        warnings.append("the variance of the reference is unknown: its noise is part of the errors")
-    return warnings
-
-
 def _contender_record(
     experiment: Experiment, contender: Contender, folder: Path
 ) -> dict[str, object]:
@@ -132,32 +121,44 @@ def _contender_record(
     refused = {record["level"] for record in levels if record["refused"]}
     trusted = [run for run in contender.runs if run.level not in refused]
     errors = [run.errors.relmse for run in trusted]
-    costs = {name: [getattr(run, name) for run in trusted] for name in ("spp", "seconds")}
-    target = experiment.budget.target
-    is_reached = any(
-        record["figures"]["relmse"] and record["figures"]["relmse"].value <= target
-        for record in levels
-    ) if target else False
-    last = _FITTED_LEVELS * experiment.rounds
+    efforts = {name: [getattr(run, name) for run in trusted] for name in _EFFORTS}
     return {
         "label": contender.label,
         "name": contender.named.name,
         "parameters": contender.named.parameters,
         "error": contender.error,
-        "notes": contender.notes,
+        "notes": remarks.notes(experiment, contender),
         "compile_seconds": contender.compile_seconds,
         "runs": [_run_record(run, folder) for run in contender.runs],
         "levels": levels,
         "slopes": {
             # Runs of equal time differ in their samples by chance only: there is no slope in that
             name: intervals.slope(values, errors) if len(levels) > 1 else None
-            for name, values in costs.items()
+            for name, values in efforts.items()
         },
-        "target": {
-            # The line through the last levels: near the target it need not bend
-            name: intervals.cost_of(target, values[-last:], errors[-last:])
-            for name, values in costs.items()
-        } if is_reached else None,
+        "target": _target_record(experiment, trusted, levels),
+    }
+
+
+def _target_record(
+    experiment: Experiment, trusted: Sequence[Run], levels: Sequence[Mapping[str, Any]]
+) -> dict[str, Estimate | None] | None:
+    """What the error costs that was to be reached; ``None`` if it was not."""
+    target = experiment.budget.target
+    errors = [level["figures"]["relmse"] for level in levels]
+    if not target or not any(error and error.value <= target for error in errors):
+        return None
+    if len(levels) == 1:
+        figures = levels[0]["figures"]
+        return {name: figures[name] and Estimate(figures[name].value) for name in _EFFORTS}
+    # The line through the last levels: near the target it need not bend
+    last = trusted[-_FITTED_LEVELS * experiment.rounds :]
+    spp = [run.spp for run in last]
+    cost = intervals.cost_of(target, spp, [run.errors.relmse for run in last])
+    return {
+        "spp": cost,
+        # Through the samples, and not from the noise of the times
+        "seconds": intervals.follow(cost, spp, [run.seconds for run in last]),
     }
 
 
@@ -170,15 +171,17 @@ def _level_record(
     experiment: Experiment, contender: Contender, level: float
 ) -> dict[str, object]:
     runs = contender.at(level)
-    refused = _refusal(experiment.reference, runs)
+    refused = remarks.refusal(experiment.reference, runs)
     first = experiment.contenders[0].at(level)
-    is_measured = not refused and not _refusal(experiment.reference, first)
+    is_measured = not refused and not remarks.refusal(experiment.reference, first)
     figures = _figures(runs, bool(refused))
     of_first = _figures(first, not is_measured) if first else {}
     own_rounds = {run.round: run for run in runs}
     pairs = [(own_rounds[run.round], run) for run in first if run.round in own_rounds]
+    # Times of different sessions do not belong together
+    timed_pairs = [(own, other) for own, other in pairs if own.session == other.session]
 
-    def ratio(name: str, value) -> Estimate | None:
+    def ratio(name: str, value: Callable[[Run], float], pairs=pairs) -> Estimate | None:
         return intervals.ratio(
             figures.get(name), of_first.get(name), [(value(a), value(b)) for a, b in pairs]
         )
@@ -189,10 +192,10 @@ def _level_record(
         "refused": refused,
         "figures": figures,
         "ratios": {
-            "seconds": ratio("seconds", lambda run: run.seconds),
+            "seconds": ratio("seconds", lambda run: run.seconds, timed_pairs),
             "relmse": ratio("relmse", lambda run: run.errors.relmse),
             "relmse_trimmed": ratio("relmse_trimmed", lambda run: run.errors.relmse_trimmed),
-            "efficiency": ratio("efficiency", _efficiency),
+            "efficiency": ratio("efficiency", _efficiency, timed_pairs),
         },
     }
 
@@ -223,23 +226,6 @@ def _efficiency(run: Run) -> float:
 
 def _mean(values: Sequence[float | None]) -> Estimate | None:
     return None if any(value is None for value in values) else intervals.mean(values)
-
-
-def _refusal(reference: Reference | None, runs: Sequence[Run]) -> str:
-    """Why the errors of a level cannot be told with this reference; empty if they can."""
-    noise = reference.noise if reference else None
-    if noise is None or not runs:
-        return ""
-    error = sum(run.errors.relmse for run in runs) / len(runs)
-    if noise <= _NOISE_LIMIT * error:
-        return ""
-    text = f"the reference is too noisy: its own relMSE is {noise:.2g}, "
-    text += f"the error {error:.2g}" if error > 0 else "the error less than that"
-    if reference.spp:
-        # Sixteen times less noise than error; an error that is not known is at most the noise
-        needed = reference.spp * 16 * noise / max(error, noise / 16)
-        text += f"; needs --reference-spp {1 << math.ceil(math.log2(needed))}"
-    return text
 
 
 def _relative(path: Path, folder: Path) -> str:

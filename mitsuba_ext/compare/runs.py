@@ -10,7 +10,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 import re
+import uuid
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -24,6 +26,11 @@ from .metrics import Errors
 #: What stands beside a run's file while it is being made, and after the process died of it.
 _RUNNING = ".running"
 _CRASHED = ".crashed"
+
+
+#: Tells the processes of one session from others. A supervisor hands its own on to its workers.
+SESSION_VARIABLE = "MITSUBA_EXT_SESSION"
+SESSION = os.environ.get(SESSION_VARIABLE) or uuid.uuid4().hex
 
 
 @dataclass
@@ -42,6 +49,7 @@ class Run:
         zero_radiance: Share of the camera samples without radiance, ``None`` if not known.
         memory: Peak of the memory that Dr.Jit held, in bytes.
         launches: Kernels launched.
+        session: In which it was measured: runs of different ones did not take turns.
         path: The EXR that holds the image.
         errors: Against the reference of the experiment.
     """
@@ -56,6 +64,7 @@ class Run:
     zero_radiance: float | None
     memory: int | None
     launches: int
+    session: str = field(default_factory=lambda: SESSION)
     path: Path = field(default_factory=Path)
     errors: Errors | None = None
 
@@ -116,28 +125,6 @@ class RunFolder:
         except (InputError, KeyError, TypeError, ValueError):
             return None
 
-    def has_crashed(self, path: Path) -> bool:
-        """Did an earlier process die during this run?"""
-        return path.with_suffix(_CRASHED).exists()
-
-    @contextlib.contextmanager
-    def marked(self, path: Path) -> Iterator[None]:
-        """Leaves a mark beside ``path`` while the run is being made. A mark that stays tells a
-        supervisor during which run the process died (:func:`blame`).
-
-        Raises:
-            RuntimeError: The process died during this run before.
-        """
-        if self.has_crashed(path):
-            raise RuntimeError(path.with_suffix(_CRASHED).read_text(encoding="utf-8"))
-        mark = path.with_suffix(_RUNNING)
-        mark.parent.mkdir(parents=True, exist_ok=True)
-        mark.touch()
-        try:
-            yield
-        finally:
-            mark.unlink(missing_ok=True)
-
     def save(
         self, run: Run, image: np.ndarray, path: Path, metadata: Mapping[str, object]
     ) -> Run:
@@ -148,9 +135,33 @@ class RunFolder:
         return replace(run, path=path)
 
 
+def has_crashed(path: Path) -> bool:
+    """Did an earlier process die while it was making ``path``?"""
+    return path.with_suffix(_CRASHED).exists()
+
+
+@contextlib.contextmanager
+def marked(path: Path) -> Iterator[None]:
+    """Leaves a mark beside ``path`` while that file (a run, a reference) is being made. A mark that
+    stays tells a supervisor what the process died of (:func:`blame`).
+
+    Raises:
+        RuntimeError: A process died of it before.
+    """
+    if has_crashed(path):
+        raise RuntimeError(path.with_suffix(_CRASHED).read_text(encoding="utf-8"))
+    mark = path.with_suffix(_RUNNING)
+    mark.parent.mkdir(parents=True, exist_ok=True)
+    mark.touch()
+    try:
+        yield
+    finally:
+        mark.unlink(missing_ok=True)
+
+
 def blame(folder: Path, message: str) -> bool:
-    """After the death of the process that was comparing in ``folder``: notes ``message`` as the end
-    of the run that it was at. Returns whether there was one."""
+    """After the end of the process that was comparing in ``folder``: notes ``message`` as the end
+    of what it was at. Returns whether there was something."""
     marks = list(folder.glob(f"*/*{_RUNNING}"))
     for mark in marks:
         mark.with_suffix(_CRASHED).write_text(message, encoding="utf-8")

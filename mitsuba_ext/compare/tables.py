@@ -78,12 +78,12 @@ def _scene_table(scene: Mapping[str, Any], budget: Mapping[str, Any]) -> Table:
 
 
 def _title(scene: Mapping[str, Any], budget: Mapping[str, Any]) -> str:
-    depth = ", ".join(f"{key} {value}" for key, value in scene["depth"].items())
+    settings = ", ".join(f"{key} {value}" for key, value in scene["settings"].items())
     values = ", ".join(f"{value:g}" for value in budget["values"])
     unit = {"time": f"{values} s", "until": f"until relMSE {values}"}
     size = "x".join(map(str, scene["size"]))
-    parts = [scene["path"] or scene["name"], size, unit.get(budget["kind"], f"{values} spp"), depth]
-    return ", ".join(filter(None, parts))
+    given = unit.get(budget["kind"], f"{values} spp")
+    return ", ".join(filter(None, [scene["path"] or scene["name"], size, given, settings]))
 
 
 def _notes(scene: Mapping[str, Any]) -> Iterator[str]:
@@ -108,8 +108,10 @@ def _number(estimate: Mapping[str, float] | None, spread: bool = True) -> str:
     value, high = estimate["value"], estimate["high"]
     if not spread:
         return f"{value:.6g}"
-    factor = f" ±{high / value - 1:.0%}" if high is not None and value > 0 else ""
-    return f"{value:#.3g}{factor}"
+    if high is None or not value > 0:
+        return f"{value:#.3g}"
+    factor = high / value
+    return f"{value:#.3g} " + (f"±{factor - 1:.0%}" if factor < 11 else "± >1000%")
 
 
 def _percent(estimate: Mapping[str, float] | None) -> str:

@@ -170,11 +170,11 @@ def _budget(results: Record) -> str:
 
 def _scene_facts(scene: Record) -> list[tuple[str, str]]:
     parameters = ", ".join(f"{key} = {value}" for key, value in scene["parameters"].items())
-    depth = ", ".join(f"{key} {value}" for key, value in scene["depth"].items())
+    settings = ", ".join(f"{key} {value}" for key, value in scene["settings"].items())
     reference = scene["reference"]
     facts = [
         ("Scene", ", ".join(filter(None, [scene["path"] or "(from Python)", parameters]))),
-        ("Image", "×".join(map(str, scene["size"])) + (f", {depth}" if depth else "")),
+        ("Image", "×".join(map(str, scene["size"])) + (f", {settings}" if settings else "")),
     ]
     if reference:
         noise = reference["noise"]
