@@ -1,6 +1,6 @@
 """Speed against error of our integrators and ``path``, on our scenes and on those of the papers.
 
-``make bench`` runs all of it (about 50 minutes on two cores), writes one report, and puts its
+``make bench`` runs all of it (about 25 minutes on two cores), writes one report, and puts its
 figures into the README; ``examples/benchmark.py open kitchen`` runs some scenes, and leaves the
 README alone. What ``out/benchmark`` holds already is not rendered again.
 """
@@ -129,6 +129,7 @@ def _table(results: dict[str, Any]) -> Iterator[str]:
 
 def _write_figure(results: dict[str, Any]) -> None:
     """Efficiency relative to ``path`` with its intervals, a row per scene."""
+    from matplotlib import ticker
     from matplotlib.figure import Figure
 
     scenes = results["scenes"]
@@ -144,6 +145,9 @@ def _write_figure(results: dict[str, Any]) -> None:
         axes.errorbar(values, rows, xerr=errors, fmt="os"[number], capsize=3, label=label)
     axes.axvline(1, color="gray", linewidth=0.8)
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(ticker.MaxNLocator(8))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_locator(ticker.NullLocator())
     axes.set_yticks(range(len(scenes)), [scene["name"] for scene in scenes])
     axes.invert_yaxis()
     axes.set_xlabel("efficiency relative to path (95 % interval)")

@@ -13,6 +13,7 @@ import venv
 from pathlib import Path
 
 import pytest
+from conftest import SCENE
 
 import mitsuba_ext
 from mitsuba_ext import runtime
@@ -34,8 +35,8 @@ def test_range_of_mitsuba_is_the_same_in_both_places() -> None:
 
 
 def test_imports_at_module_level_are_declared() -> None:
-    declared = set(re.findall(r'^    "([A-Za-z_]+)[<>=]', PYPROJECT, re.MULTILINE))
-    allowed = declared | set(_standard_library()) | {"drjit", "mitsuba_ext"}
+    declared = set(re.findall(r'^    "([A-Za-z0-9_]+)[<>=]', PYPROJECT, re.MULTILINE))
+    allowed = declared | set(_standard_library()) | {"drjit", "mitsuba_ext", "PIL"}
     for source in SOURCES:
         for file in source.rglob("*.py"):
             undeclared = _imports(file) - allowed
@@ -72,7 +73,8 @@ def test_plugin_folders_are_part_of_the_package_and_keep_their_sources() -> None
 
 @pytest.mark.slow
 def test_wheel_works_in_another_environment(tmp_path: Path) -> None:
-    """Built from the tree, installed elsewhere: the plugins are registered and render."""
+    """Built from the tree, installed elsewhere: the plugins are registered and render, and a
+    comparison writes its report."""
     tree = tmp_path / "tree"  # a copy: setuptools reuses what an earlier build left in build/
     for source in SOURCES:
         shutil.copytree(source, tree / source.name)
@@ -96,3 +98,8 @@ assert any(registry.plugin_names().values())
 sys.exit(doctor.main())
 """
     subprocess.run([str(python), "-c", code], cwd=tmp_path, check=True)
+    scene = tmp_path / "scene.xml"
+    scene.write_text(SCENE.format(integrator="", film="", body=""))
+    arguments = ["compare", scene, "path", "--spp=2", "--seeds=1", "--reference-spp=8", "--out=out"]
+    subprocess.run([python, "-m", "mitsuba_ext.cli", *arguments], cwd=tmp_path, check=True)
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000

@@ -14,7 +14,6 @@ from . import supervisor
 from .common import (
     INTERRUPTED,
     Numbers,
-    console_for_tables,
     progress_line,
     scene_options,
     select_variant,
@@ -89,7 +88,7 @@ def compare(
     holds one. All get max_depth and rr_depth of the scene's integrator unless they set their own.
     Ratios are relative to the first integrator.
     """
-    from ..compare import Comparison, SceneSetup, budgets, tables
+    from ..compare import Comparison, SceneSetup, budgets, show
 
     given = {
         "--spp": spp and budgets.equal_samples(spp),
@@ -131,11 +130,9 @@ def compare(
     if not results["scenes"]:
         click.echo("interrupted before the first run: nothing written", err=True)
         return INTERRUPTED
-    console = console_for_tables()
-    for part in tables(results):
-        console.print(part, highlight=False, soft_wrap=True)
+    show(results)
     for name in ("results.json", "report.html"):
-        console.print(f"{out / name}", highlight=False, markup=False, soft_wrap=True)
+        click.echo(out / name)
     if interrupted:
         click.echo("interrupted: the results are of the finished runs", err=True)
         return INTERRUPTED

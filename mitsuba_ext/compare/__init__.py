@@ -30,7 +30,7 @@ from .reading import read_image
 from .references import Reference, load_reference, render_reference
 from .report import write_report
 from .runs import Run
-from .tables import show, tables
+from .tables import show
 
 __all__ = [
     "Budget",
@@ -60,7 +60,6 @@ __all__ = [
     "render_reference",
     "show",
     "sweep",
-    "tables",
     "until",
     "write_exr",
     "write_report",

@@ -25,6 +25,9 @@ from .references import Reference
 
 SceneSource = Union[str, Path, Mapping[str, Any]]
 
+#: How much longer than the longest run a reference is.
+_REFERENCE_FACTOR = 16
+
 
 @dataclass(frozen=True)
 class SceneSetup:
@@ -41,9 +44,6 @@ class SceneSetup:
     size: tuple[int, int] | None = None
     parameters: Mapping[str, object] | None = None
     reference: str | Path | None = None
-
-#: How much longer than the longest run a reference is.
-_REFERENCE_FACTOR = 16
 
 
 class Comparison:

@@ -1,7 +1,7 @@
 """Speed against error: one scene with several integrators, under equal conditions.
 
-- Every integrator gets the scene's ``max_depth`` and ``rr_depth`` unless its specification says
-  otherwise: they solve the same problem.
+- Every integrator gets the settings of the scene's own (``max_depth``, ``rr_depth``,
+  ``hide_emitters``) unless its specification says otherwise: they solve the same problem.
 - Kernels are compiled beforehand, by a small render. A measured run that had to compile after all
   (a size of pass that the small one did not have) is thrown away and repeated.
 - The integrators take turns (A B C A B C …), round by round: a machine that becomes slower becomes
@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import traceback
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -58,6 +59,7 @@ class Contender:
         runs: In the order in which they were measured.
         compile_seconds: What the kernels cost to compile or to load, without tracing.
         error: Why there are no (more) runs; empty if all went well.
+        traceback: Where the error came from, for those who write the integrator.
         notes: What a reader of the figures should know.
     """
 
@@ -65,6 +67,7 @@ class Contender:
     runs: list[Run] = field(default_factory=list)
     compile_seconds: float = 0.0
     error: str = ""
+    traceback: str = ""
     notes: list[str] = field(default_factory=list)
     _zero_radiance: float | None = None  # where the integrator does not count it
     _pace: float | None = None  # seconds per sample per pixel
@@ -87,7 +90,7 @@ class Experiment:
     """Renders one scene with several integrators and measures them against a reference.
 
     Args:
-        scene: The scene; its own integrator matters only for the depth that the others take over.
+        scene: The scene; its own integrator matters only for the settings that others take over.
         integrators: Specifications (:func:`mitsuba_ext.specifications.make_named`), or a mapping
             of labels to them. Figures are given relative to the first.
         budget: What each gets.
@@ -162,7 +165,7 @@ class Experiment:
                         yield contender, index, round
 
     def _schedule_until(self) -> Iterator[tuple[Contender, int, int]]:
-        limit = self.reference.spp or _MAX_UNTIL_SPP
+        limit = max(self.reference.spp or _MAX_UNTIL_SPP, self.budget.level(0))
         going = list(self.contenders)
         index = 0
         while going and self.budget.level(index) <= limit:
@@ -192,6 +195,7 @@ class Experiment:
             action()
         except (Exception, SystemExit) as error:  # an integrator may raise anything
             contender.error = one_line(error)
+            contender.traceback = traceback.format_exc()
 
     def _take(self, contender: Contender, index: int, round: int) -> None:
         """Measures a run, or takes it from the folder."""
@@ -274,9 +278,7 @@ class Experiment:
             self._timed(contender, spp, seed=0)
         if self.budget.is_time:
             seconds = self.budget.values[0]
-            spp = timing.samples_for(
-                seconds, integrator, self.scene.scene, run_seed(0, 0)
-            )
+            spp = timing.samples_for(seconds, integrator, self.scene.scene, run_seed(0, 0))
             contender._pace = seconds / spp
         else:
             timed = self._timed(contender, spp, seed=0)

@@ -41,8 +41,8 @@ class Errors:
         mse: (I−R)².
         rmse: √mse; NaN where the subtraction left no positive ``mse``.
         sigma_mu: σ/μ, the coefficient of variation: the root of the mean squared colour difference,
-            divided by the mean luminance of the reference (Cline, *Sampling Methods in Light
-            Transport*, 2007, Eq. 4.13). NaN if that luminance is not positive.
+            divided by the mean luminance of the reference (Cline, *Sampling Methods in Ray-Based
+            Global Illumination*, 2007, Eq. 4.13). NaN if that luminance is not positive.
         flip: The perceived difference, from 0 to 1, see :func:`~.flip.mean_flip`. NaN if it was
             not asked for, or if ``flip-evaluator`` is not installed.
     """

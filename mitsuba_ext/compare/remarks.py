@@ -79,7 +79,7 @@ def _notes(experiment: Experiment, contender: Contender) -> Iterator[str]:
                 f"{len(missed)} of {len(contender.runs)} runs took another time than {wanted:g} s "
                 f"by more than {TIME_TOLERANCE:.0%}"
             )
-    for level in contender.levels():
+    for level in contender.levels()[-1:]:
         errors = [run.errors for run in contender.at(level)]
         relmse = sum(e.relmse for e in errors)
         trimmed = sum(e.relmse_trimmed for e in errors)

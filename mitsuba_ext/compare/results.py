@@ -20,6 +20,7 @@ bounds are null for a single one), or null where there is none. Other unknown nu
         integrators  a list, in the order of the command line:
             label, name, parameters
             error            why it failed; empty if it did not
+            traceback        where in Python
             notes            a list
             compile_seconds  of this session: little where a kernel was compiled before, for
                              another integrator or an earlier session
@@ -127,6 +128,7 @@ def _contender_record(
         "name": contender.named.name,
         "parameters": contender.named.parameters,
         "error": contender.error,
+        "traceback": contender.traceback,
         "notes": remarks.notes(experiment, contender),
         "compile_seconds": contender.compile_seconds,
         "runs": [_run_record(run, folder) for run in contender.runs],

@@ -6,8 +6,13 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rich import box
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+
+_ERRORS = (
+    ("relMSE", "relmse"), ("trimmed", "relmse_trimmed"), ("σ/μ", "sigma_mu"), ("FLIP", "flip"),
+)
 
 _LEGEND = (
     "Means over the rounds (seconds: median), with 95 % confidence intervals over them (as a "
@@ -17,38 +22,46 @@ _LEGEND = (
 )
 
 
-def tables(results: Mapping[str, Any]) -> Iterator[Table | Text]:
-    """A table for each scene, with what a reader has to know to trust it.
+#: On narrower terminals, only the most important figures are shown.
+_FULL_WIDTH = 140
+
+#: Width of what goes to a file or a pipe, where there is no terminal to ask.
+_PIPE_WIDTH = 160
+
+
+def show(results: Mapping[str, Any]) -> None:
+    """Prints a table for each scene, with what a reader has to know to trust it.
 
     Args:
         results: The content of ``results.json``.
     """
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=_PIPE_WIDTH)
+    for part in tables(results, console.width):
+        console.print(part, highlight=False, soft_wrap=isinstance(part, Text))
+
+
+def tables(results: Mapping[str, Any], width: int = _FULL_WIDTH) -> Iterator[Table | Text]:
+    """What :func:`show` prints, for ``width`` characters."""
     for scene in results["scenes"]:
         if scene["error"]:
             yield Text(f"{scene['name']}: {scene['error']}\n", style="red")
             continue
-        yield _scene_table(scene, results["budget"])
+        yield _scene_table(scene, results["budget"], width < _FULL_WIDTH)
         yield Text("\n".join(_notes(scene)) + "\n")
     yield Text(_LEGEND)
 
 
-def show(results: Mapping[str, Any]) -> None:
-    """Prints the tables, in a terminal as in a notebook."""
-    from rich.console import Console
-
-    console = Console()
-    for part in tables(results):
-        console.print(part, highlight=False)
-
-
-def _scene_table(scene: Mapping[str, Any], budget: Mapping[str, Any]) -> Table:
+def _scene_table(scene: Mapping[str, Any], budget: Mapping[str, Any], is_narrow: bool) -> Table:
     table = Table(
         title=_title(scene, budget), title_justify="left", title_style="", box=box.SIMPLE_HEAD,
         show_edge=False, padding=(0, 1, 0, 0),
     )
     table.add_column("integrator", overflow="fold", min_width=12)
     has_levels = budget["kind"] in ("sweep", "until")
-    headings = ["relMSE", "trimmed", "σ/μ", "FLIP", "spp", "seconds", "shadow", "eff."]
+    errors = _ERRORS[:1] if is_narrow else _ERRORS
+    headings = [*(heading for heading, _ in errors), "spp", "seconds", "shadow", "eff."]
     headings += ["slope"] if has_levels else []
     headings += ["s to target"] if budget["kind"] == "until" else []
     for heading in headings:
@@ -63,16 +76,16 @@ def _scene_table(scene: Mapping[str, Any], budget: Mapping[str, Any]) -> Table:
         level = contender["levels"][-1]
         figures = level["figures"]
         row = [
-            *(_number(figures[name]) for name in ("relmse", "relmse_trimmed", "sigma_mu", "flip")),
-            _number(figures["spp"], spread=False),
-            _number(figures["seconds"]),
+            *(_number(figures[name], not is_narrow) for _, name in errors),
+            f"{figures['spp']['value']:.6g}",
+            _number(figures["seconds"], not is_narrow),
             _percent(figures["shadow_share"]),
             _ratio(level["ratios"]["efficiency"]),
         ]
         if has_levels:
             row.append(_difference(contender["slopes"]["spp"]))
         if budget["kind"] == "until":
-            row.append(_number((contender["target"] or {}).get("seconds")))
+            row.append(_number((contender["target"] or {}).get("seconds"), not is_narrow))
         table.add_row(label, *row)
     return table
 
@@ -102,13 +115,11 @@ def _notes(scene: Mapping[str, Any]) -> Iterator[str]:
                 yield f"{contender['label']} at {level['level']:g}: {level['refused']}."
 
 
-def _number(estimate: Mapping[str, float] | None, spread: bool = True) -> str:
-    if estimate is None or estimate["value"] is None:
+def _number(estimate: Mapping[str, float] | None, with_interval: bool) -> str:
+    if estimate is None:
         return "–"
     value, high = estimate["value"], estimate["high"]
-    if not spread:
-        return f"{value:.6g}"
-    if high is None or not value > 0:
+    if not with_interval or high is None or not value > 0:
         return f"{value:#.3g}"
     factor = high / value
     return f"{value:#.3g} " + (f"±{factor - 1:.0%}" if factor < 11 else "± >1000%")
