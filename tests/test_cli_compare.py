@@ -106,6 +106,23 @@ def test_rendered_reference_has_the_mean_and_its_variance(run, make_scene, tmp_p
     assert reference.variance.max() > 1e-6
 
 
+def test_images_with_variance_serve_as_reference_and_for_z(run, make_scene, tmp_path):
+    wrapper = tmp_path / "variance.json"
+    wrapper.write_text(json.dumps({"type": "variance", "image": {"type": "path"}}))
+    scene, paths = make_scene(), [tmp_path / "a.exr", tmp_path / "b.exr"]
+    for seed, path in enumerate(paths):
+        command = ("render", scene, "-o", path, "--integrator", wrapper, "--spp", 512)
+        assert run(*command, "--seed", seed)[0] == 0
+    record = json.loads(run("diff", "--json", *paths)[1])
+    assert max(map(abs, record["z"])) < 4
+    assert record["reference_noise"] > 0
+    out = tmp_path / "out"
+    command = ("compare", scene, "path", "--spp", 4, "--seeds", 1, "--out", out)
+    assert run(*command, "--reference", paths[0])[0] == 0
+    reference = json.loads((out / "results.json").read_text())["scenes"][0]["reference"]
+    assert reference["noise"] == pytest.approx(record["reference_noise"], rel=0.5)
+
+
 def test_plain_rgb_reference_is_accepted(run, make_scene, tmp_path):
     path = tmp_path / "plain.exr"
     write_exr(path, np.ones((6, 8, 3)), "RGB", {})

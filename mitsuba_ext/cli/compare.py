@@ -43,7 +43,7 @@ from .common import (
 )
 @click.option(
     "--reference", type=click.Path(path_type=Path), metavar="FILE",
-    help="EXR with mean.R/G/B and variance.R/G/B (of the mean), or with plain R/G/B.",
+    help="EXR with mean.R/G/B or R/G/B, and variance.R/G/B (of the mean) if it is known.",
 )
 @click.option(
     "--reference-spp", type=click.IntRange(min=8), metavar="N",

@@ -38,9 +38,9 @@ _FIGURES = {
 def diff(a: Path, b: Path, as_json: bool, output: Path | None) -> int:
     """Measure how far the image A is from the reference B.
 
-    Both can be EXR (R/G/B, Y, one layer, or mean and variance), PNG, JPEG, HDR, PFM, or NumPy
-    arrays; all are compared as linear RGB. Where B has a variance, what it contributes to relMSE,
-    MSE and rMSE is subtracted; σ/μ and FLIP contain it. Relative errors are relative to B.
+    Both can be EXR (R/G/B or mean, with or without variance; Y; one layer), PNG, JPEG, HDR, PFM, or
+    NumPy arrays; all are compared as linear RGB. Where B has a variance, what it contributes to
+    relMSE, MSE and rMSE is subtracted; σ/μ and FLIP contain it. Relative errors are relative to B.
     "trimmed" leaves out the 0.1 % of the pixels with the largest errors.
 
     Where both have a variance, z is the difference of the means of the images in standard

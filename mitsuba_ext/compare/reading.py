@@ -20,9 +20,10 @@ def read_image(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, dict[st
     ====================  ======================================================================
     ``.npy``, ``.npz``    Linear floating point, (height, width) or (height, width, 1, 3 or 4). An
                           ``.npz`` holds one array, or ``mean`` and perhaps ``variance``.
-    EXR                   ``mean.R/G/B`` with ``variance.R/G/B`` (a reference), else ``R/G/B``, else
-                          ``Y``, else the only layer that has ``R/G/B`` (Blender's ``Combined``
-                          where there are several). Of several parts, only the first.
+    EXR                   ``mean.R/G/B`` (a reference), else ``R/G/B``, both with ``variance.R/G/B``
+                          where it is there (the integrator ``variance`` leaves it), else ``Y``,
+                          else the only layer that has ``R/G/B`` (Blender's ``Combined`` where
+                          there are several). Of several parts, only the first.
     PNG, JPEG, BMP, TGA   8 or 16 bits per channel, sRGB: made linear, 1 is white.
     HDR (RGBE), PFM       Linear.
     ====================  ======================================================================
@@ -86,9 +87,9 @@ def _reference(channels: Channels) -> tuple[np.ndarray, np.ndarray | None, str] 
     return None if mean is None else (mean, _stack(channels, "variance."), "mean.R/G/B")
 
 
-def _plain(channels: Channels) -> tuple[np.ndarray, None, str] | None:
+def _plain(channels: Channels) -> tuple[np.ndarray, np.ndarray | None, str] | None:
     pixels = _stack(channels, "")
-    return None if pixels is None else (pixels, None, "R/G/B")
+    return None if pixels is None else (pixels, _stack(channels, "variance."), "R/G/B")
 
 
 def _grey(channels: Channels) -> tuple[np.ndarray, None, str] | None:

@@ -2,7 +2,8 @@
 
 A reference is the mean of independent batches, so that the variance of that mean is known too. On
 disk it is an EXR with the channels ``mean.R/G/B`` and ``variance.R/G/B`` (variance of the mean);
-an EXR with plain ``R/G/B`` is accepted where no variance is known.
+an EXR with plain ``R/G/B`` is accepted too, with ``variance.R/G/B`` (as the integrator ``variance``
+leaves it) or without.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ def load_reference(path: str | Path, size: tuple[int, int] | None = None) -> Ref
     path = Path(path)
     channels, metadata = images.read_exr(path)
     mean = _stack(channels, "mean.")
-    variance = _stack(channels, "variance.") if mean is not None else None
+    variance = _stack(channels, "variance.")
     if mean is None:
         mean = _stack(channels, "")
     if mean is None:

@@ -32,7 +32,8 @@ bounds are null for a single one), or null where there is none. Other unknown nu
                 level, run_count
                 refused      why the errors are not given: the reference is too noisy for them
                 figures      F of spp, seconds (median), relmse, relmse_trimmed, mse, rmse,
-                             sigma_mu, flip, rays, shadow_share (of those that path traces),
+                             sigma_mu, flip, rays, rays_camera, rays_scatter, rays_shadow,
+                             shadow_share (of those that path traces),
                              zero_radiance, memory, launches,
                              efficiency (1 / (mean relMSE · median seconds))
                 ratios       F of seconds, relmse, relmse_trimmed, efficiency, to the first
@@ -208,6 +209,8 @@ def _figures(runs: Sequence[Run], is_refused: bool) -> dict[str, Estimate | None
     }
     for name in _COSTS:
         figures[_NAMES.get(name, name)] = _mean([getattr(run, name) for run in runs])
+    for kind in ("camera", "scatter", "shadow"):
+        figures[f"rays_{kind}"] = _mean([run.rays.get(kind) for run in runs])
     for name in _ERRORS:
         values = [getattr(run.errors, name) for run in runs]
         figures[name] = None if is_refused else _mean(values)

@@ -161,8 +161,10 @@ _ERRORS = [
 
 _WORK = [
     _figure("rays", formats.count, "rays", "Camera, scatter and shadow rays of one run", "work"),
+    _figure("scatter", formats.count, "rays_scatter", "Rays found by sampling a BSDF", "work"),
+    _figure("shadow", formats.count, "rays_shadow", "Shadow rays that were traced", "work"),
     _figure(
-        "shadow rays", formats.percent, "shadow_share",
+        "shadow share", formats.percent, "shadow_share",
         "Shadow rays traced, in percent of the connections to lights", "work",
     ),
     _figure(
