@@ -68,7 +68,7 @@ def errors(
         reference: What counts as the truth.
         reference_variance: Variance of ``reference``, ``None`` if unknown.
         flip: ``False`` leaves FLIP out, which takes more than 20 times as
-            long as the others together (on two cores 0.3 s at 320x180, 9 s at 1920x1080).
+            long as the others together (on two cores 0.3 s at 320x180, 10 s at 1920x1080).
 
     Raises:
         ValueError: The shapes differ, the reference is black, or a value is not finite.
