@@ -9,9 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from noisy import Clock
 
 import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before drjit and mitsuba)
 from mitsuba_ext import cli
+from mitsuba_ext.compare import timing
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -53,6 +55,17 @@ def _clean_up() -> None:
     dr.sync_thread()
     dr.flush_kernel_cache()
     dr.flush_malloc_cache()
+
+
+# ---- Comparisons ----
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """A clock that only the integrators under test move."""
+    clock = Clock()
+    monkeypatch.setattr(timing, "time", clock)
+    return clock
 
 
 # ---- The command line ----

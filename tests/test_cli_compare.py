@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -72,6 +73,15 @@ def test_every_budget_works_on_several_scenes(run, make_scene, tmp_path, budget,
             found = [level["level"] for level in record["levels"]]
             assert found == levels if levels else found[0] == 8
     assert (out / "report.html").stat().st_size > 10_000
+
+
+def test_progress_goes_to_a_file_line_by_line(run, make_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("mitsuba_ext.cli.common._Log.PERIOD", 0.0)
+    command = ("compare", make_scene(), "path", "prb", "--spp", 4, "--seeds", 2)
+    _, _, err = run(*command, "--reference-spp", 64, "--out", tmp_path)
+    name = tmp_path.name
+    assert f"{name}: reference 100%\n" in err and f"{name}: prb: compiling\n" in err
+    assert re.search(rf"{name}: prb, about 0:00:0\d left\n", err)
 
 
 def test_reference_that_is_too_noisy_ends_with_exit_code_1(run, make_scene, tmp_path):

@@ -7,6 +7,7 @@ import datetime
 import importlib.util
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -137,22 +138,43 @@ def progress_bars(*columns: ProgressColumn) -> Iterator[Progress]:
 
 @contextlib.contextmanager
 def progress_line() -> Iterator[Callable[[Step], None]]:
-    """What ``Comparison.run`` reports to: a progress bar with an estimate of the time left."""
+    """What ``Comparison.run`` reports to: a progress bar with an estimate of the time left; where
+    there is no terminal, a line every minute."""
     from rich.progress import TextColumn
 
+    if not sys.stderr.isatty():
+        yield _Log()
+        return
     with progress_bars(TextColumn("{task.fields[left]}", markup=False)) as bars:
         bar = bars.add_task("loading", total=None, left="")
 
         def show(step: Step) -> None:
-            total = left = None
-            if step.left is not None:
-                total = max(step.done + step.left, 1e-9)
-                left = f"about {datetime.timedelta(seconds=round(step.left))} left"
+            total = None if step.left is None else max(step.done + step.left, 1e-9)
             bars.update(
-                bar, description=step.label, total=total, completed=step.done, left=left or ""
+                bar, description=step.label, total=total, completed=step.done, left=_left(step)
             )
 
         yield show
+
+
+class _Log:
+    """Progress for a file: lines that are at least :attr:`PERIOD` seconds apart."""
+
+    PERIOD = 60.0
+
+    def __init__(self) -> None:
+        self._last = time.monotonic()
+
+    def __call__(self, step: Step) -> None:
+        if time.monotonic() - self._last >= self.PERIOD:
+            self._last = time.monotonic()
+            click.echo(", ".join(filter(None, [step.label, _left(step)])), err=True)
+
+
+def _left(step: Step) -> str:
+    if step.left is None:
+        return ""
+    return f"about {datetime.timedelta(seconds=round(step.left))} left"
 
 
 def console_for_tables() -> Console:

@@ -1,0 +1,69 @@
+"""Integrators whose error and time are known, and comparisons of them.
+
+Times come from a clock that the integrators move themselves.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from mitsuba_ext import compare
+from mitsuba_ext.compare.experiment import run_seed
+
+import mitsuba as mi  # isort: skip
+
+#: A scene whose image is 1 everywhere, whatever the integrator.
+WHITE = {
+    "type": "scene",
+    "integrator": {"type": "path", "max_depth": 3},
+    "sensor": {
+        "type": "perspective",
+        "film": {"type": "hdrfilm", "width": 32, "height": 24, "rfilter": {"type": "box"}},
+    },
+    "emitter": {"type": "constant"},
+}
+
+
+#: Numbers the integrators under test.
+COUNT = itertools.count()
+
+
+class Clock:
+    """Stands in for the module ``time``."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+def noisy_integrator(clock, sigma=1.0, cost=0.01, fixed=0.0, fails_in=None, mean=1.0, calls=None):
+    """Adds noise of variance σ²/spp to the truth, and takes ``fixed + cost · spp`` seconds."""
+
+    class Noisy(type(mi.load_dict({"type": "prb"}))):
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            if calls is not None:
+                calls.append((int(seed), spp))
+            if fails_in is not None and seed == run_seed(0, fails_in) and spp > 3:
+                raise ZeroDivisionError("no\nlight")
+            clock.now += fixed + cost * spp
+            width, height = scene.sensors()[0].film().crop_size()
+            noise = np.random.default_rng([int(seed), spp, int(sigma * 1e6)])
+            shape = (int(height), int(width), 3)
+            return mi.TensorXf(mean + sigma * spp**-0.5 * noise.standard_normal(shape))
+
+        def to_string(self):
+            return f"Noisy[{sigma}, {cost}, {fixed}, {mean}]"
+
+    name = f"noisy{next(COUNT)}"
+    mi.register_integrator(name, Noisy)
+    return name
+
+
+def compare_noisy(budget, integrators, tmp_path, **options):
+    options = {"reference_spp": 16, "seeds": 3, **options}
+    comparison = compare.Comparison(WHITE, integrators, budget, folder=tmp_path, **options)
+    return comparison.run()["scenes"][0]

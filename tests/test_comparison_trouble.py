@@ -1,0 +1,285 @@
+"""Comparisons: references that do not fit, and what becomes of trouble."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from noisy import WHITE, compare_noisy, noisy_integrator
+
+from mitsuba_ext import compare
+from mitsuba_ext.compare import InputError, experiment, runs
+from mitsuba_ext.compare.experiment import run_seed
+
+import mitsuba as mi  # isort: skip
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+# ---- The reference ----
+
+
+def test_reference_too_noisy_for_an_error_is_refused(clock, tmp_path):
+    reference = tmp_path / "reference.exr"
+    rng = np.random.default_rng(1)
+    mean = 1 + 0.1 * rng.standard_normal((24, 32, 3))
+    channels = [f"{name}.{color}" for name in ("mean", "variance") for color in "RGB"]
+    pixels = np.concatenate([mean, np.full_like(mean, 0.01)], axis=2)
+    compare.write_exr(reference, pixels, channels, {"spp": 100})
+    comparison = compare.Comparison(
+        compare.SceneSetup(WHITE, reference=reference),
+        {"first": noisy_integrator(clock)},
+        compare.sweep([4, 4000]),
+        folder=tmp_path / "out",
+    )
+    scene = comparison.run()["scenes"][0]
+    coarse, fine = scene["integrators"][0]["levels"]
+    assert not coarse["refused"]
+    assert coarse["figures"]["relmse"]["value"] == pytest.approx(1 / 4 / 1.01, rel=0.1)
+    assert "too noisy: its own relMSE is 0.01" in fine["refused"]
+    assert "--reference-spp" in fine["refused"]
+    assert fine["figures"]["relmse"] is None and fine["figures"]["efficiency"] is None
+    assert fine["ratios"]["efficiency"] is None
+
+
+def test_reference_that_is_longer_than_needed_is_taken(clock, tmp_path):
+    scene = compare.load_scene(WHITE, keep_integrator=False)
+    long = compare.render_reference(scene, 64, tmp_path)
+    assert compare.render_reference(scene, 16, tmp_path).path == long.path
+    assert compare.render_reference(scene, 128, tmp_path).path != long.path
+    assert compare.render_reference(scene, 200, tmp_path, enough=100).spp == 128
+
+
+def test_interrupted_reference_goes_on_where_it_was(tmp_path):
+    ball = {"type": "sphere", "to_world": mi.ScalarTransform4f().translate([0, 0, 5])}
+    sphere = compare.load_scene({**WHITE, "ball": ball}, keep_integrator=False)
+    whole = compare.render_reference(sphere, 32, tmp_path)
+
+    done = []
+
+    def stop(fraction):
+        done.append(fraction)
+        if fraction == 0.5:
+            raise KeyboardInterrupt
+
+    other = tmp_path / "other"
+    other.mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        compare.render_reference(sphere, 32, other, progress=stop)
+    resumed = compare.render_reference(sphere, 32, other, progress=done.append)
+    assert len(done) == 16  # of 16 batches in all
+    assert np.array_equal(resumed.mean, whole.mean)
+    assert np.array_equal(resumed.variance, whole.variance)
+    assert [path.suffix for path in other.iterdir()] == [".exr"]
+
+
+def test_failing_reference_is_an_input_error_that_names_it(clock, tmp_path):
+    def fail(props):
+        class Fails(type(mi.load_dict({"type": "prb"}))):
+            def render(self, *_, **__):
+                raise ZeroDivisionError("no light")
+
+        return Fails(props)
+
+    mi.register_integrator("fails", fail)
+    comparison = compare.Comparison(
+        WHITE, ["path"], compare.equal_samples(4), folder=tmp_path, reference_integrator="fails"
+    )
+    with pytest.raises(InputError, match='the reference of "fails" failed: no light'):
+        comparison.run()
+
+
+def test_reference_of_another_scene_or_depth_is_warned_of(clock, tmp_path):
+    reference = compare.render_reference(
+        compare.load_scene(WHITE, keep_integrator=False), 16, tmp_path
+    )
+    deeper = {**WHITE, "integrator": {"type": "path", "max_depth": 5}}
+    comparison = compare.Comparison(
+        compare.SceneSetup(deeper, reference=reference.path),
+        {"noisy": noisy_integrator(clock)},
+        compare.equal_samples(4),
+    )
+    another, depth = comparison.run()["scenes"][0]["warnings"]
+    assert "another scene" in another
+    assert depth == "the reference has max_depth 3, the scene 5"
+
+
+# ---- Trouble ----
+
+
+def test_failing_integrator_is_a_row_with_its_earlier_runs(clock, tmp_path):
+    integrators = {
+        "first": noisy_integrator(clock),
+        "fails": noisy_integrator(clock, sigma=2.0, fails_in=1),
+    }
+    scene = compare_noisy(compare.equal_samples(8), integrators, tmp_path)
+    first, fails = scene["integrators"]
+    assert (len(first["runs"]), len(fails["runs"])) == (3, 1)
+    assert fails["error"] == "no light"
+    assert "ZeroDivisionError" in fails["traceback"]
+    assert "ZeroDivisionError" in (tmp_path / "report.html").read_text()
+    assert first["error"] == ""
+
+
+def test_integrator_that_ends_the_process_politely_is_a_failed_row(clock, tmp_path):
+    def leave(props):
+        class Leaves(type(mi.load_dict({"type": "prb"}))):
+            def render(self, *_, **__):
+                raise SystemExit(5)
+
+        return Leaves(props)
+
+    mi.register_integrator("leaves", leave)
+    integrators = {"first": noisy_integrator(clock), "leaves": "leaves"}
+    first, leaves = compare_noisy(compare.equal_samples(8), integrators, tmp_path)["integrators"]
+    assert len(first["runs"]) == 3 and leaves["error"] == "5"
+
+
+def test_time_that_cannot_be_met_is_noted(clock, tmp_path):
+    slow = {"slow": noisy_integrator(clock, cost=50.0)}
+    record = compare_noisy(compare.equal_time(20), slow, tmp_path)["integrators"][0]
+    assert record["runs"][0]["spp"] == 1
+    assert "3 of 3 runs took another time than 20 s" in record["notes"][0]
+
+
+def test_fireflies_are_noted(clock, tmp_path):
+    class Fireflies(type(mi.load_dict({"type": "prb"}))):
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            clock.now += spp
+            image = np.full((24, 32, 3), 1.1)
+            image[3, 4] = 50
+            return mi.TensorXf(image)
+
+    mi.register_integrator("fireflies", Fireflies)
+    scene = compare_noisy(compare.equal_samples(8), ["fireflies"], tmp_path)
+    (note,) = scene["integrators"][0]["notes"]
+    assert "0.1 % of the pixels make up 100% of relMSE" in note
+
+
+def test_scene_that_fails_is_an_entry_and_does_not_stop_the_others(clock, tmp_path):
+    broken = {**WHITE, "shape": {"type": "sphere", "radiu": 1.0}}
+    comparison = compare.Comparison(
+        [broken, WHITE], {"noisy": noisy_integrator(clock)}, compare.equal_samples(4),
+        folder=tmp_path, reference_spp=16,
+    )
+    first, second = comparison.run()["scenes"]
+    assert "radiu" in first["error"] and not second["error"]
+    assert first["name"] != second["name"]
+    assert (tmp_path / "report.html").is_file()
+    with pytest.raises(InputError, match="radiu"):
+        compare.Comparison(broken, ["path"], compare.equal_samples(4)).run()
+
+
+def test_second_comparison_takes_up_what_is_there(clock, tmp_path):
+    calls = []
+    integrators = {"noisy": noisy_integrator(clock, calls=calls)}
+
+    def run(**options) -> dict:
+        calls.clear()
+        return compare_noisy(compare.equal_samples(8), integrators, tmp_path, **options)
+
+    once = run(seeds=2)
+    again = run(seeds=2)
+    assert calls == []
+    assert again["integrators"] == once["integrators"]
+    more = run(seeds=3)
+    assert [call for call in calls if call[1] == 8] == [(run_seed(0, 2), 8)]
+    assert more["integrators"][0]["runs"][:2] == once["integrators"][0]["runs"]
+
+
+def test_damaged_and_foreign_runs_are_rendered_again(clock, tmp_path):
+    calls = []
+    integrators = {"noisy": noisy_integrator(clock, calls=calls)}
+    scene = compare_noisy(compare.equal_samples(8), integrators, tmp_path, seeds=1)
+    path = tmp_path / scene["integrators"][0]["runs"][0]["image"]
+    path.write_bytes(path.read_bytes()[:100])
+    calls.clear()
+    compare_noisy(compare.equal_samples(8), integrators, tmp_path, seeds=1)
+    assert (run_seed(0, 0), 8) in calls
+    calls.clear()
+    others = {"noisy": noisy_integrator(clock, sigma=3.0, calls=calls)}
+    compare_noisy(compare.equal_samples(8), others, tmp_path, seeds=1)
+    assert (run_seed(0, 0), 8) in calls
+
+
+def test_runs_of_a_live_object_are_not_taken_up(clock, tmp_path):
+    calls = []
+    integrator = mi.load_dict({"type": noisy_integrator(clock, calls=calls)})
+    for _ in range(2):
+        calls.clear()
+        compare_noisy(compare.equal_samples(8), {"live": integrator}, tmp_path, seeds=1)
+        assert (run_seed(0, 0), 8) in calls
+
+
+def test_times_of_different_sessions_are_not_paired(clock, tmp_path, monkeypatch):
+    integrators = {name: noisy_integrator(clock) for name in ("first", "second")}
+    compare_noisy(compare.equal_samples(8), {"first": integrators["first"]}, tmp_path)
+    monkeypatch.setattr(runs, "SESSION", "tomorrow")
+    scene = compare_noisy(compare.equal_samples(8), integrators, tmp_path)
+    assert any("different sessions" in warning for warning in scene["warnings"])
+    ratios = scene["integrators"][1]["levels"][0]["ratios"]
+    assert ratios["efficiency"]["low"] is None and ratios["seconds"]["low"] is None
+    assert ratios["relmse"]["low"] is not None
+
+
+def test_interruption_keeps_what_is_finished_and_says_so(clock, tmp_path, monkeypatch):
+    integrators = {"noisy": noisy_integrator(clock)}
+    comparison = compare.Comparison(
+        WHITE, integrators, compare.equal_samples(8), folder=tmp_path, reference_spp=16
+    )
+    measure = experiment.Experiment._measure
+
+    def interrupted(self, contender, index, round, path):
+        if round == 2:
+            raise KeyboardInterrupt
+        return measure(self, contender, index, round, path)
+
+    monkeypatch.setattr(experiment.Experiment, "_measure", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        comparison.run()
+    stored = json.loads((tmp_path / "results.json").read_text())
+    assert stored["state"] == "interrupted"
+    assert len(stored["scenes"][0]["integrators"][0]["runs"]) == 2
+    assert "nterrupted" in (tmp_path / "report.html").read_text()
+    monkeypatch.undo()
+
+
+def test_temporary_folder_serves_where_none_is_given(clock):
+    comparison = compare.Comparison(
+        WHITE, {"noisy": noisy_integrator(clock)}, compare.equal_samples(4), reference_spp=16
+    )
+    comparison.run()
+    assert (comparison.folder / "report.html").is_file()
+
+
+@pytest.mark.parametrize(
+    "scenes, integrators, options, message",
+    [
+        ([], ["path"], {}, "no scene"),
+        (WHITE, [], {}, "no integrator"),
+        (WHITE, ["path", "path"], {}, "given twice"),
+        (WHITE, ["path"], {"seeds": 0}, "seed"),
+        ("none.xml", ["path"], {}, "no such scene"),
+    ],
+)
+def test_bad_input_is_refused_at_once(scenes, integrators, options, message):
+    with pytest.raises(InputError, match=message):
+        compare.Comparison(scenes, integrators, compare.equal_samples(4), **options)
+
+
+@pytest.mark.parametrize(
+    "make, value",
+    [
+        (compare.equal_samples, 0),
+        (compare.equal_samples, 1.5),
+        (compare.equal_time, 0),
+        (compare.equal_time, float("nan")),
+        (compare.sweep, []),
+        (compare.sweep, [0, 1]),
+        (compare.until, -1),
+    ],
+)
+def test_budgets_refuse_what_makes_no_sense(make, value):
+    with pytest.raises(InputError):
+        make(value)
