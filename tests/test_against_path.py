@@ -92,6 +92,7 @@ def test_structured_samples_over_several_passes_keep_the_mean(
     from mitsuba_ext import rendering
 
     monkeypatch.setattr(rendering, "_PASS_SAMPLES", dict.fromkeys(rendering._PASS_SAMPLES, 1024))
+    monkeypatch.setattr(rendering, "_PASS_SPP", 1)
     integrator = UNDER_TEST["neepp"].make(4)
     scene = mi.load_dict(stage(camera=sensor(sampler=sampler)))
     images = batches(scene, integrator, 16, SEEDS)

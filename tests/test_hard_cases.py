@@ -101,6 +101,7 @@ def test_passes_of_one_render_draw_different_numbers(
     in_one = batches(scene, integrator, 16, SEEDS)
     limits = dict.fromkeys(rendering._PASS_SAMPLES, 16 * 16)
     monkeypatch.setattr(rendering, "_PASS_SAMPLES", limits)
+    monkeypatch.setattr(rendering, "_PASS_SPP", 1)
     in_many = batches(scene, integrator, 16, SEEDS)
     assert integrator.statistics.passes == 16
     noise = [images.std(axis=0, ddof=1).mean() for images in (in_one, in_many)]

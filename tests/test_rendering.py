@@ -42,6 +42,7 @@ def small_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Four samples per pixel and pass."""
     limits = {dr.JitBackend.LLVM: 4 * WIDTH * HEIGHT}
     monkeypatch.setattr(rendering, "_PASS_SAMPLES", limits)
+    monkeypatch.setattr(rendering, "_PASS_SPP", 1)
 
 
 class _Constant:
@@ -81,6 +82,17 @@ class _TwoStages:
 
 def _path(name: str = "composed_path", **parameters) -> mi.Integrator:
     return mi.load_dict({"type": name, "max_depth": 3, **parameters})
+
+
+@pytest.mark.parametrize(
+    "sampler, plan", [("independent", [[14, 14, 12]]), ("stratified", [[1] * 36])]
+)
+def test_passes_of_large_films_keep_the_samples_of_a_pixel_together(scene, sampler, plan):
+    """But for samplers that hold a state for each sample."""
+    sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
+                           "film": {"type": "hdrfilm", "width": 2048, "height": 1024}})
+    job = rendering._Job(_path(), scene, sensor, 0, 36 if sampler == "stratified" else 40)
+    assert job.plan == plan
 
 
 @pytest.mark.usefixtures("small_passes")
