@@ -12,6 +12,7 @@ import numpy as np
 
 from mitsuba_ext import registry
 from mitsuba_ext.batches import Batches, batch_seeds, each_batch, sample_count
+from mitsuba_ext.camera import develop as develop_film
 from mitsuba_ext.camera import find_sensor
 from mitsuba_ext.parameters import read_parameter
 from mitsuba_ext.rendering import RenderStatistics
@@ -164,13 +165,7 @@ class Variance(mi.AdjointIntegrator):
                 self._fill(film, batches)
             self.statistics.interrupted = batches is None or batches.count < batch_count
             self.statistics.seconds = time.perf_counter() - start
-        image = film.develop() if develop else mi.TensorXf()
-        if not develop:
-            film.schedule_storage()
-        if evaluate:
-            dr.eval(image) if develop else dr.eval()
-            dr.sync_thread()
-        return image
+        return develop_film(film, develop, evaluate)
 
     def aov_names(self) -> list[str]:
         """Of the last render; before the first, of a film that takes RGB (or is monochrome)."""

@@ -107,3 +107,14 @@ def splat(
         rgb = mi.Color3f(L.x) if mi.is_monochromatic else L
     has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
     block.put(position, [rgb.x, rgb.y, rgb.z, *([alpha] if has_alpha else []), 1.0, *aovs])
+
+
+def develop(film: mi.Film, develop: bool, evaluate: bool) -> mi.TensorXf:
+    """What ``render(develop=…, evaluate=…)`` returns, once the film holds the image."""
+    image = film.develop() if develop else mi.TensorXf()
+    if not develop:
+        film.schedule_storage()
+    if evaluate:
+        dr.eval(image) if develop else dr.eval()
+        dr.sync_thread()
+    return image

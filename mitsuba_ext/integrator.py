@@ -5,7 +5,7 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import mitsuba as mi
@@ -127,22 +127,10 @@ class WalkIntegrator(mi.SamplingIntegrator):
 
     # ---- Helpers ----
 
-    def parameter(
-        self,
-        props: mi.Properties,
-        key: str,
-        default: Any,
-        minimum: float | None = None,
-        maximum: float | None = None,
-        choices: Sequence[str] = (),
-    ) -> Any:
-        """A parameter of the scene, checked. Its type is that of ``default``.
-
-        Raises:
-            TypeError: The scene gives another type (an integer passes for a float).
-            ValueError: The value is out of range, or not one of ``choices``.
-        """
-        return read_parameter(self.name, props, key, default, minimum, maximum, choices)
+    def parameter(self, props: mi.Properties, key: str, default: Any, **accepted: Any) -> Any:
+        """A parameter of the scene, checked: see :func:`mitsuba_ext.parameters.read_parameter`,
+        which also says what ``accepted`` can be."""
+        return read_parameter(self.name, props, key, default, **accepted)
 
     def no_gradients(self) -> NotImplementedError:
         """What to raise where gradients are asked for."""

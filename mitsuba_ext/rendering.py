@@ -112,13 +112,7 @@ def render(
     finally:
         # Also after an exception, the film holds the passes that were finished
         job.fill_film()
-    film = sensor.film()
-    image = film.develop() if develop else mi.TensorXf()
-    if not develop:
-        film.schedule_storage()
-    if evaluate:
-        dr.eval(image) if develop else dr.eval()
-        dr.sync_thread()
+    image = camera.develop(sensor.film(), develop, evaluate)
     job.finish()
     if interrupt.is_set():
         raise KeyboardInterrupt

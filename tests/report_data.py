@@ -36,7 +36,8 @@ def make_integrator(
             (folder / scene).mkdir(exist_ok=True)
             write_exr(folder / name, image, "RGB", {})
             runs.append({
-                "level": level, "seed": seed, "spp": level, "seconds": level / 100 + 0.01 * seed,
+                "level": level, "seed": seed, "round": seed, "spp": level,
+                "seconds": level / 100 + 0.01 * seed,
                 "relmse": metrics.relative_mse(image, reference), "relmse_trimmed": scale**2,
                 "mse": scale**2, "rmse": scale, "sigma_mu": scale, "flip": None,
                 "rays": {}, "connections": None, "zero_radiance": None, "memory": None,

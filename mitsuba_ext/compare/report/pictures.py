@@ -77,7 +77,7 @@ class Pictures:
 
 
 def load_pictures(scene: Record, level: float | None, folder: Path) -> Pictures:
-    """Reads what the scene's runs at ``level`` have rendered; the images are of the first seed."""
+    """Reads what the scene's runs at ``level`` have rendered; the images are of the first round."""
     result = Pictures()
     reference = None
     if scene["reference"]:

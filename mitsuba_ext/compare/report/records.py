@@ -62,9 +62,9 @@ def at_level(integrator: Record, level: float | None) -> Record | None:
 
 
 def runs_at(integrator: Record, level: float | None) -> list[Record]:
-    """The runs of one level, in the order of their seeds."""
+    """The runs of one level, in the order of their rounds, in which integrators share seeds."""
     runs = [run for run in integrator["runs"] if run["level"] == level]
-    return sorted(runs, key=lambda run: run["seed"])
+    return sorted(runs, key=lambda run: run["round"])
 
 
 def pictured_runs(integrator: Record, level: float | None) -> list[Record]:
