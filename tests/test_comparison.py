@@ -6,7 +6,7 @@ import pytest
 from noisy import WHITE, compare_noisy, noisy_integrator
 
 from mitsuba_ext import compare
-from mitsuba_ext.compare import InputError
+from mitsuba_ext.compare import InputError, timing
 from mitsuba_ext.compare.experiment import run_seed
 
 import mitsuba as mi  # isort: skip
@@ -101,6 +101,23 @@ def test_each_level_and_round_has_a_seed_of_its_own_which_integrators_share(cloc
                      for record in scene["integrators"])
     assert first == second
     assert len({seed for _, _, seed in first}) == 6
+
+
+def test_run_that_had_to_compile_is_thrown_away(clock, tmp_path, monkeypatch):
+    timed_render, seen = timing.timed_render, set()
+
+    def compiles_once(integrator, scene, seed, spp):
+        timed = timed_render(integrator, scene, seed, spp)
+        if (seed, spp) in seen:
+            return timed
+        seen.add((seed, spp))
+        return timed._replace(compiled=True, seconds=timed.seconds + 100)
+
+    monkeypatch.setattr(timing, "timed_render", compiles_once)
+    integrators = {"noisy": noisy_integrator(clock, cost=0.01)}
+    scene = compare_noisy(compare.equal_samples(64), integrators, tmp_path)
+    seconds = [run["seconds"] for run in scene["integrators"][0]["runs"]]
+    assert seconds == pytest.approx([0.64] * 3)
 
 
 def test_integrators_take_turns(clock, tmp_path):
