@@ -213,6 +213,9 @@ class Trouble(type(mi.load_dict({"type": "prb"}))):
             os.abort()
         if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "exit":
             os._exit(3)
+        if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "wait":
+            print("waiting", flush=True)
+            time.sleep(60)
         if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "hang":
             print("hanging", flush=True)
             while True:  # as native code, it does not hear Ctrl-C
@@ -256,6 +259,17 @@ def test_integrator_that_takes_the_process_down_is_a_failed_row(make_scene, tmp_
     process.communicate(timeout=120)
     assert process.returncode == 0
     assert stored_runs(tmp_path) == [3, 3]
+
+
+def test_first_interrupt_reaches_the_worker_which_reports_what_is_finished(make_scene, tmp_path):
+    process = troubled(make_scene(), tmp_path, "wait")
+    assert process.stdout.readline() == "waiting\n"
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "given up" not in err
+    assert stored_runs(tmp_path) == [2, 1]
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["state"] == "interrupted"
 
 
 def test_second_interrupt_gives_up_the_running_render_and_reports_the_others(make_scene, tmp_path):

@@ -118,6 +118,7 @@ def test_failing_integrator_is_a_row_with_its_earlier_runs(clock, tmp_path):
     assert (len(first["runs"]), len(fails["runs"])) == (3, 1)
     assert fails["error"] == "no light"
     assert "ZeroDivisionError" in fails["traceback"]
+    assert not list(tmp_path.rglob("*.running"))
     assert "ZeroDivisionError" in (tmp_path / "report.html").read_text()
     assert first["error"] == ""
 
