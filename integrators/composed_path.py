@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.decisions.visibility_roulette import Rejection
-from mitsuba_ext.integrator import Stage, WalkIntegrator
+from mitsuba_ext.decisions.light_sampling import METHODS, LightSampling
+from mitsuba_ext.integrator import WalkIntegrator
+from mitsuba_ext.learning.learner import Learner
 
 
 @registry.plugin
@@ -81,20 +81,31 @@ class ComposedPath(WalkIntegrator):
         self.shadow_test = self.parameter(
             props, "shadow_test", "always", choices=("always", "visibility_roulette")
         )
-        self.rejection = None
-        if self.shadow_test == "visibility_roulette":
-            self.rejection = Rejection.from_properties(self, props)
+        self.next_event = self.parameter(props, "next_event", "uniform", choices=METHODS)
+        rejects = self.shadow_test == "visibility_roulette"
+        # The parameters of what does not learn are unknown, and typos are found
+        self.light_sampling = None
+        if rejects or self.next_event != "uniform":
+            self.light_sampling = LightSampling.from_properties(
+                self, props, self.next_event, rejects
+            )
 
-    def stage_samples(self, scene: mi.Scene, spp: int) -> list[int]:
-        if self.rejection:
-            return self.rejection.stage_samples(self, scene, spp)
-        return super().stage_samples(scene, spp)
+    def decisions(self, scene: mi.Scene) -> dict[str, Any]:
+        return self.light_sampling.decisions(scene) if self.light_sampling else {}
 
-    def stages(self, scene: mi.Scene, samples: list[int]) -> Iterator[Stage]:
-        if self.rejection:
-            return self.rejection.stages(self, scene, samples)
-        return super().stages(scene, samples)
+    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
+        if self.light_sampling is None or self.max_depth < 2:
+            return []
+        return self.light_sampling.pilots(scene, spp)
+
+    def learners(self, scene: mi.Scene, samples: int) -> list[Learner]:
+        return self.light_sampling.learners(scene, samples) if self.light_sampling else []
 
     def parameters(self) -> dict[str, Any]:
-        learned = vars(self.rejection) if self.rejection else {}
-        return {"shadow_test": self.shadow_test, **learned}
+        learned = vars(self.light_sampling) if self.light_sampling else {}
+        del_keys = ("light_sampling", "rejection")
+        return {
+            "shadow_test": self.shadow_test,
+            "next_event": self.next_event,
+            **{k: v for k, v in learned.items() if k not in del_keys},
+        }

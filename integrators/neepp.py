@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.decisions.visibility_roulette import Rejection
-from mitsuba_ext.integrator import Stage, WalkIntegrator
+from mitsuba_ext.decisions.light_sampling import METHODS, LightSampling
+from mitsuba_ext.integrator import WalkIntegrator
+from mitsuba_ext.learning.learner import Learner
 
 
 @registry.plugin
@@ -103,13 +103,18 @@ class NEEPlusPlus(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.rejection = Rejection.from_properties(self, props)
+        light_sampling = self.parameter(props, "light_sampling", "contribution", choices=METHODS)
+        rejection = self.parameter(props, "rejection", True)
+        self.next_event = LightSampling.from_properties(self, props, light_sampling, rejection)
 
-    def stage_samples(self, scene: mi.Scene, spp: int) -> list[int]:
-        return self.rejection.stage_samples(self, scene, spp)
+    def decisions(self, scene: mi.Scene) -> dict[str, Any]:
+        return self.next_event.decisions(scene)
 
-    def stages(self, scene: mi.Scene, samples: list[int]) -> Iterator[Stage]:
-        return self.rejection.stages(self, scene, samples)
+    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
+        return self.next_event.pilots(scene, spp) if self.max_depth > 1 else []
+
+    def learners(self, scene: mi.Scene, samples: int) -> list[Learner]:
+        return self.next_event.learners(scene, samples)
 
     def parameters(self) -> dict[str, Any]:
-        return vars(self.rejection)
+        return vars(self.next_event)

@@ -10,7 +10,9 @@ from typing import Any
 
 import mitsuba as mi
 
-from . import rendering
+from . import camera, rendering
+from .learning.learner import Learner, Observers
+from .learning.scout import SCOUT_DEPTH, NoConnections, Scout
 from .parameters import read_parameter
 from .rendering import Stage
 from .walk import Walk
@@ -21,8 +23,8 @@ _NO_DEPTH_LIMIT = 0xFFFFFFFF
 class WalkIntegrator(mi.SamplingIntegrator):
     """An integrator whose samples are random walks.
 
-    A subclass reads its own parameters and says, in :meth:`stages`, which decisions of the walk it
-    takes over. Common parameters:
+    A subclass reads its own parameters and says, in :meth:`decisions` and :meth:`learners`, which
+    decisions of the walk it takes over. Common parameters:
 
     Parameters:
         max_depth (int): Longest path in the image, −1 for no limit, 1 for visible emitters only.
@@ -65,15 +67,46 @@ class WalkIntegrator(mi.SamplingIntegrator):
         walk = Walk(self.max_depth, self.rr_depth, self.hide_emitters, **decisions)
         return Stage(walk, learned)
 
-    def stage_samples(self, scene: mi.Scene, spp: int) -> list[int]:
-        """The samples per pixel of each stage; they add up to ``spp``. Those of the last stage
-        teach nothing."""
-        return [spp]
+    def decisions(self, scene: mi.Scene) -> dict[str, Any]:
+        """The decisions that are taken over without learning, as parameters of :class:`Walk`."""
+        return {}
 
-    def stages(self, scene: mi.Scene, samples: list[int]) -> Iterator[Stage]:
-        """Yields one stage for each entry of ``samples``. What stands between two ``yield`` runs
-        between the stages: that is where a learner turns observations into tables."""
-        yield self.stage()
+    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
+        """The samples per pixel of each pilot stage, out of ``spp``; none where nothing learns."""
+        return []
+
+    def learners(self, scene: mi.Scene, samples: int) -> list[Learner]:
+        """Who learns from ``samples`` pilot samples (of all pixels together; with 0, only those who
+        know something already)."""
+        return []
+
+    def stages(
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: list[int]
+    ) -> Iterator[Stage]:
+        """Yields one stage for each entry of ``samples``: pilots, and the last one. What stands
+        between two ``yield`` runs between the stages: learners turn observations into tables."""
+        width, height = camera.film_extent(sensor.film())
+        decisions = self.decisions(scene)
+        *pilots, _rest = samples
+        learners = self.learners(scene, width * height * sum(pilots))
+        p, n = mi.Point3f(), mi.Normal3f()
+        if any(learner.wants_scout for learner in learners):
+            scout = Scout(width * height)
+            depth = min(SCOUT_DEPTH, self.max_depth)
+            walk = Walk(depth, depth, next_event=NoConnections(), observer=scout)
+            yield Stage(walk, is_scout=True)
+            p, n = scout.vertices()
+        for learner in learners:
+            decisions.update(learner.start(scene, p, n))
+        observer = learners[0] if len(learners) == 1 else Observers(learners)
+        for index in range(len(pilots)):
+            yield self.stage(observer=observer, **decisions)
+            for learner in learners:
+                decisions.update(learner.learn(scene, is_last=index == len(pilots) - 1))
+        if not pilots:
+            for learner in learners:
+                decisions.update(learner.learn(scene, is_last=True))
+        yield self.stage("; ".join(map(str, learners)), **decisions)
 
     def parameters(self) -> dict[str, Any]:
         """What ``str()`` shows besides the common parameters."""
@@ -89,7 +122,7 @@ class WalkIntegrator(mi.SamplingIntegrator):
         """One sample, for integrators that nest this one and draw its samples (``moment``; ``aov``
         calls :meth:`render`). Nothing is learned there: each decision that needs a pilot falls
         back to its default."""
-        sample = self.stage().walk(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
+        sample = self.stage(**self.decisions(scene)).walk(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
         return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
 
     def aov_names(self) -> list[str]:

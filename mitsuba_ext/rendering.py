@@ -80,10 +80,12 @@ class RenderStatistics:
 
 @dataclass
 class Stage:
-    """One stage of a render: the walk that its samples take, and what had been learned before."""
+    """One stage of a render: the walk that its samples take, and what had been learned before. A
+    scout takes one sample per pixel that is none of the image's."""
 
     walk: Walk
     learned: str = ""
+    is_scout: bool = False
 
 
 def render(
@@ -164,7 +166,8 @@ class _Job:
         if self.integrator.timeout > 0:
             limit //= _TIMEOUT_PASS_DIVISOR
         limit = max(1, min(limit, self.integrator.samples_per_pass))
-        stages = self.integrator.stage_samples(self.scene, self.spp)
+        pilots = self.integrator.pilots(self.scene, self.spp)
+        stages = [*pilots, self.spp - sum(pilots)]
         # Independent samples can be cut anywhere, and each pass gets a seed of its own. Samples
         # that are stratified over the whole render must come in passes of equal length, to which
         # the pilots are rounded.
@@ -194,8 +197,12 @@ class _Job:
             f"Starting render job ({self.width}x{self.height}, {self.spp} samples, "
             f"{len(self.plan)} stage(s), {pass_count} pass(es))",
         )
-        stages = self.integrator.stages(self.scene, stage_samples)
-        for index, (stage, passes) in enumerate(zip(stages, self.plan)):
+        plan = iter(enumerate(self.plan))
+        for stage in self.integrator.stages(self.scene, self.sensor, stage_samples):
+            if stage.is_scout:
+                self._run_scout(stage)
+                continue
+            index, passes = next(plan)
             is_last = index == len(self.plan) - 1
             self.statistics.learned = stage.learned
             if is_last:
@@ -233,6 +240,17 @@ class _Job:
 
     def _stopped(self, interrupt: threading.Event) -> bool:
         return interrupt.is_set() or self.integrator.is_cancelled
+
+    def _run_scout(self, stage: Stage) -> None:
+        begin = time.perf_counter()
+        sampler = mi.load_dict({"type": "independent"})
+        # The same for all seeds: what a scout decides changes the size of tables, and kernels
+        sampler.seed(dr.opaque(mi.UInt32, 0), self._lanes(1))
+        ray, _weight, _position = camera.sample_rays(self.sensor, sampler, 1, self.spp)
+        sample = stage.walk(self.scene, sampler, mi.Ray3f(ray), mi.Bool(True))
+        dr.eval(sample.L)
+        self.statistics.compile_seconds += time.perf_counter() - begin
+        dr.sync_thread()
 
     def _run_pass(self, stage: Stage, spp: int) -> bool:
         """Renders ``spp`` samples per pixel into the block; did it have to compile a kernel?"""

@@ -53,7 +53,7 @@ class Walk:
         next_event: Which point of which light to connect to, and with what pdf.
         shadow_test: Whether the shadow ray of a connection is traced.
         query: How a ray meets the scene.
-        observer: Is told of each shadow ray and each path segment; ``None`` in final stages.
+        observer: Is told what happens (``learning.learner.Observer``); ``None`` in final stages.
     """
 
     max_depth: int
@@ -112,9 +112,10 @@ class Walk:
 
             # ----- Which point of which light do we connect to? -----
             active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            emitter_sample = sampler.next_2d()
+            if dr.hint(self.observer is not None, mode="scalar"):
+                self.observer.vertex(si, depth, active_em)
             ds, em_weight, next_event_state = self._sample_emitter(
-                connects, next_event_state, scene, si, emitter_sample, active_em
+                connects, next_event_state, scene, sampler, si, active_em
             )
             wo = si.to_local(ds.d)
 
@@ -130,19 +131,22 @@ class Walk:
             if dr.hint(connects, mode="scalar"):
                 bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
                 mis = dr.select(ds.delta, 1, _mis_weight(ds.pdf, bsdf_pdf))
-                unoccluded = β * bsdf_value * em_weight * mis
+                contribution = bsdf_value * em_weight
+                unoccluded = β * contribution * mis
                 active_em &= ds.pdf != 0
                 connection_count += dr.select(active_em, 1, 0)
                 # A connection that cannot contribute needs no shadow ray
                 active_em &= dr.max(dr.abs(unoccluded)) > 0
                 unoccluded, active_em, shadow_state = self._shadow_roulette(
-                    shadow_state, sampler, si, ds, unoccluded, active_em
+                    shadow_state, next_event_state, sampler, si, ds, unoccluded, active_em
                 )
                 visible = active_em & ~self.query.occluded(scene, si, ds.p, active_em)
                 L[visible] += unoccluded
                 shadow_count += dr.select(active_em, 1, 0)
                 if dr.hint(self.observer is not None, mode="scalar"):
-                    self.observer.shadow_ray(si.p, ds.p, visible, active_em)
+                    self.observer.connection(
+                        next_event_state, si, ds, contribution, visible, active_em
+                    )
 
             # ----- Move on to the next vertex -----
             bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)
@@ -177,18 +181,19 @@ class Walk:
         """Adds the light that the BSDF sample of the previous vertex ran into."""
         ds = mi.DirectionSample3f(scene, si, prev_si)
         is_connectable = ~prev_bsdf_delta & (ds.emitter != None)  # noqa: E711
-        em_pdf, state = self.next_event.pdf(state, scene, prev_si, ds, is_connectable)
+        em_pdf, state = self.next_event.pdf(state, scene, prev_si, si, ds, is_connectable)
         mis = _mis_weight(prev_bsdf_pdf, em_pdf)
         return dr.fma(β, ds.emitter.eval(si, prev_bsdf_pdf > 0) * mis, L), state
 
-    def _sample_emitter(self, connects: bool, state, scene, si, sample, active):
+    def _sample_emitter(self, connects: bool, state, scene, sampler, si, active):
         if not connects:
+            sampler.next_2d()  # the numbers that follow are those of `path`
             return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), state
-        return self.next_event.sample(state, scene, si, sample, active)
+        return self.next_event.sample(state, scene, sampler, si, active)
 
-    def _shadow_roulette(self, state, sampler, si, ds, unoccluded, active):
+    def _shadow_roulette(self, state, choice, sampler, si, ds, unoccluded, active):
         """Lets the shadow test's decision drop connections; the survivors weigh 1/p."""
-        p, state = self.shadow_test.probability(state, si, ds, active)
+        p, state = self.shadow_test.probability(state, choice, si, ds, active)
         if p is None:
             return unoccluded, active, state
         survives = sampler.next_1d() < p

@@ -104,6 +104,30 @@ def box(low: ArrayLike, high: ArrayLike, bevel: float = 0.004) -> Mesh:
     return convex(points, loops).moved((low + high) / 2)
 
 
+def block(low: ArrayLike, high: ArrayLike) -> Mesh:
+    """An axis-aligned box of six plain faces that face outwards."""
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    sides = []
+    for a in range(3):
+        u, v = ((high - low) * (np.arange(3) == (a + k) % 3) for k in (1, 2))
+        sides += [quad(low, v, u), quad(np.where(np.arange(3) == a, high, low), u, v)]
+    mesh = join(*sides)
+    return Mesh(mesh.positions, mesh.faces)
+
+
+def perforated(xs: ArrayLike, ys: ArrayLike, holes: set[tuple[int, int]]) -> Mesh:
+    """A wall in the plane z = 0 that faces +z: all cells of a grid but those that are named."""
+    xs, ys = np.asarray(xs, float), np.asarray(ys, float)
+    cells = [
+        quad((xs[i], ys[j], 0), (xs[i + 1] - xs[i], 0, 0), (0, ys[j + 1] - ys[j], 0))
+        for i in range(len(xs) - 1)
+        for j in range(len(ys) - 1)
+        if (i, j) not in holes
+    ]
+    wall = join(*cells)
+    return Mesh(wall.positions, wall.faces)
+
+
 def icosphere(levels: int) -> Mesh:
     """A unit icosahedron, its triangles split in four `levels` times."""
     g = (1 + 5**0.5) / 2

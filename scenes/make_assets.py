@@ -1,4 +1,5 @@
-"""Writes every mesh (PLY) and map (EXR) in `scenes/assets/` that the scene files use.
+"""Writes every mesh (PLY) and map (EXR) in `scenes/assets/` that the scene files use, and the
+thousand lamps of many_lamps.xml.
 
     python scenes/make_assets.py [folder]
 
@@ -15,10 +16,12 @@ import OpenEXR
 from _geometry import (
     Floats,
     Mesh,
+    block,
     box,
     icosphere,
     join,
     lathe,
+    perforated,
     quad,
     rounded,
     torus_knot,
@@ -26,10 +29,15 @@ from _geometry import (
     write_ply,
 )
 
-# The house of rooms.xml: rooms of 4 x 4 m and 2.7 m, walls 0.14 m thick
+# The house of rooms.xml and many_lamps.xml: rooms of 4 x 4 m and 2.7 m, walls 0.14 m thick
 COLUMNS, ROWS, ROOM, HEIGHT, WALL = 4, 3, 4.0, 2.7, 0.14
 DOOR_HEIGHT = 2.1
 WALL_COLOURS = 4
+INSIDE = ROOM - WALL
+
+# The room of window.xml: its size, the thickness of its walls, and the windows in its south wall
+WIDTH, DEPTH, TALL, THICK = 5.2, 4.0, 2.7, 0.24
+WINDOWS, SILL, LINTEL = ((0.35, 2.05), (2.6, 4.3)), 0.6, 2.45
 
 
 # --- things that stand around ------------------------------------------------------------------
@@ -146,23 +154,34 @@ def door() -> dict[str, Mesh]:
     return {"door": join(*leaf), "knob": join(*knobs)}
 
 
+def cupboard() -> dict[str, Mesh]:
+    """0.9 m high, its two doors a hand's breadth apart; the front faces -y."""
+    boards = [box((-0.43, -0.18, z), (0.43, 0.19, z + 0.02)) for z in (0.05, 0.46, 0.88)]
+    boards += [box((x - 0.01, -0.18, 0), (x + 0.01, 0.19, 0.9)) for x in (-0.44, 0.44)]
+    boards.append(box((-0.43, 0.18, 0.05), (0.43, 0.19, 0.9), 0.001))
+    boards += [box((x - 0.2, -0.2, 0.05), (x + 0.2, -0.18, 0.9)) for x in (-0.25, 0.25)]
+    return {"cupboard": join(*boards)}
+
+
+def fittings() -> dict[str, Mesh]:
+    """What lamps of many_lamps.xml hide in: a ledge along a wall, and a bowl on a pole."""
+    ledge = [block((-1.7, -0.12, 0), (1.7, 0, 0.015))]
+    ledge.append(block((-1.7, -0.12, 0.015), (1.7, -0.105, 0.07)))
+    stand = [(0, 0), (0.14, 0), (0.14, 0.012), (0.014, 0.02), (0.014, 1.6), (0.15, 1.72)]
+    stand += [(0.147, 1.722), (0.01, 1.61), (0, 1.61)]
+    return {"ledge": join(*ledge), "stand": lathe(stand, 24)}
+
+
 # --- the furnaces' walls -----------------------------------------------------------------------
 
 
 def wall_with_holes() -> Mesh:
     """One face of furnace_lamps.xml: [-1, 1]^2 facing +z, minus the places of its two lamps."""
     xs, ys = [-1, -0.75, -0.625, 0, 0.5, 1], [-1, -0.5, 0, 0.5, 0.625, 1]
-    cells = []
-    for i in range(5):
-        for j in range(5):
-            if (i, j) not in {(1, 3), (3, 1)}:
-                corner = (xs[i], ys[j], 0)
-                cells.append(quad(corner, (xs[i + 1] - xs[i], 0, 0), (0, ys[j + 1] - ys[j], 0)))
-    walls = join(*cells)
-    return Mesh(walls.positions, walls.faces)
+    return perforated(xs, ys, {(1, 3), (3, 1)})
 
 
-# --- the house of rooms.xml --------------------------------------------------------------------
+# --- the house of rooms.xml and many_lamps.xml --------------------------------------------------
 
 
 def opening(column: int, row: int, across: int) -> tuple[float, float] | None:
@@ -193,26 +212,31 @@ def wall_side(along: float, hole: tuple[float, float] | None) -> list[Mesh]:
     ]
 
 
+def doorways(column: int, row: int) -> list[tuple[float, float] | None]:
+    """Doorways in the north (+y), west (-x), south (-y) and east (+x) wall of a room: where they
+    begin and end, from the left corner as seen from inside."""
+    holes = [
+        opening(column, row, 1) if row + 1 < ROWS else None,
+        opening(column - 1, row, 0) if column > 0 else None,
+        opening(column, row - 1, 1) if row > 0 else None,
+        opening(column, row, 0) if column + 1 < COLUMNS else None,
+    ]
+    for turn, hole in enumerate(holes):
+        # Seen from inside, a doorway's coordinate runs backwards on the south and east side
+        if hole is not None:
+            start, stop = hole[0] - WALL / 2, hole[1] - WALL / 2
+            holes[turn] = (start, stop) if turn in (0, 1) else (INSIDE - stop, INSIDE - start)
+    return holes
+
+
 def house() -> dict[str, Mesh]:
     """Walls by colour, floor and ceiling; room (column, row) starts at 4 m times its indices."""
     colours: list[list[Mesh]] = [[] for _ in range(WALL_COLOURS)]
-    inside = ROOM - WALL
     for column in range(COLUMNS):
         for row in range(ROWS):
-            # The four neighbours: north (+y), west (-x), south (-y), east (+x)
-            holes = [
-                opening(column, row, 1) if row + 1 < ROWS else None,
-                opening(column - 1, row, 0) if column > 0 else None,
-                opening(column, row - 1, 1) if row > 0 else None,
-                opening(column, row, 0) if column + 1 < COLUMNS else None,
-            ]
-            for turn, hole in enumerate(holes):
-                # Seen from inside, a doorway's coordinate runs backwards on the west... south side
-                if hole is not None:
-                    start, stop = hole[0] - WALL / 2, hole[1] - WALL / 2
-                    hole = (start, stop) if turn in (0, 1) else (inside - stop, inside - start)
-                for part in wall_side(inside, hole):
-                    centred = part.moved((-inside / 2, inside / 2, 0)).turned(90 * turn)
+            for turn, hole in enumerate(doorways(column, row)):
+                for part in wall_side(INSIDE, hole):
+                    centred = part.moved((-INSIDE / 2, INSIDE / 2, 0)).turned(90 * turn)
                     at = ((column + 0.5) * ROOM, (row + 0.5) * ROOM, 0)
                     colours[(column + 2 * row) % WALL_COLOURS].append(centred.moved(at))
     width, depth = COLUMNS * ROOM, ROWS * ROOM
@@ -222,6 +246,248 @@ def house() -> dict[str, Mesh]:
     meshes["house_floor"] = quad((0, 0, 0), (width, 0, 0), (0, depth, 0), 0.5)
     meshes["house_ceiling"] = quad((0, depth, HEIGHT), (width, 0, 0), (0, -depth, 0))
     return meshes
+
+
+# --- the room of window.xml --------------------------------------------------------------------
+
+
+def window_room() -> dict[str, Mesh]:
+    """Walls with an inside and an outside, so that no light gets in at the corners; one window's
+    frame, its lower left corner at the origin; a curtain."""
+    edges = [x for window in WINDOWS for x in window]
+    holes = {(2 * k + 1, 1) for k in range(len(WINDOWS))}
+    xs, zs = [-THICK, *edges, WIDTH + THICK], [-THICK, SILL, LINTEL, TALL + THICK]
+    outside = perforated(xs, zs, holes).turned(90, axis=0).moved((0, -THICK, 0))
+    inside = perforated([0, *edges, WIDTH], [0, SILL, LINTEL, TALL], holes).turned(90, axis=0)
+    parts = [outside, Mesh(inside.positions, inside.faces[:, ::-1])]
+    for left, right in WINDOWS:
+        wide, high = (right - left, 0, 0), (0, 0, LINTEL - SILL)
+        parts.append(quad((left, -THICK, SILL), wide, (0, THICK, 0)))
+        parts.append(quad((left, 0, LINTEL), wide, (0, -THICK, 0)))
+        parts.append(quad((left, -THICK, SILL), (0, THICK, 0), high))
+        parts.append(quad((right, 0, SILL), (0, -THICK, 0), high))
+    parts.append(quad((0, DEPTH, 0), (WIDTH, 0, 0), (0, 0, TALL)))
+    parts.append(quad((0, 0, 0), (0, DEPTH, 0), (0, 0, TALL)))
+    parts.append(quad((WIDTH, DEPTH, 0), (0, -DEPTH, 0), (0, 0, TALL)))
+    shell = block((-THICK, -THICK, -THICK), (WIDTH + THICK, DEPTH + THICK, TALL + THICK))
+    south = np.all(shell.positions[shell.faces][:, :, 1] < 0, axis=1)
+    parts.append(Mesh(shell.positions, shell.faces[~south]))
+    walls = join(*(Mesh(part.positions, part.faces) for part in parts))
+    wide, high = WINDOWS[0][1] - WINDOWS[0][0], LINTEL - SILL
+    bars = [box((x, -0.19, 0), (x + 0.05, -0.13, high)) for x in (0, wide - 0.05)]
+    bars += [box((0, -0.19, z), (wide, -0.13, z + 0.05)) for z in (0, high - 0.05)]
+    bars.append(box((wide / 2 - 0.03, -0.2, 0), (wide / 2 + 0.03, -0.12, high)))
+    bars.append(box((0, -0.175, 1.22), (wide, -0.145, 1.25)))
+    bars.append(box((-0.05, -0.13, -0.035), (wide + 0.05, 0.06, 0.003), 0.008))
+    t = np.linspace(0, 1, 49)
+    edge = np.stack([0.34 * t, -0.03 * np.cos(12 * np.pi * t), 0 * t], axis=1)
+    strip = np.stack([edge, edge + [0, 0, 2.3]], axis=1).reshape(-1, 3)
+    first = np.arange(48)[:, None] * 2
+    faces = np.concatenate([first + [0, 2, 3], first + [0, 3, 1]])
+    return {"window_walls": walls, "window_frame": join(*bars), "curtain": Mesh(strip, faces)}
+
+
+# --- the lamps of many_lamps.xml ---------------------------------------------------------------
+
+WARM, PLAIN = (1, 0.62, 0.26), (1, 0.82, 0.6)
+TINTS = (WARM, WARM, PLAIN, PLAIN, (0.6, 0.8, 1), (1, 0.5, 0.45), (0.6, 1, 0.7))
+FACING = {"up": None, "down": "180", "out": "90"}  # about x; "out" is away from a wall
+
+# What stands at a wall: width, distances of its origin and its front from the wall, material
+AT_WALLS = {
+    "sofa": (2.0, 0.56, 1.0, "linen"),
+    "shelf": (1.04, 0.16, 0.31, "paint"),
+    "cupboard": (0.92, 0.2, 0.41, "oak"),
+}
+
+
+class Room:
+    """The furniture and the lamps of one room, as lines of XML.
+
+    A place at a wall (0 to 3: north, west, south, east) is so many metres along it, from its left
+    corner as seen from inside, and so many out from it.
+    """
+
+    def __init__(self, column: int, row: int, draw: np.random.Generator) -> None:
+        self.draw, self.lines = draw, [f"<!-- Room {column}, {row} -->"]
+        self.middle = np.array([column + 0.5, row + 0.5]) * ROOM
+        self.holes = doorways(column, row)
+        self.places: dict[str, tuple[int, float]] = {}
+
+    def between(self, low: float, high: float) -> float:
+        return low + (high - low) * self.draw.random()
+
+    def around(self, middle: Floats, reach: float) -> Floats:
+        """A point in a square."""
+        return middle + (self.between(-reach, reach), self.between(-reach, reach))
+
+    def tint(self) -> tuple:
+        return TINTS[int(len(TINTS) * self.draw.random())]
+
+    def at(self, wall: int, along: float, out: float) -> Floats:
+        """x and y in the house of a place at a wall."""
+        x, y = along - INSIDE / 2, INSIDE / 2 - out
+        c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[wall]
+        return self.middle + (c * x - s * y, s * x + c * y)
+
+    def find_place(self, width: float, out: float) -> tuple[int, float]:
+        """A place at a wall that is not in the way of a doorway or of what stands there."""
+
+        def corners(wall: int, left: float, right: float, out: float) -> Floats:
+            return np.sort([self.at(wall, left, 0), self.at(wall, right, out)], axis=0)
+
+        taken = [corners(k, *hole, 0.7) for k, hole in enumerate(self.holes) if hole]
+        for name, (wall, along) in self.places.items():
+            half, front = AT_WALLS[name][0] / 2, AT_WALLS[name][2]
+            taken.append(corners(wall, along - half, along + half, front))
+        free = []
+        for wall in range(4):
+            for along in np.arange(width / 2 + 0.05, INSIDE - width / 2, 0.1).tolist():
+                low, high = corners(wall, along - width / 2, along + width / 2, out)
+                if all(np.any(low > b) or np.any(high < a) for a, b in taken):
+                    free.append((wall, along))
+        return free[int(len(free) * self.draw.random())]
+
+    def mesh(self, name: str, material: str, place: tuple, turn: float = 0) -> None:
+        x, y, z = place
+        self.lines.append(
+            f'<shape type="ply"><string name="filename" value="assets/{name}.ply"/>'
+            f'<transform name="to_world"><rotate z="1" angle="{turn:.3g}"/>'
+            f'<translate value="{x:.3f}, {y:.3f}, {z}"/></transform><ref id="{material}"/></shape>'
+        )
+
+    def lamp(
+        self,
+        kind: str,
+        size: tuple[float, float],
+        radiance: tuple[float, float],
+        place: tuple,
+        tint: tuple | None = None,
+        facing: str = "up",
+        turn: float = 0,
+        length: float | None = None,
+    ) -> None:
+        """A lamp whose size (half its width) and radiance are between two powers of ten.
+
+        Spheres and cubes rest on their place; a rectangle with a (half) `length` is a strip.
+        """
+        x, y, z = place
+        half = 10 ** self.between(*size)
+        if kind == "sphere":
+            where = f'<point name="center" value="{x:.4f}, {y:.4f}, {z + half:.4f}"/>'
+            where += f'<float name="radius" value="{half:.4f}"/>'
+        else:
+            scale = f'x="{length}" y="{half:.4f}"' if length else f'value="{half:.4f}"'
+            turned = f'<rotate x="1" angle="{FACING[facing]}"/>' if FACING[facing] else ""
+            turned += f'<rotate z="1" angle="{turn:g}"/>' if turn else ""
+            z += half if kind == "cube" else 0
+            where = f'<transform name="to_world"><scale {scale}/>{turned}'
+            where += f'<translate value="{x:.4f}, {y:.4f}, {z:.4f}"/></transform>'
+        colour = 10 ** self.between(*radiance) * np.array(tint or self.tint())
+        self.lines.append(
+            f'<shape type="{kind}">{where}<ref id="black"/><emitter type="area">'
+            f'<rgb name="radiance" value="{colour[0]:.3g}, {colour[1]:.3g}, {colour[2]:.3g}"/>'
+            "</emitter></shape>"
+        )
+
+    def furnish(self, places: dict[str, tuple[int, float]]) -> None:
+        """Sofa, shelf and cupboard at the walls, with the lamps that they hide."""
+        for name, (width, origin, front, material) in AT_WALLS.items():
+            place = places[name] if name in places else self.find_place(width, front)
+            self.places[name] = wall, along = place
+            self.mesh(name, material, (*self.at(wall, along, origin), 0), 90 * wall)
+
+        # Behind the sofa a string of fairy lights, under it strips
+        wall, along = self.places["sofa"]
+        for _ in range(16):
+            place = self.at(wall, along + self.between(-0.9, 0.9), self.between(0.015, 0.1))
+            place = (*place, self.between(0.03, 0.72))
+            self.lamp("sphere", (-2.5, -2.2), (2, 3.5), place)
+        for side in (-0.4, 0.4):
+            place = (*self.at(wall, along + side, 0.5), 0.118)
+            self.lamp("rectangle", (-2.1, -2), (1, 2.5), place, None, "down", 90 * wall, 0.3)
+
+        # Under the boards of the shelf, behind its books, and in the cupboard
+        wall, along = self.places["shelf"]
+        for k in range(3):
+            self.mesh(f"books_{k}", f"book_{k}", (*self.at(wall, along, 0.16), 0), 90 * wall)
+        for board in (0.459, 0.859, 1.259, 1.659):
+            tint = self.tint()
+            for side in (-0.36, -0.12, 0.12, 0.36):
+                side += self.between(-0.1, 0.1)
+                place = (*self.at(wall, along + side, self.between(0.05, 0.25)), board)
+                self.lamp("disk", (-2.5, -1.9), (1.6, 3.3), place, tint, "down")
+        wall, along = self.places["cupboard"]
+        for board in (0.459, 0.879):
+            for side in (-0.28, 0, 0.28):
+                place = (*self.at(wall, along + side, self.between(0.06, 0.3)), board)
+                self.lamp("disk", (-2.3, -1.6), (1, 3), place, None, "down")
+        place = (*self.at(wall, along + 0.2, 0.2), 0.902)
+        self.lamp("cube", (-1.6, -1), (0.4, 1.6), place)
+
+    def light(self, is_picture: bool) -> None:
+        """The table, with all lamps that have nothing to do with furniture at the walls."""
+        table = self.around(self.middle, 0.2)
+        turn = 90 * self.places["sofa"][0] + self.between(-9, 9)
+        if is_picture:
+            table, turn = np.array([6.05, 5.9]), 20
+        self.mesh("table", "oak", (*table, 0.015), turn)
+        self.mesh("shade", "dark", (*table, 1.83))
+        self.lamp("disk", (-1.3, -0.9), (2, 2.7), (*table, 1.87), PLAIN, "down")
+        for side in (-0.05, 0.05):
+            self.lamp("sphere", (-2.2, -1.7), (2, 3.2), (*(table + side), 1.95), WARM)
+        for _ in range(3):
+            self.lamp("sphere", (-2.3, -1.8), (1.5, 3), (*self.around(table, 0.25), 0.766), WARM)
+        for _ in range(2):
+            place = (*self.around(table, 0.2), 0.733)
+            self.lamp("disk", (-2.2, -1.5), (1, 2.5), place, None, "down")
+
+        # Strips on a ledge, a garland along the next wall, night lights, a bowl on a pole
+        wall, tint = int(4 * self.draw.random()), self.tint()
+        if is_picture:
+            wall, tint = 1, PLAIN
+        self.mesh("ledge", "paint", (*self.at(wall, INSIDE / 2, 0), 2.4), 90 * wall)
+        for k in range(5):
+            place = (*self.at(wall, INSIDE / 2 + 0.66 * (k - 2), 0.05), 2.42)
+            self.lamp("rectangle", (-2.3, -2.1), (1.5, 2.5), place, tint, "up", 90 * wall, 0.3)
+        for t in (np.arange(16) + 0.5) / 16:
+            place = self.at((wall + 1) % 4, 0.15 + (INSIDE - 0.3) * t, 0.04)
+            place = (*place, 2.36 - 0.16 * np.sin(np.pi * (5 * t % 1)))
+            self.lamp("sphere", (-2.5, -2), (1.8, 3), place)
+        for _ in range(3):
+            wall, along = self.find_place(0.2, 0.01)
+            place = (*self.at(wall, along, 0.003), 0.25)
+            self.lamp("disk", (-1.9, -1.3), (-0.3, 1.2), place, None, "out", 90 * wall)
+        corner = np.sign([self.between(-1, 1), self.between(-1, 1)])
+        corner = self.middle + 1.7 * (np.array([-1, -1]) if is_picture else corner)
+        self.mesh("stand", "dark", (*corner, 0))
+        self.lamp("disk", (-1.6, -1.1), (2, 3), (*corner, 1.66), PLAIN)
+
+        # Spots and panels in the ceiling, paper globes under it
+        for _ in range(7):
+            place = (*self.around(self.middle, 1.6), 2.697)
+            self.lamp("disk", (-2, -1.4), (1, 3), place, None, "down")
+        place = (*self.around(self.middle, 1.2), 2.695)
+        self.lamp("rectangle", (-1, -0.5), (0.4, 1.8), place, None, "down")
+        for _ in range(0 if is_picture else 1 + int(self.middle.sum() / ROOM) % 2):
+            place = table
+            while np.linalg.norm(place - table) < 0.7:
+                place = self.around(self.middle, 1.2)
+            self.lamp("sphere", (-1.2, -0.53), (-0.3, 1), (*place, 1.9))
+
+
+def lamps() -> str:
+    """A thousand lamps, and the furniture that hides most of them, for a scene file to include."""
+    draw = np.random.Generator(np.random.PCG64(11))
+    lines = ["<!-- Written by make_assets.py -->", '<scene version="3.0.0">']
+    for row in range(ROWS):
+        for column in range(COLUMNS):
+            room, is_picture = Room(column, row, draw), (column, row) == (1, 1)
+            given = {"sofa": (2, 1.15), "shelf": (1, 1.13), "cupboard": (3, 1.3)}
+            room.furnish(given if is_picture else {})
+            room.light(is_picture)
+            lines += room.lines
+    return "\n".join([*lines, "</scene>", ""])
 
 
 # --- maps --------------------------------------------------------------------------------------
@@ -263,24 +529,42 @@ def checker() -> Floats:
     return np.where(((x // 8 + y // 8) % 2 == 0)[..., None], [0.55, 0.5, 0.44], [0.12, 0.14, 0.17])
 
 
-def sunny_sky() -> Floats:
-    """512 x 256, latitude-longitude: a gradient sky, warm ground, and a sun of 2 x 2 texels.
-
-    The sun stands 39 degrees high at u = 0.32; its four texels of 1e4 make an irradiance of 4.7
-    on a plane that faces it; on the ground they give about four times as much as all the rest.
-    """
+def sky(
+    colours: tuple, elevation_of_sun: float, u: float, sun: tuple, glow: tuple, sharpness: float
+) -> Floats:
+    """512 x 256, latitude-longitude: a gradient from horizon to zenith, plain ground, and a sun of
+    2 x 2 texels at (u, elevation in degrees) with a glow around it."""
     elevation = np.pi / 2 - np.pi * (np.arange(256) + 0.5) / 256
     up = np.sin(elevation)[:, None, None]
-    horizon, zenith, ground = np.array([[0.5, 0.58, 0.7], [0.09, 0.18, 0.42], [0.33, 0.28, 0.23]])
-    sky = zenith + (horizon - zenith) * np.exp(-3.5 * np.maximum(up, 0))
-    image = np.repeat(np.where(up > 0, sky, ground), 512, axis=1)
-    azimuth = 2 * np.pi * ((np.arange(512) + 0.5) / 512 - 0.32)
-    near = np.cos(elevation)[:, None] * np.cos(azimuth) * np.cos(np.radians(39))
-    near = near + np.sin(elevation)[:, None] * np.sin(np.radians(39))
-    image += (np.exp(60 * (near - 1)))[..., None] * np.array([1.6, 1.3, 0.9])  # the glow around it
-    row, column = int(256 * (90 - 39) / 180), int(512 * 0.32)
-    image[row : row + 2, column : column + 2] = np.array([1.15, 1.0, 0.8]) * 1e4
+    horizon, zenith, ground = np.array(colours)
+    gradient = zenith + (horizon - zenith) * np.exp(-3.5 * np.maximum(up, 0))
+    image = np.repeat(np.where(up > 0, gradient, ground), 512, axis=1)
+    azimuth = 2 * np.pi * ((np.arange(512) + 0.5) / 512 - u)
+    height = np.radians(elevation_of_sun)
+    near = np.cos(elevation)[:, None] * np.cos(azimuth) * np.cos(height)
+    near = near + np.sin(elevation)[:, None] * np.sin(height)
+    image += (np.exp(sharpness * (near - 1)))[..., None] * np.array(glow)
+    row, column = int(256 * (90 - elevation_of_sun) / 180), int(512 * u)
+    image[row : row + 2, column : column + 2] = sun
     return image
+
+
+def sunny_sky() -> Floats:
+    """The sky of sunny_gloss.xml: its sun stands 39 degrees high.
+
+    Its four texels of 1e4 make an irradiance of 4.7 on a plane that faces it; on the ground they
+    give about four times as much as all the rest.
+    """
+    colours = ((0.5, 0.58, 0.7), (0.09, 0.18, 0.42), (0.33, 0.28, 0.23))
+    sun = np.array([1.15, 1.0, 0.8]) * 1e4
+    return sky(colours, 39, 0.32, sun, (1.6, 1.3, 0.9), 60)
+
+
+def clear_sky() -> Floats:
+    """The sky of window.xml: a sun in the south-west, 33 degrees high, over dark ground."""
+    colours = ((0.65, 0.75, 0.9), (0.2, 0.42, 0.95), (0.1, 0.09, 0.07))
+    sun = np.array([1.15, 1.0, 0.8]) * 3e4
+    return sky(colours, 33, 0.625, sun, (4, 3.4, 2.6), 60)
 
 
 def write_exr(path: Path, image: Floats) -> None:
@@ -299,6 +583,9 @@ def main() -> None:
     flat = furniture() | house() | {"door": leaf_and_knob["door"]}
     flat |= {"gem": icosphere(1), "wall_with_holes": wall_with_holes()}
     smooth["knob"] = leaf_and_knob["knob"]
+    flat |= cupboard() | fittings() | window_room()
+    for name in ("stand", "curtain"):
+        smooth[name] = flat.pop(name)
     for name, mesh in smooth.items():
         write_ply(folder / f"{name}.ply", mesh, smooth=True)
     for name, mesh in flat.items():
@@ -308,9 +595,11 @@ def main() -> None:
         "painting": painting(),
         "checker": checker(),
         "sunny_sky": sunny_sky(),
+        "clear_sky": clear_sky(),
     }
     for name, image in maps.items():
         write_exr(folder / f"{name}.exr", image)
+    (folder / "lamps.xml").write_text(lamps())
 
 
 if __name__ == "__main__":

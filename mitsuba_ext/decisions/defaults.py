@@ -40,13 +40,13 @@ class EmitterSampling:
         self,
         state: Any,
         scene: mi.Scene,
+        sampler: mi.Sampler,
         si: mi.SurfaceInteraction3f,
-        sample: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, Any]:
         """A direction sample towards a light, its radiance / pdf (visibility not tested), and the
         new state."""
-        ds, weight = scene.sample_emitter_direction(si, sample, False, active)
+        ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, active)
         return ds, weight, state
 
     def pdf(
@@ -54,11 +54,12 @@ class EmitterSampling:
         state: Any,
         scene: mi.Scene,
         ref: mi.Interaction3f,
+        si: mi.SurfaceInteraction3f,
         ds: mi.DirectionSample3f,
         active: mi.Bool,
     ) -> tuple[mi.Float, Any]:
         """The solid angle density with which :meth:`sample`, at ``ref``, gives the direction
-        ``ds`` that a BSDF sample ran into, and the new state."""
+        ``ds`` in which a BSDF sample ran into the light at ``si``, and the new state."""
         return scene.pdf_emitter_direction(ref, ds, active), state
 
 
@@ -70,17 +71,23 @@ class ShadowTest:
         return ()
 
     def probability(
-        self, state: Any, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool
+        self,
+        state: Any,
+        choice: Any,
+        si: mi.SurfaceInteraction3f,
+        ds: mi.DirectionSample3f,
+        active: mi.Bool,
     ) -> tuple[mi.Float | None, Any]:
         """The probability, in (0, 1], of testing the connection from ``si`` to ``ds.p``, and the
-        new state. ``None`` means always, and leaves the roulette out of the kernel."""
+        new state. ``choice`` is the state of the next event decision that made the connection.
+        ``None`` means always, and leaves the roulette out of the kernel."""
         raise NotImplementedError
 
 
 class AlwaysTest(ShadowTest):
     """Every shadow ray is traced."""
 
-    def probability(self, state, si, ds, active):
+    def probability(self, state, choice, si, ds, active):
         return None, state
 
 

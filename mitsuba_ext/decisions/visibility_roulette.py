@@ -6,26 +6,21 @@ Source: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..learning.visibility_map import VisibilityMap
 from ..learning.voxel_grid import EMPTY
-from .defaults import AlwaysTest, ShadowTest
-
-if TYPE_CHECKING:
-    from ..integrator import Stage, WalkIntegrator
+from .defaults import ShadowTest
 
 #: Initial value of a map entry in the paper; with its law, the least probability of a test.
-_PAPER_EPSILON = 1e-4
+PAPER_EPSILON = 1e-4
 
 #: Share of rejected segments below which looking them up costs more than it saves: by this measure
 #: staircase has 0.05, kitchen 0.07 (which about breaks even), veach-ajar 0.2, door_ajar 0.5.
-_WORTHWHILE = 0.05
+WORTHWHILE = 0.05
 
 
 class VisibilityRoulette(ShadowTest):
@@ -56,7 +51,7 @@ class VisibilityRoulette(ShadowTest):
         entry = visibility.entry_of(voxel, light)
         if law == "paper":
             # The paper's map holds plain ratios, and ε where no success was seen (section 3.2)
-            self._p = dr.maximum(visibility.ratio(entry), _PAPER_EPSILON)
+            self._p = dr.maximum(visibility.ratio(entry), PAPER_EPSILON)
         else:
             self._p = dr.minimum(1, slope * visibility.posterior_mean(entry) + floor)
         dr.eval(self._column, self._p)
@@ -66,9 +61,7 @@ class VisibilityRoulette(ShadowTest):
         #: Share of the segments that the map saw end on a light and that the law would not test.
         self.rejected_share = 1 - int(kept[0]) / (1024 * int(total[0]))
 
-    def probability(
-        self, state: Any, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool
-    ) -> tuple[mi.Float, Any]:
+    def probability(self, state, choice, si, ds, active):
         voxel, active = self.voxels.index(si.p, active)
         light, active = self.voxels.index(ds.p, active)
         column = dr.gather(mi.UInt32, self._column, light, active)
@@ -77,70 +70,55 @@ class VisibilityRoulette(ShadowTest):
         return dr.select(known, p, 1), state
 
 
-@dataclass(frozen=True)
-class Rejection:
-    """Learning a visibility map in a pilot stage, and rejecting shadow rays with it in the next.
+class VisibilityLearner:
+    """Learns a visibility map in the pilots, and rejects shadow rays with it in the last stage.
 
-    The attributes are the parameters of the plugins that use it; see ``neepp`` for their meaning.
+    Parameters:
+        grid, max_memory, refine, law, slope, floor: See the integrator ``neepp``.
     """
 
-    grid: int
-    refine: int
-    max_memory: float
-    pilot_spp: int
-    law: str
-    slope: float
-    floor: float
+    wants_scout = False
 
-    @classmethod
-    def from_properties(cls, integrator: WalkIntegrator, props: mi.Properties) -> Rejection:
-        """Reads the parameters of a scene.
+    def __init__(
+        self, grid: int, max_memory: float, refine: int, law: str, slope: float, floor: float
+    ) -> None:
+        self._grid, self._max_memory, self._refine = grid, int(max_memory * 2**20), refine
+        self._law = {"law": law, "slope": slope, "floor": floor}
+        self._summary = ""
 
-        Raises:
-            TypeError, ValueError: A parameter has a wrong type or value.
-        """
-        get = integrator.parameter
-        return cls(
-            grid=get(props, "grid", 16, minimum=1, maximum=1024),
-            refine=get(props, "refine", 16, minimum=0, maximum=1024),
-            max_memory=get(props, "max_memory", 64.0, minimum=1e-3),
-            pilot_spp=get(props, "pilot_spp", 4, minimum=0),
-            law=get(props, "law", "affine", choices=("affine", "paper")),
-            slope=get(props, "slope", 10.0, minimum=0.0),
-            floor=get(props, "floor", 0.1, minimum=1e-6, maximum=1.0),
-        )
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
+        self._map = VisibilityMap(scene, self._grid, self._max_memory)
+        return {}
 
-    def stage_samples(self, integrator: WalkIntegrator, scene: mi.Scene, spp: int) -> list[int]:
-        """The samples of the pilot and of the rest. The pilot takes at most a quarter of them:
-        beyond that there is little left to save. It is left out where there is nothing to learn."""
-        pilot = min(self.pilot_spp, spp // 4)
-        if pilot == 0 or integrator.max_depth < 2 or not _has_lights_at_points(scene):
-            return [spp]
-        return [pilot, spp - pilot]
+    def vertex(self, *arguments: Any) -> None:
+        pass
 
-    def stages(
-        self, integrator: WalkIntegrator, scene: mi.Scene, samples: list[int]
-    ) -> Iterator[Stage]:
-        """The pilot's walk, then the walk that rejects. Without a pilot every connection is
-        tested."""
-        if len(samples) == 1:
-            yield integrator.stage()
-            return
-        visibility = VisibilityMap(scene, self.grid, int(self.max_memory * 2**20))
-        yield integrator.stage(observer=visibility)
-        visibility.refine(scene, self.refine)
-        learned, shadow_test = str(visibility), AlwaysTest()
-        if len(visibility.light_voxels()) > 0:
-            roulette = VisibilityRoulette(visibility, self.slope, self.floor, self.law)
-            if roulette.rejected_share >= _WORTHWHILE:
-                shadow_test = roulette
+    def connection(self, choice, si, ds, contribution, visible, tested) -> None:
+        self._map.shadow_ray(si.p, ds.p, visible, tested)
+
+    def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
+        self._map.segment(p, q, active)
+
+    def learn(self, scene: mi.Scene, is_last: bool) -> dict[str, Any]:
+        if not is_last:
+            return {}
+        self._map.refine(scene, self._refine)
+        self._summary = str(self._map)
+        decisions = {}
+        if len(self._map.light_voxels()) > 0:
+            roulette = VisibilityRoulette(self._map, **self._law)
+            if roulette.rejected_share >= WORTHWHILE:
+                decisions["shadow_test"] = roulette
             else:
-                learned += f"; not used, it would reject only {roulette.rejected_share:.0%}"
-        del visibility  # the counters: the final stage needs the roulette's table only
-        yield integrator.stage(learned, shadow_test=shadow_test)
+                self._summary += f"; not used, it would reject only {roulette.rejected_share:.0%}"
+        del self._map  # the counters: the last stage needs the roulette's table only
+        return decisions
+
+    def __str__(self) -> str:
+        return self._summary
 
 
-def _has_lights_at_points(scene: mi.Scene) -> bool:
+def has_lights_at_points(scene: mi.Scene) -> bool:
     """Is there a light that the map can cover: not at infinity, nor outside its voxels?"""
     if not scene.shapes() or not scene.bbox().valid():
         return False

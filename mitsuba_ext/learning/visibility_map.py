@@ -30,8 +30,8 @@ _SEGMENT = 1 - 1e-4
 class VisibilityMap:
     """Counts, for each pair of occupied voxels, how many segments between them were unoccluded.
 
-    The map is symmetric, so the lower triangle is stored. It is an observer of the random walk:
-    counters are integers, so that the same samples give bitwise the same map.
+    The map is symmetric, so the lower triangle is stored. Counters are integers, so that the same
+    samples give bitwise the same map.
 
     Parameters:
         scene: The scene to learn.
@@ -83,7 +83,7 @@ class VisibilityMap:
         row, column = dr.maximum(i, j), dr.minimum(i, j)
         return row * (row + 1) // 2 + column
 
-    # ---- Observer of the walk ----
+    # ---- What the walk saw ----
 
     def shadow_ray(self, p: mi.Point3f, q: mi.Point3f, visible: mi.Bool, active: mi.Bool) -> None:
         """A shadow ray was traced from ``p`` to the point ``q`` on a light."""

@@ -1,0 +1,138 @@
+"""Learning which lights to choose, and which shadow rays to trace."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..learning import light_map_file
+from ..learning.light_map import BYTES_PER_ENTRY, LightMap
+from ..learning.scout import region
+from ..learning.surface_rows import RowCounts, SurfaceRows, voxel_edges
+from ..lights.light_cells import LightCells
+from .light_roulette import LightRoulette
+from .light_selection import LightSelection
+from .visibility_roulette import WORTHWHILE
+
+#: Share of the choices that what was learned does not decide: half of them go by the unoccluded
+#: contributions, half to all cells alike.
+_DEFENSIVE = 0.1
+
+#: Voxels along each axis where the scene's author leaves the choice to us, at most; and entries of
+#: the map for each sample of the pilots (with about three connections each), at most.
+_GRID, _ENTRIES_PER_SAMPLE = 24, 4.0
+
+
+class LightLearner:
+    """Learns a light map in the pilots; chooses lights with it, and rejects shadow rays.
+
+    Parameters:
+        target: ``visibility`` or ``contribution``.
+        rejection: Law, slope and floor of the roulette; ``None``: every shadow ray is traced.
+        grid: Voxels along each axis of the region in which paths scatter; 0: chosen by the number
+            of pilot samples.
+        max_memory: Bytes that the map may take.
+        pilot_samples: Samples of all pilots together.
+        load, save: Files of a map to begin with, and of the map that was learned.
+    """
+
+    wants_scout = True
+
+    def __init__(
+        self,
+        target: str,
+        rejection: dict[str, Any] | None,
+        grid: int,
+        max_memory: int,
+        pilot_samples: int,
+        load: Path | None = None,
+        save: Path | None = None,
+    ) -> None:
+        self.target, self.rejection, self.grid = target, rejection, grid
+        self.max_memory, self.pilot_samples = max_memory, pilot_samples
+        self.load, self.save = load, save
+        self._map: LightMap | None = None
+        self._summary = ""
+
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
+        self._map, self._summary = None, "nothing: no path scatters"
+        if self.load is not None:
+            self._map = light_map_file.load(self.load, scene)
+        elif dr.width(p) > 0:
+            self._map = self._new_map(scene, p, n)
+        return {} if self._map is None else {"next_event": self._selection(self._map.unoccluded)}
+
+    def _new_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
+        bbox = region(p)
+        grid = self.grid or _GRID
+        cells = LightCells(scene, voxel_edges(bbox, grid))
+        limit = self.max_memory // BYTES_PER_ENTRY
+        if self.grid == 0:
+            limit = min(limit, int(self.pilot_samples * _ENTRIES_PER_SAMPLE))
+        counts = RowCounts(bbox, p, n)
+        # A coarser grid has no more cells
+        while grid > 1 and counts(grid) * cells.count > limit:
+            grid = max(1, int(0.8 * grid))
+        rows = SurfaceRows(bbox, grid, p, n)
+        if grid != (self.grid or _GRID):
+            cells = LightCells(scene, voxel_edges(bbox, grid))
+        if self.grid > grid:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"The light map of grid={self.grid} would exceed max_memory="
+                f"{self.max_memory / 2**20:g} MiB: grid={grid} is used.",
+            )
+        return LightMap(scene, rows, cells)
+
+    # ---- Observer ----
+
+    def vertex(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, active: mi.Bool) -> None:
+        pass
+
+    def connection(self, choice, si, ds, contribution, visible, tested) -> None:
+        if self._map is not None:
+            self._map.connection(choice, si, ds, contribution, visible, tested)
+
+    def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
+        pass
+
+    # ---- Between the stages ----
+
+    def learn(self, scene: mi.Scene, is_last: bool) -> dict[str, Any]:
+        if self._map is None:
+            return {}
+        dr.eval(self._map.tests, self._map.successes, self._map.squares)
+        decisions = {"next_event": self._selection(self._map.weights(self.target))}
+        if not is_last:
+            return decisions
+        self._summary = str(self._map)
+        if self.rejection is not None:
+            roulette = LightRoulette(self._map, **self.rejection)
+            if roulette.rejected_share >= WORTHWHILE:
+                decisions["shadow_test"] = roulette
+        if self.save is not None:
+            light_map_file.save(self.save, scene, self._map)
+        del self._map  # the last stage needs the tables only
+        return decisions
+
+    def _selection(self, weights: mi.Float) -> LightSelection:
+        """A selection that no wrong expectation can keep from any cell."""
+        light_map = self._map
+        cells, rows = light_map.cells, light_map.rows
+        safe = 0.5 * (_normalized(light_map.unoccluded, cells.count) + dr.rcp(mi.Float(cells.count)))
+        mixed = (1 - _DEFENSIVE) * _normalized(weights, cells.count) + _DEFENSIVE * safe
+        # Cells with a sampling_weight of 0 have no weight in any row
+        mixed = dr.select(light_map.unoccluded > 0, mixed, 0)
+        return LightSelection(rows, cells, mixed)
+
+    def __str__(self) -> str:
+        return self._summary
+
+
+def _normalized(weights: mi.Float, count: int) -> mi.Float:
+    """Weights that add up to one in each row; a row of zeros has equal ones."""
+    total = dr.repeat(dr.block_sum(weights, count), count)
+    return dr.select(total > 0, weights / total, dr.rcp(mi.Float(count)))

@@ -1,0 +1,125 @@
+"""The parameters of next event estimation: which light, and which shadow rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mitsuba as mi
+
+from ..learning.learner import Learner
+from ..learning.voxel_grid import VoxelGrid
+from ..lights.light_cells import LightCells
+from ..lights.weights import VoxelRows, power_weights, spatial_weights
+from .light_learner import LightLearner
+from .light_selection import LightSelection, OneRow
+from .visibility_roulette import VisibilityLearner, has_lights_at_points
+
+if TYPE_CHECKING:
+    from ..integrator import WalkIntegrator
+
+#: Ways to choose a light; the last two learn.
+METHODS = ("uniform", "power", "spatial", "linear", "visibility", "contribution")
+LEARNING = METHODS[-2:]
+
+#: Voxels along each axis where the scene's author leaves the choice to us.
+_SPATIAL_GRID, _VISIBILITY_GRID = 32, 16
+
+
+@dataclass(frozen=True)
+class LightSampling:
+    """How lights are chosen and shadow rays are rejected.
+
+    The attributes are the parameters of the plugins that use it; see ``neepp`` for their meaning.
+    """
+
+    light_sampling: str
+    rejection: bool
+    grid: int
+    max_memory: float
+    pilot_spp: int
+    refine: int
+    law: str
+    slope: float
+    floor: float
+    load_map: str
+    save_map: str
+
+    @classmethod
+    def from_properties(
+        cls, integrator: WalkIntegrator, props: mi.Properties, light_sampling: str, rejection: bool
+    ) -> LightSampling:
+        """Reads the parameters of a scene, but for the first two, which plugins name differently.
+
+        Raises:
+            TypeError, ValueError: A parameter has a wrong type or value.
+        """
+        get = integrator.parameter
+        return cls(
+            light_sampling=light_sampling,
+            rejection=rejection,
+            grid=get(props, "grid", 0, minimum=0, maximum=1024),
+            max_memory=get(props, "max_memory", 256.0, minimum=1e-3),
+            pilot_spp=get(props, "pilot_spp", 16, minimum=0),
+            refine=get(props, "refine", 16, minimum=0, maximum=1024),
+            law=get(props, "law", "affine", choices=("affine", "paper")),
+            slope=get(props, "slope", 10.0, minimum=0.0),
+            floor=get(props, "floor", 0.1, minimum=1e-6, maximum=1.0),
+            load_map=get(props, "load_map", ""),
+            save_map=get(props, "save_map", ""),
+        )
+
+    def decisions(self, scene: mi.Scene) -> dict[str, Any]:
+        """What needs no learning."""
+        if not scene.emitters():
+            return {}
+        if self.light_sampling == "linear":
+            from .linear_selection import LinearSelection
+            return {"next_event": LinearSelection(scene)}
+        if self.light_sampling == "power":
+            cells = LightCells(scene, None)
+            return {"next_event": LightSelection(OneRow(), cells, power_weights(scene, cells))}
+        if self.light_sampling == "spatial" and scene.shapes() and scene.bbox().valid():
+            rows = VoxelRows(VoxelGrid(scene, self.grid or _SPATIAL_GRID))
+            cells = LightCells(scene, None)
+            return {"next_event": LightSelection(rows, cells, spatial_weights(scene, rows, cells))}
+        return {}
+
+    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
+        """The samples of the pilots, at most a quarter of all: beyond that there is little left to
+        gain. What the first ones learn makes the later ones better."""
+        samples = min(self.pilot_spp, spp // 4)
+        if samples == 0 or not self._can_learn(scene):
+            return []
+        if self.light_sampling not in LEARNING or samples < 4:
+            return [samples]
+        quarter = samples // 4
+        return [quarter, quarter, samples - 2 * quarter]
+
+    def learners(self, scene: mi.Scene, samples: int) -> list[Learner]:
+        """Who learns from ``samples`` pilot samples (of all pixels together)."""
+        if not self._can_learn(scene) or (samples == 0 and not self.load_map):
+            return []
+        law = {"law": self.law, "slope": self.slope, "floor": self.floor}
+        if self.light_sampling in LEARNING:
+            return [
+                LightLearner(
+                    self.light_sampling,
+                    law if self.rejection else None,
+                    self.grid,
+                    int(self.max_memory * 2**20),
+                    samples,
+                    Path(self.load_map) if self.load_map else None,
+                    Path(self.save_map) if self.save_map else None,
+                )
+            ]
+        if samples == 0:
+            return []
+        grid = self.grid or _VISIBILITY_GRID
+        return [VisibilityLearner(grid, self.max_memory, self.refine, **law)]
+
+    def _can_learn(self, scene: mi.Scene) -> bool:
+        if self.light_sampling in LEARNING:
+            return bool(scene.emitters()) and bool(scene.shapes())
+        return self.rejection and has_lights_at_points(scene)

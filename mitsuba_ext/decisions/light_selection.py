@@ -1,0 +1,100 @@
+"""Choosing among lights by a table of probabilities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from ..lights.light_cells import LightCells
+from ..lights.searching import first_above
+from .defaults import EmitterSampling
+
+
+class Rows(Protocol):
+    """What decides which row of a table a surface point uses."""
+
+    count: int
+
+    def row(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
+        """The row of a point."""
+
+
+class OneRow:
+    """The same probabilities everywhere."""
+
+    count = 1
+
+    def row(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
+        return mi.UInt32(0)
+
+
+@dataclass
+class Choice:
+    """The state of a light selection: the last choice.
+
+    Attributes:
+        row: Row of the table at the last vertex.
+        cell: What was chosen there.
+        probability: With what probability.
+    """
+
+    row: mi.UInt32
+    cell: mi.UInt32
+    probability: mi.Float
+
+
+class LightSelection(EmitterSampling):
+    """Chooses a cell with the probabilities of the vertex's row, then a point on it.
+
+    Parameters:
+        rows: Which row a vertex uses.
+        cells: What there is to choose.
+        weights: For each row, a weight for each cell; shape [rows · cells], not negative. A row of
+            zeros chooses uniformly.
+    """
+
+    def __init__(self, rows: Rows, cells: LightCells, weights: mi.Float) -> None:
+        self.rows, self.cells = rows, cells
+        count = cells.count
+        entry = dr.arange(mi.UInt32, rows.count * count)
+        cell = entry % count
+        total = dr.repeat(dr.block_sum(weights, count), count)
+        weights = dr.select(total > 0, weights / total, dr.rcp(mi.Float(count)))
+        cumulative = dr.block_prefix_sum(weights, count, exclusive=False)
+        # No cell can be chosen by rounding alone, and the last always can
+        self._cumulative = dr.select(cell == count - 1, 1, dr.minimum(cumulative, 1))
+        dr.eval(self._cumulative)
+        # Opaque: scenes that differ in it only share their kernels
+        self._count = dr.opaque(mi.UInt32, count)
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Choice:
+        return Choice(mi.UInt32(0), mi.UInt32(0), mi.Float(0))
+
+    def sample(self, state, scene, sampler, si, active):
+        row = self.rows.row(si, active)
+        x = sampler.next_1d()
+        first = row * self._count
+        last = first + (self._count - 1)
+        entry = first_above(self._cumulative, first, last, x, active, self.cells.count)
+        high, low = self._bounds(entry, first, active)
+        probability = high - low
+        cell = entry - first
+        ds, weight = self.cells.sample(cell, si, sampler.next_2d(), active)
+        ds.pdf *= probability
+        weight = dr.select(probability > 0, weight / probability, 0)
+        return ds, weight, Choice(row, cell, probability)
+
+    def pdf(self, state, scene, ref, si, ds, active):
+        cell, pdf = self.cells.pdf(ref, si, ds, active)
+        first = state.row * self._count
+        high, low = self._bounds(first + cell, first, active)
+        # Also where the lookups above were masked, the density must be a number
+        return dr.select(active, pdf * (high - low), 0), state
+
+    def _bounds(self, entry, first, active) -> tuple[mi.Float, mi.Float]:
+        high = dr.gather(mi.Float, self._cumulative, entry, active)
+        low = dr.gather(mi.Float, self._cumulative, entry - 1, active & (entry > first))
+        return high, low

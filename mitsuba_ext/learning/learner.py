@@ -1,0 +1,67 @@
+"""What a technique that learns is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import mitsuba as mi
+
+
+class Observer(Protocol):
+    """What the walk tells while it is traced. Observers scatter into arrays of their own; they see
+    no return value and change nothing."""
+
+    def vertex(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, active: mi.Bool) -> None:
+        """A path is about to connect ``si`` to a light; ``depth`` is 0 at the first vertex."""
+
+    def connection(
+        self,
+        choice: Any,
+        si: mi.SurfaceInteraction3f,
+        ds: mi.DirectionSample3f,
+        contribution: mi.Spectrum,
+        visible: mi.Bool,
+        tested: mi.Bool,
+    ) -> None:
+        """A shadow ray was traced where ``tested``. ``choice`` is the state of the next event
+        decision; ``contribution`` is BSDF · radiance / pdf, before throughput and MIS weights."""
+
+    def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
+        """A path went from ``p`` to ``q``."""
+
+
+class Learner(Observer, Protocol):
+    """A technique that learns in pilot stages. One object serves one render."""
+
+    #: Does :meth:`start` need to know where paths scatter?
+    wants_scout: bool
+
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
+        """The decisions of the first pilot. ``p``, ``n``: vertices and normals of the scout, none if
+        no learner wants one."""
+
+    def learn(self, scene: mi.Scene, is_last: bool) -> dict[str, Any]:
+        """The decisions of the next stage, which is the last one if ``is_last`` says so."""
+
+    def __str__(self) -> str:
+        """A summary of what was learned."""
+
+
+class Observers:
+    """Tells several observers the same."""
+
+    def __init__(self, observers: Sequence[Observer]) -> None:
+        self._observers = observers
+
+    def vertex(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.vertex(*arguments)
+
+    def connection(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.connection(*arguments)
+
+    def segment(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.segment(*arguments)

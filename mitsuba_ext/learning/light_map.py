@@ -1,0 +1,145 @@
+"""What is learned about lights: how much of each cell reaches each row of surfaces.
+
+Sources: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, section 4.2 (= Guo's
+thesis, section 3.4.2) for the idea; cells, sides, contributions and the estimators are ours.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..decisions.light_selection import Choice
+from ..lights.environment import brightness
+from ..lights.light_cells import LightCells
+from ..lights.weights import unoccluded_weights
+from .surface_rows import SurfaceRows
+
+#: Fixed point of the squared ratios. They are clipped: a single one must not decide.
+_UNIT, _LIMIT = 2.0**20, 16.0
+
+#: What the expectation is worth, in tests: for visibility, and for the mean square.
+_PRIOR_TESTS, _PRIOR_SQUARES = 1.0, 4.0
+
+#: Bytes of an entry: the expectation, the counters, and the tables that are made of them.
+BYTES_PER_ENTRY = 32
+
+
+class LightMap:
+    """Counts, for each row of surfaces and each cell of the lights, shadow rays and what they
+    brought. An observer of the walk, whose lights must be chosen by a selection with these rows and
+    cells. Counters are integers, so that the same samples give bitwise the same map.
+
+    Parameters:
+        scene: The scene to learn.
+        rows, cells: What is lit, and by what.
+
+    Attributes:
+        unoccluded (mi.Float): What each cell contributes to each row if nothing is in between.
+        tests, successes (mi.UInt32): Shadow rays, and how many of them arrived.
+        squares (mi.UInt64): Sum of the squared contributions in units of ``unoccluded``.
+    """
+
+    def __init__(self, scene: mi.Scene, rows: SurfaceRows, cells: LightCells) -> None:
+        self.rows, self.cells = rows, cells
+        self.unoccluded = unoccluded_weights(scene, rows, cells)
+        self._count = dr.opaque(mi.UInt32, cells.count)
+        entries = rows.count * cells.count
+        self.tests = dr.zeros(mi.UInt32, entries)
+        self.successes = dr.zeros(mi.UInt32, entries)
+        self.squares = dr.zeros(mi.UInt64, entries)
+        dr.eval(self.unoccluded, self.tests, self.successes, self.squares)
+
+    # ---- Observer of the walk ----
+
+    def vertex(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, active: mi.Bool) -> None:
+        pass
+
+    def connection(
+        self,
+        choice: Choice,
+        si: mi.SurfaceInteraction3f,
+        ds: mi.DirectionSample3f,
+        contribution: mi.Spectrum,
+        visible: mi.Bool,
+        tested: mi.Bool,
+    ) -> None:
+        """A shadow ray was traced; it would have brought ``contribution``."""
+        entry = choice.row * self._count + choice.cell
+        expected = dr.gather(mi.Float, self.unoccluded, entry, tested)
+        known = visible & (expected > 0)
+        # What the cell contributes, whatever the probability of choosing it
+        value = brightness(contribution) * choice.probability
+        square = dr.square(dr.select(known, value / expected, 0))
+        square = dr.select(dr.isfinite(square), dr.minimum(square, _LIMIT), 0)
+        dr.scatter_add(self.tests, mi.UInt32(1), entry, tested)
+        dr.scatter_add(self.successes, mi.UInt32(1), entry, visible)
+        dr.scatter_add(self.squares, mi.UInt64(square * _UNIT), entry, known)
+
+    def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
+        pass
+
+    # ---- What was learned ----
+
+    def visibility(self) -> mi.Float:
+        """The probability that a shadow ray from a row to a cell arrives; shape [rows · cells].
+
+        Where few were tested, the expectation decides: that of the same cell in the surroundings
+        (twice the voxel), behind which stands that of the cell in the whole scene, and behind that
+        one the mean of all.
+        """
+        count = self.cells.count
+        entry = dr.arange(mi.UInt32, self.rows.count * count)
+        row = entry // count
+        cell = entry - row * count
+        tests, successes = (int(dr.sum(mi.UInt64(n))[0]) for n in (self.tests, self.successes))
+        # Half a success in one more test: the prior is never certain
+        overall = dr.opaque(mi.Float, (successes + 0.5) / (tests + 1))
+        expected = self._shrunk(cell, count, overall)
+        near, near_count = self.rows.coarse()
+        # The last row has no surroundings
+        near = dr.concat([near, dr.full(mi.UInt32, near_count, 1)])
+        group = dr.gather(mi.UInt32, near, row) * count + cell
+        expected = self._shrunk(group, (near_count + 1) * count, expected)
+        return (mi.Float(self.successes) + _PRIOR_TESTS * expected) / (
+            mi.Float(self.tests) + _PRIOR_TESTS
+        )
+
+    def _shrunk(self, group: mi.UInt32, group_count: int, expected: mi.Float) -> mi.Float:
+        """For each entry, the success rate of its group, drawn to ``expected``."""
+        tests, successes = (dr.zeros(mi.UInt32, group_count) for _ in range(2))
+        dr.scatter_add(tests, self.tests, group)
+        dr.scatter_add(successes, self.successes, group)
+        tests, successes = (mi.Float(dr.gather(mi.UInt32, n, group)) for n in (tests, successes))
+        return (successes + _PRIOR_TESTS * expected) / (tests + _PRIOR_TESTS)
+
+    def weights(self, target: str) -> mi.Float:
+        """The weights of a selection; shape [rows · cells].
+
+        Parameters:
+            target: ``visibility`` for the unoccluded contribution times the probability that a
+                shadow ray arrives, ``contribution`` for the root of the mean square of what arrived,
+                BSDF included.
+        """
+        visibility = self.visibility()
+        if target == "visibility":
+            return self.unoccluded * visibility
+        squares = mi.Float(self.squares) / _UNIT
+        total = int(dr.sum(self.squares)[0]) / _UNIT
+        arrived = dr.opaque(mi.Float, total / max(1, int(dr.sum(mi.UInt64(self.successes))[0])))
+        square = (squares + _PRIOR_SQUARES * visibility * arrived) / (
+            mi.Float(self.tests) + _PRIOR_SQUARES
+        )
+        # The last row's expectation is a power, to which contributions do not compare
+        entry = dr.arange(mi.UInt32, len(square))
+        is_last = entry >= (self.rows.count - 1) * self.cells.count
+        return self.unoccluded * dr.select(is_last, visibility, dr.sqrt(square))
+
+    def __str__(self) -> str:
+        seen, succeeded = (int(dr.count(n > 0)[0]) for n in (self.tests, self.successes))
+        entries = len(self.tests)
+        return (
+            f"light map: grid {self.rows.resolution}, {self.rows.count} rows, {self.cells.count} "
+            f"cells of lights, {entries} entries ({seen} seen, {succeeded} with a success), "
+            f"{entries * BYTES_PER_ENTRY / 2**20:.1f} MiB"
+        )

@@ -1,0 +1,96 @@
+"""Light maps in files: what was learned from one view of a scene serves the others."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..lights.light_cells import LightCells
+from .light_map import LightMap
+from .surface_rows import SurfaceRows, voxel_edges
+
+_FORMAT = 1
+
+
+def save(path: Path, scene: mi.Scene, light_map: LightMap) -> None:
+    """Writes a map, with a fingerprint of the scene that it belongs to."""
+    rows = light_map.rows
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file:
+        np.savez_compressed(
+            file,
+            format=_FORMAT,
+            scene=fingerprint(scene),
+            bbox=np.array([rows.bbox.min, rows.bbox.max]),
+            resolution=rows.resolution,
+            p=rows.p.numpy(),
+            n=rows.n.numpy(),
+            tests=light_map.tests.numpy(),
+            successes=light_map.successes.numpy(),
+            squares=light_map.squares.numpy(),
+        )
+
+
+def load(path: Path, scene: mi.Scene) -> LightMap:
+    """Reads a map.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no light map, or one of another scene.
+    """
+    try:
+        with np.load(path) as data:
+            stored = dict(data)
+    except (OSError, ValueError, EOFError) as error:
+        if isinstance(error, FileNotFoundError):
+            raise FileNotFoundError(f'there is no light map "{path}"') from None
+        raise ValueError(f'"{path}" is not a light map: {error}') from None
+    if stored.get("format") != _FORMAT:
+        raise ValueError(f'"{path}" is not a light map of this version')
+    if str(stored["scene"]) != fingerprint(scene):
+        raise ValueError(
+            f'the light map "{path}" belongs to another scene, or this one has changed since: '
+            f"delete it, and learn it again"
+        )
+    bbox = mi.ScalarBoundingBox3f(*stored["bbox"])
+    p, n = mi.Point3f(stored["p"]), mi.Normal3f(stored["n"])
+    rows = SurfaceRows(bbox, int(stored["resolution"]), p, n)
+    cells = LightCells(scene, voxel_edges(bbox, rows.resolution))
+    light_map = LightMap(scene, rows, cells)
+    if len(light_map.tests) != len(stored["tests"]):
+        raise ValueError(f'the light map "{path}" has been damaged: delete it, and learn it again')
+    light_map.tests = mi.UInt32(stored["tests"])
+    light_map.successes = mi.UInt32(stored["successes"])
+    light_map.squares = mi.UInt64(stored["squares"])
+    return light_map
+
+
+def fingerprint(scene: mi.Scene) -> str:
+    """A hash of shapes, materials and lights; sensors and films do not count."""
+    digest = hashlib.sha256()
+    # Objects that are named by the parser are found in another order in another process
+    lines = []
+    for shape in scene.shapes():
+        lines.append(_of(shape))
+    for emitter in scene.emitters():
+        lines.append(_of(emitter))
+    for line in sorted(lines):
+        digest.update(line)
+    return digest.hexdigest()
+
+
+def _of(scene_object: mi.Object) -> bytes:
+    digest = hashlib.sha256(scene_object.class_name().encode())
+    parameters = mi.traverse(scene_object)
+    for key in sorted(parameters.keys()):
+        value = parameters[key]
+        digest.update(key.encode())
+        if dr.is_tensor_v(value):
+            value = value.array
+        digest.update(np.ascontiguousarray(value).tobytes() if dr.is_array_v(value)
+                      else repr(value).encode())
+    return digest.digest()

@@ -1,0 +1,1 @@
+"""Lights as what next event estimation chooses from: cells of emitters, tables over them."""

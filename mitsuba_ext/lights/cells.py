@@ -1,0 +1,256 @@
+"""The cells of emitters: sampling a point on one, and finding the cell of a point."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .division import Division, divide, emitter_shapes
+from .searching import ONE_MINUS_EPSILON, first_above
+
+
+class EmitterCells:
+    """The cells of emitters, numbered from 0 to ``count`` − 1.
+
+    Parameters:
+        scene: Whose emitters they are.
+        indices: Which of them, by their numbers in the scene; at least one.
+        voxel: Emitters longer than this (three edges) are divided; ``None``: none is.
+
+    Attributes:
+        count (int): Number of cells.
+        emitter_index (numpy.ndarray): The number, in the scene, of each cell's emitter; [count].
+        share (numpy.ndarray): The share of its emitter's samples that falls into each cell (of its
+            area, therefore); shape [count].
+    """
+
+    def __init__(self, scene: mi.Scene, indices: list[int], voxel: mi.Vector3f | None) -> None:
+        edges = None if voxel is None else np.array(voxel, dtype=np.float64).reshape(3)
+        everything = divide(scene, edges)
+        divisions = [everything[i] for i in indices]
+        sizes = np.concatenate([d.cell_sizes for d in divisions])
+        pieces = np.concatenate([d.pieces for d in divisions])
+        cell_counts = np.array([len(d.cell_sizes) for d in divisions])
+        self.count = len(sizes)
+        number = np.repeat(np.arange(len(indices)), cell_counts)
+        self.emitter_index = np.array(indices)[number]
+        measure = pieces[:, 2] * pieces[:, 3]
+        ends = np.cumsum(sizes)
+        self.share = np.add.reduceat(measure, ends - sizes)
+
+        self._only = scene.emitters()[indices[0]] if len(indices) == 1 else None
+        self._emitters = dr.gather(
+            mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(np.array(indices, dtype=np.uint32))
+        )
+        self._emitter = mi.UInt32(number.astype(np.uint32))
+        self._is_divided = len(pieces) > len(indices)
+        self._longest = int(sizes.max())
+        self._has_groups = self._longest > 1
+        # Rounding shall not lead into the neighbour of a piece
+        inset = np.minimum(2.0**-23, 0.25 * pieces[:, 2:]).T
+        corner, size = pieces[:, :2].T + inset, pieces[:, 2:].T - 2 * inset
+        self._corner, self._size = mi.Point2f(_floats(corner)), mi.Vector2f(_floats(size))
+        self._share = mi.Float(self.share.astype(np.float32))
+        if self._has_groups:
+            self._last_piece = mi.UInt32((ends - 1).astype(np.uint32))
+            self._first_piece = mi.UInt32((ends - sizes).astype(np.uint32))
+            # The running share of the pieces of each cell
+            total = np.cumsum(measure)
+            below = np.concatenate([[0.0], total])[ends - sizes]
+            cumulative = (total - np.repeat(below, sizes)) / np.repeat(
+                np.maximum(self.share, 1e-300), sizes
+            )
+            cumulative[ends - 1] = 1
+            self._cumulative = mi.Float(cumulative.astype(np.float32))
+        shapes = emitter_shapes(scene)
+        self._inverse([shapes[i] for i in indices], divisions, cell_counts, sizes)
+
+    def _inverse(
+        self,
+        shapes: list[mi.Shape | None],
+        divisions: list[Division],
+        cell_counts: np.ndarray,
+        sizes: np.ndarray,
+    ) -> None:
+        """Tables from an emitter, found by its number in Dr.Jit's registry, to its cells."""
+        ids = dr.reinterpret_array(mi.UInt32, self._emitters).numpy()
+        kinds = {d.shape for d in divisions}
+        self._kinds = kinds
+        self._has_smooth = any(d.is_smooth for d in divisions)
+
+        def by_id(values) -> mi.UInt32:
+            table = np.zeros(int(ids.max(initial=0)) + 1, dtype=np.uint32)
+            table[ids] = values
+            return mi.UInt32(table)
+
+        first = np.cumsum(cell_counts) - cell_counts
+        self._first_cell = by_id(first)
+        if kinds - {"", "mesh"}:
+            self._columns = by_id([d.grid[0] for d in divisions])
+            self._rows = by_id([d.grid[1] for d in divisions])
+        if "disk" in kinds or "cylinder" in kinds:
+            self._shape = by_id([("", "rectangle", "disk", "cylinder", "mesh").index(d.shape)
+                                 for d in divisions])
+        if "mesh" not in kinds:
+            return
+        # Faces are numbered over all meshes; emitters that are none have one that leads nowhere
+        face_counts = [len(d.face_first) - 1 if d.shape == "mesh" else 0 for d in divisions]
+        self._first_face = by_id(np.cumsum(face_counts) - face_counts)
+        self._is_mesh = by_id([d.shape == "mesh" for d in divisions])
+        meshes = [(d, f) for d, f in zip(divisions, first) if d.shape == "mesh"]
+        cuts, first_entry, cell_of, entries = [], [], [], 0
+        for d, f in meshes:
+            cuts.append(np.sqrt(np.diff(d.face_first)).round().astype(np.uint32))
+            first_entry.append(d.face_first[:-1] + entries)
+            cell_of.append(np.repeat(np.arange(len(d.cell_sizes)), d.cell_sizes)[d.face_pieces] + f)
+            entries += d.face_first[-1]
+        self._face_cuts = mi.UInt32(np.concatenate(cuts))
+        self._face_first = mi.UInt32(np.concatenate(first_entry).astype(np.uint32))
+        self._cell_of_piece = mi.UInt32(np.concatenate(cell_of).astype(np.uint32))
+        self._has_cut_faces = any(int(c.max(initial=1)) > 1 for c in cuts)
+        if self._has_cut_faces:
+            corners = [
+                _corners(shape)
+                for shape, d in zip(shapes, divisions)
+                if d.shape == "mesh"
+            ]
+            a, ab, ac = (np.concatenate(x).T.astype(np.float32) for x in zip(*corners))
+            self._a, self._ab, self._ac = mi.Point3f(a), mi.Vector3f(ab), mi.Vector3f(ac)
+        if self._has_smooth:
+            normals = np.zeros((int(sizes.sum()), 3), dtype=np.float32)
+            smooth = np.zeros(len(normals), dtype=bool)
+            end = 0
+            for d in divisions:
+                begin, end = end, end + len(d.pieces)
+                if d.is_smooth:
+                    normals[begin:end], smooth[begin:end] = d.normals, True
+            self._normal = mi.Normal3f(np.ascontiguousarray(normals.T))
+            self._is_smooth_piece = mi.Bool(smooth)
+            self._is_smooth = by_id([d.is_smooth for d in divisions])
+
+    def sample(
+        self, cell: mi.UInt32, ref: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """A point on ``cell``: the direction sample, whose ``pdf`` is conditional on the cell, and
+        its radiance / pdf (visibility not tested)."""
+        if self._is_divided:
+            piece, x = cell, sample.x
+            if self._has_groups:
+                piece, x = self._piece(cell, x, active)
+            corner = dr.gather(mi.Point2f, self._corner, piece, active)
+            size = dr.gather(mi.Vector2f, self._size, piece, active)
+            sample = corner + mi.Point2f(x, sample.y) * size
+        ds, weight = self._pointer(cell, active).sample_direction(ref, sample, active)
+        if self._is_divided:
+            share = dr.gather(mi.Float, self._share, cell, active)
+            ds.pdf = dr.select(share > 0, ds.pdf / share, 0)
+            weight *= share
+        if self._has_smooth:
+            n = dr.gather(mi.Normal3f, self._normal, piece, active)
+            smooth = dr.gather(mi.Bool, self._is_smooth_piece, piece, active)
+            ratio = dr.select(smooth, _cosine_ratio(ds, n), 1)
+            ds.pdf *= ratio
+            weight *= dr.select(ratio > 0, dr.rcp(ratio), 0)
+        return ds, weight
+
+    def _piece(self, cell, x, active) -> tuple[mi.UInt32, mi.Float]:
+        """The piece of ``cell`` at the number ``x``, and what is left of the number."""
+        first = dr.gather(mi.UInt32, self._first_piece, cell, active)
+        last = dr.gather(mi.UInt32, self._last_piece, cell, active)
+        piece = first_above(self._cumulative, first, last, x, active, self._longest)
+        high = dr.gather(mi.Float, self._cumulative, piece, active)
+        low = dr.gather(mi.Float, self._cumulative, piece - 1, active & (piece > first))
+        return piece, dr.clip((x - low) / (high - low), 0, ONE_MINUS_EPSILON)
+
+    def _pointer(self, cell: mi.UInt32, active: mi.Bool):
+        if self._only is not None:
+            return self._only
+        index = cell
+        if self._is_divided:
+            index = dr.gather(mi.UInt32, self._emitter, cell, active)
+        return dr.gather(mi.EmitterPtr, self._emitters, index, active)
+
+    def pdf(
+        self,
+        ref: mi.Interaction3f,
+        si: mi.SurfaceInteraction3f,
+        ds: mi.DirectionSample3f,
+        active: mi.Bool,
+    ) -> tuple[mi.UInt32, mi.Float]:
+        """The cell that a ray from ``ref`` ran into at ``si``, and the density, conditional on the
+        cell, with which :meth:`sample` gives that direction."""
+        id = dr.reinterpret_array(mi.UInt32, ds.emitter)
+        pdf = (self._only or ds.emitter).pdf_direction(ref, ds, active)
+        cell = dr.gather(mi.UInt32, self._first_cell, id, active)
+        if not self._is_divided:
+            return cell, pdf
+        if self._kinds - {"", "mesh"}:
+            cell += self._grid_cell(id, ds, active)
+        if "mesh" in self._kinds:
+            is_mesh = active & (dr.gather(mi.UInt32, self._is_mesh, id, active) > 0)
+            cell[is_mesh] = self._mesh_cell(id, si, is_mesh)
+        if self._has_smooth:
+            smooth = dr.gather(mi.UInt32, self._is_smooth, id, active) > 0
+            pdf *= dr.select(smooth, _cosine_ratio(ds, si.n), 1)
+        share = dr.gather(mi.Float, self._share, cell, active)
+        return cell, dr.select(share > 0, pdf / share, 0)
+
+    def _grid_cell(self, id, ds, active) -> mi.UInt32:
+        """The number, within its emitter, of the cell of a rectangle, disk or cylinder."""
+        columns = dr.gather(mi.UInt32, self._columns, id, active)
+        rows = dr.gather(mi.UInt32, self._rows, id, active)
+        x, y = ds.uv.x, ds.uv.y
+        if "disk" in self._kinds or "cylinder" in self._kinds:
+            shape = dr.gather(mi.UInt32, self._shape, id, active)
+            sin, cos = dr.sincos(dr.two_pi * ds.uv.y)
+            disk = mi.warp.uniform_disk_to_square_concentric(ds.uv.x * mi.Point2f(cos, sin))
+            x, y = (
+                dr.select(shape == 2, on_disk, dr.select(shape == 3, on_cylinder, uv))
+                for on_disk, on_cylinder, uv in zip(disk, (ds.uv.y, ds.uv.x), ds.uv)
+            )
+        return _slot(x, columns) + columns * _slot(y, rows)
+
+    def _mesh_cell(self, id, si, active) -> mi.UInt32:
+        face = dr.gather(mi.UInt32, self._first_face, id, active) + si.prim_index
+        entry = dr.gather(mi.UInt32, self._face_first, face, active)
+        if self._has_cut_faces:
+            cuts = dr.gather(mi.UInt32, self._face_cuts, face, active)
+            a, ab, ac = (dr.gather(type(v), v, face, active) for v in (self._a, self._ab, self._ac))
+            # Barycentric coordinates of the nearest point in the triangle's plane
+            p = si.p - a
+            d00, d01, d11 = dr.dot(ab, ab), dr.dot(ab, ac), dr.dot(ac, ac)
+            d20, d21 = dr.dot(p, ab), dr.dot(p, ac)
+            det = d00 * d11 - d01 * d01
+            scale = dr.select(det > 0, dr.rcp(det), 0)
+            u = dr.clip((d11 * d20 - d01 * d21) * scale, 0, 1)
+            v = dr.clip((d00 * d21 - d01 * d20) * scale, 0, 1)
+            # The inverse of square_to_uniform_triangle
+            t = 1 - u
+            x, y = 1 - t * t, dr.select(t > 0, v / t, 0)
+            entry += _slot(x, cuts) + cuts * _slot(y, cuts)
+        return dr.gather(mi.UInt32, self._cell_of_piece, entry, active)
+
+
+def _floats(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, dtype=np.float32)
+
+
+def _slot(x: mi.Float, count: mi.UInt32) -> mi.UInt32:
+    """Which of ``count`` equal parts of [0, 1] holds ``x``."""
+    return dr.minimum(mi.UInt32(dr.maximum(x, 0) * mi.Float(count)), count - 1)
+
+
+def _cosine_ratio(ds: mi.DirectionSample3f, n: mi.Normal3f) -> mi.Float:
+    """What turns a density that was converted with the shading normal ``ds.n`` into the true one,
+    with the geometric normal ``n``."""
+    cosine = dr.abs(dr.dot(ds.d, n))
+    return dr.select(cosine > 0, dr.abs(dr.dot(ds.d, ds.n)) / cosine, 0)
+
+
+def _corners(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A corner of each triangle, and the edges that leave it; shape [faces, 3] each."""
+    vertices = np.array(mesh.vertex_positions_buffer()).reshape(-1, 3)
+    face = np.array(mesh.faces_buffer()).reshape(-1, 3)
+    a, b, c = (vertices[face[:, i]] for i in range(3))
+    return a, b - a, c - a

@@ -1,0 +1,236 @@
+"""An environment emitter as bins of directions."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .searching import ONE_MINUS_EPSILON, alias_tables
+
+#: Bins along the azimuth and along the polar angle.
+BINS = (32, 16)
+
+#: Nodes of emitters that are no maps: their features must not be smaller than the 0.35° between
+#: two of them (the disk of the sun measures 0.53°), or be found by the emitter's own sampling.
+_NODES = (1024, 513)
+
+#: Samples of an emitter that is no map, among them those of its own.
+_OWN_SAMPLES = 1 << 16
+
+#: Weight of black texels relative to the mean.
+_FLOOR = 1e-3
+
+#: The sine of the polar angle at the poles, where densities would be infinite.
+_LEAST_SINE = 1e-7
+
+
+class EnvironmentBins:
+    """Samples directions in rectangular bins of latitude and longitude.
+
+    Inside a bin, a texel is chosen by its brightness and a point in it by the bilinear function
+    that Mitsuba's ``envmap`` interpolates with: for maps the density of a bin is proportional to
+    what it emits.
+
+    Parameters:
+        scene: Its environment emitter is divided.
+
+    Attributes:
+        count (int): Number of bins.
+        share (numpy.ndarray): Share of the emitted brightness in each bin; shape [count].
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        self.emitter = scene.environment()
+        self.pointer = mi.EmitterPtr(self.emitter)
+        self._is_map = self.emitter.class_name() == "EnvironmentMapEmitter"
+        bbox = scene.bbox()
+        sphere = bbox.bounding_sphere() if bbox.valid() else mi.ScalarBoundingSphere3f(0.0, 1.0)
+        self._center, self._radius = mi.Point3f(sphere.center), mi.Float(sphere.radius)
+        self._to_world = mi.Transform4f(self.emitter.world_transform())
+        self._to_local = self._to_world.inverse()
+        dr.make_opaque(self._center, self._radius, self._to_world, self._to_local)
+        if self._is_map:
+            height, width = mi.traverse(self.emitter)["data"].shape[:2]
+            # Two columns are copies; the rows have their nodes at the poles, too
+            self._columns, self._rows = width - 2, height - 1
+        else:
+            self._columns, self._rows = _NODES[0], _NODES[1] - 1
+        # Nodes of a map are the middles of its columns
+        self._shift = 0.5 / self._columns
+        self._build(self._node_values())
+
+    def _node_values(self) -> np.ndarray:
+        """Brightness times sin θ at the nodes, the first column repeated; [rows + 1, columns + 1]."""
+        columns, rows = self._columns, self._rows
+        index = dr.arange(mi.UInt32, columns * (rows + 1))
+        row = index // columns
+        u = mi.Float(index - row * columns) / columns + self._shift
+        # At the poles themselves a direction does not say which column is meant
+        v = dr.clip(mi.Float(row), 1e-2, rows - 1e-2) / rows
+        value = self._brightness(mi.Point2f(u, v)).numpy().reshape(rows + 1, columns)
+        if not self._is_map:
+            # Whatever lies between the nodes: what is around, and what the emitter itself prefers
+            value = np.maximum(value, self._own_samples(value.shape))
+            wide = np.maximum(value, np.maximum(np.roll(value, 1, 1), np.roll(value, -1, 1)))
+            padded = np.pad(wide, ((1, 1), (0, 0)), mode="edge")
+            value = np.maximum(wide, np.maximum(padded[:-2], padded[2:]))
+        value = value + _FLOOR * value.mean() + 1e-30
+        sin_theta = np.sin(np.linspace(0, np.pi, rows + 1))
+        # Not zero at the poles, where a texel still has an area
+        sin_theta[[0, -1]] = 0.25 * np.sin(np.pi / rows)
+        value = value * sin_theta[:, None]
+        return np.concatenate([value, value[:, :1]], axis=1)
+
+    def _own_samples(self, shape: tuple[int, int]) -> np.ndarray:
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(0, _OWN_SAMPLES)
+        ref = dr.zeros(mi.Interaction3f, _OWN_SAMPLES)
+        ref.p, ref.wavelengths = self._center, some_wavelengths(_OWN_SAMPLES)
+        ds, weight = self.emitter.sample_direction(ref, sampler.next_2d())
+        value = (brightness(weight) * ds.pdf + dr.zeros(mi.Float, _OWN_SAMPLES)).numpy()
+        uv = self._uv(ds.d)[0].numpy()
+        result = np.zeros(shape)
+        x = np.minimum((uv[0] * self._columns).astype(int), self._columns - 1)
+        y = np.minimum((uv[1] * self._rows).round().astype(int), self._rows)
+        np.maximum.at(result, (y, x), np.where(np.isfinite(value), value, 0))
+        return result
+
+    def _brightness(self, uv: mi.Point2f) -> mi.Float:
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
+        si.wi = -(self._to_world @ self._direction(uv)[0])
+        si.wavelengths = some_wavelengths(dr.width(uv))
+        value = brightness(self.emitter.eval(si))
+        return dr.select(dr.isfinite(value), value, dr.zeros(mi.Float, dr.width(uv)))
+
+    def _build(self, node: np.ndarray) -> None:
+        columns, rows = self._columns, self._rows
+        self._bins = min(BINS[0], columns), min(BINS[1], rows)
+        self.count = self._bins[0] * self._bins[1]
+        # Each texel with its corners; its weight is their mean
+        corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]], axis=-1)
+        corners = corners.reshape(-1, 4)
+        weight = corners.mean(axis=1)
+        bin = (
+            (np.arange(rows) * self._bins[1] // rows)[:, None] * self._bins[0]
+            + np.arange(columns) * self._bins[0] // columns
+        ).ravel()
+        bin_weight = np.bincount(bin, weight, self.count)
+        self.share = bin_weight / bin_weight.sum()
+        # Densities on the sphere, but for 1 / sin θ
+        corners *= (columns * rows / (2 * np.pi**2) / bin_weight)[bin][:, None]
+        self._corners = mi.Float(corners.ravel().astype(np.float32))
+
+        order = np.argsort(bin.astype(np.uint16), kind="stable")
+        threshold, alias = alias_tables(weight[order], np.bincount(bin, minlength=self.count))
+        entries = np.empty((len(order), 2), dtype=np.uint32)
+        entries[order, 0] = threshold.astype(np.float32).view(np.uint32)
+        entries[order, 1] = order[alias]
+        self._entries = mi.UInt32(entries.ravel())
+
+    def sample(
+        self, bin: mi.UInt32, ref: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """A direction in ``bin``, whose ``pdf`` is conditional on the bin, and its radiance / pdf
+        (visibility not tested)."""
+        texel, point = self._texel(bin, sample, active)
+        point, density = mi.warp.square_to_bilinear(*self._corner_values(texel, active), point)
+        row = texel // self._columns
+        uv = mi.Point2f(
+            (mi.Float(texel - row * self._columns) + point.x) / self._columns + self._shift,
+            (mi.Float(row) + point.y) / self._rows,
+        )
+        d, sin_theta = self._direction(uv)
+
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.d = self._to_world @ d
+        ds.dist = 2 * dr.maximum(self._radius, dr.norm(ref.p - self._center))
+        ds.p = ref.p + ds.d * ds.dist
+        ds.n = -ds.d
+        ds.uv = uv
+        ds.time = ref.time
+        ds.pdf = dr.select(active, density / sin_theta, 0)
+        ds.emitter = self.pointer
+        if self._is_map:
+            # Does not have to find the texel again
+            value = self.emitter.eval_direction(ref, ds, active)
+        else:
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.wi, si.wavelengths, si.time = -ds.d, ref.wavelengths, ref.time
+            value = self.emitter.eval(si, active)
+        return ds, dr.select(ds.pdf > 0, value / ds.pdf, 0)
+
+    def pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Float]:
+        """The bin of the world space direction ``d``, and the density, conditional on the bin, with
+        which :meth:`sample` gives it."""
+        uv, sin_theta = self._uv(d)
+        x, y = uv.x * self._columns, uv.y * self._rows
+        column = dr.minimum(mi.UInt32(x), self._columns - 1)
+        row = dr.minimum(mi.UInt32(y), self._rows - 1)
+        corners = self._corner_values(row * self._columns + column, active)
+        point = mi.Point2f(x - mi.Float(column), y - mi.Float(row))
+        density = mi.warp.square_to_bilinear_pdf(*corners, point)
+        bins = self._bins
+        bin = row * bins[1] // self._rows * bins[0] + column * bins[0] // self._columns
+        return bin, dr.select(active, density / sin_theta, 0)
+
+    def _texel(self, bin, sample, active) -> tuple[mi.UInt32, mi.Point2f]:
+        """A texel of the bin with the probability of its weight, and what is left of the sample.
+
+        Each texel of a bin is as likely as the others to be the entry that is looked up; it is
+        either taken or gives way to its alias.
+        """
+        bin_row = bin // self._bins[0]
+        column, x = _entry(
+            bin - bin_row * self._bins[0], self._bins[0], self._columns, sample.x
+        )
+        row, y = _entry(bin_row, self._bins[1], self._rows, sample.y)
+        texel = row * self._columns + column
+        entry = dr.gather(mi.Vector2u, self._entries, texel, active)
+        threshold = dr.reinterpret_array(mi.Float, entry.x)
+        is_taken = x < threshold
+        # x < threshold in the first case, threshold ≤ x < 1 in the second: no division by zero
+        x = dr.select(is_taken, x, x - threshold) / dr.select(is_taken, threshold, 1 - threshold)
+        return dr.select(is_taken, texel, entry.y), mi.Point2f(x, y)
+
+    def _corner_values(self, texel: mi.UInt32, active: mi.Bool) -> list[mi.Float]:
+        """What is interpolated between the corners of a texel; positive."""
+        corners = dr.gather(mi.Vector4f, self._corners, texel, active)
+        return [dr.select(active, corner, 1) for corner in corners]
+
+    def _direction(self, uv: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
+        sin_theta, cos_theta = dr.sincos(uv.y * dr.pi)
+        sin_phi, cos_phi = dr.sincos(uv.x * dr.two_pi)
+        sin_theta = dr.maximum(sin_theta, _LEAST_SINE)
+        return mi.Vector3f(sin_phi * sin_theta, cos_theta, -cos_phi * sin_theta), sin_theta
+
+    def _uv(self, d: mi.Vector3f) -> tuple[mi.Point2f, mi.Float]:
+        """Coordinates in [0, 1] whose columns begin at nodes, and the sine of the polar angle."""
+        v = self._to_local @ d
+        u = dr.atan2(v.x, -v.z) * dr.inv_two_pi - self._shift
+        # Accurate near the poles, where the cosine does not change
+        sin_theta = dr.maximum(dr.sqrt(dr.square(v.x) + dr.square(v.z)), _LEAST_SINE)
+        return mi.Point2f(u - dr.floor(u), dr.atan2(sin_theta, v.y) * dr.inv_pi), sin_theta
+
+
+def _entry(part, parts: int, count: int, x: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """One of the columns (or rows) of which bins are made, each as likely as the others, and what is
+    left of the random number. The ``count`` columns are divided into ``parts``; this is ``part``."""
+    first = (part * count + (parts - 1)) // parts
+    width = ((part + 1) * count + (parts - 1)) // parts - first
+    x = x * mi.Float(width)
+    index = dr.minimum(mi.UInt32(x), width - 1)
+    return first + index, dr.minimum(x - mi.Float(index), ONE_MINUS_EPSILON)
+
+
+def brightness(value: mi.Spectrum) -> mi.Float:
+    """One number for a spectrum: luminance, or the mean over the sampled wavelengths."""
+    return mi.luminance(value) if mi.is_rgb else dr.mean(value)
+
+
+def some_wavelengths(width: int) -> mi.Spectrum:
+    """Wavelengths of the middle sample in spectral variants, none in the others."""
+    wavelengths = dr.zeros(mi.Interaction3f, width).wavelengths
+    if mi.is_spectral:
+        wavelengths[:] = mi.sample_rgb_spectrum(mi.sample_shifted(dr.full(mi.Float, 0.5, width)))[0]
+    return wavelengths

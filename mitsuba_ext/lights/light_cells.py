@@ -1,0 +1,82 @@
+"""Everything in a scene that next event estimation can choose: cells of emitters, and directions."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .cells import EmitterCells
+from .environment import EnvironmentBins
+
+
+class LightCells:
+    """What a scene is lit by, numbered from 0 to ``count`` − 1: first the cells of its emitters,
+    then the bins of directions of its environment.
+
+    Parameters:
+        scene: A scene with at least one emitter.
+        voxel: Emitters longer than this (three edges) are divided into cells, an environment into
+            bins. ``None``: each emitter is one cell.
+
+    Attributes:
+        count (int): Number of cells.
+        emitter_index (numpy.ndarray): The number of each cell's emitter; shape [count].
+        share (numpy.ndarray): The part of its emitter that each cell is: of the area, or of what an
+            environment emits; shape [count].
+    """
+
+    def __init__(self, scene: mi.Scene, voxel: mi.Vector3f | None) -> None:
+        environment = scene.environment() if voxel is not None else None
+        emitters = scene.emitters()
+        others = [
+            i for i, e in enumerate(emitters) if environment is None or e.ptr != environment.ptr
+        ]
+        self._emitters = EmitterCells(scene, others, voxel) if others else None
+        self._bins = EnvironmentBins(scene) if environment is not None else None
+        parts = [part for part in (self._emitters, self._bins) if part is not None]
+        self.count = sum(part.count for part in parts)
+        self.share = np.concatenate([part.share for part in parts])
+        self.emitter_index = np.full(self.count, -1)
+        self._first_bin = self.count
+        if self._emitters is not None:
+            self.emitter_index[: self._emitters.count] = self._emitters.emitter_index
+        if self._bins is not None:
+            self._first_bin -= self._bins.count
+            index = next(i for i, e in enumerate(emitters) if e.ptr == environment.ptr)
+            self.emitter_index[self._first_bin :] = index
+
+    def sample(
+        self, cell: mi.UInt32, ref: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """A point on ``cell`` (or a direction in it): the direction sample, whose ``pdf`` is
+        conditional on the cell, and its radiance / pdf (visibility not tested)."""
+        if self._bins is None:
+            return self._emitters.sample(cell, ref, sample, active)
+        if self._emitters is None:
+            return self._bins.sample(cell, ref, sample, active)
+        in_bin = cell >= self._first_bin
+        a, a_weight = self._emitters.sample(cell, ref, sample, active & ~in_bin)
+        b, b_weight = self._bins.sample(cell - self._first_bin, ref, sample, active & in_bin)
+        return dr.select(in_bin, b, a), dr.select(in_bin, b_weight, a_weight)
+
+    def pdf(
+        self,
+        ref: mi.Interaction3f,
+        si: mi.SurfaceInteraction3f,
+        ds: mi.DirectionSample3f,
+        active: mi.Bool,
+    ) -> tuple[mi.UInt32, mi.Float]:
+        """The cell that a ray from ``ref`` ran into at ``si``, and the density, conditional on the
+        cell, with which :meth:`sample` gives that direction."""
+        if self._bins is None:
+            return self._emitters.pdf(ref, si, ds, active)
+        escaped = active & (ds.emitter == self._bins.pointer)
+        bin, bin_pdf = self._bins.pdf(ds.d, escaped)
+        if self._emitters is None:
+            return bin, bin_pdf
+        cell, pdf = self._emitters.pdf(ref, si, ds, active & ~escaped)
+        return (
+            dr.select(escaped, bin + self._first_bin, cell),
+            dr.select(escaped, bin_pdf, pdf),
+        )

@@ -1,0 +1,383 @@
+"""Choosing lights by their estimated contributions: unbiased, exact densities, no wrong zero."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_cases import area, diffuse, film, lookat, rectangle, rgb, sensor
+from scipy import stats
+from statistical import REFERENCE, REFERENCE_SEEDS, SEEDS, assert_same_mean, batches, load
+
+from mitsuba_ext.decisions.linear_selection import LinearSelection
+from mitsuba_ext.rendering import Stage
+from mitsuba_ext.walk import Walk
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+LANES = 1 << 16
+
+
+def _integrator(scene: mi.Scene, max_depth: int) -> mi.Integrator:
+    integrator = mi.load_dict({"type": "composed_path", "max_depth": max_depth})
+    walk = Walk(max_depth, integrator.rr_depth, False, next_event=LinearSelection(scene))
+    integrator.stages = lambda *_arguments: iter([Stage(walk)])
+    return integrator
+
+
+def _translate(*offset: float) -> mi.ScalarTransform4f:
+    return mi.ScalarTransform4f().translate(list(offset))
+
+
+def _point(*position: float, intensity: float = 1.0, **changes) -> dict:
+    return {
+        "type": "point", "position": list(position), "intensity": rgb(intensity), **changes
+    }
+
+
+def _panel(*position: float, angle: float = 0.0, size: float = 0.3, radiance: float = 5.0) -> dict:
+    """A rectangle that shines upwards, turned about the x axis."""
+    turn = mi.ScalarTransform4f().rotate([1, 0, 0], angle).scale(size)
+    return rectangle(_translate(*position), turn, bsdf=diffuse(0.0), emitter=area(radiance))
+
+
+def _mixed() -> dict:
+    """All kinds of lights, some of them in and under a floor of rough glass."""
+    T = mi.ScalarTransform4f
+    return {
+        "type": "scene",
+        "sensor": sensor(to_world=lookat([0, -4, 2], [0, 0, 0.3], [0, 0, 1])),
+        "glass": rectangle(
+            T().scale([1.5, 1.5, 1]),
+            bsdf={"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.3},
+        ),
+        "ball": {
+            "type": "sphere", "radius": 0.4, "to_world": _translate(0.5, 0, 0.5),
+            "bsdf": {"type": "roughplastic", "diffuse_reflectance": rgb(0.5, 0.3, 0.2)},
+        },
+        "leaf": rectangle(
+            _translate(-0.6, 0, 0.5), T().rotate([1, 0, 0], 70).scale(0.4),
+            bsdf={"type": "principledthin", "base_color": rgb(0.3, 0.6, 0.2), "diff_trans": 1.2,
+                  "roughness": 0.6, "spec_trans": 0.0},
+        ),
+        "wall": rectangle(
+            _translate(0, 1.5, 1), T().rotate([1, 0, 0], 90).scale([2, 1.5, 1]),
+            bsdf={"type": "twosided", "bsdf": diffuse()},
+        ),
+        "below": _panel(0, 0, -0.7),
+        "globe": {
+            "type": "sphere", "radius": 0.25, "to_world": _translate(-0.9, -0.5, 0.1),
+            "emitter": area(2.0),
+        },
+        "lamp": _panel(0.3, -0.3, 2, angle=180),
+        "point": _point(0.2, 0.3, -0.4, intensity=0.5),
+        "spot": {
+            "type": "spot", "intensity": rgb(4.0), "cutoff_angle": 30,
+            "to_world": lookat([-1, -1, 2], [0, 0, 0], [0, 0, 1]),
+        },
+        "slide": {
+            "type": "projector", "irradiance": rgb(1.0), "scale": 3.0, "fov": 30,
+            "to_world": lookat([1, -1, 1.5], [0, 1, 0.5], [0, 0, 1]),
+        },
+        "sun": {"type": "directional", "direction": [0.3, 0.4, -1], "irradiance": rgb(0.5)},
+        "sky": {"type": "constant", "radiance": rgb(0.2)},
+    }  # fmt: skip
+
+
+# ---- Unbiased ----
+
+
+def test_mean_in_rooms_is_that_of_path():
+    scene = load("rooms", width=32, height=18)
+    a = batches(scene, _integrator(scene, 4), 64, SEEDS)
+    b = batches(scene, REFERENCE.make(4), 128, REFERENCE_SEEDS)
+    assert_same_mean(a, b, precision=0.015)
+
+
+def test_mean_with_all_kinds_of_lights_and_glass_is_that_of_path():
+    scene = mi.load_dict(_mixed())
+    a = batches(scene, _integrator(scene, 4), 256, SEEDS)
+    b = batches(scene, REFERENCE.make(4), 256, REFERENCE_SEEDS)
+    assert_same_mean(a, b, precision=0.01)
+
+
+def test_mean_with_normal_maps_that_face_away_is_that_of_path():
+    """Seen from below, some of the normals say that the surface is seen from above."""
+    normal = np.full((4, 4, 3), [1.0, 0.5, 0.6])
+    normal[::2] = [0.0, 0.5, 0.6]
+    bsdf = {
+        "type": "normalmap", "flip_invalid_normals": False, "bsdf": diffuse(),
+        "normalmap": {
+            "type": "bitmap", "raw": True, "bitmap": mi.Bitmap(normal.astype(np.float32))
+        },
+    }  # fmt: skip
+    scene = mi.load_dict({
+        "type": "scene",
+        "sensor": sensor(to_world=lookat([0, -3, -0.5], [0, 0, 0], [0, 0, 1])),
+        "floor": rectangle(bsdf=bsdf),
+        "above": _point(0.3, 0, 0.7),
+        "below": _point(-0.3, 0, -0.7),
+    })
+    a = batches(scene, _integrator(scene, 2), 64, SEEDS)
+    b = batches(scene, REFERENCE.make(2), 64, REFERENCE_SEEDS)
+    assert b.mean() > 1e-3
+    assert_same_mean(a, b)
+
+
+# ---- Densities ----
+
+
+def _vertex(scene: mi.Scene, origin: list[float], target: list[float]) -> mi.SurfaceInteraction3f:
+    """The same surface point in all lanes."""
+    o, t = mi.Point3f(*origin), mi.Point3f(*target)
+    o += dr.zeros(mi.Point3f, LANES)
+    return scene.ray_intersect(mi.Ray3f(o, dr.normalize(t - o)))
+
+
+def _select(scene: mi.Scene, si: mi.SurfaceInteraction3f):
+    """One choice for each lane."""
+    selection = LinearSelection(scene)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(7, LANES)
+    state = selection.begin(sampler, mi.Ray3f())
+    return selection, selection.sample(state, scene, sampler, si, mi.Bool(True))
+
+
+def _choices(
+    scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f
+) -> tuple[np.ndarray, np.ndarray]:
+    """How often each emitter was chosen, and with what probability according to ``ds.pdf``."""
+    pdf = ds.emitter.pdf_direction(si, ds)
+    pdf = dr.select(ds.delta, 1, pdf)
+    α = dr.select(pdf > 0, ds.pdf / pdf, 0).numpy()
+    chosen = dr.reinterpret_array(mi.UInt32, ds.emitter).numpy()
+    ids = dr.reinterpret_array(mi.UInt32, scene.emitters_dr()).numpy()
+    counts = np.array([(chosen == id).sum() for id in ids])
+    probabilities = np.zeros(len(ids))
+    for i, id in enumerate(ids):
+        if counts[i]:
+            mine = α[chosen == id]
+            probabilities[i] = mine.max()
+            # Zero are the densities of points that a sphere or a panel hides itself
+            np.testing.assert_allclose(mine[mine > 0], mine.max(), rtol=1e-3)
+    return counts, probabilities
+
+
+@pytest.mark.parametrize(
+    "origin, target",
+    [
+        ([0.1, -2, 2], [0.1, -0.6, 0]),  # the glass, from above
+        ([0.1, -0.2, -0.2], [0.2, -0.6, 0]),  # from below
+        ([0, -2, 1], [0, 1.5, 1]),  # the wall
+        ([0.5, -2, 0.6], [0.5, 0, 0.5]),  # the ball
+    ],
+)
+def test_emitters_are_chosen_as_often_as_the_density_says(origin, target):
+    scene = mi.load_dict(_mixed())
+    si = _vertex(scene, origin, target)
+    _selection, (ds, _weight, _state) = _select(scene, si)
+    counts, probabilities = _choices(scene, si, ds)
+    assert probabilities.sum() == pytest.approx(1, abs=1e-3), "Σ α"
+    expected = probabilities * LANES
+    frequent = expected > 5
+    chi2 = ((counts - expected)[frequent] ** 2 / expected[frequent]).sum()
+    assert stats.chi2.sf(chi2, frequent.sum()) > 1e-4, (counts, expected)
+
+
+def test_density_of_a_light_that_a_ray_hits_is_that_of_the_sample():
+    scene = mi.load_dict(_mixed())
+    si = _vertex(scene, [0.1, -2, 2], [0.1, -0.6, 0])
+    selection, (ds, _weight, state) = _select(scene, si)
+    hit = scene.ray_intersect(si.spawn_ray(ds.d))
+    ds_hit = mi.DirectionSample3f(scene, hit, si)
+    same = ~ds.delta & (ds_hit.emitter == ds.emitter) & (dr.norm(ds_hit.p - ds.p) < 1e-4)
+    same |= ~ds.delta & (ds_hit.emitter == ds.emitter) & (ds.emitter == scene.environment())
+    pdf, _state = selection.pdf(state, scene, mi.Interaction3f(si), hit, ds_hit, same)
+    same = same.numpy()
+    assert same.mean() > 0.3
+    np.testing.assert_allclose(pdf.numpy()[same], ds.pdf.numpy()[same], rtol=2e-3)
+    assert not pdf.numpy()[~same].any(), "masked lanes"
+
+
+# ---- Zeros ----
+
+
+def _floor(bsdf: dict, **lights) -> mi.Scene:
+    return mi.load_dict({"type": "scene", "floor": rectangle(bsdf=bsdf), **lights})
+
+
+def _counts(scene: mi.Scene, origin: tuple = (0.5, 0, 1)) -> np.ndarray:
+    """How often each emitter is chosen at the origin, seen from ``origin``."""
+    si = _vertex(scene, list(origin), [0, 0, 0])
+    _selection, (ds, _weight, _state) = _select(scene, si)
+    return _choices(scene, si, ds)[0]
+
+
+def test_a_sphere_whose_top_is_above_the_horizon_is_chosen():
+    """The error that section 3.4.2 warns of."""
+    sphere = {"type": "sphere", "radius": 1.0, "emitter": area(1.0)}
+    scene = _floor(
+        diffuse(),
+        half=sphere | {"to_world": _translate(3, 0, -0.9)},
+        under=sphere | {"to_world": _translate(0, 3, -1.5)},
+        point=_point(0, 0, 1),
+    )
+    half, under, point = _counts(scene)
+    assert half > 100 and point > 100
+    assert under == 0
+
+
+@pytest.mark.parametrize(
+    "bsdf, is_opaque",
+    [
+        (lambda: diffuse(), True),
+        (lambda: {"type": "twosided", "bsdf": {"type": "roughplastic"}}, True),
+        (lambda: {"type": "roughdielectric"}, False),
+        (lambda: {"type": "mask", "opacity": 0.5, "bsdf": diffuse()}, False),
+        (lambda: {"type": "twosided", "bsdf": {"type": "bumpmap", "bsdf": diffuse(), "texture": {
+            "type": "checkerboard"}}}, False),
+    ],
+)
+def test_lights_below_the_horizon_are_chosen_where_they_can_contribute(bsdf, is_opaque):
+    lights = {"above": _point(0, 0.5, 1), "below": _point(0, 0.5, -1)}
+    above, below = _counts(_floor(bsdf(), **lights))
+    assert above > 100
+    assert (below == 0) == is_opaque
+    if bsdf()["type"] == "twosided" and is_opaque:
+        above, below = _counts(_floor(bsdf(), **lights), (0.5, 0, -1))
+        assert above == 0 and below > 100, "seen from below"
+
+
+def test_panels_that_shine_elsewhere_are_not_chosen():
+    scene = _floor(
+        diffuse(),
+        away=_panel(0, 0, 1, radiance=1000.0),
+        disk={
+            "type": "disk", "to_world": _translate(0.5, 0, 2), "emitter": area(1000.0)
+        },
+        down=_panel(0, 1, 1, angle=180),
+        # The vertex is behind its centre's horizon, but not behind its plane
+        grazing=_panel(1, 0, 0.001, angle=90, size=0.5),
+    )  # fmt: skip
+    away, disk, down, grazing = _counts(scene)
+    assert away == 0 and disk == 0
+    assert down > 100 and grazing > 100
+
+
+def test_a_light_that_nothing_faces_is_never_chosen_in_a_render():
+    lamp = {"lamp": _panel(0, 0, 1, angle=180)}
+    up = {"up": _panel(0, 0.5, 2, radiance=1e4)}
+    camera = {"sensor": sensor(film=film(8, 8))}
+    images = [
+        batches(scene, _integrator(scene, 2), 16, range(4))
+        for scene in (_floor(diffuse(), **camera, **lamp), _floor(diffuse(), **camera, **lamp, **up))
+    ]
+    # Choosing it would waste almost all samples
+    variances = [np.var(image, axis=0).mean() for image in images]
+    assert variances[1] < 2 * variances[0]
+
+
+def test_where_no_light_contributes_the_choice_is_uniform():
+    lights = {f"p{i}": _point(i, 0, -1, intensity=1 + 10.0 * i) for i in range(4)}
+    lights["off"] = _point(0, 1, -1, sampling_weight=0.0)
+    counts = _counts(_floor(diffuse(), **lights))
+    np.testing.assert_allclose(counts[:4], LANES / 4, rtol=0.05)
+    assert counts[4] == 0
+
+
+def test_sampling_weight_is_a_factor():
+    lights = [
+        _point(0, 0.5, 1, sampling_weight=3.0), _point(0, -0.5, 1),
+        _point(0, 0, 0.5, sampling_weight=0.0),
+    ]  # fmt: skip
+    three, one, none = _counts(_floor(diffuse(), **{f"p{i}": p for i, p in enumerate(lights)}))
+    assert three / one == pytest.approx(3, rel=0.05)
+    assert none == 0
+
+
+# ---- Many, one, none ----
+
+
+def test_a_thousand_lamps_estimate_the_sum_of_a_thousand_lamps():
+    rng = np.random.default_rng(1)
+    positions = rng.uniform([-2, -2, -1], [2, 2, 3], (1000, 3))
+    intensities = 10 ** rng.uniform(-2, 2, 1000)
+    scene = _floor(
+        diffuse(),
+        **{f"p{i:04}": _point(*p, intensity=w)
+           for i, (p, w) in enumerate(zip(positions.tolist(), intensities.tolist()))},
+    )  # fmt: skip
+    si = _vertex(scene, [0.5, 0, 1], [0, 0, 0])
+    _selection, (ds, weight, _state) = _select(scene, si)
+    value = (weight.x * dr.maximum(si.to_local(ds.d).z, 0)).numpy().astype(np.float64)
+    d2 = (positions**2).sum(axis=1)
+    exact = (intensities * np.maximum(positions[:, 2], 0) / d2**1.5).sum()
+    assert abs(value.mean() - exact) < 4 * value.std() / np.sqrt(LANES)
+    # Nearly as good as the exact probabilities, which have no variance at all
+    assert value.std() < 0.3 * exact
+
+
+def test_one_emitter_needs_no_estimates_and_none_no_tables():
+    scene = _floor(diffuse(), lamp=_panel(0, 0, 1, angle=180))
+    selection = LinearSelection(scene)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 4)
+    assert selection.begin(sampler, mi.Ray3f()) == ()
+    image = batches(_floor(diffuse(), sensor=sensor(), lamp=_panel(0, 0, 1, angle=180)),
+                    _integrator(scene, 3), 4, [1])  # fmt: skip
+    assert image.mean() > 0
+    dark = _floor(diffuse(), sensor=sensor())
+    assert not batches(dark, _integrator(dark, 3), 4, [1]).any()
+
+
+# ---- In the walk ----
+
+
+class _Recording(LinearSelection):
+    """Writes what it saw at each bounce into tables."""
+
+    bounces = 4
+
+    def __init__(self, scene: mi.Scene) -> None:
+        super().__init__(scene)
+        self.totals, self.distances = (dr.zeros(mi.Float, self.bounces) for _ in range(2))
+        self.previous = dr.zeros(mi.Float, self.bounces)
+
+    def begin(self, sampler, ray):
+        return mi.UInt32(0), super().begin(sampler, ray)
+
+    def sample(self, state, scene, sampler, si, active):
+        bounce, vertex = state
+        inside = active & (bounce < self.bounces)
+        dr.scatter(self.previous, vertex.total, bounce, inside)
+        ds, weight, vertex = super().sample(vertex, scene, sampler, si, active)
+        dr.scatter(self.totals, vertex.total, bounce, inside)
+        dr.scatter(self.distances, ds.dist, bounce, inside)
+        return ds, weight, (bounce + 1, vertex)
+
+    def pdf(self, state, scene, ref, si, ds, active):
+        pdf, vertex = super().pdf(state[1], scene, ref, si, ds, active)
+        return pdf, (state[0], vertex)
+
+
+def test_each_bounce_sees_other_numbers_and_the_state_of_the_last():
+    scene = mi.load_dict({
+        "type": "scene",
+        "box": {"type": "cube", "bsdf": {"type": "twosided", "bsdf": diffuse(0.9)}},
+        "a": _panel(0.2, 0, 0.9, angle=180),
+        "b": {"type": "sphere", "radius": 0.1, "to_world": _translate(-0.5, 0.4, -0.2),
+              "emitter": area(2.0)},
+    })  # fmt: skip
+    selection = _Recording(scene)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(1, 1)
+    ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -0.5), dr.normalize(mi.Vector3f(0.3, 0.2, -1)))
+    sample = Walk(selection.bounces + 1, 100, next_event=selection)(
+        scene, sampler, ray, mi.Bool(True)
+    )
+    dr.eval(sample.L)
+    totals, previous = selection.totals.numpy(), selection.previous.numpy()
+    assert len(set(totals)) == selection.bounces and (totals > 0).all(), totals
+    assert len(set(selection.distances.numpy())) == selection.bounces
+    np.testing.assert_array_equal(previous, [0, *totals[:-1]])
