@@ -26,12 +26,20 @@ class ComposedPath(WalkIntegrator):
 
     .. pluginparameters::
 
+     * - next_event
+       - |string|
+       - How a light is chosen at each vertex: :monosp:`uniform` (as :monosp:`path` does),
+         :monosp:`power`, :monosp:`spatial`, :monosp:`linear`, :monosp:`visibility` or
+         :monosp:`contribution`; see the parameter light_sampling of :monosp:`neepp`.
+         (Default: uniform)
      * - shadow_test
        - |string|
        - Whether the shadow ray of a connection is traced: :monosp:`always`, or
-         :monosp:`visibility_roulette` (by learned visibility, see :monosp:`neepp`, whose parameters
-         grid, refine, max_memory, pilot_spp, law, slope and floor are then accepted).
+         :monosp:`visibility_roulette` (by learned visibility, see :monosp:`neepp`).
          (Default: always)
+     * - grid, max_memory, pilot_spp, law, slope, floor, refine, save_map, load_map
+       -
+       - Those of :monosp:`neepp`; known only where next_event or shadow_test is not the default.
      * - max_depth
        - |int|
        - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 adds direct

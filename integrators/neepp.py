@@ -1,4 +1,4 @@
-"""NEE++: next event estimation that learns which shadow rays are worth tracing."""
+"""NEE++: next event estimation that learns which lights to choose and which shadow rays to trace."""
 
 from __future__ import annotations
 
@@ -20,27 +20,39 @@ class NEEPlusPlus(WalkIntegrator):
     Next event estimation++ (:monosp:`neepp`)
     -----------------------------------------
 
-    A path tracer that learns, from its first samples, which pairs of voxels see each other, and
-    rejects most of the shadow rays that would be blocked. Russian roulette keeps it unbiased.
+    A path tracer that learns from its first samples which lights reach which surfaces. It chooses
+    lights accordingly, also parts of large lights and directions of the sky, and rejects most of the
+    shadow rays that would be blocked. Both are unbiased.
 
     .. pluginparameters::
 
+     * - light_sampling
+       - |string|
+       - How a light is chosen at each vertex. Learned, for the voxel and the side of the surface:
+         :monosp:`contribution` (by what arrived from it), :monosp:`visibility` (by how often it was
+         visible, times what it would contribute unoccluded). Not learned: :monosp:`uniform` (as
+         :monosp:`path` chooses), :monosp:`power`, :monosp:`spatial` (unoccluded contributions, per
+         voxel, as in pbrt-v3), :monosp:`linear` (an estimate for each light at each vertex; its
+         cost grows with their number). (Default: contribution)
+     * - rejection
+       - |bool|
+       - Reject shadow rays by learned visibility. (Default: true)
      * - grid
        - |int|
-       - Voxels along each axis of the scene's bounding box. (Default: 16)
-     * - refine
-       - |int|
-       - Random visibility tests added to each entry of the map in which the pilot saw a success,
-         for the voxels with a light. (Default: 16)
+       - Voxels along each axis of the region in which paths scatter (of the scene's bounding box,
+         where :monosp:`light_sampling` is not learned). (Default: 24, or fewer where the pilot has
+         few samples for the voxels that it sees and the lights; 16 for rejection without learned
+         light sampling, 32 for :monosp:`spatial`)
      * - max_memory
        - |float|
-       - Memory for the visibility map, in MiB. Where :monosp:`grid` needs more, a coarser grid is
-         used, with a warning. (Default: 64)
+       - Memory for what is learned, in MiB. Where :monosp:`grid` needs more, a coarser grid is
+         used, with a warning. (Default: 256)
      * - pilot_spp
        - |int|
-       - Samples per pixel from which visibility is learned, at most a quarter of all. They count
-         towards the image. With 0 nothing is learned and every shadow ray is traced. A sampler that
-         is stratified over all samples may need a longer pilot, up to a sixteenth. (Default: 4)
+       - Samples per pixel from which is learned, at most a quarter of all. They count towards the
+         image. With 0 nothing is learned: lights are chosen as by :monosp:`path`, and every shadow
+         ray is traced. A sampler that is stratified over all samples may need longer pilots.
+         (Default: 16)
      * - law
        - |string|
        - How the probability of tracing a shadow ray follows from the learned visibility V:
@@ -52,6 +64,17 @@ class NEEPlusPlus(WalkIntegrator):
      * - floor
        - |float|
        - Least probability of the affine law, 1e-6 to 1. (Default: 0.1)
+     * - refine
+       - |int|
+       - Only where light sampling is not learned: random visibility tests added to each entry of the
+         map in which the pilot saw a success, for the voxels with a light. (Default: 16)
+     * - save_map
+       - |string|
+       - File to which the learned map is written. (Default: none)
+     * - load_map
+       - |string|
+       - File of a map to begin with, from this view of the scene or another one; the pilot adds to
+         it. A map of another scene is refused. (Default: none)
      * - max_depth
        - |int|
        - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 adds direct
@@ -73,32 +96,41 @@ class NEEPlusPlus(WalkIntegrator):
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
          :monosp:`depth:depth,nn:sh_normal`. (Default: none)
 
-    **Use it when** most shadow rays are blocked: light through a door or from other rooms, many
-    lamps behind walls, and when a shadow ray is expensive. **Not when** the scene is open (it then
-    costs the pilot's bookkeeping) or the difficulty lies elsewhere, in glossy or indirect light.
+    **Use it when** there are many lights, when most of them are hidden from most places (rooms, a
+    sky seen through windows, lamps behind walls), or when large lights are partly covered. **Not
+    when** one small light lights an open scene, or when the difficulty lies elsewhere, in indirect
+    or glossy light: it then costs the pilots' bookkeeping.
 
-    Visibility is learned towards points in the scene's bounding box. Lights at infinity or outside
-    of it are always tested; where there are no others, nothing is learned, and where hardly a
-    shadow ray would be rejected, what was learned is not used. Participating media are ignored, as
-    by :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized
-    variants. Nested in :monosp:`moment` there is no pilot, so every shadow ray is traced.
+    A first sample per pixel, which is none of the image's, finds the region and the surfaces. Up to
+    three pilots follow, each of which chooses its lights by what the ones before have learned; all
+    samples weigh the same, and none teaches a pass that it is part of, so that the image is
+    unbiased. A tenth of the choices does not depend on what was learned. Where light sampling is not
+    learned, rejection knows lights in the scene's bounding box only; those outside of it and at
+    infinity are then always tested.
 
-    Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
-    Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, sections 3 to 4.1.
+    Lights on meshes with interpolated normals are sampled by the area of their triangles
+    (:monosp:`path` and :monosp:`uniform` are biased there, by a fault in Mitsuba). Textured area lights are not divided. Participating media
+    are ignored, as by :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are
+    scalar and polarized variants. Nested in :monosp:`moment` there is no pilot.
+
+    Sources: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
+    Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, sections 3 to 4.2;
+    P. Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH 2003 course 44, section
+    3.4 (:monosp:`linear`).
 
     .. tabs::
         .. code-tab:: xml
 
             <integrator type="neepp">
                 <integer name="max_depth" value="8"/>
-                <integer name="grid" value="16"/>
+                <string name="light_sampling" value="contribution"/>
             </integrator>
 
         .. code-tab:: python
 
             'type': 'neepp',
             'max_depth': 8,
-            'grid': 16
+            'light_sampling': 'contribution'
     """
 
     def __init__(self, props: mi.Properties) -> None:

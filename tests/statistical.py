@@ -65,12 +65,23 @@ REFERENCE = UnderTest("path", draws_like_path=True)
 #: Settings under which more is learned or gambled: unbiased all the same. The films of the tests
 #: are so small that the default pilot learns little.
 _TRAINED = {"pilot_spp": 32, "grid": 8}
+_MAPPED = {**_TRAINED, "light_sampling": "uniform"}
 UNUSUAL: dict[str, UnderTest] = {
     "neepp_trained": UnderTest("neepp", _TRAINED),
+    "neepp_visibility": UnderTest("neepp", {**_TRAINED, "light_sampling": "visibility"}),
     "neepp_paper": UnderTest("neepp", {**_TRAINED, "law": "paper", "grid": 4}),
-    "neepp_grid_4": UnderTest("neepp", {**_TRAINED, "grid": 4}),
-    # Every connection that the map covers is tested with the same small probability
+    "neepp_grid_64": UnderTest("neepp", {"pilot_spp": 16, "grid": 64}),
+    "neepp_grid_1": UnderTest("neepp", {**_TRAINED, "grid": 1}),
+    # Rejection by the map of pairs of voxels
+    "neepp_map": UnderTest("neepp", _MAPPED),
+    "neepp_map_paper": UnderTest("neepp", {**_MAPPED, "law": "paper", "grid": 4}),
+    # Every connection is tested with the same small probability
     "neepp_floor": UnderTest("neepp", {**_TRAINED, "slope": 0.0, "floor": 0.1}),
+    "neepp_map_floor": UnderTest("neepp", {**_MAPPED, "slope": 0.0, "floor": 0.1}),
+    # Lights by a table, by distance, by a loop over all of them; nothing is learned
+    "power": UnderTest("composed_path", {"next_event": "power"}),
+    "spatial": UnderTest("composed_path", {"next_event": "spatial"}),
+    "linear": UnderTest("composed_path", {"next_event": "linear"}),
 }
 
 #: Single tests accept |z| below this (p = 6e-5); several at once, its Šidák correction.

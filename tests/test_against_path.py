@@ -223,7 +223,10 @@ def test_image_is_that_of_path_with_hidden_emitters(name: str, light: Any) -> No
 def test_roulette_chosen_in_composed_path_is_neepp() -> None:
     scene = load("door_ajar", width=WIDTH, height=HEIGHT)
     chosen = mi.load_dict(
-        {"type": "composed_path", "shadow_test": "visibility_roulette", "max_depth": 6}
+        {
+            "type": "composed_path", "shadow_test": "visibility_roulette",
+            "next_event": "contribution", "max_depth": 6,
+        }
     )
     neepp = mi.load_dict({"type": "neepp", "max_depth": 6})
     images = [batches(scene, integrator, 32, [5])[0] for integrator in (chosen, neepp)]
@@ -240,7 +243,7 @@ def test_roulette_rejects_shadow_rays_where_most_are_blocked() -> None:
         integrator = under_test.make(6)
         batches(scene, integrator, 128, [5])
         rays[name] = integrator.statistics.rays["shadow"]
-    for name in UNUSUAL:
+    for name in (name for name in UNUSUAL if name.startswith("neepp")):
         assert rays[name] < 0.8 * rays["composed_path"], rays
 
 

@@ -30,7 +30,10 @@ _SEED_COUNT = 6
 BOTH = pytest.mark.parametrize("name", UNDER_TEST)
 
 #: With the default parameters few of the shadow rays are rejected here: gamble on all of them too.
-WITH_GAMBLER = {**UNDER_TEST, "neepp_floor": UNUSUAL["neepp_floor"]}
+WITH_GAMBLER = {
+    **UNDER_TEST,
+    **{name: UNUSUAL[name] for name in ("neepp_floor", "neepp_map_floor", "spatial", "linear")},
+}
 
 
 def _scene(case: str) -> mi.Scene:
@@ -181,10 +184,14 @@ _WRONG_REJECTION = [
     (ValueError, {"floor": 0.0}),
     (ValueError, {"floor": 1.5}),
     (ValueError, {"floor": math.nan}),
+    (ValueError, {"light_sampling": "spacial"}),
+    (TypeError, {"rejection": "yes"}),
+    (TypeError, {"load_map": 3}),
 ]
 WRONG_VALUES = [(name, *wrong) for name in UNDER_TEST for wrong in _WRONG]
 WRONG_VALUES += [("neepp", *wrong) for wrong in _WRONG_REJECTION]
 WRONG_VALUES += [("composed_path", ValueError, {"shadow_test": "sometimes"})]
+WRONG_VALUES += [("composed_path", ValueError, {"next_event": "always"})]
 
 
 @pytest.mark.parametrize(("name", "kind", "wrong"), WRONG_VALUES)

@@ -63,10 +63,10 @@ class _TwoStages:
         self.pilot_spp, self.timeout, self.samples_per_pass = pilot_spp, timeout, 2**32 - 1
         self.progress, self.is_cancelled = None, False
 
-    def stage_samples(self, scene, spp):
-        return [self.pilot_spp, spp - self.pilot_spp]
+    def pilots(self, scene, spp):
+        return [self.pilot_spp]
 
-    def stages(self, scene, samples):
+    def stages(self, scene, sensor, samples):
         yield Stage(_Constant(1.0))
         yield Stage(_Constant(3.0), "something")
 
@@ -187,7 +187,10 @@ def test_passes_share_kernels_and_memory(scene):
     integrator.progress = lambda _: compiled.append(sum(dr.detail.launch_stats()[1:]))
     integrator.render(scene, sensor, spp=30)
     few = integrator.statistics
-    assert compiled[1] == compiled[-1] and len(compiled) == few.passes > 5
+    # Pilots of 1, 1 and 5 samples, the rest of 23 in passes of four
+    assert len(compiled) == few.passes == 10
+    assert compiled[4] == compiled[-1], "a pass of the last stage had to compile"
+    assert compiled[2] == compiled[3], "a pass of a pilot had to compile"
     integrator.render(scene, sensor, spp=69, seed=1)
     many = integrator.statistics
     assert compiled[-1] == compiled[1] and many.passes > 2 * few.passes

@@ -123,11 +123,11 @@ def test_what_was_counted_becomes_the_table_and_the_roulette():
     for q, expected in ((across, 10 * 0.5 / 91 + 0.01), (within, 1.0), (_points([9, 9, 9]), 1.0)):
         ds.p = q
         roulette = VisibilityRoulette(visibility, slope=10, floor=0.01, law="affine")
-        p_test = roulette.probability((), si, ds, mi.Bool(True))[0]
+        p_test = roulette.probability((), (), si, ds, mi.Bool(True))[0]
         assert float(p_test[0]) == pytest.approx(expected)
     ds.p = across
     paper = VisibilityRoulette(visibility, slope=10, floor=0.01, law="paper")
-    assert float(paper.probability((), si, ds, mi.Bool(True))[0][0]) == pytest.approx(1e-4)
+    assert float(paper.probability((), (), si, ds, mi.Bool(True))[0][0]) == pytest.approx(1e-4)
 
 
 def test_refinement_tests_what_lies_between_the_voxels():

@@ -48,13 +48,13 @@ class _RecordingNextEvent(EmitterSampling):
     def begin(self, sampler, ray):
         return mi.UInt32(0)
 
-    def sample(self, state, scene, si, sample, active):
-        self.recorder.write(state, sample.x, active)
-        ds, weight, _ = super().sample((), scene, si, sample, active)
+    def sample(self, state, scene, sampler, si, active):
+        ds, weight, _ = super().sample((), scene, sampler, si, active)
+        self.recorder.write(state, ds.uv.x, active)
         return ds, weight, state + 1
 
-    def pdf(self, state, scene, ref, ds, active):
-        pdf, _ = super().pdf((), scene, ref, ds, active)
+    def pdf(self, state, scene, ref, si, ds, active):
+        pdf, _ = super().pdf((), scene, ref, si, ds, active)
         return pdf, state
 
 
@@ -65,7 +65,7 @@ class _RecordingShadowTest(ShadowTest):
     def begin(self, sampler, ray):
         return mi.UInt32(0)
 
-    def probability(self, state, si, ds, active):
+    def probability(self, state, choice, si, ds, active):
         self.recorder.write(state, ds.dist, active)
         return mi.Float(1), state + 1
 
@@ -143,7 +143,7 @@ def test_a_replaced_query_is_asked_for_camera_scattered_and_shadow_rays(box):
 
 def test_a_rejected_connection_traces_no_shadow_ray_and_survivors_weigh_more(box):
     class Half(ShadowTest):
-        def probability(self, state, si, ds, active):
+        def probability(self, state, choice, si, ds, active):
             return mi.Float(0.5), state
 
     def total(walk: Walk) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from ..lights.light_cells import LightCells
 from ..lights.weights import VoxelRows, power_weights, spatial_weights
 from .light_learner import LightLearner
 from .light_selection import LightSelection, OneRow
+from .linear_selection import LinearSelection
 from .visibility_roulette import VisibilityLearner, has_lights_at_points
 
 if TYPE_CHECKING:
@@ -59,7 +60,8 @@ class LightSampling:
         return cls(
             light_sampling=light_sampling,
             rejection=rejection,
-            grid=get(props, "grid", 0, minimum=0, maximum=1024),
+            # Chosen later where the scene does not say
+            grid=get(props, "grid", 1, minimum=1, maximum=1024) if "grid" in props else 0,
             max_memory=get(props, "max_memory", 256.0, minimum=1e-3),
             pilot_spp=get(props, "pilot_spp", 16, minimum=0),
             refine=get(props, "refine", 16, minimum=0, maximum=1024),
@@ -75,7 +77,6 @@ class LightSampling:
         if not scene.emitters():
             return {}
         if self.light_sampling == "linear":
-            from .linear_selection import LinearSelection
             return {"next_event": LinearSelection(scene)}
         if self.light_sampling == "power":
             cells = LightCells(scene, None)

@@ -149,10 +149,10 @@ class LinearSelection(EmitterSampling):
         chosen = dr.gather(mi.UInt32, self._candidates, slot, active)
         chosen_e = mi.Float(0)
         target = x * total
-        active &= total > 0
+        is_searched = active & (total > 0)
 
         block, before, running = mi.UInt32(0), mi.Float(0), mi.Float(0)
-        searching = mi.Bool(active)
+        searching = mi.Bool(is_searched)
         while dr.hint(searching, label="block"):
             before = running
             running = sums.read(block, searching)
@@ -162,7 +162,7 @@ class LinearSelection(EmitterSampling):
         # The sums are those of the first pass, to the last bit. They can stay below the target but
         # by rounding: then the last emitter is chosen
         index = block * self._block
-        searching = mi.Bool(active)
+        searching = mi.Bool(is_searched)
         while dr.hint(searching, label="choice"):
             e = self._estimate(index, p, normal, is_opaque, searching)
             before += e

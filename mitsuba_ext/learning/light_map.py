@@ -21,6 +21,9 @@ _UNIT, _LIMIT = 2.0**20, 16.0
 #: What the expectation is worth, in tests: for visibility, and for the mean square.
 _PRIOR_TESTS, _PRIOR_SQUARES = 1.0, 4.0
 
+#: What a diffuse surface of little albedo reflects, in units of a white one without the 1/π.
+_DARK = 0.1
+
 #: Bytes of an entry: the expectation, the counters, and the tables that are made of them.
 BYTES_PER_ENTRY = 32
 
@@ -125,8 +128,9 @@ class LightMap:
         if target == "visibility":
             return self.unoccluded * visibility
         squares = mi.Float(self.squares) / _UNIT
-        total = int(dr.sum(self.squares)[0]) / _UNIT
-        arrived = dr.opaque(mi.Float, total / max(1, int(dr.sum(mi.UInt64(self.successes))[0])))
+        # The mean square of what arrived, and of one more success of a dark surface
+        total = int(dr.sum(self.squares)[0]) / _UNIT + _DARK**2
+        arrived = dr.opaque(mi.Float, total / (int(dr.sum(mi.UInt64(self.successes))[0]) + 1))
         square = (squares + _PRIOR_SQUARES * visibility * arrived) / (
             mi.Float(self.tests) + _PRIOR_SQUARES
         )

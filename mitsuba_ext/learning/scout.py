@@ -62,6 +62,8 @@ class Scout:
     def vertices(self) -> tuple[mi.Point3f, mi.Normal3f]:
         """The places, and the geometric normals on the side from which they were seen."""
         slots = dr.compress(self._seen > 0)
+        if len(slots) == 0:
+            return mi.Point3f(), mi.Normal3f()
         p, n = dr.gather(mi.Point3f, self._p, slots), dr.gather(mi.Normal3f, self._n, slots)
         finite = dr.compress(dr.all(dr.isfinite(p) & dr.isfinite(n)))
         return dr.gather(mi.Point3f, p, finite), dr.gather(mi.Normal3f, n, finite)

@@ -26,6 +26,8 @@ class EmitterCells:
     """
 
     def __init__(self, scene: mi.Scene, indices: list[int], voxel: mi.Vector3f | None) -> None:
+        # An emitter whose shape is gone ends the process in any scene's next call of emitters
+        self._scene = scene
         edges = None if voxel is None else np.array(voxel, dtype=np.float64).reshape(3)
         everything = divide(scene, edges)
         divisions = [everything[i] for i in indices]

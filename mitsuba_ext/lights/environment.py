@@ -41,6 +41,7 @@ class EnvironmentBins:
     """
 
     def __init__(self, scene: mi.Scene) -> None:
+        self._scene = scene  # kept alive, as its emitter has to be
         self.emitter = scene.environment()
         self.pointer = mi.EmitterPtr(self.emitter)
         self._is_map = self.emitter.class_name() == "EnvironmentMapEmitter"

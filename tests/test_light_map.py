@@ -1,0 +1,300 @@
+"""Light maps: where paths scatter, what is counted, what is made of it, and files of maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from statistical import assert_same_mean, batches, load
+
+from mitsuba_ext.decisions.light_learner import LightLearner
+from mitsuba_ext.decisions.light_roulette import LightRoulette
+from mitsuba_ext.decisions.light_selection import Choice, LightSelection
+from mitsuba_ext.learning import light_map_file
+from mitsuba_ext.learning.light_map import LightMap
+from mitsuba_ext.learning.scout import Scout, region
+from mitsuba_ext.learning.surface_rows import RowCounts, SurfaceRows, voxel_edges
+from mitsuba_ext.lights.light_cells import LightCells
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def _lamp(*position: float, radiance: float = 1.0, size: float = 0.1, **more) -> dict:
+    """A rectangle that shines downwards."""
+    T = mi.ScalarTransform4f
+    return {
+        "type": "rectangle",
+        "to_world": T().translate(list(position)).rotate([1, 0, 0], 180).scale(size),
+        "emitter": {"type": "area", "radiance": radiance, **more},
+    }
+
+
+def _floor(**more) -> mi.Scene:
+    return mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}, **more})
+
+
+def _vertices(count: int = 2000) -> tuple[mi.Point3f, mi.Normal3f]:
+    """Points of a floor, and normals that point up."""
+    rng = np.random.default_rng(0)
+    p = np.concatenate([rng.uniform(-1, 1, (2, count)), np.zeros((1, count))]).astype(np.float32)
+    return mi.Point3f(p), mi.Normal3f(np.tile([[0], [0], [1]], count).astype(np.float32))
+
+
+def _map(scene: mi.Scene, grid: int = 4) -> LightMap:
+    p, n = _vertices()
+    rows = SurfaceRows(region(p), grid, p, n)
+    return LightMap(scene, rows, LightCells(scene, voxel_edges(rows.bbox, grid)))
+
+
+def _surface(p, n=(0, 0, 1), width: int = 1) -> mi.SurfaceInteraction3f:
+    si = dr.zeros(mi.SurfaceInteraction3f, width)
+    si.p, si.n = mi.Point3f(*p), mi.Normal3f(*n)
+    si.sh_frame = mi.Frame3f(si.n)
+    si.wi = mi.Vector3f(0, 0, 1)
+    return si
+
+
+# ---- Where paths scatter ----
+
+
+def _scout(scene: mi.Scene, lanes: int = 4096) -> Scout:
+    integrator = mi.load_dict({"type": "composed_path", "max_depth": 4})
+    scout = Scout(lanes)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, lanes)
+    ray = scene.sensors()[0].sample_ray(0, 0.5, sampler.next_2d(), sampler.next_2d())[0]
+    walk = integrator.stage(observer=scout).walk
+    dr.eval(walk(scene, sampler, mi.Ray3f(ray), mi.Bool(True)).L)
+    return scout
+
+
+def test_a_scout_finds_surfaces_on_the_side_that_is_seen():
+    """In a closed box, seen from inside."""
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "box": {
+        "type": "cube", "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}})
+    p, n = _scout(scene).vertices()
+    assert dr.width(p) > 2 * 4096
+    assert bool(dr.all(dr.abs(dr.dot(n, p) + 1) < 1e-4))
+
+
+def test_a_scout_of_nothing_brings_nothing():
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"},
+                          "sky": {"type": "constant"}})
+    assert dr.width(_scout(scene).vertices()[0]) == 0
+
+
+def test_a_few_distant_points_do_not_widen_the_region():
+    p, _n = _vertices(10_000)
+    p = p.numpy()
+    p[:, :5] = 1e6
+    box = region(mi.Point3f(p))
+    assert np.all(np.array(box.max) < 1.2) and np.all(np.array(box.min) > -1.2)
+    assert box.max.z > box.min.z, "a flat region has some depth"
+
+
+@pytest.mark.parametrize("scale, offset", [(1, 0), (1e-3, 0), (1e4, 0), (1, 1e3)])
+@pytest.mark.parametrize("grid", [1, 5, 64])
+def test_vertices_are_found_in_their_rows(scale, offset, grid):
+    p, n = _vertices()
+    p = scale * p + offset * scale
+    rows = SurfaceRows(region(p), grid, p, n)
+    assert RowCounts(rows.bbox, p, n)(grid) == pytest.approx(rows.count, rel=0.02, abs=2)
+    si = _surface(rows.p, rows.n, dr.width(rows.p))
+    row = rows.row(si, mi.Bool(True)).numpy()
+    assert (row < rows.count - 1).mean() > 0.99
+    expected = np.repeat(np.arange(rows.count - 1), rows.size.numpy())
+    assert (row == expected).mean() > 0.99
+    # Other places, and the other side, share the last row
+    below = _surface((0.5 * scale + offset * scale, offset * scale, offset * scale), (0, 0, -1))
+    below.wi = mi.Vector3f(0, 0, 1)
+    far = _surface((99 * scale, 0, 0))
+    assert int(rows.row(below, mi.Bool(True))[0]) == int(rows.row(far, mi.Bool(True))[0])
+    assert int(rows.row(far, mi.Bool(True))[0]) == rows.count - 1
+
+
+# ---- What is made of the counts ----
+
+
+def _observe(light_map: LightMap, cell: int, visible: int, blocked: int, value: float) -> None:
+    si = _surface((0.1, 0.1, 0), width=visible + blocked)
+    row = light_map.rows.row(si, mi.Bool(True))
+    choice = Choice(row, dr.full(mi.UInt32, cell, visible + blocked), mi.Float(0.5))
+    arrived = dr.arange(mi.UInt32, visible + blocked) < visible
+    # The contribution of an estimator that chose with probability 0.5
+    light_map.connection(choice, si, None, mi.Color3f(value / 0.5), arrived, mi.Bool(True))
+    dr.eval(light_map.tests, light_map.successes, light_map.squares)
+
+
+def _row(light_map: LightMap, values: mi.Float) -> np.ndarray:
+    row = int(light_map.rows.row(_surface((0.1, 0.1, 0)), mi.Bool(True))[0])
+    return values.numpy().reshape(-1, light_map.cells.count)[row]
+
+
+def test_visibility_and_contribution_follow_the_counts():
+    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
+    unoccluded = _row(light_map, light_map.unoccluded)
+    _observe(light_map, 0, 0, 1000, 0.0)
+    _observe(light_map, 1, 500, 500, 0.5 * unoccluded[1])
+    visibility = _row(light_map, light_map.visibility())
+    assert visibility == pytest.approx([0, 0.5], abs=0.01)
+    by_visibility = _row(light_map, light_map.weights("visibility"))
+    assert by_visibility == pytest.approx(unoccluded * visibility)
+    by_contribution = _row(light_map, light_map.weights("contribution"))
+    # The root of the mean square: half of the tests brought half of what was expected
+    assert by_contribution[1] == pytest.approx(unoccluded[1] * np.sqrt(0.5 * 0.25), rel=0.02)
+    assert by_contribution[0] < 0.05 * by_contribution[1]
+
+
+def test_surroundings_decide_where_nothing_was_tested():
+    """A cell that its neighbours never saw is not expected to be seen."""
+    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
+    _observe(light_map, 0, 0, 50, 0.0)
+    _observe(light_map, 1, 50, 0, 1.0)
+    visibility = light_map.visibility().numpy().reshape(-1, 2)
+    assert (visibility[:-1, 0] < 0.1).all() and (visibility[:-1, 1] > 0.9).all()
+
+
+def test_a_map_without_a_test_expects_the_unoccluded():
+    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1, radiance=3.0)))
+    unoccluded = light_map.unoccluded.numpy().reshape(-1, 2)
+    for target in ("visibility", "contribution"):
+        weights = light_map.weights(target).numpy().reshape(-1, 2)
+        share = weights / weights.sum(axis=1, keepdims=True)
+        np.testing.assert_allclose(share, unoccluded / unoccluded.sum(axis=1, keepdims=True), 1e-4)
+
+
+def test_one_bright_sample_does_not_decide():
+    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
+    _observe(light_map, 1, 100, 0, 0.3)
+    before = _row(light_map, light_map.weights("contribution"))[0]
+    _observe(light_map, 0, 99, 0, 0.3)
+    _observe(light_map, 0, 1, 0, 1e30)
+    after = _row(light_map, light_map.weights("contribution"))[0]
+    assert np.isfinite(after) and after < 10 * max(before, 0.3)
+
+
+def test_the_roulette_reads_the_chosen_cell():
+    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
+    _observe(light_map, 0, 0, 1000, 0.0)
+    _observe(light_map, 1, 1000, 0, 1.0)
+    si = _surface((0.1, 0.1, 0))
+    row = light_map.rows.row(si, mi.Bool(True))
+    for law, blocked in (("affine", 0.01), ("paper", 1e-4)):
+        roulette = LightRoulette(light_map, slope=10, floor=0.005, law=law)
+        p = [
+            float(roulette.probability((), Choice(row, mi.UInt32(cell), None), si, None, True)[0][0])
+            for cell in (0, 1)
+        ]
+        assert p[1] == 1 and p[0] == pytest.approx(blocked, abs=0.02)
+    assert roulette.rejected_share == pytest.approx(0.5, abs=0.01)
+
+
+def test_probabilities_of_a_selection_are_those_of_its_weights_and_no_light_is_lost():
+    scene = _floor(**{f"lamp_{i}": _lamp(i / 40 - 1, 0, 1, size=0.01) for i in range(80)})
+    light_map = _map(scene, grid=1)
+    rng = np.random.default_rng(1)
+    weights = rng.uniform(0, 1, light_map.rows.count * 80).astype(np.float32) ** 8
+    selection = LightSelection(light_map.rows, light_map.cells, mi.Float(weights))
+    sampler = mi.load_dict({"type": "independent"})
+    lanes = 1 << 18
+    sampler.seed(0, lanes)
+    si = _surface((0.1, 0.1, 0), width=lanes)
+    _ds, _weight, choice = selection.sample(None, scene, sampler, si, mi.Bool(True))
+    row = weights.reshape(-1, 80)[int(choice.row[0])].astype(np.float64)
+    expected = row / row.sum()
+    counts = np.bincount(choice.cell.numpy(), minlength=80)
+    error = np.sqrt(expected * (1 - expected) / lanes) + 2 / lanes
+    assert (np.abs(counts / lanes - expected) < 5 * error).all()
+    np.testing.assert_allclose(
+        choice.probability.numpy(), expected[choice.cell.numpy()], rtol=1e-2, atol=1e-7
+    )
+
+
+# ---- In a render ----
+
+
+def _learner(scene: mi.Scene, **parameters) -> LightLearner:
+    defaults = {"target": "contribution", "rejection": None, "grid": 0, "max_memory": 2**26,
+                "pilot_samples": 100_000}
+    learner = LightLearner(**{**defaults, **parameters})
+    learner.start(scene, *_vertices())
+    return learner
+
+
+def test_the_grid_follows_the_number_of_samples_and_the_memory():
+    scene = _floor(**{f"lamp_{i}": _lamp(i / 40 - 1, 0, 1, size=0.01) for i in range(80)})
+
+    def entries(**parameters) -> int:
+        return len(_learner(scene, **parameters)._map.tests)
+
+    assert entries(pilot_samples=1000) < entries(pilot_samples=100_000)
+    assert entries(grid=64, max_memory=2**20) * 32 <= 2**20
+    assert entries(grid=64) > entries(grid=8)
+
+
+def test_the_same_seed_learns_bitwise_the_same(tmp_path: Path):
+    scene = load("door_ajar", width=64, height=36)
+    maps = []
+    for run in range(2):
+        file = tmp_path / f"{run}.npz"
+        integrator = mi.load_dict({"type": "neepp", "max_depth": 4, "save_map": str(file)})
+        mi.render(scene, integrator=integrator, spp=64, seed=3)
+        with np.load(file) as data:
+            maps.append([data[name] for name in ("tests", "successes", "squares")])
+    assert maps[0][0].sum() > 50_000
+    for first, again in zip(*maps):
+        # A ray in ten thousand may change its fate with the order in which floats are added
+        assert (first == again).mean() > 0.999 and first.sum() == pytest.approx(again.sum(), 1e-3)
+
+
+def test_a_map_serves_another_view_and_is_refused_by_another_scene(tmp_path: Path):
+    """Learned once, used without a pilot: fewer shadow rays than without, and the same mean."""
+    file = tmp_path / "deep" / "map.npz"
+    scene = load("door_ajar", width=64, height=36)
+    learn = mi.load_dict({"type": "neepp", "max_depth": 4, "save_map": str(file)})
+    mi.render(scene, integrator=learn, spp=64)
+    sensor = mi.load_dict(
+        {
+            "type": "perspective", "fov": 40,
+            "to_world": mi.ScalarTransform4f().look_at([1, 1, 1.5], [2, 3, 1], [0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": 32, "height": 18},
+        }
+    )
+    use = mi.load_dict(
+        {"type": "neepp", "max_depth": 4, "load_map": str(file), "pilot_spp": 0}
+    )
+    image = np.array(use.render(scene, sensor, spp=64))
+    assert np.isfinite(image).all() and "light map" in use.statistics.learned
+    assert use.statistics.passes == 1
+    other = load("rooms", width=32, height=18)
+    with pytest.raises(ValueError, match="belongs to another scene"):
+        use.render(other, spp=4)
+    with pytest.raises(FileNotFoundError, match="no light map"):
+        mi.load_dict({"type": "neepp", "load_map": "nowhere.npz"}).render(scene, spp=4)
+    (tmp_path / "broken.npz").write_bytes(b"PK nothing")
+    with pytest.raises(ValueError, match="not a light map"):
+        light_map_file.load(tmp_path / "broken.npz", scene)
+
+
+def test_a_loaded_map_keeps_the_mean(tmp_path: Path):
+    file = tmp_path / "map.npz"
+    scene = load("rooms", width=32, height=18)
+    mi.render(scene, integrator=mi.load_dict(
+        {"type": "neepp", "max_depth": 3, "save_map": str(file)}), spp=64)
+    use = {"type": "neepp", "max_depth": 3, "load_map": str(file), "pilot_spp": 0}
+    images = batches(scene, mi.load_dict(use), 64, range(1, 9))
+    reference = batches(scene, mi.load_dict({"type": "path", "max_depth": 3}), 256, range(100, 108))
+    assert_same_mean(images, reference, precision=0.02)
+
+
+def test_the_fingerprint_sees_lights_and_geometry_but_no_sensor():
+    def of(**more) -> str:
+        return light_map_file.fingerprint(_floor(**more))
+
+    base = of(a=_lamp(0, 0, 1))
+    assert base == of(a=_lamp(0, 0, 1)) == of(a=_lamp(0, 0, 1), s={"type": "perspective"})
+    assert len({base, of(a=_lamp(0, 0, 1.01)), of(a=_lamp(0, 0, 1, radiance=1.1)),
+                of(a=_lamp(0, 0, 1), b=_lamp(0, 0, 2))}) == 4
