@@ -33,6 +33,7 @@ SCENES: dict[str, tuple[str, int, int, float]] = {
     "rooms": ("rooms", 4, 128, 0.015),
     "mirrors_and_glass": ("mirrors_and_glass", 3, 128, 0.012),
     "sunny_gloss": ("sunny_gloss", 2, 128, 0.012),
+    "window": ("window", 3, 64, 0.012),
 }
 
 
@@ -59,18 +60,18 @@ def test_mean_is_that_of_path(scene: str, name: str) -> None:
     _check_mean(scene, name)
 
 
-@pytest.mark.parametrize(
-    ("scene", "name"),
-    [
-        ("door_ajar", "neepp_trained"),
-        ("door_ajar", "neepp_grid_4"),
-        ("door_ajar", "neepp_paper"),
-        ("rooms", "neepp_floor"),
-    ],
-)
+#: The paper's law is so noisy that its mean is known well enough in one scene only.
+_UNUSUAL_CASES = [
+    (scene, name)
+    for name in UNUSUAL
+    for scene in (("door_ajar",) if "paper" in name else ("rooms", "window"))
+]
+
+
+@pytest.mark.parametrize(("scene", "name"), _UNUSUAL_CASES)
 def test_mean_is_that_of_path_with_unusual_parameters(scene: str, name: str) -> None:
-    """A map of which much is known, one that is far too coarse, the paper's law, and rejection
-    without regard to the map."""
+    """Grids that are far too coarse and far too fine, the paper's law, rejection without regard to
+    what was learned, lights that are chosen in other ways."""
     _check_mean(scene, name, precision=0.03)
 
 
@@ -243,7 +244,9 @@ def test_roulette_rejects_shadow_rays_where_most_are_blocked() -> None:
         integrator = under_test.make(6)
         batches(scene, integrator, 128, [5])
         rays[name] = integrator.statistics.rays["shadow"]
-    for name in (name for name in UNUSUAL if name.startswith("neepp")):
+    # A grid that is far too fine for the samples learns too little to reject much
+    learned = [n for n in UNUSUAL if n.startswith("neepp") and n != "neepp_grid_64"]
+    for name in learned:
         assert rays[name] < 0.8 * rays["composed_path"], rays
 
 

@@ -14,8 +14,7 @@ from mitsuba_ext.lights.environment import BINS, EnvironmentBins, brightness, so
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.lights.searching import alias_tables
 
-LANES = 1 << 19
-ALL_VARIANTS = ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono"]
+LANES = 1 << 18
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -63,49 +62,79 @@ ENVIRONMENTS = {
 }
 
 
+def _direction(u: float, v: float) -> list[float]:
+    """The direction of a point of a map."""
+    phi, theta = 2 * np.pi * u, np.pi * v
+    d = [np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)]
+    return [float(x) for x in d]
+
+
+#: Axis and half angle, in degrees, of the cone that holds what is small and bright.
+SPOTS = {
+    "sun": (_direction(20.5 / 64, 11 / 31), 9), "sun in the zenith": ([0, 1, 0], 9),
+    "sky": ([1, 1, 1], 0.4), "sunset": ([1, 0, 0.02], 0.4), "noon": ([0, 0, 1], 0.4),
+}  # fmt: skip
+
+
 def _scene(name: str) -> mi.Scene:
     return mi.load_dict({"type": "scene", "e": ENVIRONMENTS[name](), "ball": {"type": "sphere"}})
 
 
-@functools.lru_cache(maxsize=None)
+def _square(numbers: mi.PCG32) -> mi.Point2f:
+    return mi.Point2f(numbers.next_float32(), numbers.next_float32())
+
+
+def _everywhere(name: str, numbers: mi.PCG32) -> tuple[mi.Vector3f, mi.Float]:
+    """Directions on the whole sphere, half of them in the spot, and their density."""
+    d = mi.warp.square_to_uniform_sphere(_square(numbers))
+    if name not in SPOTS:
+        return d, dr.full(mi.Float, dr.inv_four_pi, LANES)
+    axis, degrees = SPOTS[name]
+    axis = dr.normalize(mi.Vector3f(axis))
+    area = 4 * np.sin(np.radians(degrees) / 2) ** 2  # of the cone's part of a unit sphere, over π
+    p = mi.warp.square_to_uniform_disk_concentric(_square(numbers))
+    square = float(area) * dr.squared_norm(p)
+    p *= dr.sqrt(float(area) * (1 - square / 4))
+    cone = mi.Frame3f(axis).to_world(mi.Vector3f(p.x, p.y, 1 - square / 2))
+    d = dr.select(numbers.next_float32() < 0.5, cone, d)
+    in_cone = dr.squared_norm(d - axis) < float(area)
+    return d, 0.5 * dr.inv_four_pi + dr.select(in_cone, float(0.5 / (np.pi * area)), 0)
+
+
+@functools.lru_cache(maxsize=100)
 def _samples(name: str) -> dict[str, np.ndarray]:
-    """Directions in bins of random probabilities ("by chance"), in bins chosen by their share, and
+    """Directions in bins of random probabilities ("chance"), in bins chosen by their share, and
     everywhere; numbers only, as a scene that is kept alive takes part in all later kernels."""
     scene = _scene(name)
     bins = EnvironmentBins(scene)
     rng, numbers = np.random.default_rng(5), mi.PCG32(size=LANES)
-
-    def square():
-        return mi.Point2f(numbers.next_float32(), numbers.next_float32())
-
     ref = dr.zeros(mi.Interaction3f, LANES)
-    probability = rng.random(bins.count) * (rng.random(bins.count) > 0.2) + 1e-3 * bins.share
-    probability /= probability.sum()
+    probability = 0.5 * (rng.dirichlet(np.ones(bins.count)) + bins.share)
     result = {"share": bins.share, "probability": probability}
     for kind, p in (("chance", probability), ("share", bins.share)):
         bin = rng.choice(bins.count, LANES, p=p)
-        ds, weight = bins.sample(mi.UInt32(bin.astype(np.uint32)), ref, square(), mi.Bool(True))
+        index = mi.UInt32(bin.astype(np.uint32))
+        ds, weight = bins.sample(index, ref, _square(numbers), mi.Bool(True))
         found, pdf = bins.pdf(ds.d, mi.Bool(True))
         result |= {
             f"{kind} bin": bin, f"{kind} pdf": ds.pdf.numpy(), f"{kind} d": ds.d.numpy(),
             f"{kind} found bin": found.numpy(), f"{kind} found pdf": pdf.numpy(),
             f"{kind} estimate": brightness(weight).numpy() / p[bin],
         }  # fmt: skip
-    d = mi.warp.square_to_uniform_sphere(square())
+    d, density = _everywhere(name, numbers)
     bin, pdf = bins.pdf(d, mi.Bool(True))
     si = dr.zeros(mi.SurfaceInteraction3f, LANES)
     si.wi = -d
-    value = brightness(scene.environment().eval(si))
-    own = scene.environment().sample_direction(ref, square())[1]
+    estimate = brightness(scene.environment().eval(si)) / density
     return result | {
-        "bin": bin.numpy(), "pdf": pdf.numpy(), "d": d.numpy(), "own estimate": brightness(own).numpy(),
-        "estimate": (4 * dr.pi * value + dr.zeros(mi.Float, LANES)).numpy(),
+        "bin": bin.numpy(), "pdf": pdf.numpy(), "d": d.numpy(), "density": density.numpy(),
+        "estimate": estimate.numpy(),
     }  # fmt: skip
 
 
 def _agree(a: np.ndarray, b: np.ndarray, errors: float = 4) -> bool:
     error = np.hypot(a.std() / np.sqrt(len(a)), b.std() / np.sqrt(len(b)))
-    # Single precision keeps what does not vary from being exact
+    # Where nothing varies, rounding remains
     return abs(a.mean() - b.mean()) < errors * error + 1e-6 * abs(b.mean())
 
 
@@ -116,9 +145,12 @@ def _agree(a: np.ndarray, b: np.ndarray, errors: float = 4) -> bool:
 def test_a_sampled_direction_is_found_in_its_bin_with_its_density(name):
     s = _samples(name)
     for kind in ("chance", "share"):
-        same = s[f"{kind} found bin"] == s[f"{kind} bin"]
-        assert np.mean(~same) < 2e-5
-        ratio = s[f"{kind} found pdf"][same] / s[f"{kind} pdf"][same]
+        # Around the sun, what another bin would sample in its disk is lost
+        sampled = s[f"{kind} pdf"] > 0
+        assert np.mean(~sampled) < (1e-3 if name in SPOTS else 1e-9)
+        same = (s[f"{kind} found bin"] == s[f"{kind} bin"])[sampled]
+        assert np.mean(~same) < 1e-4
+        ratio = (s[f"{kind} found pdf"] / np.maximum(s[f"{kind} pdf"], 1e-9))[sampled][same]
         assert np.mean(np.abs(ratio - 1) > 1e-2) < 2e-5
 
 
@@ -128,12 +160,14 @@ def test_the_density_of_each_bin_integrates_to_one(name):
     count = len(s["share"])
     assert s["share"].sum() == pytest.approx(1) and (s["share"] > 0).all()
     assert np.isfinite(s["pdf"]).all() and s["pdf"].min() > 0
-    density = 4 * np.pi * s["pdf"]
-    mean = np.bincount(s["bin"], density, count) / LANES
-    square = np.bincount(s["bin"], density**2, count) / LANES
-    z = (mean - 1) / np.sqrt((square - mean**2) / LANES)
-    assert np.abs(z).max() < 5
-    assert stats.chi2.sf(np.sum(z**2), count) > 1e-4
+    value = s["pdf"] / s["density"]
+    mean = np.bincount(s["bin"], value, count) / LANES
+    square = np.bincount(s["bin"], value**2, count) / LANES
+    z = np.abs(mean - 1) / np.sqrt((square - mean**2) / LANES)
+    # Too few directions meet a bin at a pole to say how exact the mean is. The bins around the sun
+    # miss the part that its disk takes from them.
+    off = (z > 5.5) & (np.bincount(s["bin"], minlength=count) > 500)
+    assert off.sum() <= (4 if name in SPOTS else 0) and (np.abs(mean[off] - 1) < 0.1).all()
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
@@ -145,8 +179,8 @@ def test_directions_are_distributed_by_the_density(name):
     def histogram(d, weights=None):
         return np.histogram2d(np.arctan2(d[1], d[0]), d[2], edges, weights=weights)[0]
 
-    density = 4 * np.pi * s["pdf"] * s["probability"][s["bin"]]
-    observed = histogram(s["chance d"])
+    density = s["pdf"] * s["probability"][s["bin"]] / s["density"]
+    observed = histogram(s["chance d"][:, s["chance pdf"] > 0])
     expected, square = histogram(s["d"], density), histogram(s["d"], density**2)
     used = expected > 25
     variance = expected + square - expected**2 / LANES
@@ -157,16 +191,70 @@ def test_directions_are_distributed_by_the_density(name):
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_bins_of_any_probabilities_give_what_the_environment_emits(name):
     s = _samples(name)
-    assert _agree(s["chance estimate"], s["own estimate"])
-    assert _agree(s["share estimate"], s["own estimate"])
-    assert _agree(s["estimate"], s["own estimate"])
+    assert _agree(s["chance estimate"], s["estimate"])
+    assert _agree(s["share estimate"], s["estimate"])
 
 
-@pytest.mark.parametrize("name", [k for k in ENVIRONMENTS if k not in ("constant", "smallest")])
+@pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_bins_are_sampled_by_what_they_emit(name):
-    """Chosen by their share, bins give nearly the same estimate for all directions."""
+    """Chosen by their share, they make nearly the same estimate of all that is emitted; also where
+    a map's own sampling misses the pole, and though the sun is smaller than a texel of the sky."""
     estimate = _samples(name)["share estimate"]
-    assert estimate.std() < (1.5 if "s" == name[0] else 0.5) * estimate.mean()
+    assert estimate.std() < (0.8 if name == "sun in the zenith" else 0.25) * estimate.mean()
+
+
+@pytest.mark.parametrize("name", ["constant", "turned", "sky"])
+def test_samples_lie_behind_the_scene_and_lanes_without_one_are_zero(name):
+    ball = {"type": "sphere", "center": [9, 0, 0]}
+    scene = mi.load_dict({"type": "scene", "e": ENVIRONMENTS[name](), "ball": ball})
+    cells = LightCells(scene, mi.Vector3f(1))
+    assert cells.count == BINS[0] * BINS[1] + (name == "sky")
+    assert cells.emitter_index.tolist() == cells.count * [0]
+    ref = dr.zeros(mi.Interaction3f, 3)
+    ref.p = mi.Point3f([9, 50, -3], [0, 0, 7], 0)
+    for active in (False, True):
+        sample = mi.Point2f([0, 0.5, 1], [0, 0.99, 1])
+        cell = mi.UInt32([0, 300, cells.count - 1])
+        ds, weight = cells.sample(cell, ref, sample, mi.Bool(active))
+        assert bool(dr.all((ds.pdf > 0) == active)) and bool(dr.all(weight.x >= 0))
+        assert active or bool(dr.all(weight.x == 0))
+        assert bool(dr.all(dr.isfinite(ds.pdf) & dr.all(dr.isfinite(ds.p) & dr.isfinite(ds.d))))
+        assert bool(dr.all(dr.norm(ds.p - mi.Point3f(9, 0, 0)) > 1))
+        # Also where there is no direction at all
+        bad = dr.zeros(mi.SurfaceInteraction3f, 3)
+        d = mi.DirectionSample3f(scene, bad, ref)
+        d.d = mi.Vector3f([0, dr.nan, 1], 0, 0)
+        pdf = cells.pdf(ref, bad, d, mi.Bool(False))[1]
+        assert bool(dr.all(pdf == 0))
+
+
+@pytest.mark.parametrize(
+    "variant, name",
+    [
+        ("llvm_ad_spectral", "constant"), ("llvm_ad_spectral", "turned"),
+        ("llvm_ad_spectral", "sky"), ("llvm_ad_mono", "constant"), ("llvm_ad_mono", "turned"),
+    ],
+    indirect=["variant"],
+)  # fmt: skip
+def test_bins_work_in_other_variants(variant, name):
+    scene = _scene(name)
+    bins = EnvironmentBins(scene)
+    rng, numbers = np.random.default_rng(2), mi.PCG32(size=LANES)
+    bin = rng.choice(bins.count, LANES, p=bins.share)
+    ref = dr.zeros(mi.Interaction3f, LANES)
+    ref.wavelengths = some_wavelengths(LANES)
+    index = mi.UInt32(bin.astype(np.uint32))
+    ds, weight = bins.sample(index, ref, _square(numbers), mi.Bool(True))
+    found, pdf = bins.pdf(ds.d, mi.Bool(True))
+    seen = (ds.pdf > 0).numpy()
+    assert np.mean(found.numpy()[seen] != bin[seen]) < 2e-5
+    assert np.abs(np.median((pdf / ds.pdf).numpy()[seen]) - 1) < 1e-5
+    d, density = _everywhere(name, numbers)
+    si = dr.zeros(mi.SurfaceInteraction3f, LANES)
+    si.wi, si.wavelengths = -d, ref.wavelengths
+    estimate = brightness(weight).numpy() / bins.share[bin]
+    assert estimate.std() < 0.25 * estimate.mean()
+    assert _agree(estimate, (brightness(scene.environment().eval(si)) / density).numpy())
 
 
 def test_alias_tables_have_the_probabilities_of_their_weights():

@@ -151,7 +151,7 @@ class Samples:
         return chosen, met
 
 
-@functools.lru_cache(maxsize=None)
+@functools.lru_cache(maxsize=100)
 def _samples(name: str, scale: float = 1, offset: float = 0) -> Samples:
     scene = _scene(SHAPES[name](), scale, offset)
     cells = LightCells(scene, mi.Vector3f(scale * VOXEL))
@@ -184,10 +184,12 @@ def _samples(name: str, scale: float = 1, offset: float = 0) -> Samples:
         visible = si.is_valid() & (dr.abs(si.t - ds.dist) < (1e-3 if offset else 3e-5) * ds.dist)
         visible &= mi.luminance(weight) > 0
         found[-1] += (visible.numpy(), dr.abs(dr.dot(ds.d, si.n)).numpy(), d.numpy().T)
-    (to_cell, to_pdf, _, visible, cosine, d), (ray_cell, ray_pdf, ray_value, _, _, ray_d) = found
+    to_cell, to_pdf, _, visible, cosine, d = found[0]
+    ray_cell, ray_pdf, ray_value, _, _, ray_d = found[1]
     return Samples(
-        cells.share, probability, cell, ds.pdf.numpy(), mi.luminance(weight).numpy(), d, visible, cosine,
-        to_cell, to_pdf, ray_cell, ray_pdf, ray_value, ray_d, 2 * np.pi * (1 - edge),
+        cells.share, probability, cell, ds.pdf.numpy(), mi.luminance(weight).numpy(), d,
+        visible, cosine, to_cell, to_pdf,
+        ray_cell, ray_pdf, ray_value, ray_d, 2 * np.pi * (1 - edge),
     )  # fmt: skip
 
 
@@ -367,7 +369,9 @@ def test_in_a_scene_of_all_lights_cells_give_what_rays_in_all_directions_find(mo
 
 def test_lanes_without_a_light_have_the_density_zero():
     """A density that is no number once made MIS weights vanish."""
-    for scene in (_mixed(), _mixed("directional environment"), _scene(SHAPES["smooth"]())):
+    alone = mi.load_dict({"type": "scene", "e": {"type": "constant"}})
+    single = _scene(SHAPES["smooth"]())
+    for scene in (_mixed(), _mixed("directional environment"), single, alone):
         for voxel in (None, mi.Vector3f(0.7)):
             cells = LightCells(scene, voxel)
             ref, si = dr.zeros(mi.Interaction3f, 4), dr.zeros(mi.SurfaceInteraction3f, 4)
@@ -378,6 +382,38 @@ def test_lanes_without_a_light_have_the_density_zero():
             cell, sample = dr.arange(mi.UInt32, 4), mi.Point2f([0, 0.1, 0.9, 0], [0, 0.7, 0.99, 1])
             ds, weight = cells.sample(cell, ref, sample, mi.Bool(False))
             assert bool(dr.all(ds.pdf == 0)) and bool(dr.all(dr.all(weight == 0)))
+
+
+def test_a_single_triangle_with_vertex_normals_is_sampled_by_its_true_area():
+    normals = np.array([[0, 0.6, -0.8], [0.6, 0, -0.8], [0, 0, -1]])
+    triangle = _mesh(SQUARE[:3], [[0, 2, 1]], normals)
+    rng = mi.PCG32(size=LANES)
+    sample = mi.Point2f(rng.next_float32(), rng.next_float32())
+    ref = dr.zeros(mi.Interaction3f, LANES)
+    scene = _scene(triangle)
+    for voxel in (None, mi.Vector3f(100)):
+        cells = LightCells(scene, voxel)
+        ds, weight = cells.sample(mi.UInt32(0), ref, sample, mi.Bool(True))
+        si = scene.ray_intersect(mi.Ray3f(ref.p, ds.d))
+        _cell, pdf = cells.pdf(ref, si, mi.DirectionSample3f(scene, si, ref), si.is_valid())
+        assert cells.count == 1
+        true = dr.square(ds.dist) / (2 * dr.abs(dr.dot(ds.d, si.n)))  # its area is 2.06
+        ratio = (pdf / true).numpy()[si.is_valid().numpy()]
+        assert ratio.std() < 1e-4 and np.median((pdf / ds.pdf).numpy()) == pytest.approx(1, 1e-4)
+
+
+@pytest.mark.parametrize("name", ["slanted", "two triangles", "tube", "many faces"])
+def test_cells_are_not_much_longer_than_a_voxel(name):
+    voxel = 1.0
+    scene = _scene(SHAPES[name]())
+    cells = LightCells(scene, mi.Vector3f(voxel))
+    n = 4096
+    rng = mi.PCG32(size=n * cells.count)
+    ref = dr.zeros(mi.Interaction3f, n * cells.count)
+    cell = dr.arange(mi.UInt32, n * cells.count) // n
+    sample = mi.Point2f(rng.next_float32(), rng.next_float32())
+    p = cells.sample(cell, ref, sample, mi.Bool(True))[0].p.numpy().reshape(3, cells.count, n)
+    assert 1 < cells.count < 64 and np.ptp(p, axis=2).max() < 1.5 * voxel
 
 
 def test_a_thousand_lights_are_not_divided():

@@ -73,8 +73,8 @@ class LightSampling:
         )
 
     def decisions(self, scene: mi.Scene) -> dict[str, Any]:
-        """What needs no learning."""
-        if not scene.emitters():
+        """What needs no learning. A single light needs no choice."""
+        if len(scene.emitters()) < 2:
             return {}
         if self.light_sampling == "linear":
             return {"next_event": LinearSelection(scene)}

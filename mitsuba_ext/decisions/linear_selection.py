@@ -45,19 +45,20 @@ class LinearSelection(EmitterSampling):
     """Chooses emitter i with the probability α_i = e_i / Σ e_j, then a point on it; e_i estimates
     what emitter i contributes to the vertex if nothing is in between.
 
-    All emitters are visited at each vertex, twice: the cost is linear in their number (hence the
-    name), in exchange for probabilities that fit each vertex and each normal without any table to
-    learn. For tens of lights; with a thousand, a table by voxels is far cheaper.
+    All emitters are visited at each vertex: the cost is linear in their number (hence the name), in
+    exchange for probabilities that fit each vertex and its normal, without a table to learn. With 24
+    lamps a sample takes a third longer than with ``path``, with a thousand eight times as long.
 
     The estimate is the emitter's power, as irradiance at the distance of its bounding sphere, times
-    the largest cosines under which the vertex sees this sphere and, if the light is flat, the sphere
-    sees the vertex. It is zero only where the whole sphere lies below the tangent plane of an opaque
-    surface, or the vertex behind the plane of a rectangle or disk. Where all estimates are zero,
-    emitters are chosen uniformly. Neither BSDFs nor the cones of spots are considered. An emitter
-    whose ``sampling_weight`` is zero is not chosen; other weights are factors of the estimates.
+    the largest cosines under which the vertex sees this sphere and, if the light is flat, under
+    which the sphere sees the vertex. It is zero only where the whole sphere lies below the tangent
+    plane of an opaque surface, or the vertex behind the plane of a rectangle or disk. Where all
+    estimates are zero, emitters are chosen uniformly. Neither BSDFs nor the cones of spots are
+    considered. An emitter whose ``sampling_weight`` is zero is not chosen; other weights are factors
+    of the estimates.
 
     Source: Shirley et al., *Monte Carlo Methods in Rendering*, SIGGRAPH course, section 3.4.2,
-    "Linear α_i", whose geometry term of one is replaced by its bound.
+    "Linear α_i", whose geometry term of one is replaced by a bound.
 
     Parameters:
         scene: Whose emitters are chosen from.
@@ -130,6 +131,10 @@ class LinearSelection(EmitterSampling):
         # Also where the lookups above were masked, the density must be a number
         return dr.select(active, pdf, 0), state
 
+    # The second pass does not visit the emitters again, but the blocks of about √n of them and then
+    # one block. Reservoir sampling would do without it, but rescale the random number at each
+    # emitter: that wears its 24 bits off, and the strata of a stratified one would not survive.
+
     @dr.syntax
     def _sums(self, p, normal, is_opaque, active) -> tuple[mi.Float, dr.Local[mi.Float]]:
         """Σ e_j, and the running sums at the end of each block."""
@@ -159,8 +164,8 @@ class LinearSelection(EmitterSampling):
             searching &= (running <= target) & (block + 1 < self._block_count)
             block += dr.select(searching, 1, 0)
 
-        # The sums are those of the first pass, to the last bit. They can stay below the target but
-        # by rounding: then the last emitter is chosen
+        # The sums are those of the first pass. They can stay below the target by rounding only: then
+        # the last emitter of those visited is chosen whose estimate is not zero
         index = block * self._block
         searching = mi.Bool(is_searched)
         while dr.hint(searching, label="choice"):

@@ -134,10 +134,7 @@ class LightMap:
         square = (squares + _PRIOR_SQUARES * visibility * arrived) / (
             mi.Float(self.tests) + _PRIOR_SQUARES
         )
-        # The last row's expectation is a power, to which contributions do not compare
-        entry = dr.arange(mi.UInt32, len(square))
-        is_last = entry >= (self.rows.count - 1) * self.cells.count
-        return self.unoccluded * dr.select(is_last, visibility, dr.sqrt(square))
+        return self.unoccluded * dr.sqrt(square)
 
     def __str__(self) -> str:
         seen, succeeded = (int(dr.count(n > 0)[0]) for n in (self.tests, self.successes))

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .division import Division, divide, emitter_shapes
+from .division import Division, divide, emitter_shapes, triangles
 from .searching import ONE_MINUS_EPSILON, first_above
 
 
@@ -46,7 +46,7 @@ class EmitterCells:
             mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(np.array(indices, dtype=np.uint32))
         )
         self._emitter = mi.UInt32(number.astype(np.uint32))
-        self._is_divided = len(pieces) > len(indices)
+        self._is_divided = any(d.shape for d in divisions)
         self._longest = int(sizes.max())
         self._has_groups = self._longest > 1
         # Rounding shall not lead into the neighbour of a piece
@@ -112,13 +112,10 @@ class EmitterCells:
         self._cell_of_piece = mi.UInt32(np.concatenate(cell_of).astype(np.uint32))
         self._has_cut_faces = any(int(c.max(initial=1)) > 1 for c in cuts)
         if self._has_cut_faces:
-            corners = [
-                _corners(shape)
-                for shape, d in zip(shapes, divisions)
-                if d.shape == "mesh"
-            ]
-            a, ab, ac = (np.concatenate(x).T.astype(np.float32) for x in zip(*corners))
-            self._a, self._ab, self._ac = mi.Point3f(a), mi.Vector3f(ab), mi.Vector3f(ac)
+            corners = [triangles(mesh) for mesh, d in zip(shapes, divisions) if d.shape == "mesh"]
+            a, b, c = (np.concatenate(x).T for x in zip(*corners))
+            self._a = mi.Point3f(_floats(a))
+            self._ab, self._ac = mi.Vector3f(_floats(b - a)), mi.Vector3f(_floats(c - a))
         if self._has_smooth:
             normals = np.zeros((int(sizes.sum()), 3), dtype=np.float32)
             smooth = np.zeros(len(normals), dtype=bool)
@@ -144,16 +141,20 @@ class EmitterCells:
             size = dr.gather(mi.Vector2f, self._size, piece, active)
             sample = corner + mi.Point2f(x, sample.y) * size
         ds, weight = self._pointer(cell, active).sample_direction(ref, sample, active)
+        # Not all emitters heed the mask
+        pdf = dr.select(active, ds.pdf, 0)
+        weight = dr.select(active, weight, 0)
         if self._is_divided:
             share = dr.gather(mi.Float, self._share, cell, active)
-            ds.pdf = dr.select(share > 0, ds.pdf / share, 0)
+            pdf = dr.select(share > 0, pdf / share, 0)
             weight *= share
         if self._has_smooth:
             n = dr.gather(mi.Normal3f, self._normal, piece, active)
             smooth = dr.gather(mi.Bool, self._is_smooth_piece, piece, active)
             ratio = dr.select(smooth, _cosine_ratio(ds, n), 1)
-            ds.pdf *= ratio
+            pdf *= ratio
             weight *= dr.select(ratio > 0, dr.rcp(ratio), 0)
+        ds.pdf = pdf
         return ds, weight
 
     def _piece(self, cell, x, active) -> tuple[mi.UInt32, mi.Float]:
@@ -186,7 +187,7 @@ class EmitterCells:
         pdf = (self._only or ds.emitter).pdf_direction(ref, ds, active)
         cell = dr.gather(mi.UInt32, self._first_cell, id, active)
         if not self._is_divided:
-            return cell, pdf
+            return cell, dr.select(active, pdf, 0)
         if self._kinds - {"", "mesh"}:
             cell += self._grid_cell(id, ds, active)
         if "mesh" in self._kinds:
@@ -196,6 +197,7 @@ class EmitterCells:
             smooth = dr.gather(mi.UInt32, self._is_smooth, id, active) > 0
             pdf *= dr.select(smooth, _cosine_ratio(ds, si.n), 1)
         share = dr.gather(mi.Float, self._share, cell, active)
+        # Masked lanes have the share 0
         return cell, dr.select(share > 0, pdf / share, 0)
 
     def _grid_cell(self, id, ds, active) -> mi.UInt32:
@@ -248,11 +250,3 @@ def _cosine_ratio(ds: mi.DirectionSample3f, n: mi.Normal3f) -> mi.Float:
     with the geometric normal ``n``."""
     cosine = dr.abs(dr.dot(ds.d, n))
     return dr.select(cosine > 0, dr.abs(dr.dot(ds.d, ds.n)) / cosine, 0)
-
-
-def _corners(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A corner of each triangle, and the edges that leave it; shape [faces, 3] each."""
-    vertices = np.array(mesh.vertex_positions_buffer()).reshape(-1, 3)
-    face = np.array(mesh.faces_buffer()).reshape(-1, 3)
-    a, b, c = (vertices[face[:, i]] for i in range(3))
-    return a, b - a, c - a

@@ -4,7 +4,10 @@ their surface.
 ``emitter.sample_direction`` turns a point of [0, 1)² into a point on the light. For rectangles,
 disks, cylinders and meshes that map does not depend on the point that is lit, so that a part of the
 square is a part of the surface, and choosing among the parts needs nothing else from Mitsuba. All
-other emitters stay whole.
+other emitters stay whole: spheres, which are sampled by the solid angle of their cone, textured
+lights, which are sampled by their texture, and those that cannot be hit.
+
+Mitsuba samples a cylinder uniformly only if its cross-section is a circle, and warns where not.
 """
 
 from __future__ import annotations
@@ -54,6 +57,9 @@ class Division:
     is_smooth: bool = False
 
 
+#: Shapes whose cells are a grid in the unit square.
+_GRIDS = {"Rectangle": "rectangle", "Disk": "disk", "Cylinder": "cylinder"}
+
 _WHOLE = np.array([[0.0, 0.0, 1.0, 1.0]])
 
 
@@ -84,7 +90,7 @@ def _divide(
     # Textured emitters sample their texture, whose map is not invertible from here
     if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
         return whole
-    kind = {"Rectangle": "rectangle", "Disk": "disk", "Cylinder": "cylinder"}.get(shape.class_name())
+    kind = _GRIDS.get(shape.class_name())
     if kind is None and shape.is_mesh() and shape.face_count() > 0:
         is_smooth = _is_smooth(shape)
         is_cut = voxel is not None and limit > 1
@@ -130,18 +136,20 @@ def _cuts(edges: np.ndarray, limit: int) -> tuple[int, int]:
 def _is_smooth(mesh: mi.Mesh) -> bool:
     if not mesh.has_vertex_normals() or mesh.has_face_normals():
         return False
-    a, b, c, face = _triangles(mesh)
+    a, b, c = triangles(mesh)
     normal = _normalized(np.cross(b - a, c - a))
+    face = np.array(mesh.faces_buffer()).reshape(-1, 3)
     vertex_normals = np.array(mesh.vertex_normals_buffer()).reshape(-1, 3)
     shading = np.stack([vertex_normals[face[:, i]] for i in range(3)])
     has_area = np.any(normal != 0, axis=1)
     return bool(np.any(np.abs((shading * normal).sum(-1))[:, has_area] < 1 - 1e-4))
 
 
-def _triangles(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def triangles(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The three corners of each face; shape [faces, 3] each."""
     vertices = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
     face = np.array(mesh.faces_buffer()).reshape(-1, 3)
-    return vertices[face[:, 0]], vertices[face[:, 1]], vertices[face[:, 2]], face
+    return vertices[face[:, 0]], vertices[face[:, 1]], vertices[face[:, 2]]
 
 
 def _normalized(v: np.ndarray) -> np.ndarray:
@@ -157,7 +165,7 @@ def _divide_mesh(
     A mesh samples its faces by area, in their order, with the second coordinate of the unit
     square; what is left of it and the first one place the point in the triangle.
     """
-    a, b, c, _face = _triangles(mesh)
+    a, b, c = triangles(mesh)
     normal = _normalized(np.cross(b - a, c - a))
     bottom, top = _faces_in_square(mesh)
 
@@ -182,6 +190,8 @@ def _divide_mesh(
 
     # What is never sampled, faces without area, makes no cells of its own
     has_area = height > 0
+    if len(pieces) == 1 and not is_smooth:
+        return Division(_WHOLE, np.ones(1, int))
     group = np.zeros(len(pieces), int)
     group[has_area] = _groups(middle[has_area], normal[piece_face][has_area], voxel, limit)
     order = np.argsort(group, kind="stable")
@@ -199,11 +209,8 @@ def _faces_in_square(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
     These are the single precision sums of Mitsuba's own table: where faces are many, others would
     lead to the neighbour of the face that is meant.
     """
-    faces, vertices = mesh.faces_buffer(), mesh.vertex_positions_buffer()
-    corner = 3 * dr.arange(mi.UInt32, mesh.face_count())
-    a, b, c = (
-        dr.gather(mi.Point3f, vertices, dr.gather(mi.UInt32, faces, corner + k)) for k in range(3)
-    )
+    index = mesh.face_indices(dr.arange(mi.UInt32, mesh.face_count()))
+    a, b, c = (mesh.vertex_position(index[k]) for k in range(3))
     area = 0.5 * dr.norm(dr.cross(b - a, c - a))
     total = dr.cumsum(area).numpy().astype(np.float64)
     top = total / max(total[-1], 1e-300)

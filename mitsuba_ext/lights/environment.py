@@ -7,12 +7,15 @@ import mitsuba as mi
 import numpy as np
 
 from .searching import ONE_MINUS_EPSILON, alias_tables
+from .sun import SunDisk, brightness, some_wavelengths
+
+__all__ = ["EnvironmentBins", "brightness", "some_wavelengths"]
 
 #: Bins along the azimuth and along the polar angle.
 BINS = (32, 16)
 
 #: Nodes of emitters that are no maps: their features must not be smaller than the 0.35° between
-#: two of them (the disk of the sun measures 0.53°), or be found by the emitter's own sampling.
+#: two of them, or be found by the emitter's own sampling. The disk of the sun is a bin of its own.
 _NODES = (1024, 513)
 
 #: Samples of an emitter that is no map, among them those of its own.
@@ -30,7 +33,7 @@ class EnvironmentBins:
 
     Inside a bin, a texel is chosen by its brightness and a point in it by the bilinear function
     that Mitsuba's ``envmap`` interpolates with: for maps the density of a bin is proportional to
-    what it emits.
+    what it emits. The sun of a ``sunsky`` is one more bin, the last, cut out of the others.
 
     Parameters:
         scene: Its environment emitter is divided.
@@ -51,6 +54,7 @@ class EnvironmentBins:
         self._to_world = mi.Transform4f(self.emitter.world_transform())
         self._to_local = self._to_world.inverse()
         dr.make_opaque(self._center, self._radius, self._to_world, self._to_local)
+        self._sun = SunDisk.of(self.emitter)
         if self._is_map:
             height, width = mi.traverse(self.emitter)["data"].shape[:2]
             # Two columns are copies; the rows have their nodes at the poles, too
@@ -62,7 +66,8 @@ class EnvironmentBins:
         self._build(self._node_values())
 
     def _node_values(self) -> np.ndarray:
-        """Brightness times sin θ at the nodes, the first column repeated; [rows + 1, columns + 1]."""
+        """Brightness times sin θ at the nodes, the first column repeated; shape [rows + 1,
+        columns + 1]."""
         columns, rows = self._columns, self._rows
         index = dr.arange(mi.UInt32, columns * (rows + 1))
         row = index // columns
@@ -89,7 +94,10 @@ class EnvironmentBins:
         ref = dr.zeros(mi.Interaction3f, _OWN_SAMPLES)
         ref.p, ref.wavelengths = self._center, some_wavelengths(_OWN_SAMPLES)
         ds, weight = self.emitter.sample_direction(ref, sampler.next_2d())
-        value = (brightness(weight) * ds.pdf + dr.zeros(mi.Float, _OWN_SAMPLES)).numpy()
+        value = brightness(weight) * ds.pdf
+        if self._sun is not None:
+            value = dr.select(self._sun.contains(ds.d), 0, value)
+        value = (value + dr.zeros(mi.Float, _OWN_SAMPLES)).numpy()
         uv = self._uv(ds.d)[0].numpy()
         result = np.zeros(shape)
         x = np.minimum((uv[0] * self._columns).astype(int), self._columns - 1)
@@ -102,12 +110,15 @@ class EnvironmentBins:
         si.wi = -(self._to_world @ self._direction(uv)[0])
         si.wavelengths = some_wavelengths(dr.width(uv))
         value = brightness(self.emitter.eval(si))
-        return dr.select(dr.isfinite(value), value, dr.zeros(mi.Float, dr.width(uv)))
+        counts = dr.isfinite(value)
+        if self._sun is not None:
+            counts &= ~self._sun.contains(-si.wi)
+        return dr.select(counts, value, dr.zeros(mi.Float, dr.width(uv)))
 
     def _build(self, node: np.ndarray) -> None:
         columns, rows = self._columns, self._rows
         self._bins = min(BINS[0], columns), min(BINS[1], rows)
-        self.count = self._bins[0] * self._bins[1]
+        count = self._bins[0] * self._bins[1]
         # Each texel with its corners; its weight is their mean
         corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]], axis=-1)
         corners = corners.reshape(-1, 4)
@@ -116,24 +127,41 @@ class EnvironmentBins:
             (np.arange(rows) * self._bins[1] // rows)[:, None] * self._bins[0]
             + np.arange(columns) * self._bins[0] // columns
         ).ravel()
-        bin_weight = np.bincount(bin, weight, self.count)
-        self.share = bin_weight / bin_weight.sum()
+        bin_weight = np.bincount(bin, weight, count)
+        self._set_shares(bin_weight)
         # Densities on the sphere, but for 1 / sin θ
         corners *= (columns * rows / (2 * np.pi**2) / bin_weight)[bin][:, None]
         self._corners = mi.Float(corners.ravel().astype(np.float32))
 
         order = np.argsort(bin.astype(np.uint16), kind="stable")
-        threshold, alias = alias_tables(weight[order], np.bincount(bin, minlength=self.count))
+        threshold, alias = alias_tables(weight[order], np.bincount(bin, minlength=count))
         entries = np.empty((len(order), 2), dtype=np.uint32)
         entries[order, 0] = threshold.astype(np.float32).view(np.uint32)
         entries[order, 1] = order[alias]
         self._entries = mi.UInt32(entries.ravel())
+
+    def _set_shares(self, bin_weight: np.ndarray) -> None:
+        """Also that of the sun."""
+        # From the sum over texels to the integral over the sphere
+        emitted = bin_weight * 2 * np.pi**2 / (self._columns * self._rows)
+        if self._sun is not None:
+            n = 64
+            x, y = dr.meshgrid(*2 * [(dr.arange(mi.Float, n) + 0.5) / n])
+            si = dr.zeros(mi.SurfaceInteraction3f, n * n)
+            si.wi, si.wavelengths = -self._sun.sample(mi.Point2f(x, y)), some_wavelengths(n * n)
+            value = float(dr.mean(brightness(self.emitter.eval(si)))[0])
+            emitted = np.append(emitted, value * self._sun.solid_angle)
+        self.count = len(emitted)
+        self.share = emitted / emitted.sum()
 
     def sample(
         self, bin: mi.UInt32, ref: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         """A direction in ``bin``, whose ``pdf`` is conditional on the bin, and its radiance / pdf
         (visibility not tested)."""
+        if self._sun is not None:
+            in_sun = bin == self.count - 1
+            bin = dr.minimum(bin, self.count - 2)  # a valid one; it is not used in the sun
         texel, point = self._texel(bin, sample, active)
         point, density = mi.warp.square_to_bilinear(*self._corner_values(texel, active), point)
         row = texel // self._columns
@@ -145,12 +173,18 @@ class EnvironmentBins:
 
         ds = dr.zeros(mi.DirectionSample3f)
         ds.d = self._to_world @ d
+        ds.pdf = density / sin_theta
+        if self._sun is not None:
+            ds.d = dr.select(in_sun, self._sun.sample(sample), ds.d)
+            # What else is sampled in the disk is lost: these directions belong to the other bin
+            is_lost = ~in_sun & self._sun.contains(ds.d)
+            ds.pdf = dr.select(in_sun, 1 / self._sun.solid_angle, dr.select(is_lost, 0, ds.pdf))
         ds.dist = 2 * dr.maximum(self._radius, dr.norm(ref.p - self._center))
         ds.p = ref.p + ds.d * ds.dist
         ds.n = -ds.d
         ds.uv = uv
         ds.time = ref.time
-        ds.pdf = dr.select(active, density / sin_theta, 0)
+        ds.pdf = dr.select(active, ds.pdf, 0)
         ds.emitter = self.pointer
         if self._is_map:
             # Does not have to find the texel again
@@ -173,7 +207,12 @@ class EnvironmentBins:
         density = mi.warp.square_to_bilinear_pdf(*corners, point)
         bins = self._bins
         bin = row * bins[1] // self._rows * bins[0] + column * bins[0] // self._columns
-        return bin, dr.select(active, density / sin_theta, 0)
+        pdf = density / sin_theta
+        if self._sun is not None:
+            in_sun = self._sun.contains(d)
+            bin = dr.select(in_sun, self.count - 1, bin)
+            pdf = dr.select(in_sun, 1 / self._sun.solid_angle, pdf)
+        return bin, dr.select(active, pdf, 0)
 
     def _texel(self, bin, sample, active) -> tuple[mi.UInt32, mi.Point2f]:
         """A texel of the bin with the probability of its weight, and what is left of the sample.
@@ -182,9 +221,8 @@ class EnvironmentBins:
         either taken or gives way to its alias.
         """
         bin_row = bin // self._bins[0]
-        column, x = _entry(
-            bin - bin_row * self._bins[0], self._bins[0], self._columns, sample.x
-        )
+        bin_column = bin - bin_row * self._bins[0]
+        column, x = _entry(bin_column, self._bins[0], self._columns, sample.x)
         row, y = _entry(bin_row, self._bins[1], self._rows, sample.y)
         texel = row * self._columns + column
         entry = dr.gather(mi.Vector2u, self._entries, texel, active)
@@ -215,23 +253,10 @@ class EnvironmentBins:
 
 
 def _entry(part, parts: int, count: int, x: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-    """One of the columns (or rows) of which bins are made, each as likely as the others, and what is
-    left of the random number. The ``count`` columns are divided into ``parts``; this is ``part``."""
+    """One of the columns (or rows) of a bin, each as likely as the others, and what is left of the
+    random number. All ``count`` columns are divided into ``parts``; the bin's are ``part``."""
     first = (part * count + (parts - 1)) // parts
     width = ((part + 1) * count + (parts - 1)) // parts - first
     x = x * mi.Float(width)
     index = dr.minimum(mi.UInt32(x), width - 1)
     return first + index, dr.minimum(x - mi.Float(index), ONE_MINUS_EPSILON)
-
-
-def brightness(value: mi.Spectrum) -> mi.Float:
-    """One number for a spectrum: luminance, or the mean over the sampled wavelengths."""
-    return mi.luminance(value) if mi.is_rgb else dr.mean(value)
-
-
-def some_wavelengths(width: int) -> mi.Spectrum:
-    """Wavelengths of the middle sample in spectral variants, none in the others."""
-    wavelengths = dr.zeros(mi.Interaction3f, width).wavelengths
-    if mi.is_spectral:
-        wavelengths[:] = mi.sample_rgb_spectrum(mi.sample_shifted(dr.full(mi.Float, 0.5, width)))[0]
-    return wavelengths

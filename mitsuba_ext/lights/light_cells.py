@@ -1,4 +1,4 @@
-"""Everything in a scene that next event estimation can choose: cells of emitters, and directions."""
+"""What next event estimation can choose in a scene: cells of emitters, and bins of directions."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def alias_tables(weights: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np
     mean = np.bincount(group, weights, len(sizes)) / np.maximum(sizes, 1)
     relative = weights / mean[group]
     threshold, alias = np.minimum(relative, 1), np.arange(len(weights))
-    # Sums that should be equal differ by rounding: those of an entry that is hardly heavy do not count
+    # Sums that should be equal differ by rounding: the excess of a hardly heavy entry is none
     is_heavy = relative > 1 + 1e-9
     heavy_count = np.bincount(group, is_heavy, len(sizes)).astype(int)
     threshold[(heavy_count == 0)[group]] = 1

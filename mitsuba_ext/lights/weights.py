@@ -133,12 +133,14 @@ def _evaluations(
         ref.wavelengths = some_wavelengths(lanes)
         ds, weight = cells.sample(pair - row * cells.count, ref, sampler.next_2d(), mi.Bool(True))
         value = brightness(weight)
-        yield where, dr.select(dr.isfinite(value), value, 0), ds.d, points
+        # Some emitters send the same everywhere: one number for all lanes
+        value = dr.select(dr.isfinite(value), value, dr.zeros(mi.Float, lanes))
+        yield where, value, ds.d, points
 
 
 def _with_last_row(scene: mi.Scene, cells: LightCells, weights: mi.Float) -> mi.Float:
-    """Appends the row of all other points, which goes by power, honours ``sampling_weight``, and
-    gives no cell less than a share of its row's mean."""
+    """Honours ``sampling_weight``, gives no cell less than a share of its row's mean, and appends the
+    row of all other points, which is the mean of the others."""
     count = cells.count
     sampling_weight = np.array([e.sampling_weight() for e in scene.emitters()], dtype=np.float32)
     factor = mi.Float(sampling_weight[cells.emitter_index])
@@ -147,4 +149,5 @@ def _with_last_row(scene: mi.Scene, cells: LightCells, weights: mi.Float) -> mi.
     mean = dr.repeat(dr.block_sum(weights, count), count) / count
     weights = dr.maximum(weights, _FLOOR * mean)
     weights = dr.select(dr.gather(mi.Float, factor, cell) > 0, weights, 0)
-    return dr.concat([weights, power_weights(scene, cells)])
+    last = weights.numpy().reshape(-1, count).mean(axis=0)
+    return dr.concat([weights, mi.Float(last)])

@@ -1,0 +1,89 @@
+"""The disk of the sun in Mitsuba's ``sunsky``: too small for a table of directions."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Angles at which the edge of the disk is looked for, up to the largest aperture, in radians.
+_ANGLES = np.geomspace(1e-4, 0.5, 4096)
+
+#: At its edge, the sun is this many times brighter than the sky next to it, or it is not treated.
+_CONTRAST = 4.0
+
+#: The disk is sampled with a little of what surrounds it: Mitsuba compares single precision cosines
+#: with that of the edge, which blurs it by half a percent.
+_MARGIN = 1.015
+
+
+class SunDisk:
+    """A small cone of directions, sampled uniformly.
+
+    Parameters:
+        direction: Its axis in world space, of unit length.
+        half_angle: In radians.
+
+    Attributes:
+        solid_angle (float): Of the cone.
+    """
+
+    def __init__(self, direction: mi.Vector3f, half_angle: float) -> None:
+        self._direction = mi.Vector3f(direction)
+        dr.make_opaque(self._direction)
+        # The square of the chord: precise for small angles, and proportional to the solid angle
+        self._square = float(4 * np.sin(half_angle / 2) ** 2)
+        self.solid_angle = np.pi * self._square
+
+    @classmethod
+    def of(cls, emitter: mi.Emitter) -> SunDisk | None:
+        """The disk in an environment that says where its sun is, if it shines."""
+        parameters = mi.traverse(emitter)
+        if emitter.class_name() != "SunskyEmitter" or "sun_direction" not in parameters:
+            return None
+        sun = dr.normalize(mi.Vector3f(parameters["sun_direction"]))
+        # Upwards: at sunset, the lower half of the disk is below the horizon
+        zenith = emitter.world_transform() @ mi.Vector3f(0, 0, 1)
+        upwards = zenith - sun * dr.dot(zenith, sun)
+        length = dr.norm(upwards)
+        # Any direction will do where the sun stands in the zenith
+        upwards = dr.select(
+            length > 1e-3, upwards / dr.maximum(length, 1e-3), mi.coordinate_system(sun)[0]
+        )
+        sin, cos = dr.sincos(mi.Float(_ANGLES.astype(np.float32)))
+        si = dr.zeros(mi.SurfaceInteraction3f, len(_ANGLES))
+        si.wi = -(sun * cos + upwards * sin)
+        si.wavelengths = some_wavelengths(len(_ANGLES))
+        value = brightness(emitter.eval(si)).numpy()
+        contrast = value[:-1] / np.maximum(value[1:], 1e-30)
+        edge = int(contrast.argmax())
+        if contrast[edge] < _CONTRAST or not value[edge] > 0:
+            return None
+        return cls(sun, _MARGIN * _ANGLES[edge + 1])
+
+    def contains(self, d: mi.Vector3f) -> mi.Bool:
+        """Does the direction ``d`` lie in the disk?"""
+        return dr.squared_norm(d - self._direction) < self._square
+
+    def sample(self, sample: mi.Point2f) -> mi.Vector3f:
+        """A direction in the disk, uniformly distributed."""
+        p = mi.warp.square_to_uniform_disk_concentric(sample)
+        square = self._square * (1 - 1e-5) * dr.squared_norm(p)
+        # The cosine of the angle is 1 − square / 2
+        p *= math.sqrt(self._square) * dr.sqrt(1 - 0.25 * square)
+        return mi.Frame3f(self._direction).to_world(mi.Vector3f(p.x, p.y, 1 - 0.5 * square))
+
+
+def brightness(value: mi.Spectrum) -> mi.Float:
+    """One number for a spectrum: luminance, or the mean over the sampled wavelengths."""
+    return mi.luminance(value) if mi.is_rgb else dr.mean(value)
+
+
+def some_wavelengths(width: int) -> mi.Spectrum:
+    """Wavelengths of the middle sample in spectral variants, none in the others."""
+    wavelengths = dr.zeros(mi.Interaction3f, width).wavelengths
+    if mi.is_spectral:
+        wavelengths[:] = mi.sample_rgb_spectrum(mi.sample_shifted(dr.full(mi.Float, 0.5, width)))[0]
+    return wavelengths
