@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import gc
+import os
 import tempfile
 import time
 from dataclasses import dataclass
@@ -23,6 +25,8 @@ CENTER = np.array([0.3, -0.4, 3.0])
 VOXEL = 0.4
 LANES = 1 << 18
 
+_FOLDER = tempfile.TemporaryDirectory()  # removed when the process ends
+
 
 # ---- Lights ----
 
@@ -36,9 +40,9 @@ def _ply(vertices, faces, normals=None) -> str:
     if normals is not None:
         parameters["vertex_normals"] = mi.Float(np.ravel(normals).astype(np.float32))
     parameters.update()
-    with tempfile.NamedTemporaryFile(suffix=".ply", delete=False) as file:
-        mesh.write_ply(file.name)
-    return file.name
+    path = f"{_FOLDER.name}/{len(os.listdir(_FOLDER.name))}.ply"
+    mesh.write_ply(path)
+    return path
 
 
 def _ball(columns: int, rows: int, smooth: bool = False) -> dict:
@@ -416,6 +420,17 @@ def test_cells_are_not_much_longer_than_a_voxel(name):
     assert 1 < cells.count < 64 and np.ptp(p, axis=2).max() < 1.5 * voxel
 
 
+def test_cells_keep_their_scene_alive():
+    """An emitter that outlives its shape ends the process in any scene's next call of emitters."""
+    cells = [LightCells(_scene(SHAPES["slanted"]()), v) for v in (None, mi.Vector3f(0.5))]
+    gc.collect()
+    mixed = LightCells(_mixed(), None)
+    for c in (*cells, mixed):
+        ref = dr.zeros(mi.Interaction3f, 10)
+        sample = mi.Point2f(dr.linspace(mi.Float, 0.1, 0.9, 10), 0.5)
+        assert bool(dr.all(c.sample(mi.UInt32(0), ref, sample, mi.Bool(True))[0].pdf > 0))
+
+
 def test_a_thousand_lights_are_not_divided():
     T = _T()
     lamp = {"type": "rectangle", "emitter": {"type": "area"}}
@@ -443,5 +458,5 @@ def test_a_large_mesh_is_divided_fast_and_into_few_cells():
     seen = (weight.x > 0) & (dr.abs(si.t - ds.dist) < 3e-5 * ds.dist)
     seen &= dr.abs(dr.dot(ds.d, si.n)) > 0.05
     found, _pdf = cells.pdf(ref, si, mi.DirectionSample3f(scene, si, ref), seen)
-    # Single precision numbers lead to the wrong one of a hundred thousand faces now and then
-    assert np.mean((found != cell).numpy()[seen.numpy()]) < 1e-3
+    # Mitsuba's sums over a hundred thousand faces are rounded: a cell has to begin where they say
+    assert np.mean((found != cell).numpy()[seen.numpy()]) < 1e-4

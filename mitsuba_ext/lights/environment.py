@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from .searching import ONE_MINUS_EPSILON, alias_tables
-from .sun import SunDisk, brightness, some_wavelengths
+from .spectra import brightness, some_wavelengths
+from .sun import SunDisk
 
 __all__ = ["EnvironmentBins", "brightness", "some_wavelengths"]
 
@@ -17,6 +18,9 @@ BINS = (32, 16)
 #: Nodes of emitters that are no maps: their features must not be smaller than the 0.35° between
 #: two of them, or be found by the emitter's own sampling. The disk of the sun is a bin of its own.
 _NODES = (1024, 513)
+
+#: Nodes where only sin θ is interpolated.
+_CONSTANT_NODES = (64, 33)
 
 #: Samples of an emitter that is no map, among them those of its own.
 _OWN_SAMPLES = 1 << 16
@@ -50,7 +54,8 @@ class EnvironmentBins:
         self._is_map = self.emitter.class_name() == "EnvironmentMapEmitter"
         bbox = scene.bbox()
         sphere = bbox.bounding_sphere() if bbox.valid() else mi.ScalarBoundingSphere3f(0.0, 1.0)
-        self._center, self._radius = mi.Point3f(sphere.center), mi.Float(sphere.radius)
+        # Samples lie behind everything, also after rounding
+        self._center, self._radius = mi.Point3f(sphere.center), mi.Float(1.001 * sphere.radius)
         self._to_world = mi.Transform4f(self.emitter.world_transform())
         self._to_local = self._to_world.inverse()
         dr.make_opaque(self._center, self._radius, self._to_world, self._to_local)
@@ -60,7 +65,9 @@ class EnvironmentBins:
             # Two columns are copies; the rows have their nodes at the poles, too
             self._columns, self._rows = width - 2, height - 1
         else:
-            self._columns, self._rows = _NODES[0], _NODES[1] - 1
+            is_constant = self.emitter.class_name() == "ConstantBackgroundEmitter"
+            columns, rows = _CONSTANT_NODES if is_constant else _NODES
+            self._columns, self._rows = columns, rows - 1
         # Nodes of a map are the middles of its columns
         self._shift = 0.5 / self._columns
         self._build(self._node_values())

@@ -53,6 +53,7 @@ def alias_tables(weights: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np
     # Sums that should be equal differ by rounding: the excess of a hardly heavy entry is none
     is_heavy = relative > 1 + 1e-9
     heavy_count = np.bincount(group, is_heavy, len(sizes)).astype(int)
+    light_count = np.where(heavy_count > 0, sizes - heavy_count, 0)
     threshold[(heavy_count == 0)[group]] = 1
     heavy = np.flatnonzero(is_heavy)
     light = np.flatnonzero(~is_heavy & (heavy_count > 0)[group])
@@ -60,19 +61,18 @@ def alias_tables(weights: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np
         return threshold, alias
     excess, lack = np.cumsum(relative[heavy] - 1), np.cumsum(1 - threshold[light])
 
-    def within_group(index: np.ndarray, kind: np.ndarray, user: np.ndarray) -> np.ndarray:
-        """Limits indices of ``kind`` to the group of the ``user``."""
-        first = np.searchsorted(group[kind], group[user], side="left")
-        last = np.searchsorted(group[kind], group[user], side="right") - 1
-        return np.clip(index, first, last)
+    def within_group(index: np.ndarray, count: np.ndarray, user: np.ndarray) -> np.ndarray:
+        """Limits indices of entries, of which the groups have ``count``, to the users' groups."""
+        end = np.cumsum(count)
+        return np.clip(index, (end - count)[group[user]], (end - 1)[group[user]])
 
     # A light entry is served by the first heavy one that has something left
     before = np.concatenate([[0.0], lack[:-1]])
     server = np.searchsorted(excess, before, side="right")
-    alias[light] = heavy[within_group(server, heavy, light)]
+    alias[light] = heavy[within_group(server, heavy_count, light)]
 
     # It may give more than it has: then the next heavy one serves it. The last one keeps the rest.
-    final = within_group(np.searchsorted(lack, excess), light, heavy)
+    final = within_group(np.searchsorted(lack, excess), light_count, heavy)
     threshold[heavy] = np.clip(1 + excess - lack[final], 0, 1)
     alias[heavy[:-1]] = heavy[1:]
     last = heavy[np.append(group[heavy[1:]] != group[heavy[:-1]], True)]

@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .spectra import brightness, some_wavelengths
+
 #: Angles at which the edge of the disk is looked for, up to the largest aperture, in radians.
 _ANGLES = np.geomspace(1e-4, 0.5, 4096)
 
@@ -74,16 +76,3 @@ class SunDisk:
         # The cosine of the angle is 1 − square / 2
         p *= math.sqrt(self._square) * dr.sqrt(1 - 0.25 * square)
         return mi.Frame3f(self._direction).to_world(mi.Vector3f(p.x, p.y, 1 - 0.5 * square))
-
-
-def brightness(value: mi.Spectrum) -> mi.Float:
-    """One number for a spectrum: luminance, or the mean over the sampled wavelengths."""
-    return mi.luminance(value) if mi.is_rgb else dr.mean(value)
-
-
-def some_wavelengths(width: int) -> mi.Spectrum:
-    """Wavelengths of the middle sample in spectral variants, none in the others."""
-    wavelengths = dr.zeros(mi.Interaction3f, width).wavelengths
-    if mi.is_spectral:
-        wavelengths[:] = mi.sample_rgb_spectrum(mi.sample_shifted(dr.full(mi.Float, 0.5, width)))[0]
-    return wavelengths
