@@ -1,4 +1,4 @@
-"""NEE++: next event estimation that learns which lights to choose and which shadow rays to trace."""
+"""NEE++: next event estimation that learns which lights to choose, and what to test."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class NEEPlusPlus(WalkIntegrator):
     -----------------------------------------
 
     A path tracer that learns from its first samples which lights reach which surfaces. It chooses
-    lights accordingly, also parts of large lights and directions of the sky, and rejects most of the
-    shadow rays that would be blocked. Both are unbiased.
+    lights accordingly, also parts of large lights and directions of the sky, and rejects most of
+    the shadow rays that would be blocked. Both are unbiased.
 
     .. pluginparameters::
 
@@ -40,7 +40,7 @@ class NEEPlusPlus(WalkIntegrator):
      * - grid
        - |int|
        - Voxels along each axis of the region in which paths scatter (of the scene's bounding box,
-         where :monosp:`light_sampling` is not learned). (Default: 24, or fewer where the pilot has
+         where :monosp:`light_sampling` is not learned). (Default: 16, or fewer where the pilot has
          few samples for the voxels that it sees and the lights; 16 for rejection without learned
          light sampling, 32 for :monosp:`spatial`)
      * - max_memory
@@ -66,8 +66,8 @@ class NEEPlusPlus(WalkIntegrator):
        - Least probability of the affine law, 1e-6 to 1. (Default: 0.1)
      * - refine
        - |int|
-       - Only where light sampling is not learned: random visibility tests added to each entry of the
-         map in which the pilot saw a success, for the voxels with a light. (Default: 16)
+       - Only where light sampling is not learned: random visibility tests added to each entry of
+         the map in which the pilot saw a success, for the voxels with a light. (Default: 16)
      * - save_map
        - |string|
        - File to which the learned map is written. (Default: none)
@@ -104,14 +104,15 @@ class NEEPlusPlus(WalkIntegrator):
     A first sample per pixel, which is none of the image's, finds the region and the surfaces. Up to
     three pilots follow, each of which chooses its lights by what the ones before have learned; all
     samples weigh the same, and none teaches a pass that it is part of, so that the image is
-    unbiased. A tenth of the choices does not depend on what was learned. Where light sampling is not
-    learned, rejection knows lights in the scene's bounding box only; those outside of it and at
+    unbiased. A tenth of the choices does not depend on what was learned. Where light sampling is
+    not learned, rejection knows lights in the scene's bounding box only; those outside of it and at
     infinity are then always tested.
 
-    Lights on meshes with interpolated normals are sampled by the area of their triangles
-    (:monosp:`path` and :monosp:`uniform` are biased there, by a fault in Mitsuba). Textured area lights are not divided. Participating media
-    are ignored, as by :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are
-    scalar and polarized variants. Nested in :monosp:`moment` there is no pilot.
+    Lights on meshes with interpolated normals are sampled by the area of their triangles;
+    :monosp:`path` and :monosp:`uniform` are biased there, by a fault in Mitsuba. Textured area
+    lights are not divided. Participating media are ignored, as by :monosp:`path`. Gradients are not
+    supported (use :monosp:`prb`), nor are scalar and polarized variants. Nested in
+    :monosp:`moment` there is no pilot.
 
     Sources: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
     Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, sections 3 to 4.2;

@@ -122,7 +122,8 @@ class WalkIntegrator(mi.SamplingIntegrator):
         """One sample, for integrators that nest this one and draw its samples (``moment``; ``aov``
         calls :meth:`render`). Nothing is learned there: each decision that needs a pilot falls
         back to its default."""
-        sample = self.stage(**self.decisions(scene)).walk(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
+        walk = self.stage(**self.decisions(scene)).walk
+        sample = walk(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
         return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
 
     def aov_names(self) -> list[str]:

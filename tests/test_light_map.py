@@ -184,10 +184,8 @@ def test_the_roulette_reads_the_chosen_cell():
     row = light_map.rows.row(si, mi.Bool(True))
     for law, blocked in (("affine", 0.01), ("paper", 1e-4)):
         roulette = LightRoulette(light_map, slope=10, floor=0.005, law=law)
-        p = [
-            float(roulette.probability((), Choice(row, mi.UInt32(cell), None), si, None, True)[0][0])
-            for cell in (0, 1)
-        ]
+        choices = [Choice(row, mi.UInt32(cell), None) for cell in (0, 1)]
+        p = [float(roulette.probability((), c, si, None, True)[0][0]) for c in choices]
         assert p[1] == 1 and p[0] == pytest.approx(blocked, abs=0.02)
     assert roulette.rejected_share == pytest.approx(0.5, abs=0.01)
 

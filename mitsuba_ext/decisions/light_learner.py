@@ -23,7 +23,7 @@ _DEFENSIVE = 0.1
 
 #: Voxels along each axis where the scene's author leaves the choice to us, at most; and entries of
 #: the map for each sample of the pilots (with about three connections each), at most.
-_GRID, _ENTRIES_PER_SAMPLE = 24, 4.0
+_GRID, _ENTRIES_PER_SAMPLE = 16, 2.0
 
 
 class LightLearner:
@@ -122,7 +122,8 @@ class LightLearner:
         """A selection that no wrong expectation can keep from any cell."""
         light_map = self._map
         cells, rows = light_map.cells, light_map.rows
-        safe = 0.5 * (_normalized(light_map.unoccluded, cells.count) + dr.rcp(mi.Float(cells.count)))
+        equal = dr.rcp(mi.Float(cells.count))
+        safe = 0.5 * (_normalized(light_map.unoccluded, cells.count) + equal)
         mixed = (1 - _DEFENSIVE) * _normalized(weights, cells.count) + _DEFENSIVE * safe
         # Cells with a sampling_weight of 0 have no weight in any row
         mixed = dr.select(light_map.unoccluded > 0, mixed, 0)

@@ -16,7 +16,7 @@ class LightRoulette(ShadowTest):
 
     Parameters:
         light_map: What was learned. The next event decision must choose from its rows and cells.
-        slope, floor, law: See :class:`~mitsuba_ext.decisions.visibility_roulette.VisibilityRoulette`.
+        slope, floor, law: See ``visibility_roulette.VisibilityRoulette``.
     """
 
     def __init__(self, light_map: LightMap, slope: float, floor: float, law: str) -> None:

@@ -46,16 +46,16 @@ class LinearSelection(EmitterSampling):
     what emitter i contributes to the vertex if nothing is in between.
 
     All emitters are visited at each vertex: the cost is linear in their number (hence the name), in
-    exchange for probabilities that fit each vertex and its normal, without a table to learn. With 24
-    lamps a sample takes a third longer than with ``path``, with a thousand eight times as long.
+    exchange for probabilities that fit each vertex and its normal, without a table to learn. With
+    24 lamps a sample takes a third longer than with ``path``, with a thousand eight times as long.
 
     The estimate is the emitter's power, as irradiance at the distance of its bounding sphere, times
     the largest cosines under which the vertex sees this sphere and, if the light is flat, under
     which the sphere sees the vertex. It is zero only where the whole sphere lies below the tangent
     plane of an opaque surface, or the vertex behind the plane of a rectangle or disk. Where all
     estimates are zero, emitters are chosen uniformly. Neither BSDFs nor the cones of spots are
-    considered. An emitter whose ``sampling_weight`` is zero is not chosen; other weights are factors
-    of the estimates.
+    considered. An emitter whose ``sampling_weight`` is zero is not chosen; other weights are
+    factors of the estimates.
 
     Source: Shirley et al., *Monte Carlo Methods in Rendering*, SIGGRAPH course, section 3.4.2,
     "Linear α_i", whose geometry term of one is replaced by a bound.
@@ -164,8 +164,8 @@ class LinearSelection(EmitterSampling):
             searching &= (running <= target) & (block + 1 < self._block_count)
             block += dr.select(searching, 1, 0)
 
-        # The sums are those of the first pass. They can stay below the target by rounding only: then
-        # the last emitter of those visited is chosen whose estimate is not zero
+        # The sums are those of the first pass. They can stay below the target by rounding only:
+        # then the last emitter of those visited is chosen whose estimate is not zero
         index = block * self._block
         searching = mi.Bool(is_searched)
         while dr.hint(searching, label="choice"):

@@ -38,8 +38,8 @@ class Learner(Observer, Protocol):
     wants_scout: bool
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
-        """The decisions of the first pilot. ``p``, ``n``: vertices and normals of the scout, none if
-        no learner wants one."""
+        """The decisions of the first pilot. ``p``, ``n``: vertices and normals of the scout, none
+        if no learner wants one."""
 
     def learn(self, scene: mi.Scene, is_last: bool) -> dict[str, Any]:
         """The decisions of the next stage, which is the last one if ``is_last`` says so."""

@@ -1,7 +1,7 @@
 """What is learned about lights: how much of each cell reaches each row of surfaces.
 
-Sources: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, section 4.2 (= Guo's
-thesis, section 3.4.2) for the idea; cells, sides, contributions and the estimators are ours.
+Sources: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, section 4.2 (=
+Guo's thesis, section 3.4.2) for the idea; cells, sides, contributions and the estimators are ours.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ class LightMap:
 
         Parameters:
             target: ``visibility`` for the unoccluded contribution times the probability that a
-                shadow ray arrives, ``contribution`` for the root of the mean square of what arrived,
-                BSDF included.
+                shadow ray arrives, ``contribution`` for the root of the mean square of what
+                arrived, BSDF included.
         """
         visibility = self.visibility()
         if target == "visibility":

@@ -95,7 +95,8 @@ def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) ->
         return dr.gather(mi.UInt32, rows.first, row) + index
 
     parts = []
-    for where, value, d, points in _evaluations(rows.count - 1, cells, _SURFACE_POINTS, vertex, rows.p):
+    evaluations = _evaluations(rows.count - 1, cells, _SURFACE_POINTS, vertex, rows.p)
+    for where, value, d, points in evaluations:
         cosine = dr.maximum(dr.dot(d, dr.gather(mi.Normal3f, rows.n, where)), 0) + _LEAST_COSINE
         parts.append(dr.sqrt(dr.block_sum(dr.square(value * cosine), points) / points))
         dr.eval(parts[-1])
@@ -139,8 +140,8 @@ def _evaluations(
 
 
 def _with_last_row(scene: mi.Scene, cells: LightCells, weights: mi.Float) -> mi.Float:
-    """Honours ``sampling_weight``, gives no cell less than a share of its row's mean, and appends the
-    row of all other points, which is the mean of the others."""
+    """Honours ``sampling_weight``, gives no cell less than a share of its row's mean, and appends
+    the row of all other points, which is the mean of the others."""
     count = cells.count
     sampling_weight = np.array([e.sampling_weight() for e in scene.emitters()], dtype=np.float32)
     factor = mi.Float(sampling_weight[cells.emitter_index])
