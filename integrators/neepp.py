@@ -21,7 +21,7 @@ class NEEPlusPlus(WalkIntegrator):
     -----------------------------------------
 
     A path tracer that learns from its first samples which lights reach which surfaces. It chooses
-    lights accordingly, also parts of large lights and directions of the sky, and rejects most of
+    lights accordingly, also parts of large lights and directions of the sky, and can reject most of
     the shadow rays that would be blocked. Both are unbiased.
 
     .. pluginparameters::
@@ -36,7 +36,9 @@ class NEEPlusPlus(WalkIntegrator):
          cost grows with their number). (Default: contribution)
      * - rejection
        - |bool|
-       - Reject shadow rays by learned visibility. (Default: true)
+       - Reject shadow rays by learned visibility. It saves time where lights are not chosen by what
+         was learned; otherwise those that are hidden are hardly chosen any more, and rejection
+         costs more error than it saves time. (Default: false)
      * - grid
        - |int|
        - Voxels along each axis of the region in which paths scatter (of the scene's bounding box,
@@ -101,12 +103,12 @@ class NEEPlusPlus(WalkIntegrator):
     when** one small light lights an open scene, or when the difficulty lies elsewhere, in indirect
     or glossy light: it then costs the pilots' bookkeeping.
 
-    A first sample per pixel, which is none of the image's, finds the region and the surfaces. Up to
-    three pilots follow, each of which chooses its lights by what the ones before have learned; all
-    samples weigh the same, and none teaches a pass that it is part of, so that the image is
-    unbiased. A tenth of the choices does not depend on what was learned. Where light sampling is
-    not learned, rejection knows lights in the scene's bounding box only; those outside of it and at
-    infinity are then always tested.
+    A first sample per pixel, which is none of the image's, finds the region and the surfaces. Two
+    pilots follow, the second of which chooses its lights by what the first has learned; all samples
+    weigh the same, and none teaches a stage that it is part of, so that the image is unbiased. A
+    tenth of the choices does not depend on what was learned. Where light sampling is not learned,
+    rejection knows lights in the scene's bounding box only; those outside of it and at infinity are
+    then always tested.
 
     Lights on meshes with interpolated normals are sampled by the area of their triangles;
     :monosp:`path` and :monosp:`uniform` are biased there, by a fault in Mitsuba. Textured area
@@ -137,7 +139,7 @@ class NEEPlusPlus(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         light_sampling = self.parameter(props, "light_sampling", "contribution", choices=METHODS)
-        rejection = self.parameter(props, "rejection", True)
+        rejection = self.parameter(props, "rejection", False)
         self.next_event = LightSampling.from_properties(self, props, light_sampling, rejection)
 
     def decisions(self, scene: mi.Scene) -> dict[str, Any]:

@@ -65,20 +65,22 @@ REFERENCE = UnderTest("path", draws_like_path=True)
 #: Settings under which more is learned or gambled: unbiased all the same. The films of the tests
 #: are so small that the default pilot learns little.
 _TRAINED = {"pilot_spp": 32, "grid": 8}
-_MAPPED = {**_TRAINED, "light_sampling": "uniform"}
+_REJECTING = {**_TRAINED, "rejection": True}
+_MAPPED = {**_REJECTING, "light_sampling": "uniform"}
 UNUSUAL: dict[str, UnderTest] = {
-    "neepp_trained": UnderTest("neepp", _TRAINED),
-    "neepp_visibility": UnderTest("neepp", {**_TRAINED, "light_sampling": "visibility"}),
-    "neepp_paper": UnderTest("neepp", {**_TRAINED, "law": "paper", "grid": 4}),
-    "neepp_grid_64": UnderTest("neepp", {"pilot_spp": 16, "grid": 64}),
-    "neepp_grid_1": UnderTest("neepp", {**_TRAINED, "grid": 1}),
-    # Rejection by the map of pairs of voxels
-    "neepp_map": UnderTest("neepp", _MAPPED),
-    "neepp_map_paper": UnderTest("neepp", {**_MAPPED, "law": "paper", "grid": 4}),
+    "trained": UnderTest("neepp", _TRAINED),
+    "visibility": UnderTest("neepp", {**_TRAINED, "light_sampling": "visibility"}),
+    "grid_64": UnderTest("neepp", {"pilot_spp": 16, "grid": 64}),
+    "grid_1": UnderTest("neepp", {**_TRAINED, "grid": 1}),
+    "rejecting": UnderTest("neepp", _REJECTING),
+    "rejecting_paper": UnderTest("neepp", {**_REJECTING, "law": "paper", "grid": 4}),
     # Every connection is tested with the same small probability
-    "neepp_floor": UnderTest("neepp", {**_TRAINED, "slope": 0.0, "floor": 0.1}),
-    "neepp_map_floor": UnderTest("neepp", {**_MAPPED, "slope": 0.0, "floor": 0.1}),
-    # Lights by a table, by distance, by a loop over all of them; nothing is learned
+    "rejecting_floor": UnderTest("neepp", {**_REJECTING, "slope": 0.0, "floor": 0.1}),
+    # Rejection alone, by the map of pairs of voxels
+    "mapped": UnderTest("neepp", _MAPPED),
+    "mapped_paper": UnderTest("neepp", {**_MAPPED, "law": "paper", "grid": 4}),
+    "mapped_floor": UnderTest("neepp", {**_MAPPED, "slope": 0.0, "floor": 0.1}),
+    # Lights by power, by distance, by a loop over all of them; nothing is learned
     "power": UnderTest("composed_path", {"next_event": "power"}),
     "spatial": UnderTest("composed_path", {"next_event": "spatial"}),
     "linear": UnderTest("composed_path", {"next_event": "linear"}),

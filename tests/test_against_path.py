@@ -65,6 +65,8 @@ _UNUSUAL_CASES = [
     (scene, name)
     for name in UNUSUAL
     for scene in (("door_ajar",) if "paper" in name else ("rooms", "window"))
+    # Rejection alone leaves skies alone
+    if not (scene == "window" and name.startswith("mapped"))
 ]
 
 
@@ -229,7 +231,7 @@ def test_roulette_chosen_in_composed_path_is_neepp() -> None:
             "next_event": "contribution", "max_depth": 6,
         }
     )
-    neepp = mi.load_dict({"type": "neepp", "max_depth": 6})
+    neepp = mi.load_dict({"type": "neepp", "rejection": True, "max_depth": 6})
     images = [batches(scene, integrator, 32, [5])[0] for integrator in (chosen, neepp)]
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6)
     rays = [integrator.statistics.rays["shadow"] for integrator in (chosen, neepp)]
@@ -244,9 +246,7 @@ def test_roulette_rejects_shadow_rays_where_most_are_blocked() -> None:
         integrator = under_test.make(6)
         batches(scene, integrator, 128, [5])
         rays[name] = integrator.statistics.rays["shadow"]
-    # A grid that is far too fine for the samples learns too little to reject much
-    learned = [n for n in UNUSUAL if n.startswith("neepp") and n != "neepp_grid_64"]
-    for name in learned:
+    for name in (name for name in UNUSUAL if UNUSUAL[name].parameters.get("rejection")):
         assert rays[name] < 0.8 * rays["composed_path"], rays
 
 

@@ -32,7 +32,7 @@ BOTH = pytest.mark.parametrize("name", UNDER_TEST)
 #: With the default parameters few of the shadow rays are rejected here: gamble on all of them too.
 WITH_GAMBLER = {
     **UNDER_TEST,
-    **{name: UNUSUAL[name] for name in ("neepp_floor", "neepp_map_floor", "spatial", "linear")},
+    **{name: UNUSUAL[name] for name in ("rejecting_floor", "spatial", "linear")},
 }
 
 

@@ -125,7 +125,7 @@ def _observe(light_map: LightMap, cell: int, visible: int, blocked: int, value: 
     arrived = dr.arange(mi.UInt32, visible + blocked) < visible
     # The contribution of an estimator that chose with probability 0.5
     light_map.connection(choice, si, None, mi.Color3f(value / 0.5), arrived, mi.Bool(True))
-    dr.eval(light_map.tests, light_map.successes, light_map.squares)
+    light_map.evaluate()
 
 
 def _row(light_map: LightMap, values: mi.Float) -> np.ndarray:

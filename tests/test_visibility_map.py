@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.decisions.visibility_roulette import VisibilityRoulette
+from mitsuba_ext.decisions.visibility_roulette import VisibilityLearner, VisibilityRoulette
 from mitsuba_ext.learning.visibility_map import MAX_VOXELS, VisibilityMap, _row_and_column
 from mitsuba_ext.learning.voxel_grid import VoxelGrid
 
@@ -161,8 +161,9 @@ def test_the_same_seed_gives_bitwise_the_same_map(scenes):
     walk_maps = []
     for _ in range(2):
         integrator = mi.load_dict({"type": "neepp", "max_depth": 4})
-        visibility = VisibilityMap(scene, 12, 2**24)
-        stage = integrator.stage(observer=visibility)
+        learner = VisibilityLearner(12, 16, 4, law="affine", slope=10, floor=0.1)
+        learner.start(scene, mi.Point3f(), mi.Normal3f())
+        stage, visibility = integrator.stage(observer=learner), learner._map
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(3, 50_000)
         ray = scene.sensors()[0].sample_ray(0, 0, sampler.next_2d(), sampler.next_2d())[0]

@@ -104,7 +104,7 @@ class LightLearner:
     def learn(self, scene: mi.Scene, is_last: bool) -> dict[str, Any]:
         if self._map is None:
             return {}
-        dr.eval(self._map.tests, self._map.successes, self._map.squares)
+        self._map.evaluate()
         decisions = {"next_event": self._selection(self._map.weights(self.target))}
         if not is_last:
             return decisions

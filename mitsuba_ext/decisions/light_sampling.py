@@ -95,8 +95,7 @@ class LightSampling:
             return []
         if self.light_sampling not in LEARNING or samples < 4:
             return [samples]
-        quarter = samples // 4
-        return [quarter, quarter, samples - 2 * quarter]
+        return [samples // 4, samples - samples // 4]
 
     def learners(self, scene: mi.Scene, samples: int) -> list[Learner]:
         """Who learns from ``samples`` pilot samples (of all pixels together)."""

@@ -88,13 +88,24 @@ class LightSelection(EmitterSampling):
         return ds, weight, Choice(row, cell, probability)
 
     def pdf(self, state, scene, ref, si, ds, active):
+        # Few rays run into a light: the others jump over all this
+        return _if(active, self._density, (state.row, ref, si, ds, active)), state
+
+    def _density(self, row, ref, si, ds, active) -> mi.Float:
         cell, pdf = self.cells.pdf(ref, si, ds, active)
-        first = state.row * self._count
+        first = row * self._count
         high, low = self._bounds(first + cell, first, active)
         # Also where the lookups above were masked, the density must be a number
-        return dr.select(active, pdf * (high - low), 0), state
+        return dr.select(active, pdf * (high - low), 0)
 
     def _bounds(self, entry, first, active) -> tuple[mi.Float, mi.Float]:
         high = dr.gather(mi.Float, self._cumulative, entry, active)
         low = dr.gather(mi.Float, self._cumulative, entry - 1, active & (entry > first))
         return high, low
+
+
+def _if(active: mi.Bool, function, arguments: tuple) -> mi.Float:
+    """``function(*arguments)`` where ``active``, 0 elsewhere."""
+    return dr.if_stmt(
+        arguments, active, lambda *values: function(*values), lambda *_values: mi.Float(0)
+    )

@@ -45,9 +45,9 @@ class LinearSelection(EmitterSampling):
     """Chooses emitter i with the probability α_i = e_i / Σ e_j, then a point on it; e_i estimates
     what emitter i contributes to the vertex if nothing is in between.
 
-    All emitters are visited at each vertex: the cost is linear in their number (hence the name), in
-    exchange for probabilities that fit each vertex and its normal, without a table to learn. With
-    24 lamps a sample takes a third longer than with ``path``, with a thousand eight times as long.
+    All emitters are visited at each vertex: the cost is linear in their number (hence the name),
+    in exchange for probabilities that fit each vertex and its normal, without a table to learn.
+    With 24 lamps a sample takes a third longer than with ``path``, with 1000 eight times as long.
 
     The estimate is the emitter's power, as irradiance at the distance of its bounding sphere, times
     the largest cosines under which the vertex sees this sphere and, if the light is flat, under

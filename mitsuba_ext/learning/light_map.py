@@ -48,10 +48,10 @@ class LightMap:
         self.unoccluded = unoccluded_weights(scene, rows, cells)
         self._count = dr.opaque(mi.UInt32, cells.count)
         entries = rows.count * cells.count
-        self.tests = dr.zeros(mi.UInt32, entries)
-        self.successes = dr.zeros(mi.UInt32, entries)
+        # Tests in the low half, successes in the high one: one addition counts both
+        self._counts = dr.zeros(mi.UInt64, entries)
         self.squares = dr.zeros(mi.UInt64, entries)
-        dr.eval(self.unoccluded, self.tests, self.successes, self.squares)
+        dr.eval(self.unoccluded, self._counts, self.squares)
 
     # ---- Observer of the walk ----
 
@@ -75,14 +75,33 @@ class LightMap:
         value = brightness(contribution) * choice.probability
         square = dr.square(dr.select(known, value / expected, 0))
         square = dr.select(dr.isfinite(square), dr.minimum(square, _LIMIT), 0)
-        dr.scatter_add(self.tests, mi.UInt32(1), entry, tested)
-        dr.scatter_add(self.successes, mi.UInt32(1), entry, visible)
+        dr.scatter_add(
+            self._counts, dr.select(visible, mi.UInt64((1 << 32) + 1), 1), entry, tested
+        )
         dr.scatter_add(self.squares, mi.UInt64(square * _UNIT), entry, known)
 
     def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
         pass
 
     # ---- What was learned ----
+
+    @property
+    def tests(self) -> mi.UInt32:
+        return mi.UInt32(self._counts & 0xFFFFFFFF)
+
+    @property
+    def successes(self) -> mi.UInt32:
+        return mi.UInt32(self._counts >> 32)
+
+    def restore(self, tests: mi.UInt32, successes: mi.UInt32, squares: mi.UInt64) -> None:
+        """Takes over the counts of another map with the same rows and cells."""
+        self._counts = mi.UInt64(tests) | (mi.UInt64(successes) << 32)
+        self.squares = mi.UInt64(squares)
+        self.evaluate()
+
+    def evaluate(self) -> None:
+        """Ends the observation of a stage."""
+        dr.eval(self._counts, self.squares)
 
     def visibility(self) -> mi.Float:
         """The probability that a shadow ray from a row to a cell arrives; shape [rows · cells].

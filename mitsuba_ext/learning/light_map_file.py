@@ -63,9 +63,10 @@ def load(path: Path, scene: mi.Scene) -> LightMap:
     light_map = LightMap(scene, rows, cells)
     if len(light_map.tests) != len(stored["tests"]):
         raise ValueError(f'the light map "{path}" has been damaged: delete it, and learn it again')
-    light_map.tests = mi.UInt32(stored["tests"])
-    light_map.successes = mi.UInt32(stored["successes"])
-    light_map.squares = mi.UInt64(stored["squares"])
+    light_map.restore(
+        *(mi.UInt32(stored[name]) for name in ("tests", "successes")),
+        mi.UInt64(stored["squares"]),
+    )
     return light_map
 
 
