@@ -187,13 +187,15 @@ def test_passes_share_kernels_and_memory(scene):
     integrator.progress = lambda _: compiled.append(sum(dr.detail.launch_stats()[1:]))
     integrator.render(scene, sensor, spp=30)
     few = integrator.statistics
-    # Pilots of 1, 1 and 5 samples, the rest of 23 in passes of four
-    assert len(compiled) == few.passes == 10
-    assert compiled[4] == compiled[-1], "a pass of the last stage had to compile"
-    assert compiled[2] == compiled[3], "a pass of a pilot had to compile"
-    integrator.render(scene, sensor, spp=69, seed=1)
+    # Pilots of 1 and 6 samples in passes of 1, 3 and 3, the rest of 23 in passes of four
+    assert len(compiled) == few.passes == 9
+    assert compiled[1] == compiled[2], "a pass of a pilot had to compile"
+    assert compiled[3] == compiled[8], "a pass of the last stage had to compile"
+    integrator.render(scene, sensor, spp=30, seed=1)
+    assert compiled[-1] == compiled[8], "another seed had to compile"
+    integrator.render(scene, sensor, spp=69)
     many = integrator.statistics
-    assert compiled[-1] == compiled[1] and many.passes > 2 * few.passes
+    assert many.passes > 1.9 * few.passes
     assert many.memory <= 1.05 * few.memory
 
 
