@@ -192,7 +192,8 @@ def test_passes_share_kernels_and_memory(scene):
     assert compiled[1] == compiled[2], "a pass of a pilot had to compile"
     assert compiled[3] == compiled[8], "a pass of the last stage had to compile"
     integrator.render(scene, sensor, spp=30, seed=1)
-    assert compiled[-1] == compiled[8], "another seed had to compile"
+    # One that sets a seed, at most: none of those that trace
+    assert compiled[-1] <= compiled[8] + 1, "another seed had to compile"
     integrator.render(scene, sensor, spp=69)
     many = integrator.statistics
     assert many.passes > 1.9 * few.passes
