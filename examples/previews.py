@@ -1,4 +1,4 @@
-"""Renders the pictures of the README: ``.venv/bin/python examples/previews.py`` (15 minutes)."""
+"""Renders the pictures of the README: ``.venv/bin/python examples/previews.py`` (25 minutes)."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ PICTURES = {
     "open": 256,
     "mirrors_and_glass": 2048,
     "sunny_gloss": 1024,
+    "many_lamps": 2048,
+    "window": 2048,
 }
 
 

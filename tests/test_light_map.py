@@ -272,9 +272,10 @@ def test_a_map_serves_another_view_and_is_refused_by_another_scene(tmp_path: Pat
         use.render(other, spp=4)
     with pytest.raises(FileNotFoundError, match="no light map"):
         mi.load_dict({"type": "neepp", "load_map": "nowhere.npz"}).render(scene, spp=4)
-    (tmp_path / "broken.npz").write_bytes(b"PK nothing")
-    with pytest.raises(ValueError, match="not a light map"):
-        light_map_file.load(tmp_path / "broken.npz", scene)
+    for content in (b"PK nothing", b"", file.read_bytes()[:-500]):
+        (tmp_path / "broken.npz").write_bytes(content)
+        with pytest.raises(ValueError, match="not a light map"):
+            light_map_file.load(tmp_path / "broken.npz", scene)
 
 
 def test_a_loaded_map_keeps_the_mean(tmp_path: Path):

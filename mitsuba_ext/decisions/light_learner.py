@@ -39,8 +39,6 @@ class LightLearner:
         load, save: Files of a map to begin with, and of the map that was learned.
     """
 
-    wants_scout = True
-
     def __init__(
         self,
         target: str,
@@ -54,6 +52,8 @@ class LightLearner:
         self.target, self.rejection, self.grid = target, rejection, grid
         self.max_memory, self.pilot_samples = max_memory, pilot_samples
         self.load, self.save = load, save
+        # A loaded map brings its region and its rows
+        self.wants_scout = load is None
         self._map: LightMap | None = None
         self._summary = ""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import zipfile
 from pathlib import Path
 
 import drjit as dr
@@ -45,7 +46,7 @@ def load(path: Path, scene: mi.Scene) -> LightMap:
     try:
         with np.load(path) as data:
             stored = dict(data)
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         if isinstance(error, FileNotFoundError):
             raise FileNotFoundError(f'there is no light map "{path}"') from None
         raise ValueError(f'"{path}" is not a light map: {error}') from None
@@ -72,16 +73,9 @@ def load(path: Path, scene: mi.Scene) -> LightMap:
 
 def fingerprint(scene: mi.Scene) -> str:
     """A hash of shapes, materials and lights; sensors and films do not count."""
-    digest = hashlib.sha256()
-    # Objects that are named by the parser are found in another order in another process
-    lines = []
-    for shape in scene.shapes():
-        lines.append(_of(shape))
-    for emitter in scene.emitters():
-        lines.append(_of(emitter))
-    for line in sorted(lines):
-        digest.update(line)
-    return digest.hexdigest()
+    # Sorted: their order differs from one loading of a scene to the next
+    digests = sorted(_of(part) for part in [*scene.shapes(), *scene.emitters()])
+    return hashlib.sha256(b"".join(digests)).hexdigest()
 
 
 def _of(scene_object: mi.Object) -> bytes:
