@@ -31,7 +31,7 @@ SCENES: dict[str, tuple[str, int, int, float]] = {
     "cornell_box": ("cornell_box", 6, 256, 0.002),
     "door_ajar": ("door_ajar", 6, 128, 0.01),
     "rooms": ("rooms", 4, 128, 0.015),
-    "mirrors_and_glass": ("mirrors_and_glass", 3, 128, 0.012),
+    "mirrors_and_glass": ("mirrors_and_glass", 3, 128, 0.015),
     "sunny_gloss": ("sunny_gloss", 2, 128, 0.012),
     "window": ("window", 3, 64, 0.012),
 }

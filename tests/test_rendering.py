@@ -192,8 +192,8 @@ def test_passes_share_kernels_and_memory(scene):
     assert compiled[1] == compiled[2], "a pass of a pilot had to compile"
     assert compiled[3] == compiled[8], "a pass of the last stage had to compile"
     integrator.render(scene, sensor, spp=30, seed=1)
-    # One that sets a seed, at most: none of those that trace
-    assert compiled[-1] <= compiled[8] + 1, "another seed had to compile"
+    # Small ones that make tables may be new, but none of those that trace
+    assert compiled[10] == compiled[11] and compiled[12] == compiled[17], "another seed compiled"
     integrator.render(scene, sensor, spp=69)
     many = integrator.statistics
     assert many.passes > 1.9 * few.passes

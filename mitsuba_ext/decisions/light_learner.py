@@ -23,7 +23,7 @@ _DEFENSIVE = 0.1
 
 #: Voxels along each axis where the scene's author leaves the choice to us, at most; and entries of
 #: the map for each sample of the pilots (with about three connections each), at most.
-_GRID, _ENTRIES_PER_SAMPLE = 16, 2.0
+_GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 
 
 class LightLearner:

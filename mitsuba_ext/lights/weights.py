@@ -19,10 +19,11 @@ _FLOOR = 1e-3
 #: Samples of an emitter's power.
 _POWER_SAMPLES = 256
 
-#: Points of a row at which a cell is evaluated, at most: pbrt's, and where learning follows.
-_VOXEL_POINTS, _SURFACE_POINTS = 128, 8
+#: Points of a row at which a cell is evaluated, at least and at most. In voxels, most are pbrt's
+#: number; on surfaces, fewer than four make what is expected of a thousand lamps too noisy.
+_VOXEL_POINTS, _SURFACE_POINTS = (1, 128), (4, 8)
 
-#: Evaluations of all cells in all rows, about.
+#: Evaluations of all cells in all rows, about, between these bounds.
 _EVALUATIONS = 1 << 22
 
 #: Added to the cosine at a surface, whose shading normal may differ.
@@ -106,13 +107,14 @@ def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) ->
 def _evaluations(
     rows: int,
     cells: LightCells,
-    most_points: int,
+    bounds: tuple[int, int],
     draw: Callable[[mi.UInt32, mi.Sampler], mi.Point3f | mi.UInt32],
     vertices: mi.Point3f | None = None,
 ) -> Iterator[tuple[mi.Point3f | mi.UInt32, mi.Float, mi.Vector3f, int]]:
     """Samples every cell from points of every row, as many of them for each as all can have.
 
     Parameters:
+        bounds: The least and the largest number of points.
         draw: Returns a point of each row, or the index of one of ``vertices``.
 
     Yields:
@@ -120,7 +122,7 @@ def _evaluations(
         direction of the sample, and the number of points of each pair.
     """
     pair_count = rows * cells.count
-    points = max(1, min(most_points, _EVALUATIONS // pair_count))
+    points = max(bounds[0], min(bounds[1], _EVALUATIONS // pair_count))
     sampler = mi.load_dict({"type": "independent"})
     step = max(1, _CHUNK // points)
     for begin in range(0, pair_count, step):
