@@ -38,7 +38,7 @@ class ComposedPath(WalkIntegrator):
          :monosp:`visibility_roulette` (by learned visibility, see :monosp:`neepp`).
          (Default: always)
      * - grid, max_memory, pilot_spp, law, slope, floor, refine, save_map, load_map
-       -
+       - |several|
        - Those of :monosp:`neepp`; known only where next_event or shadow_test is not the default.
      * - max_depth
        - |int|
