@@ -111,9 +111,9 @@ class ComposedPath(WalkIntegrator):
 
     def parameters(self) -> dict[str, Any]:
         learned = vars(self.light_sampling) if self.light_sampling else {}
-        del_keys = ("light_sampling", "rejection")
+        named_differently = ("light_sampling", "rejection")
         return {
             "shadow_test": self.shadow_test,
             "next_event": self.next_event,
-            **{k: v for k, v in learned.items() if k not in del_keys},
+            **{k: v for k, v in learned.items() if k not in named_differently},
         }

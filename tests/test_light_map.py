@@ -278,6 +278,12 @@ def test_a_map_serves_another_view_and_is_refused_by_another_scene(tmp_path: Pat
             light_map_file.load(tmp_path / "broken.npz", scene)
 
 
+@pytest.mark.parametrize("key", ["load_map", "save_map"])
+def test_a_file_of_a_map_needs_learned_light_sampling(key: str):
+    with pytest.raises(RuntimeError, match=f'"{key}" needs lights that are chosen by'):
+        mi.load_dict({"type": "neepp", "light_sampling": "power", key: "map.npz"})
+
+
 def test_a_loaded_map_keeps_the_mean(tmp_path: Path):
     file = tmp_path / "map.npz"
     scene = load("rooms", width=32, height=18)

@@ -57,6 +57,12 @@ class LightSampling:
             TypeError, ValueError: A parameter has a wrong type or value.
         """
         get = integrator.parameter
+        for key in ("load_map", "save_map"):
+            if get(props, key, "") and light_sampling not in LEARNING:
+                raise ValueError(
+                    f'"{integrator.name}": the parameter "{key}" needs lights that are chosen by '
+                    f'what was learned ({" or ".join(LEARNING)}), not "{light_sampling}"'
+                )
         return cls(
             light_sampling=light_sampling,
             rejection=rejection,
@@ -92,6 +98,8 @@ class LightSampling:
         gain. What the first ones learn makes the later ones better."""
         samples = min(self.pilot_spp, spp // 4)
         if samples == 0 or not self._can_learn(scene):
+            if self.save_map and not self.load_map:
+                mi.Log(mi.LogLevel.Warn, f'Nothing is learned: "{self.save_map}" is not written.')
             return []
         if self.light_sampling not in LEARNING or samples < 4:
             return [samples]
