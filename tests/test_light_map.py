@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import drjit as dr
@@ -303,3 +304,18 @@ def test_the_fingerprint_sees_lights_and_geometry_but_no_sensor():
     assert base == of(a=_lamp(0, 0, 1)) == of(a=_lamp(0, 0, 1), s={"type": "perspective"})
     assert len({base, of(a=_lamp(0, 0, 1.01)), of(a=_lamp(0, 0, 1, radiance=1.1)),
                 of(a=_lamp(0, 0, 1), b=_lamp(0, 0, 2))}) == 4
+
+
+def test_learned_light_sampling_lowers_the_variance_where_lights_are_many():
+    """Against the choice of ``path``, in rooms of which most lamps cannot be seen."""
+    scene = load("rooms", width=32, height=18)
+    variances = {}
+    for name in ("composed_path", "neepp"):
+        integrator = mi.load_dict({"type": name, "max_depth": 2})
+        images = batches(scene, integrator, 64, range(1, 9))
+        variances[name] = np.median(images.var(axis=0, ddof=1) / (images.mean(axis=0) ** 2 + 1e-4))
+    seen, arrived = re.search(
+        r"\((\d+) seen, (\d+) with a success\)", integrator.statistics.learned
+    ).groups()
+    assert int(seen) > int(arrived) > 100, "the pilots taught nothing"
+    assert variances["neepp"] < 0.4 * variances["composed_path"], variances
