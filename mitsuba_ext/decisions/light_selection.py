@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..lights.light_cells import LightCells
-from ..lights.searching import first_above
+from ..lights.searching import alias_tables
 from .defaults import EmitterSampling
 
 
@@ -59,14 +59,20 @@ class LightSelection(EmitterSampling):
     def __init__(self, rows: Rows, cells: LightCells, weights: mi.Float) -> None:
         self.rows, self.cells = rows, cells
         count = cells.count
-        entry = dr.arange(mi.UInt32, rows.count * count)
-        cell = entry % count
+        weights = mi.Float64(weights)
         total = dr.repeat(dr.block_sum(weights, count), count)
-        weights = dr.select(total > 0, weights / total, dr.rcp(mi.Float(count)))
-        cumulative = dr.block_prefix_sum(weights, count, exclusive=False)
-        # No cell can be chosen by rounding alone, and the last always can
-        self._cumulative = dr.select(cell == count - 1, 1, dr.minimum(cumulative, 1))
-        dr.eval(self._cumulative)
+        relative = dr.select(total > 0, weights * (count / total), 1)
+        entry = dr.arange(mi.UInt32, rows.count * count)
+        first = entry - entry % count
+        threshold, alias = alias_tables(relative, first, first + (count - 1), count)
+        probability = mi.Float(relative / count)
+        dr.eval(threshold, alias, probability)
+        # Side by side: what a draw needs is read with one access to memory
+        own = dr.reinterpret_array(mi.Float, alias - first)
+        self._table = dr.ravel(
+            mi.Vector4f(threshold, own, probability, dr.gather(mi.Float, probability, alias))
+        )
+        dr.eval(self._table)
         # Opaque: scenes that differ in it only share their kernels
         self._count = dr.opaque(mi.UInt32, count)
 
@@ -76,12 +82,12 @@ class LightSelection(EmitterSampling):
     def sample(self, state, scene, sampler, si, active):
         row = self.rows.row(si, active)
         x = sampler.next_1d()
-        first = row * self._count
-        last = first + (self._count - 1)
-        entry = first_above(self._cumulative, first, last, x, active, self.cells.count)
-        high, low = self._bounds(entry, first, active)
-        probability = high - low
-        cell = entry - first
+        x *= mi.Float(self._count)
+        cell = dr.minimum(mi.UInt32(x), self._count - 1)
+        entry = dr.gather(mi.Vector4f, self._table, row * self._count + cell, active)
+        is_taken = x - mi.Float(cell) < entry[0]
+        cell = dr.select(is_taken, cell, dr.reinterpret_array(mi.UInt32, entry[1]))
+        probability = dr.select(is_taken, entry[2], entry[3])
         ds, weight = self.cells.sample(cell, si, sampler.next_2d(), active)
         ds.pdf *= probability
         weight = dr.select(probability > 0, weight / probability, 0)
@@ -93,15 +99,10 @@ class LightSelection(EmitterSampling):
 
     def _density(self, row, ref, si, ds, active) -> mi.Float:
         cell, pdf = self.cells.pdf(ref, si, ds, active)
-        first = row * self._count
-        high, low = self._bounds(first + cell, first, active)
+        entry = row * self._count + cell
+        probability = dr.gather(mi.Float, self._table, 4 * entry + 2, active)
         # Also where the lookups above were masked, the density must be a number
-        return dr.select(active, pdf * (high - low), 0)
-
-    def _bounds(self, entry, first, active) -> tuple[mi.Float, mi.Float]:
-        high = dr.gather(mi.Float, self._cumulative, entry, active)
-        low = dr.gather(mi.Float, self._cumulative, entry - 1, active & (entry > first))
-        return high, low
+        return dr.select(active, pdf * probability, 0)
 
 
 def _if(active: mi.Bool, function, arguments: tuple) -> mi.Float:

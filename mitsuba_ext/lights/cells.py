@@ -52,7 +52,8 @@ class EmitterCells:
         # Rounding shall not lead into the neighbour of a piece
         inset = np.minimum(2.0**-23, 0.25 * pieces[:, 2:]).T
         corner, size = pieces[:, :2].T + inset, pieces[:, 2:].T - 2 * inset
-        self._corner, self._size = mi.Point2f(_floats(corner)), mi.Vector2f(_floats(size))
+        # Corner and size of a piece side by side: one access to memory reads all four
+        self._pieces = mi.Float(_floats(np.concatenate([corner, size]).T).ravel())
         self._share = mi.Float(self.share.astype(np.float32))
         if self._has_groups:
             self._last_piece = mi.UInt32((ends - 1).astype(np.uint32))
@@ -137,9 +138,8 @@ class EmitterCells:
             piece, x = cell, sample.x
             if self._has_groups:
                 piece, x = self._piece(cell, x, active)
-            corner = dr.gather(mi.Point2f, self._corner, piece, active)
-            size = dr.gather(mi.Vector2f, self._size, piece, active)
-            sample = corner + mi.Point2f(x, sample.y) * size
+            left, bottom, width, height = dr.gather(mi.Vector4f, self._pieces, piece, active)
+            sample = mi.Point2f(dr.fma(x, width, left), dr.fma(sample.y, height, bottom))
         ds, weight = self._pointer(cell, active).sample_direction(ref, sample, active)
         # Not all emitters heed the mask
         pdf = dr.select(active, ds.pdf, 0)

@@ -141,10 +141,18 @@ class EnvironmentBins:
         self._corners = mi.Float(corners.ravel().astype(np.float32))
 
         order = np.argsort(bin.astype(np.uint16), kind="stable")
-        threshold, alias = alias_tables(weight[order], np.bincount(bin, minlength=count))
+        size = np.bincount(bin, minlength=count)
+        end = np.cumsum(size)
+        of = bin[order]
+        threshold, alias = alias_tables(
+            mi.Float64((weight * size[bin] / bin_weight[bin])[order]),
+            mi.UInt32((end - size)[of].astype(np.uint32)),
+            mi.UInt32((end - 1)[of].astype(np.uint32)),
+            int(size.max()),
+        )
         entries = np.empty((len(order), 2), dtype=np.uint32)
-        entries[order, 0] = threshold.astype(np.float32).view(np.uint32)
-        entries[order, 1] = order[alias]
+        entries[order, 0] = threshold.numpy().view(np.uint32)
+        entries[order, 1] = order[alias.numpy()]
         self._entries = mi.UInt32(entries.ravel())
 
     def _set_shares(self, bin_weight: np.ndarray) -> None:

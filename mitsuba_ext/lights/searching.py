@@ -4,77 +4,79 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 #: The largest number below one.
 ONE_MINUS_EPSILON = 1 - 2**-24
 
+#: Fixed point of the weights in an alias table.
+_ONE = 2.0**32
+
 
 def first_above(
-    cumulative: mi.Float,
+    cumulative: mi.Float | mi.UInt64,
     first: mi.UInt32,
     last: mi.UInt32,
-    x: mi.Float,
+    x: mi.Float | mi.UInt64,
     active: mi.Bool,
     longest: int,
+    reaches: bool = False,
 ) -> mi.UInt32:
-    """The first index of [first, last] whose entry exceeds ``x``; ``last`` if none does. No range
-    has more than ``longest`` entries: that fixes the number of steps, all of them without a branch.
+    """The first index of [first, last] whose entry exceeds ``x`` (``reaches``: or equals it);
+    ``last`` if none does. No range has more than ``longest`` entries: that fixes the number of
+    steps, all of them without a branch.
     """
     index = mi.UInt32(first)
     step = 1 << max(0, (longest - 1).bit_length() - 1) if longest > 1 else 0
     while step > 0:
         probe = index + (step - 1)
         inside = active & (probe < last)
-        below = inside & (dr.gather(mi.Float, cumulative, probe, inside) <= x)
+        value = dr.gather(type(cumulative), cumulative, probe, inside)
+        below = inside & ((value < x) if reaches else (value <= x))
         index = dr.select(below, index + step, index)
         step >>= 1
     return index
 
 
-def alias_tables(weights: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Walker's alias tables for consecutive groups of positive weights, all groups at once.
+def alias_tables(
+    relative: mi.Float64, first: mi.UInt32, last: mi.UInt32, longest: int
+) -> tuple[mi.Float, mi.UInt32]:
+    """Walker's alias tables for consecutive groups of weights, all groups at once.
 
     An entry chosen uniformly in its group keeps a random number below its threshold and gives all
     others to its alias. Lighter entries give what they lack to the heavier ones in their order, as
     Vose's algorithm does; here, running sums tell which (Hübschle-Schneider and Sanders 2019).
 
     Args:
-        weights: Of all entries; shape [n].
-        sizes: Number of entries of each group; their sum is n.
+        relative: The weights of all entries, in units of the mean of their group; shape [n].
+        first, last: Where the group of each entry begins and ends; shape [n].
+        longest: No group has more entries.
 
     Returns:
-        The threshold of each entry, in [0, 1], and the index of its alias, in [0, n).
+        The threshold of each entry, in [0, 1], and the index of its alias, in its group.
     """
-    group = np.repeat(np.arange(len(sizes)), sizes)
-    mean = np.bincount(group, weights, len(sizes)) / np.maximum(sizes, 1)
-    relative = weights / mean[group]
-    threshold, alias = np.minimum(relative, 1), np.arange(len(weights))
-    # Sums that should be equal differ by rounding: the excess of a hardly heavy entry is none
-    is_heavy = relative > 1 + 1e-9
-    heavy_count = np.bincount(group, is_heavy, len(sizes)).astype(int)
-    light_count = np.where(heavy_count > 0, sizes - heavy_count, 0)
-    threshold[(heavy_count == 0)[group]] = 1
-    heavy = np.flatnonzero(is_heavy)
-    light = np.flatnonzero(~is_heavy & (heavy_count > 0)[group])
-    if len(heavy) == 0:
-        return threshold, alias
-    excess, lack = np.cumsum(relative[heavy] - 1), np.cumsum(1 - threshold[light])
+    # In fixed point: sums are exact, in whatever order they are taken, and never decrease
+    relative = mi.UInt64(relative * _ONE + 0.5)
+    one = dr.opaque(mi.UInt64, int(_ONE))
+    excess = _running_sum(dr.maximum(relative, one) - one, first)
+    lack = _running_sum(one - dr.minimum(relative, one), first)
+    entry = dr.arange(mi.UInt32, len(relative))
+    is_heavy = relative > one
+    # A light entry is served by the first heavy one that has something left. That may give more
+    # than it has: then the next heavy one serves it.
+    served = dr.select(is_heavy, excess, dr.gather(mi.UInt64, lack, entry - 1, entry > first))
+    alias = first_above(excess, first, last, served, mi.Bool(True), longest)
+    final = first_above(lack, first, last, excess, is_heavy, longest, reaches=True)
+    given = dr.gather(mi.UInt64, lack, final, is_heavy)
+    threshold = dr.select(is_heavy, one + excess - dr.minimum(given, one + excess), relative)
+    # Excess and lack of a group are equal but for rounding: the last entries keep the difference
+    found = dr.gather(mi.UInt64, excess, alias) > served
+    threshold = dr.minimum(mi.Float(mi.Float64(threshold) / _ONE), 1)
+    return dr.select(found, threshold, 1), dr.select(found, alias, entry)
 
-    def within_group(index: np.ndarray, count: np.ndarray, user: np.ndarray) -> np.ndarray:
-        """Limits indices of entries, of which the groups have ``count``, to the users' groups."""
-        end = np.cumsum(count)
-        return np.clip(index, (end - count)[group[user]], (end - 1)[group[user]])
 
-    # A light entry is served by the first heavy one that has something left
-    before = np.concatenate([[0.0], lack[:-1]])
-    server = np.searchsorted(excess, before, side="right")
-    alias[light] = heavy[within_group(server, heavy_count, light)]
-
-    # It may give more than it has: then the next heavy one serves it. The last one keeps the rest.
-    final = within_group(np.searchsorted(lack, excess), light_count, heavy)
-    threshold[heavy] = np.clip(1 + excess - lack[final], 0, 1)
-    alias[heavy[:-1]] = heavy[1:]
-    last = heavy[np.append(group[heavy[1:]] != group[heavy[:-1]], True)]
-    threshold[last], alias[last] = 1, last
-    return threshold, alias
+def _running_sum(values: mi.UInt64, first: mi.UInt32) -> mi.UInt64:
+    """The sum of all values from the ``first`` of the group to each entry itself."""
+    total = dr.cumsum(values)
+    total -= dr.gather(mi.UInt64, total, first - 1, first > 0)
+    dr.eval(total)
+    return total
