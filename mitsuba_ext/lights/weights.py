@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
@@ -19,11 +19,11 @@ _FLOOR = 1e-3
 #: Samples of an emitter's power.
 _POWER_SAMPLES = 256
 
-#: Points of a row at which a cell is evaluated, at least and at most. In voxels, most are pbrt's
-#: number; on surfaces, fewer than four make what is expected of a thousand lamps too noisy.
-_VOXEL_POINTS, _SURFACE_POINTS = (1, 128), (4, 8)
+#: Points of a row from which a cell is evaluated, at least and at most. In voxels, most are pbrt's
+#: number.
+_VOXEL_POINTS, _SURFACE_POINTS = (1, 128), (2, 16)
 
-#: Evaluations of all cells in all rows, about, between these bounds.
+#: Evaluations of all cells in all rows, about, between these bounds; and again of the brighter ones.
 _EVALUATIONS = 1 << 22
 
 #: Added to the cosine at a surface, whose shading normal may differ.
@@ -75,70 +75,86 @@ def spatial_weights(scene: mi.Scene, rows: VoxelRows, cells: LightCells) -> mi.F
     """The mean radiance / pdf with which each cell arrives at points of a voxel, whether visible or
     not (as in pbrt-v3's ``SpatialLightDistribution``); shape [rows · cells]."""
 
-    def random_point(row: mi.UInt32, sampler: mi.Sampler) -> mi.Point3f:
+    def arrives(row: mi.UInt32, cell: mi.UInt32, sampler: mi.Sampler) -> mi.Float:
         sample = mi.Point3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d())
-        return rows.voxels.point(row, sample)
+        return _light(cells, cell, rows.voxels.point(row, sample), sampler)[0]
 
-    parts = []
-    for _p, value, _d, points in _evaluations(rows.count - 1, cells, _VOXEL_POINTS, random_point):
-        parts.append(dr.block_sum(value, points) / points)
-        dr.eval(parts[-1])
-    return _with_last_row(scene, cells, dr.concat(parts))
+    means = _means(rows.count - 1, cells.count, _VOXEL_POINTS, arrives)
+    return _with_last_row(scene, cells, means)
 
 
 def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) -> mi.Float:
     """The root of the mean square of what each cell contributes to a white diffuse surface of each
     row if nothing is in between; shape [rows · cells]."""
 
-    def vertex(row: mi.UInt32, sampler: mi.Sampler) -> mi.UInt32:
+    def squared_contribution(row: mi.UInt32, cell: mi.UInt32, sampler: mi.Sampler) -> mi.Float:
         size = dr.gather(mi.UInt32, rows.size, row)
         index = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(size)), size - 1)
-        return dr.gather(mi.UInt32, rows.first, row) + index
+        index += dr.gather(mi.UInt32, rows.first, row)
+        value, d = _light(cells, cell, dr.gather(mi.Point3f, rows.p, index), sampler)
+        cosine = dr.maximum(dr.dot(d, dr.gather(mi.Normal3f, rows.n, index)), 0) + _LEAST_COSINE
+        return dr.square(value * cosine)
 
-    parts = []
-    evaluations = _evaluations(rows.count - 1, cells, _SURFACE_POINTS, vertex, rows.p)
-    for where, value, d, points in evaluations:
-        cosine = dr.maximum(dr.dot(d, dr.gather(mi.Normal3f, rows.n, where)), 0) + _LEAST_COSINE
-        parts.append(dr.sqrt(dr.block_sum(dr.square(value * cosine), points) / points))
-        dr.eval(parts[-1])
-    return _with_last_row(scene, cells, dr.concat(parts))
+    means = _means(rows.count - 1, cells.count, _SURFACE_POINTS, squared_contribution)
+    return _with_last_row(scene, cells, dr.sqrt(means))
 
 
-def _evaluations(
+def _light(
+    cells: LightCells, cell: mi.UInt32, p: mi.Point3f, sampler: mi.Sampler
+) -> tuple[mi.Float, mi.Vector3f]:
+    """The brightness of radiance / pdf of a sample of ``cell`` at ``p``, and its direction."""
+    lanes = dr.width(cell)
+    ref = dr.zeros(mi.SurfaceInteraction3f, lanes)
+    ref.p, ref.wavelengths = p, some_wavelengths(lanes)
+    ds, weight = cells.sample(cell, ref, sampler.next_2d(), mi.Bool(True))
+    value = brightness(weight)
+    # Some emitters send the same everywhere: one number for all lanes
+    return dr.select(dr.isfinite(value), value, dr.zeros(mi.Float, lanes)), ds.d
+
+
+def _means(
     rows: int,
-    cells: LightCells,
+    cells: int,
     bounds: tuple[int, int],
-    draw: Callable[[mi.UInt32, mi.Sampler], mi.Point3f | mi.UInt32],
-    vertices: mi.Point3f | None = None,
-) -> Iterator[tuple[mi.Point3f | mi.UInt32, mi.Float, mi.Vector3f, int]]:
-    """Samples every cell from points of every row, as many of them for each as all can have.
+    measure: Callable[[mi.UInt32, mi.UInt32, mi.Sampler], mi.Float],
+) -> mi.Float:
+    """The mean of ``measure(row, cell, sampler)`` over samples, for each row and cell; shape
+    [rows · cells]. Where there is not the time for many samples of all, those above the mean of
+    their row have them.
 
     Parameters:
-        bounds: The least and the largest number of points.
-        draw: Returns a point of each row, or the index of one of ``vertices``.
-
-    Yields:
-        For consecutive pairs (row, cell): what was drawn, the brightness of radiance / pdf, the
-        direction of the sample, and the number of points of each pair.
+        bounds: The least and the largest number of samples.
     """
-    pair_count = rows * cells.count
-    points = max(bounds[0], min(bounds[1], _EVALUATIONS // pair_count))
+    pairs = dr.arange(mi.UInt32, rows * cells)
+    samples = _sample_count(len(pairs), bounds)
+    means = _means_of(pairs, cells, samples, measure)
+    if samples < bounds[1]:
+        row_mean = dr.repeat(dr.block_sum(means, cells), cells) / cells
+        important = dr.compress(means > row_mean)
+        more = _sample_count(len(important), bounds)
+        if more > samples:
+            dr.scatter(means, _means_of(important, cells, more, measure), important)
+    return means
+
+
+def _sample_count(pairs: int, bounds: tuple[int, int]) -> int:
+    return max(bounds[0], min(bounds[1], _EVALUATIONS // max(1, pairs)))
+
+
+def _means_of(pairs: mi.UInt32, cells: int, samples: int, measure: Callable) -> mi.Float:
     sampler = mi.load_dict({"type": "independent"})
-    step = max(1, _CHUNK // points)
-    for begin in range(0, pair_count, step):
-        lanes = min(step, pair_count - begin) * points
+    step = max(1, _CHUNK // samples)
+    parts = []
+    for begin in range(0, len(pairs), step):
+        lanes = min(step, len(pairs) - begin) * samples
         sampler.seed(begin, lanes)
-        pair = dr.opaque(mi.UInt32, begin) + dr.arange(mi.UInt32, lanes) // points
-        row = pair // cells.count
-        where = draw(row, sampler)
-        ref = dr.zeros(mi.SurfaceInteraction3f, lanes)
-        ref.p = where if vertices is None else dr.gather(mi.Point3f, vertices, where)
-        ref.wavelengths = some_wavelengths(lanes)
-        ds, weight = cells.sample(pair - row * cells.count, ref, sampler.next_2d(), mi.Bool(True))
-        value = brightness(weight)
-        # Some emitters send the same everywhere: one number for all lanes
-        value = dr.select(dr.isfinite(value), value, dr.zeros(mi.Float, lanes))
-        yield where, value, ds.d, points
+        index = dr.opaque(mi.UInt32, begin) + dr.arange(mi.UInt32, lanes) // samples
+        pair = dr.gather(mi.UInt32, pairs, index)
+        row = pair // cells
+        value = measure(row, pair - row * cells, sampler)
+        parts.append(dr.block_sum(value, samples) / samples)
+        dr.eval(parts[-1])
+    return dr.concat(parts)
 
 
 def _with_last_row(scene: mi.Scene, cells: LightCells, weights: mi.Float) -> mi.Float:
