@@ -91,7 +91,7 @@ class WalkIntegrator(mi.SamplingIntegrator):
         learners = self.learners(scene, width * height * sum(pilots))
         p, n = mi.Point3f(), mi.Normal3f()
         if any(learner.wants_scout for learner in learners):
-            scout = Scout(width * height)
+            scout = Scout()
             depth = min(SCOUT_DEPTH, self.max_depth)
             walk = Walk(depth, depth, next_event=NoConnections(), observer=scout)
             yield Stage(walk, is_scout=True)

@@ -92,6 +92,8 @@ class Walk:
         directions_state = self.directions.begin(sampler, ray)
         next_event_state = self.next_event.begin(sampler, ray)
         shadow_state = self.shadow_test.begin(sampler, ray)
+        if dr.hint(self.observer is not None, mode="scalar"):
+            self.observer.begin(dr.width(ray))
 
         pi = self.query.closest(scene, ray, coherent=True, active=active)
         if dr.hint(self.hide_emitters, mode="scalar"):

@@ -63,7 +63,7 @@ def _surface(p, n=(0, 0, 1), width: int = 1) -> mi.SurfaceInteraction3f:
 
 def _scout(scene: mi.Scene, lanes: int = 4096) -> Scout:
     integrator = mi.load_dict({"type": "composed_path", "max_depth": 4})
-    scout = Scout(lanes)
+    scout = Scout()
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, lanes)
     ray = scene.sensors()[0].sample_ray(0, 0.5, sampler.next_2d(), sampler.next_2d())[0]

@@ -9,10 +9,13 @@ import drjit as dr
 import mitsuba as mi
 
 from ..learning import light_map_file
+from ..learning.learner import Learner
 from ..learning.light_map import BYTES_PER_ENTRY, LightMap
 from ..learning.scout import region
 from ..learning.surface_rows import RowCounts, SurfaceRows, voxel_edges
 from ..lights.light_cells import LightCells
+from ..lights.weights import uniform_weights
+from .defaults import EmitterSampling
 from .light_roulette import LightRoulette
 from .light_selection import LightSelection
 from .visibility_roulette import WORTHWHILE
@@ -25,9 +28,15 @@ _DEFENSIVE = 0.1
 #: the map for each sample of the pilots (with about three connections each), at most.
 _GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 
+#: By how much the variance of next event estimation must fall: what learning costs in time.
+_LEAST_GAIN = 0.07
 
-class LightLearner:
+
+class LightLearner(Learner):
     """Learns a light map in the pilots; chooses lights with it, and rejects shadow rays.
+
+    Where the map says that choosing lights as ``path`` does is nearly as good, and nothing else
+    needs it, learning ends there.
 
     Parameters:
         target: ``visibility`` or ``contribution``.
@@ -54,16 +63,23 @@ class LightLearner:
         self.load, self.save = load, save
         # A loaded map brings its region and its rows
         self.wants_scout = load is None
+        self._is_needed = grid > 0 or rejection is not None or load is not None or save is not None
         self._map: LightMap | None = None
         self._summary = ""
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
         self._map, self._summary = None, "nothing: no path scatters"
         if self.load is not None:
-            self._map = light_map_file.load(self.load, scene)
+            self._map = light_map_file.load(self.load, scene, self.pilot_samples)
         elif dr.width(p) > 0:
             self._map = self._new_map(scene, p, n)
-        return {} if self._map is None else {"next_event": self._selection(self._map.unoccluded)}
+            # Mitsuba samples these with a wrong density
+            self._is_needed |= self._map.cells.has_smooth_meshes
+            if self._map.cells.count == 1 and not self._is_needed:
+                self._map, self._summary = None, "nothing: there is one light to choose"
+        if self._map is None:
+            return {}
+        return self._selection(self._probabilities(self._map.unoccluded))
 
     def _new_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
         bbox = region(p)
@@ -85,19 +101,17 @@ class LightLearner:
                 f"The light map of grid={self.grid} would exceed max_memory="
                 f"{self.max_memory / 2**20:g} MiB: grid={grid} is used.",
             )
-        return LightMap(scene, rows, cells)
+        return LightMap(scene, rows, cells, self.pilot_samples)
 
     # ---- Observer ----
 
-    def vertex(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, active: mi.Bool) -> None:
-        pass
+    def begin(self, lanes: int) -> None:
+        if self._map is not None:
+            self._map.begin(lanes)
 
     def connection(self, choice, si, ds, contribution, visible, tested) -> None:
         if self._map is not None:
             self._map.connection(choice, si, ds, contribution, visible, tested)
-
-    def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
-        pass
 
     # ---- Between the stages ----
 
@@ -105,7 +119,17 @@ class LightLearner:
         if self._map is None:
             return {}
         self._map.evaluate()
-        decisions = {"next_event": self._selection(self._map.weights(self.target))}
+        probabilities = self._probabilities(self._map.weights(self.target))
+        if not self._is_needed:
+            gain = self._gain(scene, probabilities)
+            if gain < _LEAST_GAIN:
+                self._summary = (
+                    f"{self._map}; not used, it would lower the variance of next event estimation "
+                    f"by only {max(0.0, gain):.0%}"
+                )
+                self._map = None
+                return {"next_event": EmitterSampling()}
+        decisions = self._selection(probabilities)
         if not is_last:
             return decisions
         self._summary = str(self._map)
@@ -115,19 +139,29 @@ class LightLearner:
                 decisions["shadow_test"] = roulette
         if self.save is not None:
             light_map_file.save(self.save, scene, self._map)
-        del self._map  # the last stage needs the tables only
+        self._map = None  # the last stage needs the tables only
         return decisions
 
-    def _selection(self, weights: mi.Float) -> LightSelection:
-        """A selection that no wrong expectation can keep from any cell."""
-        light_map = self._map
-        cells, rows = light_map.cells, light_map.rows
-        equal = dr.rcp(mi.Float(cells.count))
-        safe = 0.5 * (_normalized(light_map.unoccluded, cells.count) + equal)
-        mixed = (1 - _DEFENSIVE) * _normalized(weights, cells.count) + _DEFENSIVE * safe
+    def _gain(self, scene: mi.Scene, probabilities: mi.Float) -> float:
+        """By how much, relatively, these probabilities lower the variance of next event estimation
+        below that of Mitsuba's choice."""
+        rows, cells = self._map.rows, self._map.cells
+        uniform = _normalized(uniform_weights(scene, cells), cells.count)
+        default, learned = self._map.relative_variances(
+            dr.tile(uniform, rows.count), probabilities
+        )
+        return 1 - learned / default if default > 0 else 0.0
+
+    def _probabilities(self, weights: mi.Float) -> mi.Float:
+        """Probabilities that no wrong expectation can keep from any cell."""
+        count, unoccluded = self._map.cells.count, self._map.unoccluded
+        safe = 0.5 * (_normalized(unoccluded, count) + dr.rcp(mi.Float(count)))
+        mixed = (1 - _DEFENSIVE) * _normalized(weights, count) + _DEFENSIVE * safe
         # Cells with a sampling_weight of 0 have no weight in any row
-        mixed = dr.select(light_map.unoccluded > 0, mixed, 0)
-        return LightSelection(rows, cells, mixed)
+        return _normalized(dr.select(unoccluded > 0, mixed, 0), count)
+
+    def _selection(self, probabilities: mi.Float) -> dict[str, Any]:
+        return {"next_event": LightSelection(self._map.rows, self._map.cells, probabilities)}
 
     def __str__(self) -> str:
         return self._summary

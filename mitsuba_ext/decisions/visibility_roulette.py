@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..learning.learner import Learner
 from ..learning.visibility_map import VisibilityMap
 from ..learning.voxel_grid import EMPTY
 from .defaults import ShadowTest
@@ -70,14 +71,12 @@ class VisibilityRoulette(ShadowTest):
         return dr.select(known, p, 1), state
 
 
-class VisibilityLearner:
+class VisibilityLearner(Learner):
     """Learns a visibility map in the pilots, and rejects shadow rays with it in the last stage.
 
     Parameters:
         grid, max_memory, refine, law, slope, floor: See the integrator ``neepp``.
     """
-
-    wants_scout = False
 
     def __init__(
         self, grid: int, max_memory: float, refine: int, law: str, slope: float, floor: float
@@ -89,9 +88,6 @@ class VisibilityLearner:
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
         self._map = VisibilityMap(scene, self._grid, self._max_memory)
         return {}
-
-    def vertex(self, *arguments: Any) -> None:
-        pass
 
     def connection(self, choice, si, ds, contribution, visible, tested) -> None:
         self._map.shadow_ray(si.p, ds.p, visible, tested)

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import mitsuba as mi
 
 
-class Observer(Protocol):
-    """What the walk tells while it is traced. Observers scatter into arrays of their own; they see
-    no return value and change nothing."""
+class Observer:
+    """What the walk tells while it is traced; whoever listens overrides what it wants to hear.
+    Observers scatter into arrays of their own; they see no return value and change nothing.
+
+    No observer is a dataclass: Dr.Jit would take one that a loop uses for a part of its state.
+    """
+
+    def begin(self, lanes: int) -> None:
+        """A pass of so many paths begins, one in each lane."""
 
     def vertex(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, active: mi.Bool) -> None:
         """A path is about to connect ``si`` to a light; ``depth`` is 0 at the first vertex."""
@@ -31,28 +37,35 @@ class Observer(Protocol):
         """A path went from ``p`` to ``q``."""
 
 
-class Learner(Observer, Protocol):
+class Learner(Observer):
     """A technique that learns in pilot stages. One object serves one render."""
 
     #: Does :meth:`start` need to know where paths scatter?
-    wants_scout: bool
+    wants_scout = False
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
         """The decisions of the first pilot. ``p``, ``n``: vertices and normals of the scout, none
         if no learner wants one."""
+        raise NotImplementedError
 
     def learn(self, scene: mi.Scene, is_last: bool) -> dict[str, Any]:
         """The decisions of the next stage, which is the last one if ``is_last`` says so."""
+        raise NotImplementedError
 
     def __str__(self) -> str:
         """A summary of what was learned."""
+        raise NotImplementedError
 
 
-class Observers:
+class Observers(Observer):
     """Tells several observers the same."""
 
     def __init__(self, observers: Sequence[Observer]) -> None:
         self._observers = observers
+
+    def begin(self, lanes: int) -> None:
+        for observer in self._observers:
+            observer.begin(lanes)
 
     def vertex(self, *arguments: Any) -> None:
         for observer in self._observers:

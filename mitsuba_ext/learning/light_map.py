@@ -13,6 +13,7 @@ from ..decisions.light_selection import Choice
 from ..lights.environment import brightness
 from ..lights.light_cells import LightCells
 from ..lights.weights import unoccluded_weights
+from .learner import Observer
 from .surface_rows import SurfaceRows
 
 #: Fixed point of the squared ratios. They are clipped: a single one must not decide.
@@ -24,11 +25,17 @@ _PRIOR_TESTS, _PRIOR_SQUARES = 1.0, 4.0
 #: What a diffuse surface of little albedo reflects, in units of a white one without the 1/π.
 _DARK = 0.1
 
+#: Tests of an entry, about, that are enough: where a pilot brings more, not all are recorded.
+_ENOUGH_TESTS, _TESTS_PER_SAMPLE = 32, 2
+
+#: Relative variance of a row, at most: few dark ones must not decide for all.
+_MOST_VARIANCE = 100.0
+
 #: Bytes of an entry: the expectation, the counters, and the tables that are made of them.
 BYTES_PER_ENTRY = 32
 
 
-class LightMap:
+class LightMap(Observer):
     """Counts, for each row of surfaces and each cell of the lights, shadow rays and what they
     brought. An observer of the walk, whose lights must be chosen by a selection with these rows and
     cells. Counters are integers, so that the same samples give bitwise the same map.
@@ -36,6 +43,7 @@ class LightMap:
     Parameters:
         scene: The scene to learn.
         rows, cells: What is lit, and by what.
+        samples: How many samples will be observed, about.
 
     Attributes:
         unoccluded (mi.Float): What each cell contributes to each row if nothing is in between.
@@ -43,7 +51,9 @@ class LightMap:
         squares (mi.UInt64): Sum of the squared contributions in units of ``unoccluded``.
     """
 
-    def __init__(self, scene: mi.Scene, rows: SurfaceRows, cells: LightCells) -> None:
+    def __init__(
+        self, scene: mi.Scene, rows: SurfaceRows, cells: LightCells, samples: int = 0
+    ) -> None:
         self.rows, self.cells = rows, cells
         self.unoccluded = unoccluded_weights(scene, rows, cells)
         self._count = dr.opaque(mi.UInt32, cells.count)
@@ -51,12 +61,16 @@ class LightMap:
         # Tests in the low half, successes in the high one: one addition counts both
         self._counts = dr.zeros(mi.UInt64, entries)
         self.squares = dr.zeros(mi.UInt64, entries)
+        # Opaque, too: one in so many lanes is recorded
+        enough = _ENOUGH_TESTS * entries
+        self._stride = dr.opaque(mi.UInt32, max(1, samples * _TESTS_PER_SAMPLE // enough))
+        self._is_recorded = mi.Bool(True)
         dr.eval(self.unoccluded, self._counts, self.squares)
 
     # ---- Observer of the walk ----
 
-    def vertex(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, active: mi.Bool) -> None:
-        pass
+    def begin(self, lanes: int) -> None:
+        self._is_recorded = dr.arange(mi.UInt32, lanes) % self._stride == 0
 
     def connection(
         self,
@@ -69,8 +83,9 @@ class LightMap:
     ) -> None:
         """A shadow ray was traced; it would have brought ``contribution``."""
         entry = choice.row * self._count + choice.cell
+        tested &= self._is_recorded
         expected = dr.gather(mi.Float, self.unoccluded, entry, tested)
-        known = visible & (expected > 0)
+        known = visible & tested & (expected > 0)
         # What the cell contributes, whatever the probability of choosing it
         value = brightness(contribution) * choice.probability
         square = dr.square(dr.select(known, value / expected, 0))
@@ -79,9 +94,6 @@ class LightMap:
             self._counts, dr.select(visible, mi.UInt64((1 << 32) + 1), 1), entry, tested
         )
         dr.scatter_add(self.squares, mi.UInt64(square * _UNIT), entry, known)
-
-    def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
-        pass
 
     # ---- What was learned ----
 
@@ -146,14 +158,38 @@ class LightMap:
         visibility = self.visibility()
         if target == "visibility":
             return self.unoccluded * visibility
+        return self.unoccluded * dr.sqrt(self._square(visibility))
+
+    def _square(self, visibility: mi.Float) -> mi.Float:
+        """The mean square of what a shadow ray brought, in units of ``unoccluded`` squared."""
         squares = mi.Float(self.squares) / _UNIT
         # The mean square of what arrived, and of one more success of a dark surface
         total = int(dr.sum(self.squares)[0]) / _UNIT + _DARK**2
         arrived = dr.opaque(mi.Float, total / (int(dr.sum(mi.UInt64(self.successes))[0]) + 1))
-        square = (squares + _PRIOR_SQUARES * visibility * arrived) / (
+        return (squares + _PRIOR_SQUARES * visibility * arrived) / (
             mi.Float(self.tests) + _PRIOR_SQUARES
         )
-        return self.unoccluded * dr.sqrt(square)
+
+    def relative_variances(self, *selections: mi.Float) -> list[float]:
+        """How much next event estimation will scatter: its variance in units of its squared mean,
+        averaged over the vertices that were observed.
+
+        Parameters:
+            selections: Probabilities of the cells in each row, which add up to one there.
+        """
+        count = self.cells.count
+        visibility = self.visibility()
+        square = dr.square(self.unoccluded) * self._square(visibility)
+        # What a cell brings on average, if all that arrives of it is alike
+        mean = dr.block_sum(dr.sqrt(square * visibility), count)
+        vertices = mi.Float(dr.block_sum(self.tests, count))
+        results = []
+        for p in selections:
+            second_moment = dr.block_sum(dr.select(p > 0, square / p, 0), count)
+            variance = dr.clip(second_moment / dr.square(mean) - 1, 0, _MOST_VARIANCE)
+            total = dr.sum(dr.select(mean > 0, vertices * variance, 0))
+            results.append(float(total[0]) / max(1.0, float(dr.sum(vertices)[0])))
+        return results
 
     def __str__(self) -> str:
         seen, succeeded = (int(dr.count(n > 0)[0]) for n in (self.tests, self.successes))

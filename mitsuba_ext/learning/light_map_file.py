@@ -36,8 +36,8 @@ def save(path: Path, scene: mi.Scene, light_map: LightMap) -> None:
         )
 
 
-def load(path: Path, scene: mi.Scene) -> LightMap:
-    """Reads a map.
+def load(path: Path, scene: mi.Scene, samples: int = 0) -> LightMap:
+    """Reads a map, to which about so many ``samples`` will be added.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -61,7 +61,7 @@ def load(path: Path, scene: mi.Scene) -> LightMap:
     p, n = mi.Point3f(stored["p"]), mi.Normal3f(stored["n"])
     rows = SurfaceRows(bbox, int(stored["resolution"]), p, n)
     cells = LightCells(scene, voxel_edges(bbox, rows.resolution))
-    light_map = LightMap(scene, rows, cells)
+    light_map = LightMap(scene, rows, cells, samples)
     if len(light_map.tests) != len(stored["tests"]):
         raise ValueError(f'the light map "{path}" has been damaged: delete it, and learn it again')
     light_map.restore(

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..decisions.defaults import EmitterSampling
+from .learner import Observer
 
 #: Paths, about, and vertices of each.
 _PATHS, _VERTICES = 1 << 16, 3
@@ -28,14 +29,10 @@ class NoConnections(EmitterSampling):
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), state
 
 
-class Scout:
-    """Records where paths scatter. An observer of the walk.
+class Scout(Observer):
+    """Records where paths scatter, for about 65,000 of the paths of one pass."""
 
-    Parameters:
-        lanes: Width of the wavefront that is observed; of its paths about 65,000 are recorded.
-    """
-
-    def __init__(self, lanes: int) -> None:
+    def begin(self, lanes: int) -> None:
         stride = max(1, lanes // _PATHS)
         paths = -(-lanes // stride)
         self._lane = dr.arange(mi.UInt32, lanes)
@@ -52,12 +49,6 @@ class Scout:
         dr.scatter(self._p, si.p, slot, active)
         dr.scatter(self._n, lit_normal(si), slot, active)
         dr.scatter(self._seen, mi.UInt32(1), slot, active)
-
-    def connection(self, state, si, ds, contribution, visible, tested) -> None:
-        pass
-
-    def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
-        pass
 
     def vertices(self) -> tuple[mi.Point3f, mi.Normal3f]:
         """The places, and the geometric normals on the side from which they were seen."""

@@ -23,6 +23,8 @@ class EmitterCells:
         emitter_index (numpy.ndarray): The number, in the scene, of each cell's emitter; [count].
         share (numpy.ndarray): The share of its emitter's samples that falls into each cell (of its
             area, therefore); shape [count].
+        has_smooth_meshes (bool): Has a mesh among them interpolated normals, with which Mitsuba's
+            own sampling has a wrong density?
     """
 
     def __init__(self, scene: mi.Scene, indices: list[int], voxel: mi.Vector3f | None) -> None:
@@ -80,7 +82,7 @@ class EmitterCells:
         ids = dr.reinterpret_array(mi.UInt32, self._emitters).numpy()
         kinds = {d.shape for d in divisions}
         self._kinds = kinds
-        self._has_smooth = any(d.is_smooth for d in divisions)
+        self.has_smooth_meshes = any(d.is_smooth for d in divisions)
 
         def by_id(values) -> mi.UInt32:
             table = np.zeros(int(ids.max(initial=0)) + 1, dtype=np.uint32)
@@ -117,7 +119,7 @@ class EmitterCells:
             a, b, c = (np.concatenate(x).T for x in zip(*corners))
             self._a = mi.Point3f(_floats(a))
             self._ab, self._ac = mi.Vector3f(_floats(b - a)), mi.Vector3f(_floats(c - a))
-        if self._has_smooth:
+        if self.has_smooth_meshes:
             normals = np.zeros((int(sizes.sum()), 3), dtype=np.float32)
             smooth = np.zeros(len(normals), dtype=bool)
             end = 0
@@ -148,7 +150,7 @@ class EmitterCells:
             share = dr.gather(mi.Float, self._share, cell, active)
             pdf = dr.select(share > 0, pdf / share, 0)
             weight *= share
-        if self._has_smooth:
+        if self.has_smooth_meshes:
             n = dr.gather(mi.Normal3f, self._normal, piece, active)
             smooth = dr.gather(mi.Bool, self._is_smooth_piece, piece, active)
             ratio = dr.select(smooth, _cosine_ratio(ds, n), 1)
@@ -193,7 +195,7 @@ class EmitterCells:
         if "mesh" in self._kinds:
             is_mesh = active & (dr.gather(mi.UInt32, self._is_mesh, id, active) > 0)
             cell[is_mesh] = self._mesh_cell(id, si, is_mesh)
-        if self._has_smooth:
+        if self.has_smooth_meshes:
             smooth = dr.gather(mi.UInt32, self._is_smooth, id, active) > 0
             pdf *= dr.select(smooth, _cosine_ratio(ds, si.n), 1)
         share = dr.gather(mi.Float, self._share, cell, active)

@@ -24,6 +24,8 @@ class LightCells:
         emitter_index (numpy.ndarray): The number of each cell's emitter; shape [count].
         share (numpy.ndarray): The part of its emitter that each cell is: of the area, or of what an
             environment emits; shape [count].
+        has_smooth_meshes (bool): Is a light a mesh with interpolated normals? Mitsuba's own
+            sampling has a wrong density there.
     """
 
     def __init__(self, scene: mi.Scene, voxel: mi.Vector3f | None) -> None:
@@ -39,6 +41,7 @@ class LightCells:
         self.share = np.concatenate([part.share for part in parts])
         self.emitter_index = np.full(self.count, -1)
         self._first_bin = self.count
+        self.has_smooth_meshes = self._emitters is not None and self._emitters.has_smooth_meshes
         if self._emitters is not None:
             self.emitter_index[: self._emitters.count] = self._emitters.emitter_index
         if self._bins is not None:
