@@ -177,6 +177,42 @@ def test_one_bright_sample_does_not_decide():
     assert np.isfinite(after) and after < 10 * max(before, 0.3)
 
 
+def test_the_predicted_variance_is_that_of_the_counts():
+    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
+    unoccluded = _row(light_map, light_map.unoccluded)
+    _observe(light_map, 0, 20_000, 0, unoccluded[0])
+    _observe(light_map, 1, 10_000, 10_000, 0.5 * unoccluded[1])
+    mean = np.array([1, 0.25]) * unoccluded
+    square = np.array([1, 0.125]) * np.square(unoccluded)
+    selections = [np.array([0.5, 0.5]), np.array([0.8, 0.2]), np.array([1, 0])]
+    expected = [(square / p).sum() / mean.sum() ** 2 - 1 for p in selections[:2]]
+    # A cell that is never chosen brings nothing
+    expected.append(square[0] / mean.sum() ** 2 - 1)
+    tiled = [mi.Float(np.tile(p, light_map.rows.count)) for p in selections]
+    predicted = light_map.relative_variances(*tiled)
+    assert predicted == pytest.approx(np.maximum(expected, 0), rel=5e-3, abs=1e-3)
+
+
+def test_of_a_large_pilot_a_part_is_recorded():
+    scene = _floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1))
+    p, n = _vertices()
+    rows = SurfaceRows(region(p), 1, p, n)
+    lanes = 1 << 16
+    recorded = []
+    for samples in (0, 100, 10_000):
+        light_map = LightMap(scene, rows, LightCells(scene, None), samples)
+        light_map.begin(lanes)
+        choice = Choice(mi.UInt32(0), mi.UInt32(0), mi.Float(0.5))
+        si = _surface((0.1, 0.1, 0), width=lanes)
+        light_map.connection(choice, si, None, mi.Color3f(0.1), mi.Bool(True), mi.Bool(True))
+        light_map.evaluate()
+        assert bool(dr.all(light_map.tests == light_map.successes))
+        assert int(light_map.squares[0]) / int(light_map.tests[0]) > 0
+        recorded.append(int(light_map.tests[0]))
+    # Four entries want 128 tests; there are two for each sample
+    assert recorded == [lanes, lanes, pytest.approx(lanes / 156, rel=0.01)]
+
+
 def test_the_roulette_reads_the_chosen_cell():
     light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
     _observe(light_map, 0, 0, 1000, 0.0)
@@ -319,3 +355,29 @@ def test_learned_light_sampling_lowers_the_variance_where_lights_are_many():
     ).groups()
     assert int(seen) > int(arrived) > 100, "the pilots taught nothing"
     assert variances["neepp"] < 0.4 * variances["composed_path"], variances
+
+
+def _learned(scene: mi.Scene, **parameters) -> str:
+    integrator = mi.load_dict({"type": "neepp", "max_depth": 3, **parameters})
+    assert np.isfinite(np.array(mi.render(scene, integrator=integrator, spp=64))).all()
+    return integrator.statistics.learned
+
+
+def _stage(**lights) -> mi.Scene:
+    """A floor, seen from above by a small film."""
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 32, "height": 32}
+    view = T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    return _floor(sensor={"type": "perspective", "to_world": view, "film": film}, **lights)
+
+
+def test_learning_ends_where_it_would_not_pay():
+    """Two lamps side by side are chosen well enough by chance, unless the user wants more."""
+    assert "one light" in _learned(_stage(a=_lamp(0, 0, 9, size=0.05)))
+    pair = _stage(a=_lamp(0, 0, 9, size=0.1), b=_lamp(0.1, 0, 9, size=0.1))
+    assert "not used" in _learned(pair)
+    assert "not used" not in _learned(pair, grid=8)
+    assert "not used" not in _learned(pair, rejection=True)
+    # One is hidden from nearly everything
+    different = _stage(a=_lamp(0, 0, 9, size=0.1), b=_lamp(0, 0, -1, size=0.5))
+    assert "not used" not in _learned(different)

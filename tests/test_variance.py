@@ -1,16 +1,15 @@
-"""The integrator ``variance`` and the batches below it: mean, variance, film, and hard input."""
+"""The integrator ``variance`` and the batches below it: mean, variance, samples, and film."""
 
 from __future__ import annotations
 
 import math
-import os
-import signal
 import weakref
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from batched import film_channels, render_batches, small_scene, with_variance
 from hard_cases import film, lookat, sensor, stage
 from statistical import THRESHOLD, z_exact
 
@@ -32,28 +31,13 @@ FORMATS = {
 }
 
 
-def _variance(nested: str | dict = "path", batches: int = 4, **parameters) -> mi.Integrator:
-    inner = {"type": nested} if isinstance(nested, str) else nested
-    return mi.load_dict({"type": "variance", "batches": batches, "nested": inner, **parameters})
-
-
-def _scene(*size: int, sampler: str = "independent", **changes) -> mi.Scene:
-    return mi.load_dict(stage(camera=sensor(film=film(*size, **changes), sampler=sampler)))
-
-
-def _film_channels(scene: mi.Scene) -> dict[str, np.ndarray]:
-    bitmap = scene.sensors()[0].film().bitmap()
-    pixels = np.array(bitmap)
-    return {field.name: pixels[..., index] for index, field in enumerate(bitmap.struct_())}
-
-
 # ---- Mean and variance ----
 
 
 @pytest.mark.parametrize("nested", NESTED)
 def test_mean_and_variance_are_those_of_the_batches(nested):
-    scene, inner = _scene(9, 7), mi.load_dict({"type": nested})
-    image = mi.render(scene, integrator=_variance(nested), spp=32, seed=5).numpy()
+    scene, inner = small_scene(9, 7), mi.load_dict({"type": nested})
+    image = mi.render(scene, integrator=with_variance(nested), spp=32, seed=5).numpy()
     images = [
         inner.render(scene, seed=seed, spp=8).numpy().astype(np.float64)
         for seed in batch_seeds(5, 4)
@@ -67,7 +51,7 @@ def test_mean_and_variance_are_those_of_the_batches(nested):
 
 def test_constant_environment_has_no_variance():
     scene = mi.load_dict({"type": "scene", "c": sensor(film=film(8, 8)), "e": {"type": "constant"}})
-    image = mi.render(scene, integrator=_variance(), spp=16).numpy()
+    image = mi.render(scene, integrator=with_variance(), spp=16).numpy()
     np.testing.assert_allclose(image[..., :3], 1, rtol=1e-6)
     assert not image[..., 3:].any()
 
@@ -93,7 +77,7 @@ def lattice(variant: str) -> mi.Scene:
 def test_variance_is_that_of_the_mean_of_all_samples(lattice, batches):
     """Bernoulli: p (1 − p) / spp. The pixels are independent."""
     spp, p = 64, 0.3
-    image = mi.render(lattice, integrator=_variance("direct", batches), spp=spp, seed=1).numpy()
+    image = mi.render(lattice, integrator=with_variance("direct", batches), spp=spp, seed=1).numpy()
     mean, variance = (image[..., c].ravel().astype(np.float64) for c in (0, 3))
     exact = p * (1 - p) / spp
     assert abs(z_exact(variance, exact)[0]) < THRESHOLD
@@ -114,7 +98,7 @@ def test_variance_announces_the_differences_of_independent_renders(nested, sampl
     view = lookat([0, -4, 1.2], [0, 0, -0.2], [0, 0, 1])
     wide = film(12, 12, rfilter={"type": "gaussian"})
     scene = mi.load_dict(stage(camera=sensor(to_world=view, film=wide, sampler=sampler)))
-    integrator = _variance({"type": nested, "max_depth": 3}, batches=4)
+    integrator = with_variance({"type": nested, "max_depth": 3}, batches=4)
     images = [
         mi.render(scene, integrator=integrator, spp=64, seed=seed).numpy().astype(np.float64)
         for seed in range(24)
@@ -153,13 +137,8 @@ def test_seeds_of_batches_are_not_shared():
     assert not set(mi.sample_tea_32(mi.UInt32(0), dr.arange(mi.UInt32, 64))[0]) & set(seeds[0])
 
 
-def render_batches(*arguments) -> Batches:
-    *_, batches = each_batch(*arguments)
-    return batches
-
-
 def test_batches_come_one_by_one_and_can_be_gone_on_with(tmp_path):
-    scene, path = _scene(6, 5), mi.load_dict({"type": "path"})
+    scene, path = small_scene(6, 5), mi.load_dict({"type": "path"})
     counts = [batches.count for batches in each_batch(path, scene, 0, 4, [7, 8])]
     assert counts == [1, 2]
     render_batches(path, scene, 0, 4, [7, 8]).save(tmp_path / "batches")
@@ -172,7 +151,7 @@ def test_batches_come_one_by_one_and_can_be_gone_on_with(tmp_path):
 
 
 def test_non_finite_batch_is_not_averaged_away():
-    scene = _scene(6, 5)
+    scene = small_scene(6, 5)
 
     class Broken(mi.SamplingIntegrator):
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
@@ -194,7 +173,7 @@ def test_no_batch_is_kept(monkeypatch):
         add(self, image, spp)
 
     monkeypatch.setattr(Batches, "add", watched)
-    mi.render(_scene(6, 5), integrator=_variance(batches=8), spp=8)
+    mi.render(small_scene(6, 5), integrator=with_variance(batches=8), spp=8)
     assert len(kept) == 8 and not any(image() is not None for image in kept)
 
 
@@ -217,7 +196,7 @@ def test_no_batch_is_kept(monkeypatch):
     ],
 )
 def test_samples_exceed_those_asked_for_by_less_than_a_batch(sampler, spp, expected):
-    scene, integrator = _scene(3, 2, sampler=sampler), _variance("direct", 16)
+    scene, integrator = small_scene(3, 2, sampler=sampler), with_variance("direct", 16)
     integrator.render(scene, spp=spp)
     count, batch_spp = expected
     assert (integrator.statistics.passes, integrator.statistics.spp) == (count, count * batch_spp)
@@ -225,7 +204,7 @@ def test_samples_exceed_those_asked_for_by_less_than_a_batch(sampler, spp, expec
 
 def test_one_sample_is_refused():
     with pytest.raises(ValueError, match='"variance".* at least 2 samples.* spp = 1'):
-        _variance().render(_scene(4, 4), spp=1)
+        with_variance().render(small_scene(4, 4), spp=1)
 
 
 def test_the_samplers_count_is_used_and_left_as_it_was():
@@ -233,7 +212,7 @@ def test_the_samplers_count_is_used_and_left_as_it_was():
     sampler = scene.sensors()[0].sampler()
     sampler.set_sample_count(12)
     for nested in ("path", "prb", "neepp"):
-        integrator = _variance(nested)
+        integrator = with_variance(nested)
         integrator.render(scene)
         assert integrator.statistics.spp == 12, "spp=0 means the sampler's count"
         integrator.render(scene, spp=8)
@@ -247,13 +226,13 @@ def test_the_samplers_count_is_used_and_left_as_it_was():
     ("nested", "pixel_format"), [*(("path", name) for name in FORMATS), ("ptracer", "xyza")]
 )
 def test_film_develops_the_mean_in_every_pixel_format(nested, pixel_format):
-    scene = _scene(7, 5, pixel_format=pixel_format, rfilter={"type": "gaussian"})
-    integrator = _variance(nested)
+    scene = small_scene(7, 5, pixel_format=pixel_format, rfilter={"type": "gaussian"})
+    integrator = with_variance(nested)
     image = mi.render(scene, integrator=integrator, spp=16, seed=2).numpy()
     names = FORMATS[pixel_format]
     colors = [name for name in names if name != "A"]
     assert integrator.aov_names() == [f"variance.{color}" for color in colors]
-    channels = _film_channels(scene)
+    channels = film_channels(scene)
     assert list(channels) == names + integrator.aov_names()
     np.testing.assert_allclose(np.stack(list(channels.values()), 2), image, rtol=1e-6)
     batches = render_batches(integrator.nested, scene, 0, 4, batch_seeds(2, 4))
@@ -279,12 +258,12 @@ def test_film_develops_the_mean_in_every_pixel_format(nested, pixel_format):
 )  # fmt: skip
 @pytest.mark.parametrize("nested", ["path", "ptracer", "neepp"])
 def test_odd_films_hold_what_is_returned(changes, nested):
-    scene = _scene(**changes)
-    image = mi.render(scene, integrator=_variance(nested), spp=64).numpy()
+    scene = small_scene(**changes)
+    image = mi.render(scene, integrator=with_variance(nested), spp=64).numpy()
     crop = scene.sensors()[0].film().crop_size()
     assert image.shape[:2] == (crop[1], crop[0])
     assert np.isfinite(image).all() and image.any() and (image[..., -3:] >= 0).all()
-    channels = _film_channels(scene)
+    channels = film_channels(scene)
     np.testing.assert_allclose(np.stack(list(channels.values()), 2), image, rtol=1e-6)
     plain = mi.load_dict({"type": nested}).render(scene, spp=256).numpy()
     error = np.sqrt(image[..., -3:].mean())
@@ -294,45 +273,45 @@ def test_odd_films_hold_what_is_returned(changes, nested):
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"], indirect=True)
 def test_other_variants(variant):
     colors = ["Y"] if mi.is_monochromatic else ["R", "G", "B"]
-    scene = _scene(6, 5, pixel_format="luminance" if mi.is_monochromatic else "rgb")
+    scene = small_scene(6, 5, pixel_format="luminance" if mi.is_monochromatic else "rgb")
     for nested in ("path", "ptracer", "neepp"):
-        integrator = _variance(nested)
+        integrator = with_variance(nested)
         assert integrator.aov_names() == [f"variance.{color}" for color in colors]
         image = mi.render(scene, integrator=integrator, spp=64).numpy()
         assert image.shape == (5, 6, 2 * len(colors))
         assert np.isfinite(image).all() and (image[..., len(colors) :] > 0).any()
-        assert list(_film_channels(scene)) == colors + integrator.aov_names()
+        assert list(film_channels(scene)) == colors + integrator.aov_names()
 
 
 def test_aovs_of_the_nested_integrator_are_passed_on_as_means():
-    scene = _scene(8, 6)
-    ours = _variance({"type": "composed_path", "aovs": "d:depth,n:sh_normal"})
+    scene = small_scene(8, 6)
+    ours = with_variance({"type": "composed_path", "aovs": "d:depth,n:sh_normal"})
     image = mi.render(scene, integrator=ours, spp=16).numpy()
     assert ours.aov_names()[:4] == ["d.T", "n.X", "n.Y", "n.Z"]
-    channels = _film_channels(scene)
+    channels = film_channels(scene)
     assert list(channels) == ["R", "G", "B", *ours.aov_names()]
     np.testing.assert_allclose(np.stack(list(channels.values()), 2), image, rtol=1e-6)
 
     aov = {"type": "aov", "aovs": "d:depth,n:sh_normal", "img": {"type": "path"}}
-    mitsubas = _variance(aov)
+    mitsubas = with_variance(aov)
     wrapped = mi.render(scene, integrator=mitsubas, spp=16).numpy()
     assert mitsubas.aov_names() == [
         "img.R", "img.G", "img.B", "img.A", "d.T", "n.X", "n.Y", "n.Z",
         "variance.R", "variance.G", "variance.B",
     ]  # fmt: skip
-    assert list(_film_channels(scene)) == ["R", "G", "B", *mitsubas.aov_names()]
+    assert list(film_channels(scene)) == ["R", "G", "B", *mitsubas.aov_names()]
     # Both see the same camera rays; the image is that of the nested integrator
     np.testing.assert_allclose(wrapped[..., 7:11], image[..., 3:7], rtol=1e-3, atol=1e-4)
-    plain = mi.render(scene, integrator=_variance("path"), spp=16).numpy()
+    plain = mi.render(scene, integrator=with_variance("path"), spp=16).numpy()
     np.testing.assert_allclose(wrapped[..., :3], plain[..., :3], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(wrapped[..., -3:], plain[..., -3:], rtol=1e-2, atol=1e-6)
 
 
 def test_moment_can_be_nested():
-    scene = _scene(6, 5)
-    integrator = _variance({"type": "moment", "m": {"type": "path"}})
+    scene = small_scene(6, 5)
+    integrator = with_variance({"type": "moment", "m": {"type": "path"}})
     mi.render(scene, integrator=integrator, spp=16)
-    assert "m2_m.X" in _film_channels(scene) and "variance.R" in _film_channels(scene)
+    assert "m2_m.X" in film_channels(scene) and "variance.R" in film_channels(scene)
 
 
 def test_films_that_are_not_rgb_are_refused():
@@ -342,7 +321,7 @@ def test_films_that_are_not_rgb_are_refused():
                    "band": {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]}}  # fmt: skip
         scene = mi.load_dict(stage(camera=sensor(film=special)))
         with pytest.raises(NotImplementedError, match='"variance".*hdrfilm'):
-            _variance().render(scene, spp=4)
+            with_variance().render(scene, spp=4)
     finally:
         mi.set_variant("llvm_ad_rgb")
 
@@ -359,172 +338,3 @@ def test_command_line_writes_the_channels(run, make_scene, tmp_path):
     assert set(channels) == {"R", "G", "B", "variance.R", "variance.G", "variance.B"}
     assert metadata["spp"] == 20 and np.isfinite(list(channels.values())).all()
     assert run("render", make_scene(integrator=xml), "-o", tmp_path / "a.png", "--spp", 20)[0] == 0
-
-
-# ---- Calls ----
-
-
-def test_render_takes_the_arguments_that_mitsuba_takes():
-    scene, integrator = _scene(6, 5), _variance()
-    sensor_, same = scene.sensors()[0], dict(rtol=1e-5, atol=1e-6)
-    image = integrator.render(scene, sensor=sensor_, seed=mi.UInt32(2**32 - 1), spp=8).numpy()
-    np.testing.assert_allclose(integrator.render(scene, 0, 2**32 - 1, 8).numpy(), image, **same)
-    lazy = integrator.render(scene, seed=2**32 - 1, spp=8, evaluate=False).numpy()
-    np.testing.assert_allclose(lazy, image, **same)
-    other = integrator.render(scene, seed=0, spp=8).numpy()
-    assert np.abs(other - image).max() > 0.01 * image.max()
-    assert integrator.render(scene, seed=2**32 - 1, spp=8, develop=False).shape == (0,)
-    np.testing.assert_allclose(np.array(sensor_.film().bitmap()), image, **same)
-    with pytest.raises(ValueError, match="there is no sensor 1: the scene has 1"):
-        integrator.render(scene, sensor=1, spp=4)
-
-
-def test_scene_with_the_integrator_in_xml():
-    scene = mi.load_string(
-        """<scene version="3.0.0">
-        <integrator type="variance"><integer name="batches" value="3"/>
-            <integrator type="path"><integer name="max_depth" value="2"/></integrator>
-        </integrator>
-        <emitter type="constant"/><shape type="sphere"/>
-        <sensor type="perspective"><sampler type="independent"/>
-            <transform name="to_world"><lookat origin="0, 0, 5" target="0, 0, 0" up="0, 1, 0"/>
-            </transform><film type="hdrfilm"><integer name="width" value="4"/>
-            <integer name="height" value="3"/><string name="pixel_format" value="rgb"/></film>
-        </sensor></scene>"""
-    )
-    assert mi.render(scene, spp=6).shape == (3, 4, 6)
-    text = str(scene.integrator())
-    assert text.startswith("variance[") and "batches = 3" in text and "max_depth = 2" in text
-
-
-def test_statistics_are_summed_over_the_batches():
-    scene, integrator = _scene(6, 5), _variance("neepp")
-    integrator.render(scene, spp=32)
-    statistics = integrator.statistics
-    assert statistics.spp == 32 and statistics.passes >= 4 and statistics.seconds > 0
-    assert statistics.rays["camera"] == 6 * 5 * 32 and statistics.rays["shadow"] > 0
-    assert 0 < statistics.zero_radiance < 1 and not statistics.interrupted
-
-
-# ---- Stopping ----
-
-
-def test_cancelling_returns_the_image_of_the_finished_batches():
-    scene, integrator = _scene(6, 5), _variance(batches=8)
-    fractions = []
-
-    def progress(fraction: float) -> None:
-        fractions.append(fraction)
-        if fraction >= 0.5:
-            integrator.cancel()
-
-    integrator.progress = progress
-    image = integrator.render(scene, spp=32, seed=3).numpy()
-    assert fractions == [0.125, 0.25, 0.375, 0.5]
-    assert integrator.statistics.interrupted and integrator.statistics.spp == 16
-    batches = render_batches(integrator.nested, scene, 0, 4, batch_seeds(3, 4))
-    np.testing.assert_allclose(image[..., :3], batches.mean, rtol=1e-5, atol=1e-7)
-    integrator.progress = None
-    integrator.render(scene, spp=32)
-    assert integrator.statistics.spp == 32, "a later render is not cancelled"
-
-
-@pytest.mark.parametrize("nested", ["path", "neepp"])
-def test_ctrl_c_leaves_the_finished_batches_in_the_film(nested):
-    scene, integrator = _scene(6, 5), _variance(nested)
-    integrator.progress = lambda fraction: fraction < 0.5 or os.kill(os.getpid(), signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        integrator.render(scene, spp=64)
-    assert integrator.statistics.interrupted and integrator.statistics.spp in (32, 48)
-    channels = _film_channels(scene)
-    assert "variance.R" in channels and np.isfinite(list(channels.values())).all()
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_ctrl_c_inside_of_a_batch_drops_it():
-    """Ours finish the pass and raise."""
-    scene, integrator = _scene(6, 5), _variance("neepp")
-    whole = integrator.render(scene, spp=64)
-    count = []
-
-    def interrupt(fraction: float) -> None:
-        count.append(fraction)
-        if integrator.statistics.spp == 32:  # in the third batch
-            os.kill(os.getpid(), signal.SIGINT)
-
-    integrator.nested.progress = interrupt
-    with pytest.raises(KeyboardInterrupt):
-        integrator.render(scene, spp=64)
-    assert integrator.statistics.spp == 32
-    assert _film_channels(scene)["variance.R"].shape == whole.shape[:2]
-
-
-def test_variance_after_a_single_batch_is_unknown():
-    scene, integrator = _scene(6, 5), _variance()
-    integrator.progress = lambda _: integrator.cancel()
-    image = integrator.render(scene, spp=16).numpy()
-    assert np.isfinite(image[..., :3]).all() and np.isnan(image[..., 3:]).all()
-
-
-def test_an_error_in_the_progress_callback_leaves_a_valid_film():
-    scene, integrator = _scene(6, 5), _variance()
-
-    def fail(fraction: float) -> None:
-        if fraction > 0.5:
-            raise OSError("no terminal")
-
-    integrator.progress = fail
-    with pytest.raises(OSError, match="no terminal"):
-        integrator.render(scene, spp=16)
-    assert np.isfinite(list(_film_channels(scene).values())).all()
-
-
-# ---- Errors ----
-
-
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({}, "exactly one integrator must be nested in it; found none"),
-        ({"a": {"type": "path"}, "b": {"type": "path"}}, "exactly one .*Path.*, Path"),
-        ({"a": {"type": "sphere"}}, "exactly one integrator.*Sphere"),
-        ({"a": {"type": "path"}, "batches": 1}, '"batches" is 1; it must be at least 2'),
-        ({"a": {"type": "path"}, "batches": 2.5}, '"batches" is 2.5; .* type int'),
-        ({"a": {"type": "variance", "n": {"type": "path"}}}, "nested in another"),
-        ({"a": {"type": "neepp", "aovs": "variance:albedo"}}, 'AOV of the name "variance.B"'),
-    ],
-)
-def test_wrong_use_is_explained(parameters, message):
-    with pytest.raises((TypeError, ValueError, RuntimeError), match=f'"variance".*{message}'):
-        mi.load_dict({"type": "variance", **parameters})
-
-
-@pytest.mark.parametrize("unknown", ["max_depth", "hide_emitters", "timeout", "spp"])
-def test_parameters_of_the_nested_integrator_are_refused(unknown):
-    with pytest.raises(RuntimeError, match=f'unreferenced.*"variance"(.|\n)*{unknown}'):
-        _variance(**{unknown: 4})
-
-
-@pytest.mark.parametrize("outer", [{"type": "moment"}, {"type": "aov", "aovs": "d:depth"}])
-def test_integrators_that_draw_single_samples_refuse_to_nest_it(outer):
-    with pytest.raises(RuntimeError, match="Child objects must be of type 'SamplingIntegrator'"):
-        mi.load_dict({**outer, "x": {"type": "variance", "nested": {"type": "path"}}})
-
-
-def test_gradients_are_refused_with_a_hint_at_prb():
-    scene = _scene(4, 4)
-    parameters = mi.traverse(scene)
-    key = "light.emitter.radiance.value"
-    dr.enable_grad(parameters[key])
-    parameters.update()
-    integrator = _variance("prb")
-    image = mi.render(scene, parameters, integrator=integrator, spp=4)
-    with pytest.raises((NotImplementedError, RuntimeError)) as caught:
-        dr.backward(dr.sum(image))
-    error, texts = caught.value, ""
-    while error is not None:
-        texts, error = texts + str(error), error.__cause__ or error.__context__
-    assert '"variance" does not compute gradients' in texts and '"prb"' in texts
-    for method, arguments in (("render_forward", ()), ("render_backward", (None,))):
-        with pytest.raises(NotImplementedError, match='"variance".*"prb"'):
-            getattr(integrator, method)(scene, parameters, *arguments)

@@ -28,8 +28,9 @@ _DEFENSIVE = 0.1
 #: the map for each sample of the pilots (with about three connections each), at most.
 _GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 
-#: By how much the variance of next event estimation must fall: what learning costs in time.
-_LEAST_GAIN = 0.07
+#: By how much the variance must fall, relatively: what learning costs in time. And the relative
+#: variance of everything that does not depend on the choice, at least.
+_LEAST_GAIN, _OTHER_VARIANCE = 0.07, 0.1
 
 
 class LightLearner(Learner):
@@ -124,8 +125,8 @@ class LightLearner(Learner):
             gain = self._gain(scene, probabilities)
             if gain < _LEAST_GAIN:
                 self._summary = (
-                    f"{self._map}; not used, it would lower the variance of next event estimation "
-                    f"by only {max(0.0, gain):.0%}"
+                    f"{self._map}; not used, it would lower the variance by only "
+                    f"{max(0.0, gain):.0%}"
                 )
                 self._map = None
                 return {"next_event": EmitterSampling()}
@@ -143,14 +144,14 @@ class LightLearner(Learner):
         return decisions
 
     def _gain(self, scene: mi.Scene, probabilities: mi.Float) -> float:
-        """By how much, relatively, these probabilities lower the variance of next event estimation
-        below that of Mitsuba's choice."""
+        """By how much, relatively, these probabilities lower the variance below that of Mitsuba's
+        choice."""
         rows, cells = self._map.rows, self._map.cells
         uniform = _normalized(uniform_weights(scene, cells), cells.count)
         default, learned = self._map.relative_variances(
             dr.tile(uniform, rows.count), probabilities
         )
-        return 1 - learned / default if default > 0 else 0.0
+        return (default - learned) / (default + _OTHER_VARIANCE)
 
     def _probabilities(self, weights: mi.Float) -> mi.Float:
         """Probabilities that no wrong expectation can keep from any cell."""

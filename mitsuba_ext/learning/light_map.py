@@ -83,7 +83,7 @@ class LightMap(Observer):
     ) -> None:
         """A shadow ray was traced; it would have brought ``contribution``."""
         entry = choice.row * self._count + choice.cell
-        tested &= self._is_recorded
+        tested = tested & self._is_recorded
         expected = dr.gather(mi.Float, self.unoccluded, entry, tested)
         known = visible & tested & (expected > 0)
         # What the cell contributes, whatever the probability of choosing it

@@ -32,6 +32,7 @@ class EmitterCells:
         self._scene = scene
         edges = None if voxel is None else np.array(voxel, dtype=np.float64).reshape(3)
         everything = divide(scene, edges)
+        shapes = emitter_shapes(scene)
         divisions = [everything[i] for i in indices]
         sizes = np.concatenate([d.cell_sizes for d in divisions])
         pieces = np.concatenate([d.pieces for d in divisions])
@@ -49,6 +50,13 @@ class EmitterCells:
         )
         self._emitter = mi.UInt32(number.astype(np.uint32))
         self._is_divided = any(d.shape for d in divisions)
+        # The emitter itself would sample the texture, whatever part of the unit square it is given
+        self._has_textures = any(d.is_textured for d in divisions)
+        if self._has_textures:
+            self._is_textured = mi.Bool([d.is_textured for d in divisions])
+            number_of = {shape.ptr: i for i, shape in enumerate(scene.shapes())}
+            numbers = [number_of.get(getattr(shapes[i], "ptr", None), 0) for i in indices]
+            self._shapes = dr.gather(mi.ShapePtr, scene.shapes_dr(), mi.UInt32(numbers))
         self._longest = int(sizes.max())
         self._has_groups = self._longest > 1
         # Rounding shall not lead into the neighbour of a piece
@@ -68,7 +76,6 @@ class EmitterCells:
             )
             cumulative[ends - 1] = 1
             self._cumulative = mi.Float(cumulative.astype(np.float32))
-        shapes = emitter_shapes(scene)
         self._inverse([shapes[i] for i in indices], divisions, cell_counts, sizes)
 
     def _inverse(
@@ -89,6 +96,8 @@ class EmitterCells:
             table[ids] = values
             return mi.UInt32(table)
 
+        if self._has_textures:
+            self._is_textured_id = by_id([d.is_textured for d in divisions])
         first = np.cumsum(cell_counts) - cell_counts
         self._first_cell = by_id(first)
         if kinds - {"", "mesh"}:
@@ -142,7 +151,7 @@ class EmitterCells:
                 piece, x = self._piece(cell, x, active)
             left, bottom, width, height = dr.gather(mi.Vector4f, self._pieces, piece, active)
             sample = mi.Point2f(dr.fma(x, width, left), dr.fma(sample.y, height, bottom))
-        ds, weight = self._pointer(cell, active).sample_direction(ref, sample, active)
+        ds, weight = self._sample_emitter(cell, ref, sample, active)
         # Not all emitters heed the mask
         pdf = dr.select(active, ds.pdf, 0)
         weight = dr.select(active, weight, 0)
@@ -158,6 +167,22 @@ class EmitterCells:
             weight *= dr.select(ratio > 0, dr.rcp(ratio), 0)
         ds.pdf = pdf
         return ds, weight
+
+    def _sample_emitter(self, cell, ref, sample, active):
+        """What the cell's emitter makes of a point of the unit square."""
+        emitter = self._pointer(cell, active)
+        if not self._has_textures:
+            return emitter.sample_direction(ref, sample, active)
+        number = dr.gather(mi.UInt32, self._emitter, cell, active)
+        textured = dr.gather(mi.Bool, self._is_textured, number, active)
+        ds, weight = emitter.sample_direction(ref, sample, active & ~textured)
+        textured &= active
+        shape = dr.gather(mi.ShapePtr, self._shapes, number, textured)
+        by_area = shape.sample_direction(ref, sample, textured)
+        by_area.emitter = mi.EmitterPtr(emitter)
+        value = emitter.eval_direction(ref, by_area, textured)
+        value = dr.select(by_area.pdf > 0, value / by_area.pdf, 0)
+        return dr.select(textured, by_area, ds), dr.select(textured, value, weight)
 
     def _piece(self, cell, x, active) -> tuple[mi.UInt32, mi.Float]:
         """The piece of ``cell`` at the number ``x``, and what is left of the number."""
@@ -186,7 +211,12 @@ class EmitterCells:
         """The cell that a ray from ``ref`` ran into at ``si``, and the density, conditional on the
         cell, with which :meth:`sample` gives that direction."""
         id = dr.reinterpret_array(mi.UInt32, ds.emitter)
-        pdf = (self._only or ds.emitter).pdf_direction(ref, ds, active)
+        textured = mi.Bool(False)
+        if self._has_textures:
+            textured = active & (dr.gather(mi.UInt32, self._is_textured_id, id, active) > 0)
+        pdf = (self._only or ds.emitter).pdf_direction(ref, ds, active & ~textured)
+        if self._has_textures:
+            pdf = dr.select(textured, si.shape.pdf_direction(ref, ds, textured), pdf)
         cell = dr.gather(mi.UInt32, self._first_cell, id, active)
         if not self._is_divided:
             return cell, dr.select(active, pdf, 0)

@@ -18,6 +18,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .spectra import brightness, some_wavelengths
+
 #: Cells of one emitter, at most.
 _MAX_CELLS = 64
 
@@ -26,6 +28,10 @@ _CELL_BUDGET = 1024
 
 #: An edge this much longer than a voxel is not worth a cut.
 _TOLERANCE = 0.25
+
+#: How much worse than sampling a texture it may be to sample cells of its light by area; and
+#: points along each edge of a cell by which that is decided.
+_UNEVENNESS, _TEXTURE_SAMPLES = 1.5, 16
 
 #: Cuts along each side of a triangle, at most.
 _MAX_CUTS = 8
@@ -45,6 +51,7 @@ class Division:
         face_first: First piece of each face in the order (face, row, column); shape [faces + 1].
         face_pieces: Where these pieces are found in ``pieces``.
         is_smooth: Do the interpolated normals of the mesh differ from those of its faces?
+        is_textured: Does the radiance vary? The *shape* then maps the unit square to its surface.
     """
 
     pieces: np.ndarray
@@ -55,6 +62,7 @@ class Division:
     face_first: np.ndarray | None = None
     face_pieces: np.ndarray | None = None
     is_smooth: bool = False
+    is_textured: bool = False
 
 
 #: Shapes whose cells are a grid in the unit square.
@@ -87,9 +95,15 @@ def _divide(
     is_area = emitter.class_name() == "AreaLight"
     if shape is None or not is_area:
         return whole
-    # Textured emitters sample their texture, whose map is not invertible from here
     if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
-        return whole
+        division = _divide_shape(shape, voxel, limit)
+        division.is_textured = True
+        return division if _is_even(emitter, shape, division) else whole
+    return _divide_shape(shape, voxel, limit)
+
+
+def _divide_shape(shape: mi.Shape, voxel: np.ndarray | None, limit: int) -> Division:
+    whole = Division(_WHOLE, np.ones(1, int))
     kind = _GRIDS.get(shape.class_name())
     if kind is None and shape.is_mesh() and shape.face_count() > 0:
         is_smooth = _is_smooth(shape)
@@ -105,6 +119,28 @@ def _divide(
         [x / columns, y / rows, np.full(x.shape, 1 / columns), np.full(x.shape, 1 / rows)], axis=1
     )
     return Division(pieces, np.ones(len(pieces), int), kind, (columns, rows))
+
+
+def _is_even(emitter: mi.Emitter, shape: mi.Shape, division: Division) -> bool:
+    """Is a textured emitter so even within its cells that sampling them by area, and choosing among
+    them, has at most ``_UNEVENNESS`` times the second moment of sampling the texture?"""
+    if len(division.cell_sizes) == 1:
+        return False
+    n = _TEXTURE_SAMPLES
+    x, y = np.meshgrid((np.arange(n) + 0.5) / n, (np.arange(n) + 0.5) / n)
+    grid = np.stack([x.ravel(), y.ravel()], axis=1)
+    pieces = division.pieces[:, None]
+    points = (pieces[..., :2] + grid * pieces[..., 2:]).reshape(-1, 2).T
+    ps = shape.sample_position(0.0, mi.Point2f(points.astype(np.float32)))
+    si = mi.SurfaceInteraction3f(ps, some_wavelengths(points.shape[1]))
+    si.wi = mi.Vector3f(0, 0, 1)
+    value = brightness(emitter.eval(si)).numpy().astype(np.float64).reshape(-1, n * n)
+    area = division.pieces[:, 2] * division.pieces[:, 3]
+    cell = np.repeat(np.arange(len(division.cell_sizes)), division.cell_sizes)
+    share, square = (np.bincount(cell, w) for w in (area, area * np.square(value).mean(axis=1)))
+    # Cells are chosen by the root of their mean square, texels by their radiance
+    by_texture = (area * value.mean(axis=1)).sum()
+    return np.sqrt(share * square).sum() ** 2 <= _UNEVENNESS * by_texture**2
 
 
 def _edges(shape: mi.Shape, kind: str) -> np.ndarray:

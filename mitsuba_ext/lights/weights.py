@@ -23,7 +23,7 @@ _POWER_SAMPLES = 256
 #: number.
 _VOXEL_POINTS, _SURFACE_POINTS = (1, 128), (2, 16)
 
-#: Evaluations of all cells in all rows, about, between these bounds; and again of the brighter ones.
+#: Evaluations of all cells in all rows, about, between these bounds; and again of the brighter.
 _EVALUATIONS = 1 << 22
 
 #: Added to the cosine at a surface, whose shading normal may differ.

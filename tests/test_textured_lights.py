@@ -1,0 +1,101 @@
+"""Large lights with a texture: divided where their cells are about even, whole otherwise."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from statistical import assert_same_mean, batches
+
+from mitsuba_ext.lights.light_cells import LightCells
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+LANES = 1 << 18
+
+
+def _texture(spots: bool) -> dict:
+    """A gradient in two directions that differs by colour, or a few bright texels on black."""
+    y, x = np.mgrid[0:32, 0:64]
+    image = np.stack([x / 64, y / 32, 1 - x / 64], axis=-1) + 0.1
+    if spots:
+        image *= ((x % 13 == 5) & (y % 11 == 3))[..., None]
+    return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(image.astype(np.float32))}
+
+
+@pytest.fixture(params=["rectangle", "mesh"])
+def surface(request: pytest.FixtureRequest, tmp_path) -> dict:
+    """A rectangle, or the same as four triangles with texture coordinates."""
+    if request.param == "rectangle":
+        return {"type": "rectangle"}
+    corners = [(-1, -1), (1, -1), (1, 1), (-1, 1), (0.2, -0.1)]
+    lines = [f"v {x} {y} 0" for x, y in corners]
+    lines += [f"vt {(x + 1) / 2} {(y + 1) / 2}" for x, y in corners]
+    lines += [f"f {a}/{a} {b}/{b} 5/5" for a, b in ((1, 2), (2, 3), (3, 4), (4, 1))]
+    (tmp_path / "light.obj").write_text("\n".join(lines) + "\n")
+    return {"type": "obj", "filename": str(tmp_path / "light.obj"), "face_normals": True}
+
+
+def _scene(surface: dict, spots: bool = False, **more) -> mi.Scene:
+    """A light of 6 by 4 above the origin, tilted."""
+    T = mi.ScalarTransform4f
+    to_world = T().translate([0.5, 0, 2]).rotate([0, 1, 0], 165).scale([3, 2, 1])
+    emitter = {"type": "area", "radiance": _texture(spots)}
+    light = {**surface, "to_world": to_world, "emitter": emitter}
+    return mi.load_dict({"type": "scene", "light": light, **more})
+
+
+def test_a_texture_with_spots_is_sampled_by_mitsuba(surface: dict):
+    scene = _scene(surface, spots=True)
+    assert LightCells(scene, mi.Vector3f(1.0)).count == 1
+    assert LightCells(_scene(surface), None).count == 1, "what is not divided samples its texture"
+
+
+def test_cells_of_a_gradient_bring_what_rays_find(surface: dict):
+    scene = _scene(surface)
+    cells = LightCells(scene, mi.Vector3f(1.0))
+    assert cells.count >= 20 and cells.share.sum() == pytest.approx(1)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, LANES)
+    ref = dr.zeros(mi.Interaction3f, LANES)
+    ref.p = mi.Point3f(0.1, -0.2, 0)
+
+    # All directions; the cells that they run into
+    ray = mi.Ray3f(ref.p, mi.warp.square_to_uniform_sphere(sampler.next_2d()))
+    si = scene.ray_intersect(ray)
+    ds = mi.DirectionSample3f(scene, si, ref)
+    hit, pdf = cells.pdf(ref, si, ds, si.is_valid())
+    value = mi.luminance(si.emitter(scene).eval(si)) * 4 * np.pi
+    rays = np.bincount(hit.numpy(), np.where(si.is_valid().numpy(), value.numpy(), 0), cells.count)
+
+    # Each cell sampled by itself: the same light, the same density, and found again
+    cell = dr.arange(mi.UInt32, LANES) % cells.count
+    ds, weight = cells.sample(cell, ref, sampler.next_2d(), mi.Bool(True))
+    samples = np.bincount(cell.numpy(), mi.luminance(weight).numpy())
+    share = np.bincount(cell.numpy())
+    assert samples / share == pytest.approx(rays / LANES, rel=0.08, abs=2e-3)
+    assert samples.sum() / share.mean() == pytest.approx(rays.sum() / LANES, rel=0.01)
+    met = scene.ray_intersect(mi.Ray3f(ref.p, ds.d))
+    again, density = cells.pdf(ref, met, mi.DirectionSample3f(scene, met, ref), met.is_valid())
+    assert (again == cell).numpy().mean() > 0.9999
+    assert np.median(np.abs((density / ds.pdf).numpy() - 1)) < 1e-4
+
+
+@pytest.mark.parametrize("spots", [False, True])
+def test_the_mean_is_that_of_path(surface: dict, spots: bool):
+    scene = _scene(
+        surface, spots,
+        floor={"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)},
+        ball={"type": "sphere", "radius": 0.5, "center": [0, 0, 0.6]},
+        # A light without a texture is another branch
+        lamp={"type": "sphere", "radius": 0.2, "center": [-2, 1, 1],
+              "emitter": {"type": "area", "radiance": 3.0}},
+        sensor={"type": "perspective", "fov": 50, "film": {
+            "type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}},
+            "to_world": mi.ScalarTransform4f().look_at([0, -6, 3], [0, 0, 1], [0, 0, 1])},
+    )  # fmt: skip
+    neepp = mi.load_dict({"type": "neepp", "max_depth": 3, "grid": 8})
+    images = batches(scene, neepp, 64, range(1, 17))
+    reference = batches(scene, mi.load_dict({"type": "path", "max_depth": 3}), 64, range(100, 116))
+    assert_same_mean(images, reference, precision=0.01)
