@@ -44,11 +44,11 @@ class NEEPlusPlus(WalkIntegrator):
        - Voxels along each axis of the region in which paths scatter (of the scene's bounding box,
          where :monosp:`light_sampling` is not learned). (Default: 16, or fewer where the pilot has
          few samples for the voxels that it sees and the lights; 16 for rejection without learned
-         light sampling, 32 for :monosp:`spatial`)
+         light sampling; 32, or what fits into the memory, for :monosp:`spatial`)
      * - max_memory
        - |float|
-       - Memory for what is learned, in MiB. Where :monosp:`grid` needs more, a coarser grid is
-         used, with a warning. (Default: 256)
+       - Memory for what is learned, and for the table of :monosp:`spatial`, in MiB. Where
+         :monosp:`grid` needs more, a coarser grid is used, with a warning. (Default: 512)
      * - pilot_spp
        - |int|
        - Samples per pixel from which is learned, at most a quarter of all. They count towards the

@@ -15,8 +15,9 @@ tile, image                 variance of the mean of the pixel's tile, and of the
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -38,12 +39,13 @@ class Regression:
 
     integrator: str
     scene: str
+    parameters: dict[str, Any] = field(default_factory=dict)
     max_depth: int = 6
     spp: int = 128
 
     @property
     def name(self) -> str:
-        return f"{self.integrator}_{self.scene}"
+        return "_".join(map(str, [self.integrator, *self.parameters.values(), self.scene]))
 
     @property
     def reference(self) -> Path:
@@ -56,8 +58,13 @@ REGRESSIONS = {
         Regression("composed_path", "cornell_box"),
         Regression("composed_path", "mirrors_and_glass"),
         Regression("composed_path", "sunny_gloss", max_depth=3),
+        Regression("composed_path", "rooms", {"next_event": "spatial"}),
+        Regression("composed_path", "rooms", {"next_event": "linear"}),
         Regression("neepp", "door_ajar"),
         Regression("neepp", "rooms"),
+        Regression("neepp", "rooms", {"light_sampling": "visibility"}, spp=256),
+        Regression("neepp", "many_lamps", spp=384),
+        Regression("neepp", "window"),
         Regression("neepp", "open"),
     )
 }
@@ -68,8 +75,9 @@ def render(regression: Regression, seeds: range) -> np.ndarray:
     from statistical import batches, load
 
     scene = load(regression.scene, width=32, height=18)
-    parameters = {"type": regression.integrator, "max_depth": regression.max_depth}
-    return batches(scene, mi.load_dict(parameters), regression.spp, seeds)
+    integrator = {"type": regression.integrator, "max_depth": regression.max_depth}
+    integrator |= regression.parameters
+    return batches(scene, mi.load_dict(integrator), regression.spp, seeds)
 
 
 def regenerate(regression: Regression) -> None:

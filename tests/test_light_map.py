@@ -266,8 +266,21 @@ def test_the_grid_follows_the_number_of_samples_and_the_memory():
         return len(_learner(scene, **parameters)._map.tests)
 
     assert entries(pilot_samples=1000) < entries(pilot_samples=100_000)
-    assert entries(grid=64, max_memory=2**20) * 32 <= 2**20
+    assert entries(grid=64, max_memory=2**22) * 128 <= 2**22
     assert entries(grid=64) > entries(grid=8)
+
+
+def test_voxels_of_a_selection_without_learning_fit_into_the_memory():
+    scene = _floor(**{f"lamp_{i}": _lamp(i / 40 - 1, 0, 1, size=0.01) for i in range(80)})
+
+    def rows(**parameters) -> int:
+        integrator = mi.load_dict(
+            {"type": "composed_path", "next_event": "spatial", **parameters}
+        )
+        return integrator.decisions(scene)["next_event"].rows.count
+
+    assert 1 < rows(max_memory=0.5) <= 2**19 / 40 / 80 < rows()
+    assert rows(grid=1) == 2
 
 
 def test_the_same_seed_learns_bitwise_the_same(tmp_path: Path):

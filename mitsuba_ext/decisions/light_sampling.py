@@ -13,7 +13,7 @@ from ..learning.voxel_grid import VoxelGrid
 from ..lights.light_cells import LightCells
 from ..lights.weights import VoxelRows, power_weights, spatial_weights
 from .light_learner import LightLearner
-from .light_selection import LightSelection, OneRow
+from .light_selection import TABLE_BYTES, LightSelection, OneRow
 from .linear_selection import LinearSelection
 from .visibility_roulette import VisibilityLearner, has_lights_at_points
 
@@ -68,7 +68,7 @@ class LightSampling:
             rejection=rejection,
             # Chosen later where the scene does not say
             grid=get(props, "grid", 1, minimum=1, maximum=1024) if "grid" in props else 0,
-            max_memory=get(props, "max_memory", 256.0, minimum=1e-3),
+            max_memory=get(props, "max_memory", 512.0, minimum=1e-3),
             pilot_spp=get(props, "pilot_spp", 16, minimum=0),
             refine=get(props, "refine", 16, minimum=0, maximum=1024),
             law=get(props, "law", "affine", choices=("affine", "paper")),
@@ -88,10 +88,25 @@ class LightSampling:
             cells = LightCells(scene, None)
             return {"next_event": LightSelection(OneRow(), cells, power_weights(scene, cells))}
         if self.light_sampling == "spatial" and scene.shapes() and scene.bbox().valid():
-            rows = VoxelRows(VoxelGrid(scene, self.grid or _SPATIAL_GRID))
             cells = LightCells(scene, None)
+            rows = self._voxel_rows(scene, cells.count)
             return {"next_event": LightSelection(rows, cells, spatial_weights(scene, rows, cells))}
         return {}
+
+    def _voxel_rows(self, scene: mi.Scene, cells: int) -> VoxelRows:
+        """Voxels for ``spatial``, not more than there is memory for."""
+        grid = self.grid or _SPATIAL_GRID
+        rows = VoxelRows(VoxelGrid(scene, grid))
+        limit = self.max_memory * 2**20 / (cells * TABLE_BYTES)
+        while rows.count > limit and rows.voxels.resolution > 1:
+            rows = VoxelRows(VoxelGrid(scene, int(0.8 * rows.voxels.resolution)))
+        if self.grid > rows.voxels.resolution:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"The table of grid={grid} would exceed max_memory={self.max_memory:g} MiB: "
+                f"grid={rows.voxels.resolution} is used.",
+            )
+        return rows
 
     def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
         """The samples of the pilots, at most a quarter of all: beyond that there is little left to

@@ -12,6 +12,12 @@ from ..lights.light_cells import LightCells
 from ..lights.searching import alias_tables
 from .defaults import EmitterSampling
 
+#: Entries of a table that are computed together: they need some memory.
+_ENTRIES_AT_ONCE = 1 << 20
+
+#: Bytes of an entry, and of the weights that it is made of while they are computed.
+TABLE_BYTES = 40
+
 
 class Rows(Protocol):
     """What decides which row of a table a surface point uses."""
@@ -58,23 +64,9 @@ class LightSelection(EmitterSampling):
 
     def __init__(self, rows: Rows, cells: LightCells, weights: mi.Float) -> None:
         self.rows, self.cells = rows, cells
-        count = cells.count
-        weights = mi.Float64(weights)
-        total = dr.repeat(dr.block_sum(weights, count), count)
-        relative = dr.select(total > 0, weights * (count / total), 1)
-        entry = dr.arange(mi.UInt32, rows.count * count)
-        first = entry - entry % count
-        threshold, alias = alias_tables(relative, first, first + (count - 1), count)
-        probability = mi.Float(relative / count)
-        dr.eval(threshold, alias, probability)
-        # Side by side: what a draw needs is read with one access to memory
-        own = dr.reinterpret_array(mi.Float, alias - first)
-        self._table = dr.ravel(
-            mi.Vector4f(threshold, own, probability, dr.gather(mi.Float, probability, alias))
-        )
-        dr.eval(self._table)
+        self._table = _table(weights, rows.count, cells.count)
         # Opaque: scenes that differ in it only share their kernels
-        self._count = dr.opaque(mi.UInt32, count)
+        self._count = dr.opaque(mi.UInt32, cells.count)
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Choice:
         return Choice(mi.UInt32(0), mi.UInt32(0), mi.Float(0))
@@ -103,6 +95,28 @@ class LightSelection(EmitterSampling):
         probability = dr.gather(mi.Float, self._table, 4 * entry + 2, active)
         # Also where the lookups above were masked, the density must be a number
         return dr.select(active, pdf * probability, 0)
+
+
+def _table(weights: mi.Float, rows: int, count: int) -> mi.Float:
+    """For each entry of an alias table its threshold, the cell of its alias, its own probability
+    and that of the alias. Side by side: a draw reads them with one access to memory."""
+    table = dr.empty(mi.Float, 4 * rows * count)
+    step = max(1, _ENTRIES_AT_ONCE // count)
+    for begin in range(0, rows, step):
+        entry = dr.arange(mi.UInt32, min(step, rows - begin) * count)
+        offset = dr.opaque(mi.UInt32, begin * count)
+        part = mi.Float64(dr.gather(mi.Float, weights, entry + offset))
+        total = dr.repeat(dr.block_sum(part, count), count)
+        relative = dr.select(total > 0, part * (count / total), 1)
+        first = entry - entry % count
+        threshold, alias = alias_tables(relative, first, first + (count - 1), count)
+        probability = mi.Float(relative / count)
+        dr.eval(threshold, alias, probability)
+        cell = dr.reinterpret_array(mi.Float, alias - first)
+        values = mi.Vector4f(threshold, cell, probability, dr.gather(mi.Float, probability, alias))
+        dr.scatter(table, values, entry + offset)
+        dr.eval(table)
+    return table
 
 
 def _if(active: mi.Bool, function, arguments: tuple) -> mi.Float:

@@ -31,8 +31,9 @@ _ENOUGH_TESTS, _TESTS_PER_SAMPLE = 32, 2
 #: Relative variance of a row, at most: few dark ones must not decide for all.
 _MOST_VARIANCE = 100.0
 
-#: Bytes of an entry: the expectation, the counters, and the tables that are made of them.
-BYTES_PER_ENTRY = 32
+#: Bytes of an entry, at most: the expectation, the counters, the table that is made of them, and
+#: what that takes in between.
+BYTES_PER_ENTRY = 128
 
 
 class LightMap(Observer):
