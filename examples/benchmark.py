@@ -22,13 +22,12 @@ import mitsuba as mi  # isort: skip
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "scenes"
 
-#: ``path``, the strongest selection that learns nothing, rejection alone, light sampling, and both.
+#: ``path``, the strongest selection that learns nothing, rejection alone, and learned selection.
 INTEGRATORS = {
     "path": "path",
     "spatial": "composed_path:next_event=spatial",
     "rejection": "neepp:light_sampling=uniform,rejection=true",
     "neepp": "neepp",
-    "both": "neepp:rejection=true",
 }
 
 #: Our scenes, at their own size.
@@ -55,7 +54,7 @@ FIGURE = ROOT / "examples" / "figures" / "efficiency.svg"
 
 @click.command()
 @click.argument("names", nargs=-1)
-@click.option("--spp", default=64, show_default=True, help="Samples per pixel of each run.")
+@click.option("--spp", default=128, show_default=True, help="Samples per pixel of each run.")
 @click.option("--seeds", default=3, show_default=True, help="Runs of each integrator.")
 @click.option("--reference-spp", default=4096, show_default=True, help="Of our scenes.")
 @click.option("--integrator", "integrators", multiple=True, help="Instead of the standard ones.")
@@ -150,8 +149,8 @@ def _write_figure(results: dict[str, Any]) -> None:
         values = [ratio["value"] for ratio in ratios]
         errors = [[ratio["value"] - ratio["low"] for ratio in ratios],
                   [ratio["high"] - ratio["value"] for ratio in ratios]]
-        rows = [row + 0.18 * (number - 1.5) for row in range(len(scenes))]
-        axes.errorbar(values, rows, xerr=errors, fmt="osD^"[number], capsize=3, label=label)
+        rows = [row + 0.2 * (number - 1) for row in range(len(scenes))]
+        axes.errorbar(values, rows, xerr=errors, fmt="osD"[number], capsize=3, label=label)
     axes.axvline(1, color="gray", linewidth=0.8)
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(ticker.MaxNLocator(8))

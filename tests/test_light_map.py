@@ -210,7 +210,7 @@ def test_of_a_large_pilot_a_part_is_recorded():
         assert int(light_map.squares[0]) / int(light_map.tests[0]) > 0
         recorded.append(int(light_map.tests[0]))
     # Four entries want 128 tests; there are two for each sample
-    assert recorded == [lanes, lanes, pytest.approx(lanes / 156, rel=0.01)]
+    assert recorded == [lanes, lanes, pytest.approx(lanes / 156, rel=0.05)]
 
 
 def test_the_roulette_reads_the_chosen_cell():

@@ -73,11 +73,11 @@ class LightSelection(EmitterSampling):
 
     def sample(self, state, scene, sampler, si, active):
         row = self.rows.row(si, active)
-        x = sampler.next_1d()
-        x *= mi.Float(self._count)
-        cell = dr.minimum(mi.UInt32(x), self._count - 1)
+        # Two numbers: what is left of one, after choosing among many entries, is too coarse
+        x, y = sampler.next_2d()
+        cell = dr.minimum(mi.UInt32(x * mi.Float(self._count)), self._count - 1)
         entry = dr.gather(mi.Vector4f, self._table, row * self._count + cell, active)
-        is_taken = x - mi.Float(cell) < entry[0]
+        is_taken = y < entry[0]
         cell = dr.select(is_taken, cell, dr.reinterpret_array(mi.UInt32, entry[1]))
         probability = dr.select(is_taken, entry[2], entry[3])
         ds, weight = self.cells.sample(cell, si, sampler.next_2d(), active)

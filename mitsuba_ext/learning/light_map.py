@@ -71,7 +71,9 @@ class LightMap(Observer):
     # ---- Observer of the walk ----
 
     def begin(self, lanes: int) -> None:
-        self._is_recorded = dr.arange(mi.UInt32, lanes) % self._stride == 0
+        # Scattered: lanes that follow each other are the samples of one pixel, row by row
+        scattered = (dr.arange(mi.UInt32, lanes) * 0x9E3779B9) >> 8
+        self._is_recorded = scattered % self._stride == 0
 
     def connection(
         self,
@@ -180,7 +182,9 @@ class LightMap(Observer):
         """
         count = self.cells.count
         visibility = self.visibility()
-        square = dr.square(self.unoccluded) * self._square(visibility)
+        # In units of the row: squares of any light's brightness are numbers then
+        row = dr.repeat(dr.block_sum(self.unoccluded, count), count)
+        square = dr.square(self.unoccluded / row) * self._square(visibility)
         # What a cell brings on average, if all that arrives of it is alike
         mean = dr.block_sum(dr.sqrt(square * visibility), count)
         vertices = mi.Float(dr.block_sum(self.tests, count))
@@ -188,7 +192,8 @@ class LightMap(Observer):
         for p in selections:
             second_moment = dr.block_sum(dr.select(p > 0, square / p, 0), count)
             variance = dr.clip(second_moment / dr.square(mean) - 1, 0, _MOST_VARIANCE)
-            total = dr.sum(dr.select(mean > 0, vertices * variance, 0))
+            is_known = (vertices > 0) & dr.isfinite(variance)
+            total = dr.sum(dr.select(is_known, vertices * variance, 0))
             results.append(float(total[0]) / max(1.0, float(dr.sum(vertices)[0])))
         return results
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
+import zlib
 from pathlib import Path
 
 import drjit as dr
@@ -15,6 +16,9 @@ from .light_map import LightMap
 from .surface_rows import SurfaceRows, voxel_edges
 
 _FORMAT = 1
+
+#: What a file holds besides its format.
+_ARRAYS = {"scene", "bbox", "resolution", "p", "n", "tests", "successes", "squares"}
 
 
 def save(path: Path, scene: mi.Scene, light_map: LightMap) -> None:
@@ -46,11 +50,11 @@ def load(path: Path, scene: mi.Scene, samples: int = 0) -> LightMap:
     try:
         with np.load(path) as data:
             stored = dict(data)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         if isinstance(error, FileNotFoundError):
             raise FileNotFoundError(f'there is no light map "{path}"') from None
         raise ValueError(f'"{path}" is not a light map: {error}') from None
-    if stored.get("format") != _FORMAT:
+    if stored.get("format") != _FORMAT or not stored.keys() >= _ARRAYS:
         raise ValueError(f'"{path}" is not a light map of this version')
     if str(stored["scene"]) != fingerprint(scene):
         raise ValueError(

@@ -237,8 +237,10 @@ class EnvironmentBins:
         """
         bin_row = bin // self._bins[0]
         bin_column = bin - bin_row * self._bins[0]
-        column, x = _entry(bin_column, self._bins[0], self._columns, sample.x)
-        row, y = _entry(bin_row, self._bins[1], self._rows, sample.y)
+        column, x, width = _entry(bin_column, self._bins[0], self._columns, sample.x)
+        row, y, _height = _entry(bin_row, self._bins[1], self._rows, sample.y)
+        # What is left of a number is coarse; thresholds of dark texels beside the sun are small
+        x = dr.minimum(dr.fma(y, width * 2.0**-23, x), ONE_MINUS_EPSILON)
         texel = row * self._columns + column
         entry = dr.gather(mi.Vector2u, self._entries, texel, active)
         threshold = dr.reinterpret_array(mi.Float, entry.x)
@@ -267,11 +269,12 @@ class EnvironmentBins:
         return mi.Point2f(u - dr.floor(u), dr.atan2(sin_theta, v.y) * dr.inv_pi), sin_theta
 
 
-def _entry(part, parts: int, count: int, x: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-    """One of the columns (or rows) of a bin, each as likely as the others, and what is left of the
-    random number. All ``count`` columns are divided into ``parts``; the bin's are ``part``."""
+def _entry(part, parts: int, count: int, x: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+    """One of the columns (or rows) of a bin, each as likely as the others, what is left of the
+    random number, and the number of columns. All ``count`` columns are divided into ``parts``; the
+    bin's are ``part``."""
     first = (part * count + (parts - 1)) // parts
     width = ((part + 1) * count + (parts - 1)) // parts - first
     x = x * mi.Float(width)
     index = dr.minimum(mi.UInt32(x), width - 1)
-    return first + index, dr.minimum(x - mi.Float(index), ONE_MINUS_EPSILON)
+    return first + index, dr.minimum(x - mi.Float(index), ONE_MINUS_EPSILON), mi.Float(width)

@@ -87,16 +87,17 @@ def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) ->
     """The root of the mean square of what each cell contributes to a white diffuse surface of each
     row if nothing is in between; shape [rows · cells]."""
 
-    def squared_contribution(row: mi.UInt32, cell: mi.UInt32, sampler: mi.Sampler) -> mi.Float:
+    def squared_contribution(row: mi.UInt32, cell: mi.UInt32, sampler: mi.Sampler) -> mi.Float64:
         size = dr.gather(mi.UInt32, rows.size, row)
         index = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(size)), size - 1)
         index += dr.gather(mi.UInt32, rows.first, row)
         value, d = _light(cells, cell, dr.gather(mi.Point3f, rows.p, index), sampler)
         cosine = dr.maximum(dr.dot(d, dr.gather(mi.Normal3f, rows.n, index)), 0) + _LEAST_COSINE
-        return dr.square(value * cosine)
+        # In double precision: the square of what shines brightly may be no single one
+        return dr.square(mi.Float64(value * cosine))
 
     means = _means(rows.count - 1, cells.count, _SURFACE_POINTS, squared_contribution)
-    return _with_last_row(scene, cells, dr.sqrt(means))
+    return _with_last_row(scene, cells, mi.Float(dr.sqrt(means)))
 
 
 def _light(
@@ -116,8 +117,8 @@ def _means(
     rows: int,
     cells: int,
     bounds: tuple[int, int],
-    measure: Callable[[mi.UInt32, mi.UInt32, mi.Sampler], mi.Float],
-) -> mi.Float:
+    measure: Callable[[mi.UInt32, mi.UInt32, mi.Sampler], mi.Float | mi.Float64],
+) -> mi.Float | mi.Float64:
     """The mean of ``measure(row, cell, sampler)`` over samples, for each row and cell; shape
     [rows · cells]. Where there is not the time for many samples of all, those above the mean of
     their row have them.
@@ -132,7 +133,7 @@ def _means(
         row_mean = dr.repeat(dr.block_sum(means, cells), cells) / cells
         important = dr.compress(means > row_mean)
         more = _sample_count(len(important), bounds)
-        if more > samples:
+        if len(important) > 0 and more > samples:
             dr.scatter(means, _means_of(important, cells, more, measure), important)
     return means
 
@@ -141,7 +142,9 @@ def _sample_count(pairs: int, bounds: tuple[int, int]) -> int:
     return max(bounds[0], min(bounds[1], _EVALUATIONS // max(1, pairs)))
 
 
-def _means_of(pairs: mi.UInt32, cells: int, samples: int, measure: Callable) -> mi.Float:
+def _means_of(
+    pairs: mi.UInt32, cells: int, samples: int, measure: Callable
+) -> mi.Float | mi.Float64:
     sampler = mi.load_dict({"type": "independent"})
     step = max(1, _CHUNK // samples)
     parts = []
@@ -158,15 +161,19 @@ def _means_of(pairs: mi.UInt32, cells: int, samples: int, measure: Callable) -> 
 
 
 def _with_last_row(scene: mi.Scene, cells: LightCells, weights: mi.Float) -> mi.Float:
-    """Honours ``sampling_weight``, gives no cell less than a share of its row's mean, and appends
-    the row of all other points, which is the mean of the others."""
+    """Honours ``sampling_weight``, gives no cell less than a share of its row's mean (in a row that
+    nothing reaches, the same to all), and appends the row of all other points, which is the mean of
+    the others."""
     count = cells.count
     sampling_weight = np.array([e.sampling_weight() for e in scene.emitters()], dtype=np.float32)
     factor = mi.Float(sampling_weight[cells.emitter_index])
     cell = dr.arange(mi.UInt32, len(weights)) % count
-    weights *= dr.gather(mi.Float, factor, cell)
+    factor = dr.gather(mi.Float, factor, cell)
+    weights *= factor
     mean = dr.repeat(dr.block_sum(weights, count), count) / count
-    weights = dr.maximum(weights, _FLOOR * mean)
-    weights = dr.select(dr.gather(mi.Float, factor, cell) > 0, weights, 0)
-    last = weights.numpy().reshape(-1, count).mean(axis=0)
+    typical = dr.sum(mean) / len(mean)
+    fallback = dr.select(typical > 0, typical, 1)
+    weights = dr.select(mean > 0, dr.maximum(weights, _FLOOR * mean), fallback)
+    weights = dr.select(factor > 0, weights, 0)
+    last = weights.numpy().reshape(-1, count).mean(axis=0, dtype=np.float64)
     return dr.concat([weights, mi.Float(last)])

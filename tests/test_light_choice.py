@@ -1,0 +1,170 @@
+"""The choice of a light: weights, probabilities, densities, and when learning is given up."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from lights import ball
+from test_light_map import _floor, _lamp, _learner, _map, _observe, _row, _surface
+
+from mitsuba_ext.decisions.defaults import EmitterSampling
+from mitsuba_ext.decisions.light_selection import LightSelection, OneRow
+from mitsuba_ext.lights import weights as lights_weights
+from mitsuba_ext.lights.light_cells import LightCells
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def _sampler(lanes: int) -> mi.Sampler:
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, lanes)
+    return sampler
+
+
+# ---- Probabilities and densities ----
+
+
+def test_the_density_of_a_light_that_is_hit_is_that_of_choosing_it():
+    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1), c=_lamp(-0.5, 0, 1)))
+    scene = light_map.cells._emitters._scene
+    weights = np.tile([1, 2, 5], light_map.rows.count).astype(np.float32)
+    selection = LightSelection(light_map.rows, light_map.cells, mi.Float(weights))
+    lanes = 1 << 12
+    si = _surface((0.1, 0.1, 0), width=lanes)
+    ds, _weight, choice = selection.sample(None, scene, _sampler(lanes), si, mi.Bool(True))
+    hit = scene.ray_intersect(si.spawn_ray(ds.d))
+    found = mi.DirectionSample3f(scene, hit, si)
+    pdf, _ = selection.pdf(choice, scene, si, hit, found, mi.Bool(True))
+    # At the edge of a cell, rounding may find its neighbour
+    assert np.mean(np.isclose(pdf.numpy(), ds.pdf.numpy(), rtol=1e-3)) > 0.99
+
+
+class _Cells:
+    """Cells of which only the number matters."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def sample(self, cell, si, x, active):
+        return dr.zeros(mi.DirectionSample3f, dr.width(cell)), mi.Color3f(1)
+
+
+@pytest.mark.parametrize("count", [10_000, 16_384])
+def test_dim_lights_among_many_are_chosen_as_often_as_is_said(count: int):
+    lanes, rounds = 1 << 22, 8
+    weights = np.full(count, 1e-3, np.float32) * np.linspace(0.9, 1.1, count, dtype=np.float32)
+    weights[::20] = 20
+    selection = LightSelection(OneRow(), _Cells(count), mi.Float(weights))
+    sampler, si = _sampler(lanes), dr.zeros(mi.SurfaceInteraction3f, lanes)
+    chosen = np.zeros(count)
+    for _ in range(rounds):
+        choice = selection.sample(None, None, sampler, si, mi.Bool(True))[2]
+        chosen += np.bincount(choice.cell.numpy(), minlength=count)
+    expected = rounds * lanes * weights / weights.sum(dtype=float)
+    is_dim = weights < 1
+    total = expected[is_dim].sum()
+    assert abs(chosen[is_dim].sum() - total) < 5 * np.sqrt(total)
+    # Each of them, too: about three times, or not at all
+    assert np.mean(np.square(chosen - expected)[is_dim] / expected[is_dim]) == pytest.approx(1, 0.1)
+
+
+def test_no_light_has_less_than_its_defensive_share():
+    learner = _learner(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
+    light_map = learner._map
+    _observe(light_map, 0, 0, 100_000, 0.0)
+    _observe(light_map, 1, 100_000, 0, _row(light_map, light_map.unoccluded)[1])
+    p = _row(light_map, learner._probabilities(light_map.weights("contribution")))
+    assert p.min() >= 0.99 * 0.05 / light_map.cells.count and p.sum() == pytest.approx(1)
+
+
+def test_lights_without_sampling_weight_stay_dark_where_no_other_light_arrives():
+    look = mi.ScalarTransform4f().look_at([-0.8, 0, 1], [-0.8, 0, 0], [0, 1, 0])
+    scene = _floor(
+        spot={"type": "spot", "cutoff_angle": 15, "to_world": look},
+        off={"type": "point", "position": [0.5, 0, 1], "sampling_weight": 0.0},
+    )
+    learner = _learner(scene, grid=8)
+    selection = LightSelection(
+        learner._map.rows, learner._map.cells, learner._probabilities(learner._map.unoccluded)
+    )
+    lanes = 1 << 12
+    si = _surface((0.6, 0.1, 0), width=lanes)
+    _ds, weight, choice = selection.sample(None, scene, _sampler(lanes), si, mi.Bool(True))
+    assert not weight.numpy().any() and bool(dr.all(choice.probability == 1))
+
+
+# ---- Weights before anything is learned ----
+
+
+def test_the_default_of_a_divided_light_is_its_area():
+    scene = _floor(wide=_lamp(0, 0, 1, size=1.0), small=_lamp(0, 0, 0.5))
+    cells = LightCells(scene, mi.Vector3f(0.5))
+    weights = lights_weights.uniform_weights(scene, cells).numpy()
+    assert cells.count > 4
+    assert np.bincount(cells.emitter_index, weights) == pytest.approx(np.ones(2))
+
+
+def test_other_points_expect_the_mean_of_all_rows_and_sampling_weights_count():
+    lamps = {"a": _lamp(0.3, 0, 1), "b": _lamp(-0.3, 0, 1)}
+    table = _map(_floor(**lamps)).unoccluded.numpy().reshape(-1, 2)
+    assert table[-1] == pytest.approx(table[:-1].mean(axis=0), rel=1e-4) and (table[-1] > 0).all()
+    lamps["a"]["emitter"]["sampling_weight"] = 3.0
+    other = _map(_floor(**lamps)).unoccluded.numpy().reshape(-1, 2)
+    # The order of emitters differs from one loading to the next
+    assert np.sort(other.sum(axis=0) / other.sum()) == pytest.approx([0.25, 0.75], abs=0.04)
+
+
+@pytest.mark.parametrize("radiance", [1e-24, 1e21])
+def test_expectations_of_extreme_lights_are_numbers(radiance: float):
+    scene = _floor(a=_lamp(0, 0, 1, radiance=radiance), b=_lamp(0.5, 0, 1, radiance=radiance))
+    light_map = _map(scene)
+    table = light_map.unoccluded.numpy()
+    assert np.isfinite(table).all() and (table > 0).all()
+    _observe(light_map, 0, 100, 0, _row(light_map, light_map.unoccluded)[0])
+    equal = mi.Float(np.full(len(table), 0.5))
+    assert 0 < light_map.relative_variances(equal)[0] < 10
+
+
+@pytest.mark.parametrize("evaluations, runs", [(1 << 22, 1), (200, 2)])
+def test_important_pairs_are_measured_again_as_themselves(monkeypatch, evaluations, runs):
+    monkeypatch.setattr(lights_weights, "_EVALUATIONS", evaluations)
+    calls = []
+
+    def measure(row, cell, sampler):
+        calls.append(dr.width(row))
+        return mi.Float(10 * row + cell)
+
+    means = lights_weights._means(10, 5, (2, 16), measure).numpy().reshape(10, 5)
+    assert np.array_equal(means, 10 * np.arange(10)[:, None] + np.arange(5))
+    assert len(calls) == runs
+
+
+def test_pairs_that_are_all_alike_are_not_measured_again(monkeypatch):
+    monkeypatch.setattr(lights_weights, "_EVALUATIONS", 200)
+    means = lights_weights._means(
+        50, 2, (2, 16), lambda row, cell, sampler: dr.full(mi.Float, 1, dr.width(row))
+    )
+    assert (means.numpy() == 1).all()
+
+
+# ---- Giving up ----
+
+
+@pytest.mark.parametrize("grid, ends", [(0, True), (4, False)])
+def test_learning_that_does_not_pay_ends_with_the_choice_of_path_unless_needed(grid, ends):
+    scene = _floor(a=_lamp(-0.1, 0, 50), b=_lamp(0.1, 0, 50))  # nothing to choose between
+    learner = _learner(scene, grid=grid)
+    for cell in (0, 1):
+        _observe(learner._map, cell, 1000, 0, _row(learner._map, learner._map.unoccluded)[cell])
+    decisions = learner.learn(scene, is_last=False)
+    assert (type(decisions["next_event"]) is EmitterSampling) == ends
+    assert ("not used" in str(learner)) == ends and (learner._map is None) == ends
+
+
+def test_smooth_meshes_are_sampled_by_their_triangles_even_where_nothing_is_gained():
+    assert not _learner(_floor(a=_lamp(0, 0, 1)))._is_needed
+    light = {**ball(16, 8, smooth=True), "emitter": {"type": "area"}}
+    learner = _learner(mi.load_dict({"type": "scene", "ball": light}))
+    assert learner._is_needed and learner._map is not None
