@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from lights import ball
-from test_light_map import _floor, _lamp, _learner, _map, _observe, _row, _surface
+from maps import floor, lamp, learner_of, map_of, observe, row_of, surface
 
 from mitsuba_ext.decisions.defaults import EmitterSampling
 from mitsuba_ext.decisions.light_selection import LightSelection, OneRow
@@ -27,12 +27,12 @@ def _sampler(lanes: int) -> mi.Sampler:
 
 
 def test_the_density_of_a_light_that_is_hit_is_that_of_choosing_it():
-    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1), c=_lamp(-0.5, 0, 1)))
+    light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1), c=lamp(-0.5, 0, 1)))
     scene = light_map.cells._emitters._scene
     weights = np.tile([1, 2, 5], light_map.rows.count).astype(np.float32)
     selection = LightSelection(light_map.rows, light_map.cells, mi.Float(weights))
     lanes = 1 << 12
-    si = _surface((0.1, 0.1, 0), width=lanes)
+    si = surface((0.1, 0.1, 0), width=lanes)
     ds, _weight, choice = selection.sample(None, scene, _sampler(lanes), si, mi.Bool(True))
     hit = scene.ray_intersect(si.spawn_ray(ds.d))
     found = mi.DirectionSample3f(scene, hit, si)
@@ -71,26 +71,26 @@ def test_dim_lights_among_many_are_chosen_as_often_as_is_said(count: int):
 
 
 def test_no_light_has_less_than_its_defensive_share():
-    learner = _learner(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
+    learner = learner_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1)))
     light_map = learner._map
-    _observe(light_map, 0, 0, 100_000, 0.0)
-    _observe(light_map, 1, 100_000, 0, _row(light_map, light_map.unoccluded)[1])
-    p = _row(light_map, learner._probabilities(light_map.weights("contribution")))
+    observe(light_map, 0, 0, 100_000, 0.0)
+    observe(light_map, 1, 100_000, 0, row_of(light_map, light_map.unoccluded)[1])
+    p = row_of(light_map, learner._probabilities(light_map.weights("contribution")))
     assert p.min() >= 0.99 * 0.05 / light_map.cells.count and p.sum() == pytest.approx(1)
 
 
 def test_lights_without_sampling_weight_stay_dark_where_no_other_light_arrives():
     look = mi.ScalarTransform4f().look_at([-0.8, 0, 1], [-0.8, 0, 0], [0, 1, 0])
-    scene = _floor(
+    scene = floor(
         spot={"type": "spot", "cutoff_angle": 15, "to_world": look},
         off={"type": "point", "position": [0.5, 0, 1], "sampling_weight": 0.0},
     )
-    learner = _learner(scene, grid=8)
+    learner = learner_of(scene, grid=8)
     selection = LightSelection(
         learner._map.rows, learner._map.cells, learner._probabilities(learner._map.unoccluded)
     )
     lanes = 1 << 12
-    si = _surface((0.6, 0.1, 0), width=lanes)
+    si = surface((0.6, 0.1, 0), width=lanes)
     _ds, weight, choice = selection.sample(None, scene, _sampler(lanes), si, mi.Bool(True))
     assert not weight.numpy().any() and bool(dr.all(choice.probability == 1))
 
@@ -99,7 +99,7 @@ def test_lights_without_sampling_weight_stay_dark_where_no_other_light_arrives()
 
 
 def test_the_default_of_a_divided_light_is_its_area():
-    scene = _floor(wide=_lamp(0, 0, 1, size=1.0), small=_lamp(0, 0, 0.5))
+    scene = floor(wide=lamp(0, 0, 1, size=1.0), small=lamp(0, 0, 0.5))
     cells = LightCells(scene, mi.Vector3f(0.5))
     weights = lights_weights.uniform_weights(scene, cells).numpy()
     assert cells.count > 4
@@ -107,22 +107,22 @@ def test_the_default_of_a_divided_light_is_its_area():
 
 
 def test_other_points_expect_the_mean_of_all_rows_and_sampling_weights_count():
-    lamps = {"a": _lamp(0.3, 0, 1), "b": _lamp(-0.3, 0, 1)}
-    table = _map(_floor(**lamps)).unoccluded.numpy().reshape(-1, 2)
+    lamps = {"a": lamp(0.3, 0, 1), "b": lamp(-0.3, 0, 1)}
+    table = map_of(floor(**lamps)).unoccluded.numpy().reshape(-1, 2)
     assert table[-1] == pytest.approx(table[:-1].mean(axis=0), rel=1e-4) and (table[-1] > 0).all()
     lamps["a"]["emitter"]["sampling_weight"] = 3.0
-    other = _map(_floor(**lamps)).unoccluded.numpy().reshape(-1, 2)
+    other = map_of(floor(**lamps)).unoccluded.numpy().reshape(-1, 2)
     # The order of emitters differs from one loading to the next
     assert np.sort(other.sum(axis=0) / other.sum()) == pytest.approx([0.25, 0.75], abs=0.04)
 
 
 @pytest.mark.parametrize("radiance", [1e-24, 1e21])
 def test_expectations_of_extreme_lights_are_numbers(radiance: float):
-    scene = _floor(a=_lamp(0, 0, 1, radiance=radiance), b=_lamp(0.5, 0, 1, radiance=radiance))
-    light_map = _map(scene)
+    scene = floor(a=lamp(0, 0, 1, radiance=radiance), b=lamp(0.5, 0, 1, radiance=radiance))
+    light_map = map_of(scene)
     table = light_map.unoccluded.numpy()
     assert np.isfinite(table).all() and (table > 0).all()
-    _observe(light_map, 0, 100, 0, _row(light_map, light_map.unoccluded)[0])
+    observe(light_map, 0, 100, 0, row_of(light_map, light_map.unoccluded)[0])
     equal = mi.Float(np.full(len(table), 0.5))
     assert 0 < light_map.relative_variances(equal)[0] < 10
 
@@ -154,17 +154,17 @@ def test_pairs_that_are_all_alike_are_not_measured_again(monkeypatch):
 
 @pytest.mark.parametrize("grid, ends", [(0, True), (4, False)])
 def test_learning_that_does_not_pay_ends_with_the_choice_of_path_unless_needed(grid, ends):
-    scene = _floor(a=_lamp(-0.1, 0, 50), b=_lamp(0.1, 0, 50))  # nothing to choose between
-    learner = _learner(scene, grid=grid)
+    scene = floor(a=lamp(-0.1, 0, 50), b=lamp(0.1, 0, 50))  # nothing to choose between
+    learner = learner_of(scene, grid=grid)
     for cell in (0, 1):
-        _observe(learner._map, cell, 1000, 0, _row(learner._map, learner._map.unoccluded)[cell])
+        observe(learner._map, cell, 1000, 0, row_of(learner._map, learner._map.unoccluded)[cell])
     decisions = learner.learn(scene, is_last=False)
     assert (type(decisions["next_event"]) is EmitterSampling) == ends
     assert ("not used" in str(learner)) == ends and (learner._map is None) == ends
 
 
 def test_smooth_meshes_are_sampled_by_their_triangles_even_where_nothing_is_gained():
-    assert not _learner(_floor(a=_lamp(0, 0, 1)))._is_needed
+    assert not learner_of(floor(a=lamp(0, 0, 1)))._is_needed
     light = {**ball(16, 8, smooth=True), "emitter": {"type": "area"}}
-    learner = _learner(mi.load_dict({"type": "scene", "ball": light}))
+    learner = learner_of(mi.load_dict({"type": "scene", "ball": light}))
     assert learner._is_needed and learner._map is not None

@@ -9,53 +9,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from maps import floor, lamp, learner_of, map_of, observe, row_of, surface, vertices
 from statistical import assert_same_mean, batches, load
 
-from mitsuba_ext.decisions.light_learner import LightLearner
 from mitsuba_ext.decisions.light_roulette import LightRoulette
 from mitsuba_ext.decisions.light_selection import Choice, LightSelection
 from mitsuba_ext.learning import light_map_file
 from mitsuba_ext.learning.light_map import LightMap
 from mitsuba_ext.learning.scout import Scout, region
-from mitsuba_ext.learning.surface_rows import RowCounts, SurfaceRows, voxel_edges
+from mitsuba_ext.learning.surface_rows import RowCounts, SurfaceRows
 from mitsuba_ext.lights.light_cells import LightCells
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-def _lamp(*position: float, radiance: float = 1.0, size: float = 0.1, **more) -> dict:
-    """A rectangle that shines downwards."""
-    T = mi.ScalarTransform4f
-    return {
-        "type": "rectangle",
-        "to_world": T().translate(list(position)).rotate([1, 0, 0], 180).scale(size),
-        "emitter": {"type": "area", "radiance": radiance, **more},
-    }
-
-
-def _floor(**more) -> mi.Scene:
-    return mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}, **more})
-
-
-def _vertices(count: int = 2000) -> tuple[mi.Point3f, mi.Normal3f]:
-    """Points of a floor, and normals that point up."""
-    rng = np.random.default_rng(0)
-    p = np.concatenate([rng.uniform(-1, 1, (2, count)), np.zeros((1, count))]).astype(np.float32)
-    return mi.Point3f(p), mi.Normal3f(np.tile([[0], [0], [1]], count).astype(np.float32))
-
-
-def _map(scene: mi.Scene, grid: int = 4) -> LightMap:
-    p, n = _vertices()
-    rows = SurfaceRows(region(p), grid, p, n)
-    return LightMap(scene, rows, LightCells(scene, voxel_edges(rows.bbox, grid)))
-
-
-def _surface(p, n=(0, 0, 1), width: int = 1) -> mi.SurfaceInteraction3f:
-    si = dr.zeros(mi.SurfaceInteraction3f, width)
-    si.p, si.n = mi.Point3f(*p), mi.Normal3f(*n)
-    si.sh_frame = mi.Frame3f(si.n)
-    si.wi = mi.Vector3f(0, 0, 1)
-    return si
 
 
 # ---- Where paths scatter ----
@@ -88,7 +53,7 @@ def test_a_scout_of_nothing_brings_nothing():
 
 
 def test_a_few_distant_points_do_not_widen_the_region():
-    p, _n = _vertices(10_000)
+    p, _n = vertices(10_000)
     p = p.numpy()
     p[:, :5] = 1e6
     box = region(mi.Point3f(p))
@@ -99,19 +64,19 @@ def test_a_few_distant_points_do_not_widen_the_region():
 @pytest.mark.parametrize("scale, offset", [(1, 0), (1e-3, 0), (1e4, 0), (1, 1e3)])
 @pytest.mark.parametrize("grid", [1, 5, 64])
 def test_vertices_are_found_in_their_rows(scale, offset, grid):
-    p, n = _vertices()
+    p, n = vertices()
     p = scale * p + offset * scale
     rows = SurfaceRows(region(p), grid, p, n)
     assert RowCounts(rows.bbox, p, n)(grid) == pytest.approx(rows.count, rel=0.02, abs=2)
-    si = _surface(rows.p, rows.n, dr.width(rows.p))
+    si = surface(rows.p, rows.n, dr.width(rows.p))
     row = rows.row(si, mi.Bool(True)).numpy()
     assert (row < rows.count - 1).mean() > 0.99
     expected = np.repeat(np.arange(rows.count - 1), rows.size.numpy())
     assert (row == expected).mean() > 0.99
     # Other places, and the other side, share the last row
-    below = _surface((0.5 * scale + offset * scale, offset * scale, offset * scale), (0, 0, -1))
+    below = surface((0.5 * scale + offset * scale, offset * scale, offset * scale), (0, 0, -1))
     below.wi = mi.Vector3f(0, 0, 1)
-    far = _surface((99 * scale, 0, 0))
+    far = surface((99 * scale, 0, 0))
     assert int(rows.row(below, mi.Bool(True))[0]) == int(rows.row(far, mi.Bool(True))[0])
     assert int(rows.row(far, mi.Bool(True))[0]) == rows.count - 1
 
@@ -119,31 +84,16 @@ def test_vertices_are_found_in_their_rows(scale, offset, grid):
 # ---- What is made of the counts ----
 
 
-def _observe(light_map: LightMap, cell: int, visible: int, blocked: int, value: float) -> None:
-    si = _surface((0.1, 0.1, 0), width=visible + blocked)
-    row = light_map.rows.row(si, mi.Bool(True))
-    choice = Choice(row, dr.full(mi.UInt32, cell, visible + blocked), mi.Float(0.5))
-    arrived = dr.arange(mi.UInt32, visible + blocked) < visible
-    # The contribution of an estimator that chose with probability 0.5
-    light_map.connection(choice, si, None, mi.Color3f(value / 0.5), arrived, mi.Bool(True))
-    light_map.evaluate()
-
-
-def _row(light_map: LightMap, values: mi.Float) -> np.ndarray:
-    row = int(light_map.rows.row(_surface((0.1, 0.1, 0)), mi.Bool(True))[0])
-    return values.numpy().reshape(-1, light_map.cells.count)[row]
-
-
 def test_visibility_and_contribution_follow_the_counts():
-    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
-    unoccluded = _row(light_map, light_map.unoccluded)
-    _observe(light_map, 0, 0, 1000, 0.0)
-    _observe(light_map, 1, 500, 500, 0.5 * unoccluded[1])
-    visibility = _row(light_map, light_map.visibility())
+    light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1)))
+    unoccluded = row_of(light_map, light_map.unoccluded)
+    observe(light_map, 0, 0, 1000, 0.0)
+    observe(light_map, 1, 500, 500, 0.5 * unoccluded[1])
+    visibility = row_of(light_map, light_map.visibility())
     assert visibility == pytest.approx([0, 0.5], abs=0.01)
-    by_visibility = _row(light_map, light_map.weights("visibility"))
+    by_visibility = row_of(light_map, light_map.weights("visibility"))
     assert by_visibility == pytest.approx(unoccluded * visibility)
-    by_contribution = _row(light_map, light_map.weights("contribution"))
+    by_contribution = row_of(light_map, light_map.weights("contribution"))
     # The root of the mean square: half of the tests brought half of what was expected
     assert by_contribution[1] == pytest.approx(unoccluded[1] * np.sqrt(0.5 * 0.25), rel=0.02)
     assert by_contribution[0] < 0.05 * by_contribution[1]
@@ -151,15 +101,15 @@ def test_visibility_and_contribution_follow_the_counts():
 
 def test_surroundings_decide_where_nothing_was_tested():
     """A cell that its neighbours never saw is not expected to be seen."""
-    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
-    _observe(light_map, 0, 0, 50, 0.0)
-    _observe(light_map, 1, 50, 0, 1.0)
+    light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1)))
+    observe(light_map, 0, 0, 50, 0.0)
+    observe(light_map, 1, 50, 0, 1.0)
     visibility = light_map.visibility().numpy().reshape(-1, 2)
     assert (visibility[:-1, 0] < 0.1).all() and (visibility[:-1, 1] > 0.9).all()
 
 
 def test_a_map_without_a_test_expects_the_unoccluded():
-    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1, radiance=3.0)))
+    light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1, radiance=3.0)))
     unoccluded = light_map.unoccluded.numpy().reshape(-1, 2)
     for target in ("visibility", "contribution"):
         weights = light_map.weights(target).numpy().reshape(-1, 2)
@@ -168,20 +118,20 @@ def test_a_map_without_a_test_expects_the_unoccluded():
 
 
 def test_one_bright_sample_does_not_decide():
-    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
-    _observe(light_map, 1, 100, 0, 0.3)
-    before = _row(light_map, light_map.weights("contribution"))[0]
-    _observe(light_map, 0, 99, 0, 0.3)
-    _observe(light_map, 0, 1, 0, 1e30)
-    after = _row(light_map, light_map.weights("contribution"))[0]
+    light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1)))
+    observe(light_map, 1, 100, 0, 0.3)
+    before = row_of(light_map, light_map.weights("contribution"))[0]
+    observe(light_map, 0, 99, 0, 0.3)
+    observe(light_map, 0, 1, 0, 1e30)
+    after = row_of(light_map, light_map.weights("contribution"))[0]
     assert np.isfinite(after) and after < 10 * max(before, 0.3)
 
 
 def test_the_predicted_variance_is_that_of_the_counts():
-    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
-    unoccluded = _row(light_map, light_map.unoccluded)
-    _observe(light_map, 0, 20_000, 0, unoccluded[0])
-    _observe(light_map, 1, 10_000, 10_000, 0.5 * unoccluded[1])
+    light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1)))
+    unoccluded = row_of(light_map, light_map.unoccluded)
+    observe(light_map, 0, 20_000, 0, unoccluded[0])
+    observe(light_map, 1, 10_000, 10_000, 0.5 * unoccluded[1])
     mean = np.array([1, 0.25]) * unoccluded
     square = np.array([1, 0.125]) * np.square(unoccluded)
     selections = [np.array([0.5, 0.5]), np.array([0.8, 0.2]), np.array([1, 0])]
@@ -194,8 +144,8 @@ def test_the_predicted_variance_is_that_of_the_counts():
 
 
 def test_of_a_large_pilot_a_part_is_recorded():
-    scene = _floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1))
-    p, n = _vertices()
+    scene = floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1))
+    p, n = vertices()
     rows = SurfaceRows(region(p), 1, p, n)
     lanes = 1 << 16
     recorded = []
@@ -203,7 +153,7 @@ def test_of_a_large_pilot_a_part_is_recorded():
         light_map = LightMap(scene, rows, LightCells(scene, None), samples)
         light_map.begin(lanes)
         choice = Choice(mi.UInt32(0), mi.UInt32(0), mi.Float(0.5))
-        si = _surface((0.1, 0.1, 0), width=lanes)
+        si = surface((0.1, 0.1, 0), width=lanes)
         light_map.connection(choice, si, None, mi.Color3f(0.1), mi.Bool(True), mi.Bool(True))
         light_map.evaluate()
         assert bool(dr.all(light_map.tests == light_map.successes))
@@ -214,10 +164,10 @@ def test_of_a_large_pilot_a_part_is_recorded():
 
 
 def test_the_roulette_reads_the_chosen_cell():
-    light_map = _map(_floor(a=_lamp(0, 0, 1), b=_lamp(0.5, 0, 1)))
-    _observe(light_map, 0, 0, 1000, 0.0)
-    _observe(light_map, 1, 1000, 0, 1.0)
-    si = _surface((0.1, 0.1, 0))
+    light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1)))
+    observe(light_map, 0, 0, 1000, 0.0)
+    observe(light_map, 1, 1000, 0, 1.0)
+    si = surface((0.1, 0.1, 0))
     row = light_map.rows.row(si, mi.Bool(True))
     for law, blocked in (("affine", 0.01), ("paper", 1e-4)):
         roulette = LightRoulette(light_map, slope=10, floor=0.005, law=law)
@@ -228,15 +178,15 @@ def test_the_roulette_reads_the_chosen_cell():
 
 
 def test_probabilities_of_a_selection_are_those_of_its_weights_and_no_light_is_lost():
-    scene = _floor(**{f"lamp_{i}": _lamp(i / 40 - 1, 0, 1, size=0.01) for i in range(80)})
-    light_map = _map(scene, grid=1)
+    scene = floor(**{f"lamp_{i}": lamp(i / 40 - 1, 0, 1, size=0.01) for i in range(80)})
+    light_map = map_of(scene, grid=1)
     rng = np.random.default_rng(1)
     weights = rng.uniform(0, 1, light_map.rows.count * 80).astype(np.float32) ** 8
     selection = LightSelection(light_map.rows, light_map.cells, mi.Float(weights))
     sampler = mi.load_dict({"type": "independent"})
     lanes = 1 << 18
     sampler.seed(0, lanes)
-    si = _surface((0.1, 0.1, 0), width=lanes)
+    si = surface((0.1, 0.1, 0), width=lanes)
     _ds, _weight, choice = selection.sample(None, scene, sampler, si, mi.Bool(True))
     row = weights.reshape(-1, 80)[int(choice.row[0])].astype(np.float64)
     expected = row / row.sum()
@@ -251,19 +201,11 @@ def test_probabilities_of_a_selection_are_those_of_its_weights_and_no_light_is_l
 # ---- In a render ----
 
 
-def _learner(scene: mi.Scene, **parameters) -> LightLearner:
-    defaults = {"target": "contribution", "rejection": None, "grid": 0, "max_memory": 2**26,
-                "pilot_samples": 100_000}
-    learner = LightLearner(**{**defaults, **parameters})
-    learner.start(scene, *_vertices())
-    return learner
-
-
 def test_the_grid_follows_the_number_of_samples_and_the_memory():
-    scene = _floor(**{f"lamp_{i}": _lamp(i / 40 - 1, 0, 1, size=0.01) for i in range(80)})
+    scene = floor(**{f"lamp_{i}": lamp(i / 40 - 1, 0, 1, size=0.01) for i in range(80)})
 
     def entries(**parameters) -> int:
-        return len(_learner(scene, **parameters)._map.tests)
+        return len(learner_of(scene, **parameters)._map.tests)
 
     assert entries(pilot_samples=1000) < entries(pilot_samples=100_000)
     assert entries(grid=64, max_memory=2**22) * 128 <= 2**22
@@ -271,7 +213,7 @@ def test_the_grid_follows_the_number_of_samples_and_the_memory():
 
 
 def test_voxels_of_a_selection_without_learning_fit_into_the_memory():
-    scene = _floor(**{f"lamp_{i}": _lamp(i / 40 - 1, 0, 1, size=0.01) for i in range(80)})
+    scene = floor(**{f"lamp_{i}": lamp(i / 40 - 1, 0, 1, size=0.01) for i in range(80)})
 
     def rows(**parameters) -> int:
         integrator = mi.load_dict(
@@ -347,12 +289,12 @@ def test_a_loaded_map_keeps_the_mean(tmp_path: Path):
 
 def test_the_fingerprint_sees_lights_and_geometry_but_no_sensor():
     def of(**more) -> str:
-        return light_map_file.fingerprint(_floor(**more))
+        return light_map_file.fingerprint(floor(**more))
 
-    base = of(a=_lamp(0, 0, 1))
-    assert base == of(a=_lamp(0, 0, 1)) == of(a=_lamp(0, 0, 1), s={"type": "perspective"})
-    assert len({base, of(a=_lamp(0, 0, 1.01)), of(a=_lamp(0, 0, 1, radiance=1.1)),
-                of(a=_lamp(0, 0, 1), b=_lamp(0, 0, 2))}) == 4
+    base = of(a=lamp(0, 0, 1))
+    assert base == of(a=lamp(0, 0, 1)) == of(a=lamp(0, 0, 1), s={"type": "perspective"})
+    assert len({base, of(a=lamp(0, 0, 1.01)), of(a=lamp(0, 0, 1, radiance=1.1)),
+                of(a=lamp(0, 0, 1), b=lamp(0, 0, 2))}) == 4
 
 
 def test_learned_light_sampling_lowers_the_variance_where_lights_are_many():
@@ -381,16 +323,16 @@ def _stage(**lights) -> mi.Scene:
     T = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": 32, "height": 32}
     view = T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
-    return _floor(sensor={"type": "perspective", "to_world": view, "film": film}, **lights)
+    return floor(sensor={"type": "perspective", "to_world": view, "film": film}, **lights)
 
 
 def test_learning_ends_where_it_would_not_pay():
     """Two lamps side by side are chosen well enough by chance, unless the user wants more."""
-    assert "one light" in _learned(_stage(a=_lamp(0, 0, 9, size=0.05)))
-    pair = _stage(a=_lamp(0, 0, 9, size=0.1), b=_lamp(0.1, 0, 9, size=0.1))
+    assert "one light" in _learned(_stage(a=lamp(0, 0, 9, size=0.05)))
+    pair = _stage(a=lamp(0, 0, 9, size=0.1), b=lamp(0.1, 0, 9, size=0.1))
     assert "not used" in _learned(pair)
     assert "not used" not in _learned(pair, grid=8)
     assert "not used" not in _learned(pair, rejection=True)
     # One is hidden from nearly everything
-    different = _stage(a=_lamp(0, 0, 9, size=0.1), b=_lamp(0, 0, -1, size=0.5))
+    different = _stage(a=lamp(0, 0, 9, size=0.1), b=lamp(0, 0, -1, size=0.5))
     assert "not used" not in _learned(different)

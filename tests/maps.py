@@ -1,0 +1,72 @@
+"""Light maps of a floor under lamps, for the tests of what is learned from them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_ext.decisions.light_learner import LightLearner
+from mitsuba_ext.decisions.light_selection import Choice
+from mitsuba_ext.learning.light_map import LightMap
+from mitsuba_ext.learning.scout import region
+from mitsuba_ext.learning.surface_rows import SurfaceRows, voxel_edges
+from mitsuba_ext.lights.light_cells import LightCells
+
+
+def lamp(*position: float, radiance: float = 1.0, size: float = 0.1, **more) -> dict:
+    """A rectangle that shines downwards."""
+    T = mi.ScalarTransform4f
+    return {
+        "type": "rectangle",
+        "to_world": T().translate(list(position)).rotate([1, 0, 0], 180).scale(size),
+        "emitter": {"type": "area", "radiance": radiance, **more},
+    }
+
+
+def floor(**more) -> mi.Scene:
+    return mi.load_dict({"type": "scene", "floor": {"type": "rectangle"}, **more})
+
+
+def vertices(count: int = 2000) -> tuple[mi.Point3f, mi.Normal3f]:
+    """Points of a floor, and normals that point up."""
+    rng = np.random.default_rng(0)
+    p = np.concatenate([rng.uniform(-1, 1, (2, count)), np.zeros((1, count))]).astype(np.float32)
+    return mi.Point3f(p), mi.Normal3f(np.tile([[0], [0], [1]], count).astype(np.float32))
+
+
+def map_of(scene: mi.Scene, grid: int = 4) -> LightMap:
+    p, n = vertices()
+    rows = SurfaceRows(region(p), grid, p, n)
+    return LightMap(scene, rows, LightCells(scene, voxel_edges(rows.bbox, grid)))
+
+
+def surface(p, n=(0, 0, 1), width: int = 1) -> mi.SurfaceInteraction3f:
+    si = dr.zeros(mi.SurfaceInteraction3f, width)
+    si.p, si.n = mi.Point3f(*p), mi.Normal3f(*n)
+    si.sh_frame = mi.Frame3f(si.n)
+    si.wi = mi.Vector3f(0, 0, 1)
+    return si
+
+
+def observe(light_map: LightMap, cell: int, visible: int, blocked: int, value: float) -> None:
+    si = surface((0.1, 0.1, 0), width=visible + blocked)
+    row = light_map.rows.row(si, mi.Bool(True))
+    choice = Choice(row, dr.full(mi.UInt32, cell, visible + blocked), mi.Float(0.5))
+    arrived = dr.arange(mi.UInt32, visible + blocked) < visible
+    # The contribution of an estimator that chose with probability 0.5
+    light_map.connection(choice, si, None, mi.Color3f(value / 0.5), arrived, mi.Bool(True))
+    light_map.evaluate()
+
+
+def row_of(light_map: LightMap, values: mi.Float) -> np.ndarray:
+    row = int(light_map.rows.row(surface((0.1, 0.1, 0)), mi.Bool(True))[0])
+    return values.numpy().reshape(-1, light_map.cells.count)[row]
+
+
+def learner_of(scene: mi.Scene, **parameters) -> LightLearner:
+    defaults = {"target": "contribution", "rejection": None, "grid": 0, "max_memory": 2**26,
+                "pilot_samples": 100_000}
+    learner = LightLearner(**{**defaults, **parameters})
+    learner.start(scene, *vertices())
+    return learner
