@@ -153,7 +153,7 @@ def _write_figure(results: dict[str, Any]) -> None:
         axes.errorbar(values, rows, xerr=errors, fmt="osD"[number], capsize=3, label=label)
     axes.axvline(1, color="gray", linewidth=0.8)
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(ticker.MaxNLocator(8))
+    axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_locator(ticker.NullLocator())
     axes.set_yticks(range(len(scenes)), [scene["name"] for scene in scenes])
