@@ -30,7 +30,7 @@ def film_extent(film: mi.Film) -> tuple[int, int]:
 
 def sample_rays(
     sensor: mi.Sensor, sampler: mi.Sampler, spp_per_pass: int, spp: int
-) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Point2f]:
+) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Point2f, mi.UInt32]:
     """Camera rays of one pass: ``spp_per_pass`` for each pixel of the film.
 
     The random numbers are drawn in the order in which ``mi.SamplingIntegrator`` draws them, so that
@@ -42,8 +42,8 @@ def sample_rays(
         spp: Samples per pixel of the whole render; it scales the ray differentials.
 
     Returns:
-        The rays, their importance weights, and the positions on the film (in pixels) at which to
-        put what they bring back.
+        The rays, their importance weights, the positions on the film (in pixels) at which to put
+        what they bring back, and the number of the pixel of each (row by row in the film's extent).
     """
     film = sensor.film()
     width, height = film_extent(film)
@@ -75,7 +75,9 @@ def sample_rays(
         ray.scale_differential(dr.opaque(mi.Float, spp**-0.5))
 
     # A box filter ignores the offset inside the pixel: it would only add rounding errors
-    return ray, weight, mi.Point2f(corner) if film.rfilter().is_box_filter() else position
+    if film.rfilter().is_box_filter():
+        position = mi.Point2f(corner)
+    return ray, weight, position, pixel
 
 
 def splat(

@@ -246,8 +246,8 @@ class _Job:
         sampler = mi.load_dict({"type": "independent"})
         # The same for all seeds: what a scout decides changes the size of tables, and kernels
         sampler.seed(dr.opaque(mi.UInt32, 0), self._lanes(1))
-        ray, _weight, _position = camera.sample_rays(self.sensor, sampler, 1, self.spp)
-        sample = stage.walk(self.scene, sampler, mi.Ray3f(ray), mi.Bool(True))
+        ray, _weight, _position, pixel = camera.sample_rays(self.sensor, sampler, 1, self.spp)
+        sample = stage.walk(self.scene, sampler, mi.Ray3f(ray), mi.Bool(True), pixel)
         dr.eval(sample.L)
         self.statistics.compile_seconds += time.perf_counter() - begin
         dr.sync_thread()
@@ -257,8 +257,8 @@ class _Job:
         begin = time.perf_counter()
         misses = _kernel_cache_misses()
         sampler = self._pass_sampler(spp)
-        ray, weight, position = camera.sample_rays(self.sensor, sampler, spp, self.spp)
-        sample = stage.walk(self.scene, sampler, mi.Ray3f(ray), mi.Bool(True))
+        ray, weight, position, pixel = camera.sample_rays(self.sensor, sampler, spp, self.spp)
+        sample = stage.walk(self.scene, sampler, mi.Ray3f(ray), mi.Bool(True), pixel)
         if dr.grad_enabled(sample.L):
             raise self.integrator.no_gradients()
         aovs = self.integrator.sample_aovs(self.scene, sampler, ray)

@@ -67,9 +67,15 @@ class Walk:
 
     @dr.syntax
     def __call__(
-        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        active: mi.Bool,
+        pixel: mi.UInt32 | None = None,
     ) -> PathSample:
-        """Traces one path for each lane of ``ray``."""
+        """Traces one path for each lane of ``ray``. ``pixel`` is where on the film it begins, row
+        by row; a walk without decisions that learn can do without."""
         # What the scene lacks is left out of the kernel: these are Python booleans
         has_emitters = len(scene.emitters()) > 0
         connects = has_emitters and self.max_depth > 1
@@ -82,6 +88,7 @@ class Walk:
         L = mi.Spectrum(0)                              # Radiance accumulator
         β = mi.Spectrum(1)                              # Path throughput weight
         η = mi.Float(1)                                 # Product of relative indices of refraction
+        guidance = mi.Float(1)                          # Part of β that is due to guided samples
         depth = mi.UInt32(0)                            # Depth of the current vertex
         valid = mi.Bool(sees_environment and self.max_depth > 0)  # Has the path met anything?
         prev_si = dr.zeros(mi.Interaction3f)            # Previous scattering event
@@ -89,11 +96,11 @@ class Walk:
         prev_bsdf_delta = mi.Bool(True)
         scatter_count, shadow_count, connection_count = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
         active = mi.Bool(active) & (self.max_depth > 0)
-        directions_state = self.directions.begin(sampler, ray)
+        directions_state = self.directions.begin(sampler, ray, pixel)
         next_event_state = self.next_event.begin(sampler, ray)
         shadow_state = self.shadow_test.begin(sampler, ray)
         if dr.hint(self.observer is not None, mode="scalar"):
-            self.observer.begin(dr.width(ray))
+            self.observer.begin(dr.width(ray), pixel)
 
         pi = self.query.closest(scene, ray, coherent=True, active=active)
         if dr.hint(self.hide_emitters, mode="scalar"):
@@ -149,11 +156,16 @@ class Walk:
                     self.observer.connection(
                         next_event_state, si, ds, contribution, visible, active_em
                     )
+            if dr.hint(self.observer is not None, mode="scalar"):
+                self.observer.direction(
+                    si, depth, sample_2, directions_weight, L, active_next
+                )
 
             # ----- Move on to the next vertex -----
             bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)
             ray = si.spawn_ray(si.to_world(bs.wo))
             β *= bsdf_weight * directions_weight
+            guidance *= directions_weight
             η *= bs.eta
             valid |= si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
@@ -163,8 +175,9 @@ class Walk:
             depth[si.is_valid()] += 1
 
             # ----- Russian roulette -----
+            # Where guided samples are dense, paths have little throughput because they matter
             β_max = dr.max(β)
-            rr_probability = dr.minimum(β_max * dr.square(η), 0.95)
+            rr_probability = dr.minimum(β_max / guidance * dr.square(η), 0.95)
             rr_active = depth >= self.rr_depth
             rr_continue = sampler.next_1d() < rr_probability
             β[rr_active] *= dr.rcp(rr_probability)
@@ -175,6 +188,8 @@ class Walk:
             if dr.hint(self.observer is not None, mode="scalar"):
                 self.observer.segment(prev_si.p, ray(pi.t), active & pi.is_valid())
 
+        if dr.hint(self.observer is not None, mode="scalar"):
+            self.observer.end(L)
         return PathSample(
             dr.select(valid, L, 0), valid, scatter_count, shadow_count, connection_count
         )

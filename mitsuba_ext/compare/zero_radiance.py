@@ -29,7 +29,7 @@ def zero_radiance_share(integrator: mi.Integrator, scene: mi.Scene, seed: int) -
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()
         sampler.seed(seed, width * height * spp)
-        ray, _weight, _position = camera.sample_rays(sensor, sampler, spp, spp)
+        ray, *_rest = camera.sample_rays(sensor, sampler, spp, spp)
         L = integrator.sample(scene, sampler, ray, None, mi.Bool(True))[0]
     except Exception:  # sample() of another signature, a sampler that cannot be copied, …
         return None

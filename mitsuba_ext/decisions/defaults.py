@@ -11,8 +11,8 @@ import mitsuba as mi
 class DirectionSamples:
     """Which primary samples choose the lobe and the direction of a BSDF sample: uniform ones."""
 
-    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
-        """The state before the first bounce."""
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
+        """The state before the first bounce of paths that begin in ``pixel`` of the film."""
         return ()
 
     def draw(

@@ -106,7 +106,7 @@ class LightLearner(Learner):
 
     # ---- Observer ----
 
-    def begin(self, lanes: int) -> None:
+    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         if self._map is not None:
             self._map.begin(lanes)
 

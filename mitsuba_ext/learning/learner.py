@@ -15,8 +15,8 @@ class Observer:
     No observer is a dataclass: Dr.Jit would take one that a loop uses for a part of its state.
     """
 
-    def begin(self, lanes: int) -> None:
-        """A pass of so many paths begins, one in each lane."""
+    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
+        """A pass of so many paths begins, one in each lane, in ``pixel`` of the film."""
 
     def vertex(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, active: mi.Bool) -> None:
         """A path is about to connect ``si`` to a light; ``depth`` is 0 at the first vertex."""
@@ -32,6 +32,21 @@ class Observer:
     ) -> None:
         """A shadow ray was traced where ``tested``. ``choice`` is the state of the next event
         decision; ``contribution`` is BSDF · radiance / pdf, before throughput and MIS weights."""
+
+    def direction(
+        self,
+        si: mi.SurfaceInteraction3f,
+        depth: mi.UInt32,
+        sample: mi.Point2f,
+        weight: mi.Float | float,
+        L: mi.Spectrum,
+        active: mi.Bool,
+    ) -> None:
+        """The number ``sample``, of density 1 / ``weight``, chose the direction in which a path
+        goes on; it has brought ``L`` until now."""
+
+    def end(self, L: mi.Spectrum) -> None:
+        """All paths of the pass are at their end, and bring ``L``."""
 
     def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
         """A path went from ``p`` to ``q``."""
@@ -63,9 +78,9 @@ class Observers(Observer):
     def __init__(self, observers: Sequence[Observer]) -> None:
         self._observers = observers
 
-    def begin(self, lanes: int) -> None:
+    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         for observer in self._observers:
-            observer.begin(lanes)
+            observer.begin(lanes, pixel)
 
     def vertex(self, *arguments: Any) -> None:
         for observer in self._observers:
@@ -74,6 +89,14 @@ class Observers(Observer):
     def connection(self, *arguments: Any) -> None:
         for observer in self._observers:
             observer.connection(*arguments)
+
+    def direction(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.direction(*arguments)
+
+    def end(self, L: mi.Spectrum) -> None:
+        for observer in self._observers:
+            observer.end(L)
 
     def segment(self, *arguments: Any) -> None:
         for observer in self._observers:

@@ -70,7 +70,7 @@ class LightMap(Observer):
 
     # ---- Observer of the walk ----
 
-    def begin(self, lanes: int) -> None:
+    def begin(self, lanes: int, pixel: mi.UInt32 | None = None) -> None:
         # Scattered: lanes that follow each other are the samples of one pixel, row by row
         scattered = (dr.arange(mi.UInt32, lanes) * 0x9E3779B9) >> 8
         self._is_recorded = scattered % self._stride == 0

@@ -32,7 +32,7 @@ class NoConnections(EmitterSampling):
 class Scout(Observer):
     """Records where paths scatter, for about 65,000 of the paths of one pass."""
 
-    def begin(self, lanes: int) -> None:
+    def begin(self, lanes: int, pixel: mi.UInt32 | None = None) -> None:
         stride = max(1, lanes // _PATHS)
         paths = -(-lanes // stride)
         self._lane = dr.arange(mi.UInt32, lanes)
