@@ -109,10 +109,10 @@ class GuideLearner(Learner):
                 )
                 return {"directions": DirectionSamples()}
             summary = f", variance about {gain:.0%} lower"
-        builder, roots = self._regions.build(records)
+        builder, roots, below = self._regions.build(records)
         share_of_trees = dr.full(mi.Float, share, len(roots))
         trees = SampleTrees(
-            builder.probability, builder.child, builder.is_even, roots, share_of_trees
+            builder.probability, builder.child, builder.is_even, roots, share_of_trees, below
         )
         records.restart_counting()
         self._share = share

@@ -23,7 +23,9 @@ class Regions(Protocol):
     def tree(self, state: Any, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
         """The tree for a vertex."""
 
-    def after(self, state: Any, leaf: mi.UInt32, active: mi.Bool) -> Any:
+    def after(
+        self, state: Any, trees: SampleTrees, leaf: mi.UInt32, active: mi.Bool
+    ) -> Any:
         """The state after a sample was drawn from a leaf."""
 
 
@@ -49,7 +51,8 @@ class GuidedDirections(DirectionSamples):
         active = active & (depth < self._bounces)
         tree = self._regions.tree(state, si, active)
         sample_2, density, leaf = self._trees.sample(tree, sample_2, active)
-        return sample_1, sample_2, dr.rcp(density), self._regions.after(state, leaf, active)
+        state = self._regions.after(state, self._trees, leaf, active)
+        return sample_1, sample_2, dr.rcp(density), state
 
 
 class LaterConnections(EmitterSampling):

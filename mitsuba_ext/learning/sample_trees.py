@@ -35,9 +35,7 @@ class SampleTrees:
         is_even: Is the node split along the first axis? Shape [nodes].
         root: The first node of each tree; it is split along the first axis, or a leaf. [trees].
         share: The share of the samples that a tree decides, in [0, 1]; shape [trees].
-
-    Attributes:
-        leaf_count (int): An upper bound of the numbers that name leaves.
+        value: For each node, a number that :meth:`value` gives where it is a leaf; shape [nodes].
     """
 
     def __init__(
@@ -47,9 +45,12 @@ class SampleTrees:
         is_even: mi.Bool,
         root: mi.UInt32,
         share: mi.Float,
+        value: mi.UInt32 | None = None,
     ) -> None:
         # A node's children take a block of four
         inner = dr.compress(is_even & (probability >= 0))
+        if len(inner) == 0:
+            inner = mi.UInt32(0)  # it is a leaf, and its block is never read
         block = dr.zeros(mi.UInt32, len(probability))
         # Opaque: trees of other sizes share the kernels
         first = dr.opaque(mi.UInt32, len(root))
@@ -57,23 +58,29 @@ class SampleTrees:
         bits, grandchildren = _pack(probability, child)
         dr.eval(block, bits, grandchildren)
 
-        self.leaf_count = len(root) + 4 * len(inner)
-        nodes = dr.zeros(mi.Float, 2 * self.leaf_count)
-        _write(nodes, dr.arange(mi.UInt32, len(root)), bits, block, root, mi.Bool(True))
-        for index, (node, exists) in enumerate(grandchildren):
+        slots = len(root) + 4 * len(inner)
+        self._nodes = dr.zeros(mi.Float, 2 * slots)
+        self._values = dr.zeros(mi.UInt32, 0 if value is None else slots)
+        placed = [(dr.arange(mi.UInt32, len(root)), root)]
+        for index, node in enumerate(grandchildren):
             slot = dr.gather(mi.UInt32, block, inner) + index
-            node, exists = dr.gather(mi.UInt32, node, inner), dr.gather(mi.Bool, exists, inner)
-            _write(nodes, slot, bits, block, node, exists)
-        is_leaf = dr.gather(mi.Float, probability, root) < 0
-        self._nodes = nodes
+            placed.append((slot, dr.gather(mi.UInt32, node, inner)))
+        for slot, node in placed:
+            packed = mi.Point2u(
+                dr.gather(mi.UInt32, bits, node), dr.gather(mi.UInt32, block, node)
+            )
+            dr.scatter(self._nodes, dr.reinterpret_array(mi.Point2f, packed), slot)
+            if value is not None:
+                dr.scatter(self._values, dr.gather(mi.UInt32, value, node), slot)
         # Nothing is read of a tree without a split
+        is_leaf = dr.gather(mi.Float, probability, root) < 0
         self._share = dr.select(is_leaf, 0, share)
-        dr.eval(self._nodes, self._share)
+        dr.eval(self._nodes, self._share, self._values)
 
     @property
     def bytes(self) -> int:
         """Memory that the trees take."""
-        return 4 * (len(self._nodes) + len(self._share))
+        return 4 * (len(self._nodes) + len(self._share) + len(self._values))
 
     def sample(
         self, tree: mi.UInt32, u: mi.Point2f, active: mi.Bool
@@ -101,6 +108,10 @@ class SampleTrees:
         _point, density, leaf = self._descend(tree, u, mi.Bool(False), active & (share > 0))
         return dr.fma(share, density - 1, 1), leaf
 
+    def value(self, leaf: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """What the caller has given the leaf."""
+        return dr.gather(mi.UInt32, self._values, leaf, active)
+
     @dr.syntax
     def _descend(
         self, root: mi.UInt32, u: mi.Point2f, by_tree: mi.Bool, active: mi.Bool
@@ -127,6 +138,9 @@ class SampleTrees:
             edge *= 0.5
             node = packed.y + side
             active &= ((packed.x >> (3 * _BITS + side)) & 1) == 0
+        # Rounding must not move a sample into the next cell, or to 1
+        last = 1 - (1 - _ALMOST_ONE) / edge
+        x, y = dr.minimum(x, last), dr.minimum(y, last)
         point = mi.Point2f((mi.Float(column) + x) * edge, (mi.Float(row) + y) * edge)
         return point, density, node
 
@@ -141,36 +155,26 @@ def _choose(x: mi.Float, bits: mi.UInt32, by_tree: mi.Bool) -> tuple[mi.Float, m
     return dr.minimum(x, _ALMOST_ONE), is_upper, dr.select(is_upper, 1 - p, p)
 
 
-def _pack(probability: mi.Float, child: mi.UInt32) -> tuple[mi.UInt32, list]:
-    """The first word of each node, as if it were split along the first axis; and its four
-    grandchildren: number, and whether it has splits."""
+def _pack(probability: mi.Float, child: mi.UInt32) -> tuple[mi.UInt32, list[mi.UInt32]]:
+    """The first word of each node, as if it were split along the first axis; and the four nodes
+    that stand below it (twice the same, where there is no second split)."""
     is_inner = probability >= 0
     bits = _rounded(probability)
     grandchildren = []
     for side in range(2):
-        node = child + side
-        p = dr.gather(mi.Float, probability, node, is_inner)
+        node = dr.select(is_inner, child + side, 0)
+        p = dr.gather(mi.Float, probability, node)
         is_split = is_inner & (p >= 0)
         bits |= _rounded(dr.select(is_split, p, 0.5)) << (_BITS * (1 + side))
-        first = dr.gather(mi.UInt32, child, node, is_split)
+        first = dr.gather(mi.UInt32, child, node)
         for upper in range(2):
-            grandchild = first + upper
-            has_splits = is_split & (
-                dr.gather(mi.Float, probability, grandchild, is_split) >= 0
-            )
+            grandchild = dr.select(is_split, first + upper, node)
+            is_leaf = ~is_split | (dr.gather(mi.Float, probability, grandchild) < 0)
             leaf_bit = 1 << (3 * _BITS + 2 * side + upper)
-            bits |= dr.select(has_splits, mi.UInt32(0), leaf_bit)
-            grandchildren.append((grandchild, has_splits))
+            bits |= dr.select(is_leaf, mi.UInt32(leaf_bit), 0)
+            grandchildren.append(grandchild)
     return bits, grandchildren
 
 
 def _rounded(probability: mi.Float) -> mi.UInt32:
     return mi.UInt32(dr.clip(probability * _ONE + 0.5, 0, _ONE - 1))
-
-
-def _write(nodes: mi.Float, slot: mi.UInt32, bits, block, node, exists) -> None:
-    """Writes packed nodes into their slots."""
-    value = mi.Point2u(
-        dr.gather(mi.UInt32, bits, node, exists), dr.gather(mi.UInt32, block, node, exists)
-    )
-    dr.scatter(nodes, dr.reinterpret_array(mi.Point2f, value), slot, exists)

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from .path_records import PathRecords
+from .sample_trees import SampleTrees
 from .scout import lit_normal, region
 from .tree_builder import Samples, TreeBuilder
 
@@ -71,7 +72,9 @@ class SurfaceRegions:
         """The tree of a vertex: that of the smallest region it belongs to."""
         return self.label(si, None, active)
 
-    def after(self, state: tuple, leaf: mi.UInt32, active: mi.Bool) -> tuple:
+    def after(
+        self, state: tuple, trees: SampleTrees, leaf: mi.UInt32, active: mi.Bool
+    ) -> tuple:
         """The state after a sample was drawn from a leaf."""
         return state
 
@@ -83,8 +86,8 @@ class SurfaceRegions:
         slot = (cell.x + _GRIDS[-1] * (cell.y + _GRIDS[-1] * cell.z)) * _SIDES + side
         return dr.gather(mi.UInt32, self._table, mi.UInt32(slot), inside)
 
-    def build(self, records: PathRecords) -> tuple[TreeBuilder, mi.UInt32]:
-        """Trees of all regions, and their roots. A region expects what the one around it found."""
+    def build(self, records: PathRecords) -> tuple[TreeBuilder, mi.UInt32, None]:
+        """The trees and their roots. A region expects what the one around it found."""
         samples = Samples(records.code, records.value, records.weight)
         builder = TreeBuilder()
         roots = np.zeros(self.count, np.uint32)
@@ -96,7 +99,7 @@ class SurfaceRegions:
             expected = mi.UInt32(roots[self._parent[regions]]) if level > 0 else None
             first = builder.add(samples, tree, size, expected)
             roots[regions] = first + np.arange(size)
-        return builder, mi.UInt32(roots)
+        return builder, mi.UInt32(roots), None
 
     def _numbers(self, level: int) -> np.ndarray:
         """For each region, which one of a level's it lies in; too large a number for none."""

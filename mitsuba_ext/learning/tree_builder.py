@@ -132,6 +132,15 @@ class TreeBuilder:
         self._append(levels)
         return first_node
 
+    def leaf(self, root: mi.UInt32, code: mi.UInt32) -> mi.UInt32:
+        """The leaf of the tree at ``root`` in which a cell lies."""
+        node = mi.UInt32(root)
+        for depth in range(DEPTH):
+            is_inner = dr.gather(mi.Float, self.probability, node) >= 0
+            side = (code >> (DEPTH - 1 - depth)) & 1
+            node = dr.select(is_inner, dr.gather(mi.UInt32, self.child, node) + side, node)
+        return node
+
     def _split(self, level: _Level, splits: mi.UInt32, depth: int) -> _Level:
         """Splits some of the nodes; their children are left and right ones in turn."""
         begin, end, code, twin = (
