@@ -106,7 +106,7 @@ class ComposedPath(WalkIntegrator):
             return []
         return self.light_sampling.pilots(scene, spp)
 
-    def learners(self, scene: mi.Scene, samples: int) -> list[Learner]:
+    def learners(self, scene: mi.Scene, sensor: mi.Sensor, samples: int) -> list[Learner]:
         return self.light_sampling.learners(scene, samples) if self.light_sampling else []
 
     def parameters(self) -> dict[str, Any]:

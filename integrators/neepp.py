@@ -149,7 +149,7 @@ class NEEPlusPlus(WalkIntegrator):
     def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
         return self.next_event.pilots(scene, spp) if self.max_depth > 1 else []
 
-    def learners(self, scene: mi.Scene, samples: int) -> list[Learner]:
+    def learners(self, scene: mi.Scene, sensor: mi.Sensor, samples: int) -> list[Learner]:
         return self.next_event.learners(scene, samples)
 
     def parameters(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from mitsuba_ext import registry
 from mitsuba_ext.decisions.defaults import EmitterSampling
-from mitsuba_ext.decisions.guide_learner import GuideLearner
+from mitsuba_ext.decisions.guiding import Guiding
 from mitsuba_ext.decisions.guided_directions import LaterConnections
 from mitsuba_ext.integrator import WalkIntegrator
 from mitsuba_ext.learning.learner import Learner
@@ -21,37 +21,114 @@ class PSSGuided(WalkIntegrator):
 
     Path guiding in primary sample space (:monosp:`pss_guided`)
     -----------------------------------------------------------
+
+    A path tracer that learns from its first samples which random numbers choose directions from
+    which light comes, and draws these more often. It is unbiased, knows nothing of materials or of
+    lights, and guides all BSDFs alike.
+
+    .. pluginparameters::
+
+     * - regions
+       - |string|
+       - What has a tree of samples: :monosp:`surfaces` (voxels, and the sides of the surfaces in
+         them; all bounces use the trees of the places where they happen), or :monosp:`tiles` (of
+         the film, as in the thesis; the samples of a path's first bounce decide about the tree of
+         the second, and so on). (Default: surfaces)
+     * - tile
+       - |int|
+       - Edge of a tile in pixels; known only with :monosp:`tiles`. (Default: 16)
+     * - bounces
+       - |int|
+       - How many directions of a path are guided, at most; those that do not pay are left out. At
+         most 5 with tiles. (Default: 6; 2 with tiles)
+     * - nee_first_bounce
+       - |bool|
+       - Connect the first vertex of a path to lights? False is the setting in which the thesis
+         measures, for comparisons. (Default: true)
+     * - pilot_spp
+       - |int|
+       - Samples per pixel from which is learned, at most a quarter of all. They count towards the
+         image. With 0, or where they are fewer than 3, nothing is guided. A sampler that is
+         stratified over all samples may need longer pilots. (Default: 32)
+     * - max_memory
+       - |float|
+       - Memory for what is recorded and learned, in MiB. Where the pilots need more, they record
+         a part of their paths. (Default: 512)
+     * - max_depth
+       - |int|
+       - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 adds direct
+         illumination, and so on. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Path depth at which Russian roulette on the throughput begins. What guiding adds to the
+         throughput does not count: paths to bright places are not ended sooner. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: false)
+     * - timeout
+       - |float|
+       - Seconds after which to stop, 0 or less for no limit. It is kept as by
+         :monosp:`composed_path`; the pilots are always finished. (Default: -1)
+     * - aovs
+       - |string|
+       - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
+         :monosp:`depth:depth,nn:sh_normal`. (Default: none)
+
+    **Use it when** light comes by way of other surfaces: through doors, windows and gaps, from lit
+    corners, along mirrors and glossy things. **Not when** most light is direct (use
+    :monosp:`neepp` to choose among many lights), when an image has fewer than 16 samples per pixel,
+    or for caustics of small lights seen through glass, which paths from the camera do not find.
+
+    Each tree is a k-d tree over the two numbers by which a BSDF chooses a direction. Its density is
+    what paths brought on average from there on, drawn to what was found in larger surroundings
+    where there are few samples, and mixed with uniform numbers. The second of three pilots shows
+    what the trees of the first are worth: if it is less than 8 % of the variance, learning ends
+    there and the rest is rendered as by :monosp:`path`. The same measurement says how much of the
+    samples trees decide (40, 60 or 80 %) and how many bounces are worth guiding. After a render,
+    :monosp:`integrator.statistics.learned` tells, and :monosp:`integrator.guide` holds what was
+    learned (see examples/learned_samples.py).
+
+    The number that chooses a lobe of the BSDF is not guided. Participating media are ignored, as by
+    :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized
+    variants. Nested in :monosp:`moment` there is no pilot.
+
+    Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of
+    film tiles. Regions of surfaces, the estimates, and the measurement of the gain are ours.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="pss_guided">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'pss_guided',
+            'max_depth': 8
     """
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        get = self.parameter
-        self.regions = get(props, "regions", "surfaces", choices=("surfaces", "tiles"))
-        tiles = self.regions == "tiles"
-        self.tile = get(props, "tile", 16, minimum=1) if tiles else None
-        self.bounces = get(props, "bounces", 2 if tiles else 6, minimum=1, maximum=5 if tiles else 64)
-        self.nee_first_bounce = get(props, "nee_first_bounce", True)
-        self.pilot_spp = get(props, "pilot_spp", 16, minimum=0)
-        self.max_memory = get(props, "max_memory", 512.0, minimum=1e-3)
+        self.guiding = Guiding(self, props)
+        self.nee_first_bounce = self.parameter(props, "nee_first_bounce", True)
+
+    @property
+    def guide(self):
+        """What the last render has learned (:class:`~mitsuba_ext.decisions.guided_directions.\
+GuidedDirections`); ``None`` where nothing was guided."""
+        return self.guiding.guide
 
     def decisions(self, scene: mi.Scene) -> dict[str, Any]:
-        return {} if self.nee_first_bounce else {"next_event": LaterConnections(EmitterSampling())}
+        if self.nee_first_bounce:
+            return {}
+        return {"next_event": LaterConnections(EmitterSampling())}
 
     def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
-        samples = min(self.pilot_spp, spp // 4)
-        if samples < 2 or self.max_depth < 2:
-            return []
-        return [max(1, samples // 4), samples - max(1, samples // 4)]
+        return self.guiding.pilots(scene, spp, self.max_depth)
 
-    def learners(self, scene: mi.Scene, samples: int) -> list[Learner]:
-        if samples == 0:
-            return []
-        return [GuideLearner(self.tile, self._extent, min(self.bounces, self.max_depth-1), int(self.max_memory*2**20), samples)]
-
-    def stages(self, scene, sensor, samples):
-        from mitsuba_ext import camera
-        self._extent = camera.film_extent(sensor.film())
-        yield from super().stages(scene, sensor, samples)
+    def learners(self, scene: mi.Scene, sensor: mi.Sensor, samples: int) -> list[Learner]:
+        return self.guiding.learners(scene, sensor, samples, self.max_depth)
 
     def parameters(self) -> dict[str, Any]:
-        return {}
+        return {**self.guiding.parameters(), "nee_first_bounce": self.nee_first_bounce}

@@ -75,7 +75,7 @@ class WalkIntegrator(mi.SamplingIntegrator):
         """The samples per pixel of each pilot stage, out of ``spp``; none where nothing learns."""
         return []
 
-    def learners(self, scene: mi.Scene, samples: int) -> list[Learner]:
+    def learners(self, scene: mi.Scene, sensor: mi.Sensor, samples: int) -> list[Learner]:
         """Who learns from ``samples`` pilot samples (of all pixels together; with 0, only those who
         know something already)."""
         return []
@@ -88,7 +88,7 @@ class WalkIntegrator(mi.SamplingIntegrator):
         width, height = camera.film_extent(sensor.film())
         decisions = self.decisions(scene)
         *pilots, _rest = samples
-        learners = self.learners(scene, width * height * sum(pilots))
+        learners = self.learners(scene, sensor, width * height * sum(pilots))
         p, n = mi.Point3f(), mi.Normal3f()
         if any(learner.wants_scout for learner in learners):
             scout = Scout()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -11,78 +12,69 @@ import numpy as np
 from ..learning.learner import Learner
 from ..learning.path_records import BYTES_PER_RECORD, PathRecords
 from ..learning.sample_trees import SampleTrees
-from ..learning.surface_regions import SurfaceRegions
-from ..learning.tile_regions import TileRegions
 from .defaults import DirectionSamples
-from .guided_directions import GuidedDirections
+from .guided_directions import GuidedDirections, Regions
 
-#: The share of the samples that trees decide in the second pilot, and from which of these one is
-#: chosen for the rest.
+#: The share of the samples that trees decide in the second pilot, and those from which one is
+#: chosen as soon as it is known what they are worth.
 _FIRST_SHARE, _SHARES = 0.6, (0.4, 0.6, 0.8)
 
-#: By how much the variance must fall, relatively: what guiding costs in time. And what a bounce
-#: must add.
-_LEAST_GAIN, _LEAST_OF_BOUNCE = 0.1, 0.01
-
-#: Samples of a region, at least.
-_REGION_SAMPLES = 64
+#: By how much the variance must fall, relatively, by all bounces and by each of them: it is what
+#: they cost in time.
+_LEAST_GAIN, _LEAST_OF_BOUNCE = 0.08, 0.02
 
 
 class GuideLearner(Learner):
-    """Learns trees of primary samples in the pilots. The second pilot shows what the trees of the
-    first one are worth: if too little, learning ends there.
+    """Learns trees of primary samples in the pilots. The second pilot draws from the trees of the
+    first one, and so shows what they are worth: if too little, learning ends there. The same
+    samples tell how many bounces to guide, and how much is left to chance.
 
     Parameters:
-        tile: Edge of the film's tiles that have a tree each; ``None``: regions of surfaces have.
-        extent: Width and height of the film.
+        regions: Makes the regions that have a tree each, from the scout's vertices and normals.
+        wants_scout: Does it need these?
         bounces: How many directions of a path are guided, at most.
-        max_memory: Bytes for what is recorded, and built from it.
+        max_memory: Bytes for what is recorded, and for what is built from it.
         pilot_samples: Samples of all pilots together.
+
+    Attributes:
+        guide (GuidedDirections): What was learned; ``None`` where nothing is guided.
     """
 
     def __init__(
         self,
-        tile: int | None,
-        extent: tuple[int, int],
+        regions: Callable[[mi.Point3f, mi.Normal3f], Regions],
+        wants_scout: bool,
         bounces: int,
         max_memory: int,
         pilot_samples: int,
     ) -> None:
-        self.tile, self.extent, self.bounces = tile, extent, bounces
-        self.max_memory, self.pilot_samples = max_memory, pilot_samples
-        self.wants_scout = tile is None
+        self._make_regions, self.wants_scout = regions, wants_scout
+        self.bounces, self.max_memory, self.pilot_samples = bounces, max_memory, pilot_samples
+        self.guide: GuidedDirections | None = None
         self._records: PathRecords | None = None
         self._share, self._summary = _FIRST_SHARE, ""
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
-        self._records, self._share = None, None
-        self._summary = "no guiding: no path scatters"
-        if self.tile is not None:
-            self._regions = TileRegions(*self.extent, self.tile)
-        elif dr.width(p) > 0:
-            width, height = self.extent
-            paths = dr.width(p) / 3
-            self._regions = SurfaceRegions(
-                p, n, max(1, _REGION_SAMPLES * width * height / self.pilot_samples)
-            )
-        else:
+        self.guide, self._records = None, None
+        self._summary = "no guide: no path scatters"
+        if self.wants_scout and dr.width(p) == 0:
             return {}
-        records = self.pilot_samples * self.bounces
-        stride = -(-records * BYTES_PER_RECORD // self.max_memory)
-        self._records = PathRecords(self._regions.label, self.bounces, stride)
+        self._regions = self._make_regions(p, n)
+        most = self.pilot_samples * self.bounces * BYTES_PER_RECORD
+        self._records = PathRecords(self._regions.label, self.bounces, -(-most // self.max_memory))
         return {}
 
     # ---- Observer ----
 
-    def begin(self, lanes, pixel) -> None:
+    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         if self._records is not None:
             self._records.begin(lanes, pixel)
 
-    def direction(self, *arguments) -> None:
+    def direction(self, *arguments: Any) -> None:
         if self._records is not None:
             self._records.direction(*arguments)
 
-    def end(self, L) -> None:
+    def end(self, L: mi.Spectrum) -> None:
         if self._records is not None:
             self._records.end(L)
 
@@ -93,40 +85,42 @@ class GuideLearner(Learner):
         if records is None:
             return {}
         records.finish()
-        bounces, share = self.bounces, _FIRST_SHARE
-        summary = ""
-        if self._share is not None:
+        bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
+        if self.guide is not None:
             gains = self._gains(records)
             share = max(gains, key=lambda s: gains[s].sum())
-            gain = gains[share].sum()
             paying = np.flatnonzero(gains[share] > _LEAST_OF_BOUNCE)
-            bounces = paying[-1] + 1 if len(paying) else 0
+            bounces = int(paying[-1]) + 1 if len(paying) else 0
+            gain = gains[share][:bounces].sum()
+            effect = f"about {gain:.0%} less variance"
             if gain < _LEAST_GAIN:
-                self._records = None
-                self._summary = (
-                    f"{self._regions}; not used, guiding would lower the variance by only "
-                    f"{max(0.0, gain):.0%}"
-                )
+                self.guide, self._records = None, None
+                self._summary = f"no guide: with {self._regions}, {effect}"
                 return {"directions": DirectionSamples()}
-            summary = f", variance about {gain:.0%} lower"
         builder, roots, below = self._regions.build(records)
-        share_of_trees = dr.full(mi.Float, share, len(roots))
         trees = SampleTrees(
-            builder.probability, builder.child, builder.is_even, roots, share_of_trees, below
+            builder.probability,
+            builder.child,
+            builder.is_even,
+            roots,
+            dr.full(mi.Float, share, len(roots)),
+            below,
         )
         records.restart_counting()
         self._share = share
         self._summary = (
-            f"{self._regions}, {len(records.code)} samples, {trees.bytes / 2**20:.1f} MiB of trees, "
-            f"{bounces} bounces, a share of {share:g}{summary}"
+            f"guide: {self._regions}, {len(records.code)} samples, trees of "
+            f"{trees.bytes / 2**20:.1f} MiB for {bounces} bounces that decide {share:.0%} of the "
+            f"samples, {effect}"
         )
+        self.guide = GuidedDirections(trees, self._regions, bounces)
         if is_last:
             self._records = None
-        return {"directions": GuidedDirections(trees, self._regions, bounces)}
+        return {"directions": self.guide}
 
     def _gains(self, records: PathRecords) -> dict[float, np.ndarray]:
-        """By how much, relatively, the trees that drew the last samples lower the variance, for
-        each share and bounce."""
+        """By how much, relatively, the trees that drew the last samples lower the variance: for
+        each share that they could decide, by bounce."""
         new = dr.arange(mi.UInt32, len(records.code) - records.first_new)
         new += dr.opaque(mi.UInt32, records.first_new)
         value, weight, importance, bounce = (
@@ -141,6 +135,7 @@ class GuideLearner(Learner):
             dr.scatter_add(sums, mi.Float64(x), bounce)
             return sums.numpy()
 
+        # The mean squares under uniform samples, of those that were drawn, and of other shares
         uniform, actual = by_bounce(square * drawn), by_bounce(square)
         variance = max(records.variance + (uniform - actual).sum(), 1e-30)
         return {

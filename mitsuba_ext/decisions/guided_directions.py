@@ -20,6 +20,11 @@ class Regions(Protocol):
     def begin(self, pixel: mi.UInt32 | None) -> Any:
         """The state of paths that begin in ``pixel``."""
 
+    def label(
+        self, si: mi.SurfaceInteraction3f, pixel: mi.UInt32, active: mi.Bool
+    ) -> mi.UInt32:
+        """The region by which a sample is recorded."""
+
     def tree(self, state: Any, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
         """The tree for a vertex."""
 

@@ -32,7 +32,7 @@ class PathRecords(Observer):
         region, code (mi.UInt32): Of each sample: its region, and the cell of the primary sample.
         history (mi.UInt32): The cells of the path's earlier samples, the last one in the low byte.
         bounce (mi.UInt32): 0 for the first.
-        value (mi.Float): What the path brought from there on: the samples' densities are divided by.
+        value (mi.Float): What the path brought from there on, divided by densities of samples.
         weight (mi.Float): 1 / density of the sample.
         importance (mi.Float): By how much a squared error counts, at the place in the image.
         variance (float): Sum over the paths of the squared errors that they make, weighted so.

@@ -98,7 +98,7 @@ class SampleTrees:
         active = active & (share > 0)
         x = dr.select(active, dr.minimum(x, _ALMOST_ONE), u.x)
         point, density, leaf = self._descend(tree, mi.Point2f(x, u.y), by_tree, active)
-        return point, dr.fma(share, density - 1, 1), leaf
+        return point, dr.fma(share, density, 1 - share), leaf
 
     def density(
         self, tree: mi.UInt32, u: mi.Point2f, active: mi.Bool
@@ -106,7 +106,7 @@ class SampleTrees:
         """The density of a sample, and the number of its leaf."""
         share = dr.gather(mi.Float, self._share, tree, active)
         _point, density, leaf = self._descend(tree, u, mi.Bool(False), active & (share > 0))
-        return dr.fma(share, density - 1, 1), leaf
+        return dr.fma(share, density, 1 - share), leaf
 
     def value(self, leaf: mi.UInt32, active: mi.Bool) -> mi.UInt32:
         """What the caller has given the leaf."""

@@ -32,7 +32,7 @@ _LEAST_CHANGE = 0.05
 
 #: Fixed point of contributions, their squares and weights. Sums are exact: the same samples give
 #: the same trees.
-_UNITS = 2.0**20, 2.0**26, 2.0**10
+_UNITS = 2.0**20, 2.0**26, 2.0**20
 
 #: Largest contribution, in units of their mean. No sum of squares exceeds this times the number of
 #: samples, and so 2⁶⁴ units.
@@ -51,7 +51,8 @@ class Samples:
     def __init__(self, code: mi.UInt32, value: mi.Float, weight: mi.Float) -> None:
         self.code = code
         # No mean of numbers is below their largest one by more than their count
-        value = mi.Float64(dr.minimum(value / dr.maximum(dr.mean(value), 1e-30), _LIMIT))
+        value = mi.Float64(value)  # so that the order of the samples does not tell in their mean
+        value = dr.minimum(value / dr.maximum(dr.mean(value), 1e-30), _LIMIT)
         values = value, dr.square(value), mi.Float64(weight)
         self.values = [mi.UInt64(x * unit) for x, unit in zip(values, _UNITS)]
         dr.eval(self.values)
@@ -211,7 +212,8 @@ class TreeBuilder:
                 dr.scatter(square, dr.select(is_kept, new, 1), level.splits)
             dr.eval(probability, child, square)
             below = square
-            columns.append((probability, child, dr.full(mi.Bool, depth % 2 == 0, level.count), square))
+            is_even = dr.full(mi.Bool, depth % 2 == 0, level.count)
+            columns.append((probability, child, is_even, square))
         old = self.probability, self.child, self.is_even, self._square
         self.probability, self.child, self.is_even, self._square = (
             joined([x, *reversed(new)]) for x, new in zip(old, zip(*columns))
