@@ -8,8 +8,8 @@ import mitsuba as mi
 
 from mitsuba_ext import registry
 from mitsuba_ext.decisions.defaults import EmitterSampling
-from mitsuba_ext.decisions.guiding import Guiding
 from mitsuba_ext.decisions.guided_directions import LaterConnections
+from mitsuba_ext.decisions.guiding import Guiding
 from mitsuba_ext.integrator import WalkIntegrator
 from mitsuba_ext.learning.learner import Learner
 

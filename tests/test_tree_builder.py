@@ -109,7 +109,7 @@ def test_a_split_is_kept_for_those_below_it():
     """On a checkerboard, the first split alone says nothing."""
     u = _uniform(1 << 14)
     table = _table(_learned(u, (u[0] < 0.5) == (u[1] < 0.5)))
-    assert table[::15, ::15] == pytest.approx(np.array([[2, 0], [0, 2]]), abs=0.02)
+    assert table[::15, ::15] == pytest.approx(np.array([[2, 0], [0, 2]]), abs=0.05)
 
 
 @pytest.mark.parametrize("count", [16, 1000])

@@ -32,7 +32,7 @@ class _RecordingDirections(DirectionSamples):
     def __init__(self, recorder: _Recorder) -> None:
         self.recorder = recorder
 
-    def begin(self, sampler, ray):
+    def begin(self, sampler, ray, pixel):
         return mi.UInt32(0)
 
     def draw(self, state, sampler, si, depth, active):

@@ -19,9 +19,9 @@ from .guided_directions import GuidedDirections, Regions
 #: chosen as soon as it is known what they are worth.
 _FIRST_SHARE, _SHARES = 0.6, (0.4, 0.6, 0.8)
 
-#: By how much the variance must fall, relatively, by all bounces and by each of them: it is what
-#: they cost in time.
-_LEAST_GAIN, _LEAST_OF_BOUNCE = 0.08, 0.02
+#: What guiding the first direction of a path and each further one costs, in units of the time of a
+#: path (measured: 0 to 5 %, and 1 to 8 %); and the efficiency that it must reach.
+_COST, _COST_OF_BOUNCE, _LEAST_EFFICIENCY = 0.03, 0.04, 1.02
 
 
 class GuideLearner(Learner):
@@ -85,15 +85,15 @@ class GuideLearner(Learner):
         if records is None:
             return {}
         records.finish()
+        if records.count == 0:
+            self._records, self._summary = None, "no guide: no path scatters"
+            return {}
         bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
         if self.guide is not None:
             gains = self._gains(records)
-            share = max(gains, key=lambda s: gains[s].sum())
-            paying = np.flatnonzero(gains[share] > _LEAST_OF_BOUNCE)
-            bounces = int(paying[-1]) + 1 if len(paying) else 0
-            gain = gains[share][:bounces].sum()
+            share, bounces, gain, efficiency = _best(gains)
             effect = f"about {gain:.0%} less variance"
-            if gain < _LEAST_GAIN:
+            if efficiency < _LEAST_EFFICIENCY:
                 self.guide, self._records = None, None
                 self._summary = f"no guide: with {self._regions}, {effect}"
                 return {"directions": DirectionSamples()}
@@ -109,7 +109,7 @@ class GuideLearner(Learner):
         records.restart_counting()
         self._share = share
         self._summary = (
-            f"guide: {self._regions}, {len(records.code)} samples, trees of "
+            f"guide: {self._regions}, {records.count} samples, trees of "
             f"{trees.bytes / 2**20:.1f} MiB for {bounces} bounces that decide {share:.0%} of the "
             f"samples, {effect}"
         )
@@ -121,7 +121,7 @@ class GuideLearner(Learner):
     def _gains(self, records: PathRecords) -> dict[float, np.ndarray]:
         """By how much, relatively, the trees that drew the last samples lower the variance: for
         each share that they could decide, by bounce."""
-        new = dr.arange(mi.UInt32, len(records.code) - records.first_new)
+        new = dr.arange(mi.UInt32, records.count - records.first_new)
         new += dr.opaque(mi.UInt32, records.first_new)
         value, weight, importance, bounce = (
             dr.gather(type(x), x, new)
@@ -146,3 +146,16 @@ class GuideLearner(Learner):
 
     def __str__(self) -> str:
         return self._summary
+
+
+def _best(gains: dict[float, np.ndarray]) -> tuple[float, int, float, float]:
+    """The most efficient way to guide: the trees' share, how many bounces, by how much their
+    variance is lower, and the efficiency relative to no guide."""
+    candidates = []
+    for share, by_bounce in gains.items():
+        for index, gain in enumerate(np.cumsum(by_bounce)):
+            cost = 1 + _COST + _COST_OF_BOUNCE * index
+            efficiency = 1 / (max(1 - gain, 1e-3) * cost)
+            candidates.append((efficiency, share, index + 1, float(gain)))
+    efficiency, share, bounces, gain = max(candidates)
+    return share, bounces, gain, efficiency

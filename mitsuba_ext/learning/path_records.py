@@ -51,7 +51,12 @@ class PathRecords(Observer):
     def restart_counting(self) -> None:
         """Lets ``paths``, ``variance`` and ``first_new`` speak of what comes from now on."""
         self.paths, self.variance = 0, 0.0
-        self.first_new = len(self.code) if self._passes else 0
+        self.first_new = self.count
+
+    @property
+    def count(self) -> int:
+        """How many samples there are, after :meth:`finish`."""
+        return len(self.code) if self._passes else 0
 
     # ---- Observer of the walk ----
 
@@ -87,6 +92,8 @@ class PathRecords(Observer):
     def finish(self) -> None:
         """Ends the observation of a stage."""
         self._collect()
+        if not self._passes:
+            return
         columns = [joined(parts) for parts in zip(*self._passes)]
         self.region, self.code, self.history, self.bounce = columns[:4]
         self.value, self.weight, self.importance = columns[4:]
@@ -100,6 +107,9 @@ class PathRecords(Observer):
         self.paths += self._lanes
         self.variance += float(dr.sum(mi.Float64(error))[0])
         slot = dr.compress(self._weights > 0)
+        self._lanes = 0
+        if len(slot) == 0:
+            return
         key, weight, before = (
             dr.gather(type(x), x, slot) for x in (self._keys, self._weights, self._before)
         )
@@ -120,7 +130,6 @@ class PathRecords(Observer):
         ]
         dr.eval(columns)
         self._passes.append(columns)
-        self._lanes = 0
         self._keys = self._weights = self._before = self._total = self._pixel = None
 
 
