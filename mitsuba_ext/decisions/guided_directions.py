@@ -60,6 +60,16 @@ class GuidedDirections(DirectionSamples):
         return sample_1, sample_2, dr.rcp(density), state
 
 
+    def density(
+        self, si: mi.SurfaceInteraction3f, pixel: mi.UInt32 | None, u: mi.Point2f
+    ) -> mi.Float:
+        """The density of ``u`` among the samples that choose the first direction, for paths that
+        begin in ``pixel`` of the film (row by row) and meet ``si`` first."""
+        active = mi.Bool(True)
+        tree = self._regions.tree(self._regions.begin(pixel), si, active)
+        return self._trees.density(tree, u, active)[0]
+
+
 class LaterConnections(EmitterSampling):
     """Another choice of lights, but for a path's first vertex: there, light is found by BSDF
     samples only (the setting of the thesis's section 2.4.2)."""
