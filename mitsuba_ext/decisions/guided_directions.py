@@ -82,9 +82,11 @@ class LaterConnections(EmitterSampling):
 
     def sample(self, state, scene, sampler, si, active):
         vertex, inner = state
-        ds, weight, inner = self._choice.sample(inner, scene, sampler, si, active & (vertex > 0))
-        ds.pdf = dr.select(vertex > 0, ds.pdf, 0)
-        return ds, dr.select(vertex > 0, weight, 0), (vertex + 1, inner)
+        ds, weight, inner = self._choice.sample(inner, scene, sampler, si, active)
+        # No BSDF sample runs into a light without extent
+        connects = (vertex > 0) | ds.delta
+        ds.pdf = dr.select(connects, ds.pdf, 0)
+        return ds, dr.select(connects, weight, 0), (vertex + 1, inner)
 
     def pdf(self, state, scene, ref, si, ds, active):
         vertex, inner = state

@@ -52,7 +52,9 @@ class Samples:
         self.code = code
         # No mean of numbers is below their largest one by more than their count
         value = mi.Float64(value)  # so that the order of the samples does not tell in their mean
-        value = dr.minimum(value / dr.maximum(dr.mean(value), 1e-30), _LIMIT)
+        # Opaque: other counts share the kernel
+        mean = dr.sum(value) / dr.opaque(mi.Float64, len(value))
+        value = dr.minimum(value / dr.maximum(mean, 1e-30), _LIMIT)
         values = value, dr.square(value), mi.Float64(weight)
         self.values = [mi.UInt64(x * unit) for x, unit in zip(values, _UNITS)]
         dr.eval(self.values)
@@ -164,11 +166,14 @@ class TreeBuilder:
         twins = dr.gather(mi.UInt32, self.child, twin, has_twins)
         level.splits = splits
         level.probability = (evidence * found + _PRIOR * expected) / (evidence + _PRIOR)
+        twin_l, twin_r = (dr.select(has_twins, x, twin) for x in (twins, twins + 1))
+        # All at once: each of them would be a kernel of its own
+        dr.eval(begin, middle, end, code, middle_code, twin_l, twin_r, level.probability)
         return _Level(
             _alternate(begin, middle),
             _alternate(middle, end),
             _alternate(code, middle_code),
-            _alternate(*(dr.select(has_twins, x, twin) for x in (twins, twins + 1))),
+            _alternate(twin_l, twin_r),
         )
 
     def _lower_bound(self, code, first=None, last=None) -> mi.UInt32:
@@ -198,6 +203,7 @@ class TreeBuilder:
             probability = dr.gather(mi.Float, self.probability, level.twin)
             child = dr.gather(mi.UInt32, self.child, level.twin)
             square = dr.gather(mi.Float, self._square, level.twin)
+            dr.eval(probability, child, square)
             if below is not None:
                 left = 2 * dr.arange(mi.UInt32, len(level.splits))
                 first_child = dr.opaque(mi.UInt32, level.first_child)
@@ -207,9 +213,10 @@ class TreeBuilder:
                     + dr.square(1 - p) * dr.gather(mi.Float, below, left + 1)
                 )
                 is_kept = new > 1 + _LEAST_CHANGE
-                dr.scatter(probability, dr.select(is_kept, p, LEAF), level.splits)
+                p, new = dr.select(is_kept, p, LEAF), dr.select(is_kept, new, 1)
+                dr.scatter(probability, p, level.splits)
                 dr.scatter(child, first_child + left, level.splits)
-                dr.scatter(square, dr.select(is_kept, new, 1), level.splits)
+                dr.scatter(square, new, level.splits)
             dr.eval(probability, child, square)
             below = square
             is_even = dr.full(mi.Bool, depth % 2 == 0, level.count)
