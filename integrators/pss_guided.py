@@ -44,7 +44,8 @@ class PSSGuided(WalkIntegrator):
      * - nee_first_bounce
        - |bool|
        - Connect the first vertex of a path to lights? False is the setting in which the thesis
-         measures, for comparisons. (Default: true)
+         measures, for comparisons; lights without extent are connected to all the same.
+         (Default: true)
      * - pilot_spp
        - |int|
        - Samples per pixel from which is learned, at most a quarter of all. They count towards the
@@ -82,9 +83,9 @@ class PSSGuided(WalkIntegrator):
     Each tree is a k-d tree over the two numbers by which a BSDF chooses a direction. Its density is
     what paths brought on average from there on, drawn to what was found in larger surroundings
     where there are few samples, and mixed with uniform numbers. The second of three pilots shows
-    what the trees of the first are worth: if it is less than 8 % of the variance, learning ends
-    there and the rest is rendered as by :monosp:`path`. The same measurement says how much of the
-    samples trees decide (40, 60 or 80 %) and how many bounces are worth guiding. After a render,
+    what the trees of the first are worth. From that follows how much of the samples trees decide
+    (40, 60 or 80 %) and how many bounces are worth the time of guiding them; if none is, learning
+    ends there, and the rest is rendered as by :monosp:`path`. After a render,
     :monosp:`integrator.statistics.learned` tells, and :monosp:`integrator.guide` holds what was
     learned (see examples/learned_samples.py).
 
