@@ -26,6 +26,7 @@ class HardCase:
         spp: Samples per pixel of one seed.
         parameters: Of the integrators.
         is_black: The image must be zero everywhere.
+        seeds: Renders of each integrator: few, as a failure here is a large deviation.
     """
 
     make: Callable[[], Scene]
@@ -34,6 +35,7 @@ class HardCase:
     max_depth: int = 4
     parameters: dict[str, Any] = field(default_factory=dict)
     is_black: bool = False
+    seeds: int = 6
 
 
 def rgb(*value: float) -> Scene:
@@ -306,7 +308,7 @@ HARD_CASES: dict[str, HardCase] = {
     "radiance_1e-4": HardCase(lambda: stage(radiance=1e-4)),
     "radiance_1e6": HardCase(lambda: stage(radiance=1e6)),
     "lamp_of_radius_1e-4": HardCase(lambda: _small_lamp(1e-4)),
-    "thousand_lights": HardCase(_many_lights),
+    "thousand_lights": HardCase(_many_lights, seeds=4),  # seconds to trace
     "no_light": HardCase(lambda: stage(light={}), is_black=True),
     "light_that_nothing_sees": HardCase(_hidden_light, is_black=True),
     "lights_seen_directly_only": HardCase(stage, max_depth=1, precision=0.03),

@@ -66,8 +66,12 @@ REGRESSIONS = {
         Regression("neepp", "many_lamps", spp=384),
         Regression("neepp", "window"),
         Regression("neepp", "open"),
+        # Longer pilots than by default: the film is small
+        Regression("pss_guided", "door_ajar", {"pilot_spp": 96}, spp=384),
+        Regression("pss_guided", "door_ajar", {"pilot_spp": 96, "regions": "tiles", "tile": 8},
+                   spp=384),
     )
-}
+}  # fmt: skip
 
 
 def render(regression: Regression, seeds: range) -> np.ndarray:

@@ -11,15 +11,18 @@ the module of the standard library.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import stats
+
+from mitsuba_ext.decisions import guide_learner
 
 SCENES = Path(__file__).parents[1] / "scenes"
 
@@ -34,6 +37,7 @@ class UnderTest:
         min_depth, max_depth: The values of ``max_depth`` that it can render; -1 is tested where
             ``unlimited``.
         draws_like_path: At the same seed, does it draw the numbers that ``path`` draws?
+        insists: Does it guide whatever that gains? On the small films of tests it gains little.
     """
 
     plugin: str
@@ -42,21 +46,41 @@ class UnderTest:
     max_depth: float = math.inf
     unlimited: bool = True
     draws_like_path: bool = False
+    insists: bool = False
 
     def can_render(self, max_depth: int) -> bool:
         return self.unlimited if max_depth == -1 else self.min_depth <= max_depth <= self.max_depth
 
     def make(self, max_depth: int = -1, **parameters: Any) -> mi.Integrator:
         """The integrator; it takes the place of the scene's own in ``mi.render``."""
-        return mi.load_dict(
+        integrator = mi.load_dict(
             {"type": self.plugin, "max_depth": max_depth, **self.parameters, **parameters}
         )
+        if self.insists:
+            integrator.render = insisting(integrator.render)
+        return integrator
+
+
+def insisting(render: Callable) -> Callable:
+    """Guides all bounces, whatever the learner measures."""
+
+    def whatever_it_gains(gains: dict[float, np.ndarray]) -> tuple[float, int, float, float]:
+        share, _bounces, gain, _efficiency = best(gains)
+        return share, len(gains[share]), gain, math.inf
+
+    def insisting_render(*arguments: Any, **options: Any) -> mi.TensorXf:
+        with mock.patch.object(guide_learner, "_best", whatever_it_gains):
+            return render(*arguments, **options)
+
+    best = guide_learner._best
+    return insisting_render
 
 
 #: Add a new integrator here: furnaces, z-tests and hard cases are then run on it.
 UNDER_TEST: dict[str, UnderTest] = {
     "composed_path": UnderTest("composed_path", draws_like_path=True),
     "neepp": UnderTest("neepp"),
+    "pss_guided": UnderTest("pss_guided", insists=True),
 }
 
 #: What they are compared with.
@@ -67,6 +91,7 @@ REFERENCE = UnderTest("path", draws_like_path=True)
 _TRAINED = {"pilot_spp": 32, "grid": 8}
 _REJECTING = {**_TRAINED, "rejection": True}
 _MAPPED = {**_REJECTING, "light_sampling": "uniform"}
+_TILES = {"regions": "tiles", "tile": 5}
 UNUSUAL: dict[str, UnderTest] = {
     "trained": UnderTest("neepp", _TRAINED),
     "visibility": UnderTest("neepp", {**_TRAINED, "light_sampling": "visibility"}),
@@ -84,6 +109,8 @@ UNUSUAL: dict[str, UnderTest] = {
     "power": UnderTest("composed_path", {"next_event": "power"}),
     "spatial": UnderTest("composed_path", {"next_event": "spatial"}),
     "linear": UnderTest("composed_path", {"next_event": "linear"}),
+    "tiles": UnderTest("pss_guided", _TILES, insists=True),
+    "tiles_deep": UnderTest("pss_guided", {**_TILES, "tile": 64, "bounces": 5}, insists=True),
 }
 
 #: Single tests accept |z| below this (p = 6e-5); several at once, its Šidák correction.

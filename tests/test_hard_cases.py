@@ -24,19 +24,30 @@ from statistical import (
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-#: A hard case needs few seeds: the large deviations of a failure, not the small ones of a bias.
-_SEED_COUNT = 6
-
 BOTH = pytest.mark.parametrize("name", UNDER_TEST)
 
-#: With the default parameters no shadow ray is rejected: gamble on all of them too. Ways to choose
-#: a light matter where there are several.
-_SEVERAL_LIGHTS = (
-    "thousand_lights", "delta_lights", "textured_two_sided_lights", "materials", "no_light",
-)
+_SEVERAL_LIGHTS = ("delta_lights", "textured_two_sided_lights", "materials", "no_light")
+
+#: Settings that need not see all cases, and those that matter to them. With the default parameters
+#: no shadow ray is rejected: gamble on them too. Films matter to tiles.
+_UNUSUAL_CASES = {
+    "rejecting_floor": (
+        *_SEVERAL_LIGHTS, "plain", "scaled_by_1e-3", "scaled_by_1e4", "moved_by_1e3_sizes",
+        "radiance_1e6", "lamp_of_radius_1e-4", "light_that_nothing_sees", "sun_of_one_texel",
+        "smooth_normal_lamp", "closed_box", "degenerate_light", "one_sample", "max_depth_2",
+    ),
+    "spatial": _SEVERAL_LIGHTS,
+    "linear": ("thousand_lights", *_SEVERAL_LIGHTS),
+    "tiles": (
+        "no_light", "materials", "empty_before_environment", "film_of_one_pixel",
+        "film_of_odd_size", "cropped_film", "three_samples", "thousand_samples",
+        "max_depth_unlimited", "hidden_environment",
+    ),
+    "tiles_deep": ("closed_box", "cropped_film"),
+}  # fmt: skip
 HARD_PAIRS = [
-    *((case, name) for case in HARD_CASES for name in (*UNDER_TEST, "rejecting_floor")),
-    *((case, name) for case in _SEVERAL_LIGHTS for name in ("spatial", "linear")),
+    *((case, name) for case in HARD_CASES for name in UNDER_TEST),
+    *((case, name) for name, cases in _UNUSUAL_CASES.items() for case in cases),
 ]
 
 
@@ -49,7 +60,7 @@ def _scene(case: str) -> mi.Scene:
 def _means_of_path(case: str) -> np.ndarray:
     hard = HARD_CASES[case]
     path = REFERENCE.make(hard.max_depth, **hard.parameters)
-    images = batches(_scene(case), path, hard.spp, REFERENCE_SEEDS[:_SEED_COUNT])
+    images = batches(_scene(case), path, hard.spp, REFERENCE_SEEDS[: hard.seeds])
     return images.mean(axis=(1, 2, 3))
 
 
@@ -60,7 +71,7 @@ def test_hard_case_has_sound_pixels_and_the_mean_of_path(case: str, name: str) -
     if not under_test.can_render(hard.max_depth):
         pytest.skip(f"{name} cannot render max_depth={hard.max_depth}")
     integrator = under_test.make(hard.max_depth, **hard.parameters)
-    seeds = [SEEDS[0]] if under_test.draws_like_path else SEEDS[:_SEED_COUNT]
+    seeds = [SEEDS[0]] if under_test.draws_like_path else SEEDS[: hard.seeds]
     scene = _scene(case)
     images = batches(scene, integrator, hard.spp, seeds)
     assert_images_are_sound(images)
@@ -79,7 +90,7 @@ def test_hard_case_has_sound_pixels_and_the_mean_of_path(case: str, name: str) -
 def _assert_same_mean(a: np.ndarray, b: np.ndarray, precision: float) -> None:
     z = z_welch(a[:, None], b[:, None])[0]
     assert abs(z) < THRESHOLD, f"mean {a.mean():.6g}, path {b.mean():.6g}: z = {z:.2f}"
-    error = math.hypot(a.std(ddof=1), b.std(ddof=1)) / math.sqrt(_SEED_COUNT) / b.mean()
+    error = math.hypot(a.std(ddof=1), b.std(ddof=1)) / math.sqrt(len(a)) / b.mean()
     assert error <= precision, f"too noisy to say anything: relative standard error {error:.2%}"
 
 
@@ -104,11 +115,11 @@ def test_passes_of_one_render_draw_different_numbers(
     from mitsuba_ext import rendering
 
     scene, integrator = _scene("plain"), UNDER_TEST[name].make(4)
-    in_one = batches(scene, integrator, 16, SEEDS)
+    in_one = batches(scene, integrator, 16, SEEDS[:8])
     limits = dict.fromkeys(rendering._PASS_SAMPLES, 16 * 16)
     monkeypatch.setattr(rendering, "_PASS_SAMPLES", limits)
     monkeypatch.setattr(rendering, "_PASS_SPP", 1)
-    in_many = batches(scene, integrator, 16, SEEDS)
+    in_many = batches(scene, integrator, 16, SEEDS[:8])
     assert integrator.statistics.passes == 16
     noise = [images.std(axis=0, ddof=1).mean() for images in (in_one, in_many)]
     assert 0.8 < noise[1] / noise[0] < 1.25
@@ -191,8 +202,20 @@ _WRONG_REJECTION = [
     (TypeError, {"rejection": "yes"}),
     (TypeError, {"load_map": 3}),
 ]
+_WRONG_GUIDING = [
+    (ValueError, {"regions": "walls"}),
+    (TypeError, {"regions": 4}),
+    (ValueError, {"bounces": 0}),
+    (ValueError, {"bounces": 65}),
+    (TypeError, {"nee_first_bounce": 1}),
+    (ValueError, {"pilot_spp": -1}),
+    (TypeError, {"pilot_spp": 3.5}),
+    (ValueError, {"max_memory": 0.0}),
+    (ValueError, {"max_memory": math.nan}),
+]
 WRONG_VALUES = [(name, *wrong) for name in UNDER_TEST for wrong in _WRONG]
 WRONG_VALUES += [("neepp", *wrong) for wrong in _WRONG_REJECTION]
+WRONG_VALUES += [("pss_guided", *wrong) for wrong in _WRONG_GUIDING]
 WRONG_VALUES += [("composed_path", ValueError, {"shadow_test": "sometimes"})]
 WRONG_VALUES += [("composed_path", ValueError, {"next_event": "always"})]
 
@@ -213,6 +236,7 @@ def test_wrong_value_is_named_with_its_parameter_and_plugin(
         ("composed_path", "max_depht"),
         ("composed_path", "grid"),  # known only with shadow_test=visibility_roulette
         ("neepp", "voxels"),
+        ("pss_guided", "tile"),  # known only with regions=tiles
     ],
 )
 def test_unknown_parameter_is_refused(plugin: str, unknown: str) -> None:

@@ -96,6 +96,6 @@ def test_the_mean_is_that_of_path(surface: dict, spots: bool):
             "to_world": mi.ScalarTransform4f().look_at([0, -6, 3], [0, 0, 1], [0, 0, 1])},
     )  # fmt: skip
     neepp = mi.load_dict({"type": "neepp", "max_depth": 3, "grid": 8})
-    images = batches(scene, neepp, 64, range(1, 17))
+    images = batches(scene, neepp, 64, range(1, 9))
     reference = batches(scene, mi.load_dict({"type": "path", "max_depth": 3}), 64, range(100, 116))
     assert_same_mean(images, reference, precision=0.01)

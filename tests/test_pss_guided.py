@@ -1,0 +1,259 @@
+"""Path guiding: unbiased whatever it guides, worth it behind a door, and quiet where it is not."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_cases import HARD_CASES, area, diffuse, film, lookat, rectangle, sensor, stage
+from statistical import (
+    REFERENCE,
+    REFERENCE_SEEDS,
+    SEEDS,
+    UnderTest,
+    assert_images_are_sound,
+    assert_same_image,
+    assert_same_mean,
+    batches,
+    load,
+)
+
+from mitsuba_ext.decisions import DirectionSamples
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+TILES = {"regions": "tiles", "tile": 5}
+
+
+def insisting(max_depth: int = 5, **parameters: Any) -> mi.Integrator:
+    return UnderTest("pss_guided", parameters, insists=True).make(max_depth)
+
+
+def hidden_lamp(camera: dict | None = None, **changes: Any) -> mi.Scene:
+    """A box lit by a spot on its ceiling: the lamp stands on a shelf."""
+    T = mi.ScalarTransform4f
+    view = lookat([0, -3.2, 1], [0, 0, 1], [0, 0, 1])
+    room = T().translate([0, -1, 1]).scale([1.5, 3, 1])
+    shelf = T().translate([0.7, 0.5, 1.75]).scale([0.4, 0.4, 0.02])
+    lamp = T().translate([0.7, 0.5, 1.8]).scale([0.1, 0.1, 1])
+    scene = {
+        "type": "scene",
+        "sensor": camera or sensor(to_world=view, film=film(24, 24)),
+        "room": {"type": "cube", "to_world": room, "flip_normals": True,
+                 "bsdf": diffuse(0.7, 0.6, 0.5)},
+        "shelf": {"type": "cube", "to_world": shelf, "bsdf": diffuse(0.3)},
+        "lamp": rectangle(lamp, bsdf=diffuse(0.0), emitter=area(100.0)),
+        **changes,
+    }  # fmt: skip
+    return mi.load_dict({key: value for key, value in scene.items() if value is not None})
+
+
+@pytest.fixture(scope="module")
+def reference() -> np.ndarray:
+    mi.set_variant("llvm_ad_rgb")
+    return batches(hidden_lamp(), REFERENCE.make(5), 512, REFERENCE_SEEDS)
+
+
+# ---- The mean ----
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        *({"bounces": count} for count in (1, 2, 3, 4)),
+        *({**TILES, "bounces": count} for count in (1, 2, 3, 5)),
+        {"bounces": 2, "nee_first_bounce": False},
+        {**TILES, "tile": 64, "bounces": 3, "nee_first_bounce": False},
+        {**TILES, "tile": 1},
+    ],
+    ids=str,
+)
+def test_mean_is_that_of_path_whatever_is_guided(
+    parameters: dict[str, Any], reference: np.ndarray
+) -> None:
+    integrator = insisting(pilot_spp=64, **parameters)
+    images = batches(hidden_lamp(), integrator, 256, SEEDS[:8])
+    assert integrator.guide is not None
+    bounces = min(parameters.get("bounces", 2), 4)
+    assert f"for {bounces} bounces that" in integrator.statistics.learned
+    assert_same_mean(images, reference, 0.015 if parameters.get("nee_first_bounce", True) else 0.03)
+
+
+def test_guiding_lowers_the_variance_behind_a_door() -> None:
+    """In nearly all pixels: light comes by way of a streak on the floor. The learner finds that the
+    regions of surfaces are worth their time."""
+    scene = load("door_ajar", width=64, height=36)
+
+    def logarithm(integrator: mi.Integrator, seeds: range) -> float:
+        images = batches(scene, integrator, 96, seeds[:4]).mean(axis=3)
+        return np.log(images.var(axis=0, ddof=1) + 1e-9).mean()
+
+    reference = logarithm(REFERENCE.make(6), REFERENCE_SEEDS)
+    surfaces, tiles = UnderTest("pss_guided").make(6), insisting(6, **{**TILES, "tile": 10})
+    for integrator, most in ((surfaces, 0.8), (tiles, 0.93)):
+        ratio = math.exp(logarithm(integrator, SEEDS) - reference)
+        assert integrator.guide is not None and ratio < most, str(ratio)
+        assert "% less variance" in integrator.statistics.learned
+
+
+def test_early_roulette_keeps_the_mean_of_long_paths() -> None:
+    scene = load("cornell_box", width=16, height=16)
+    integrator = insisting(-1, rr_depth=2)
+    images = batches(scene, integrator, 128, SEEDS[:8])
+    assert integrator.guide is not None
+    reference = batches(scene, REFERENCE.make(-1, rr_depth=20), 256, REFERENCE_SEEDS[:8])
+    assert_same_mean(images, reference, precision=0.012)
+
+
+@pytest.mark.parametrize("parameters", [{}, TILES], ids=["surfaces", "tiles"])
+def test_memory_bounds_what_is_recorded(
+    parameters: dict[str, Any], reference: np.ndarray
+) -> None:
+    """A hundred samples of 37,000: trees are poor, and the mean is right."""
+    integrator = insisting(max_memory=0.015, **parameters)
+    images = batches(hidden_lamp(), integrator, 128, SEEDS[:8])
+    assert_same_mean(images, reference, precision=0.015)
+    recorded = int(integrator.statistics.learned.split(" samples,")[0].split()[-1])
+    assert 20 < recorded < 120
+
+
+@pytest.mark.parametrize("spp", [1, 2, 3, 11])
+def test_too_few_samples_for_pilots_give_the_image_of_path(spp: int) -> None:
+    scene, integrator = hidden_lamp(), insisting()
+    image, path = (batches(scene, i, spp, [5])[0] for i in (integrator, REFERENCE.make(5)))
+    assert integrator.guide is None and integrator.statistics.passes == 1
+    assert_same_image(image, path)
+
+
+@pytest.mark.parametrize("spp", [12, 13])
+def test_three_pilots_of_one_sample_keep_the_mean(spp: int, reference: np.ndarray) -> None:
+    integrator = insisting()
+    images = batches(hidden_lamp(), integrator, spp, SEEDS)
+    assert integrator.guide is not None
+    assert (integrator.statistics.passes, integrator.statistics.spp) == (4, spp)
+    assert_same_mean(images, reference, precision=0.1)
+
+
+# ---- Without connections at the first vertex ----
+
+
+def test_later_connections_alone_have_the_mean_of_path() -> None:
+    """Lights without extent, which no direction runs into, are connected nevertheless."""
+    point = {"type": "point", "position": [0.8, -1, 1.5], "intensity": {"type": "rgb", "value": 1}}
+    for more in ({}, {"point": point}):
+        scene = mi.load_dict(stage(**more))
+        later = UnderTest("pss_guided", {"nee_first_bounce": False, "pilot_spp": 0}).make(4)
+        images = batches(scene, later, 256, SEEDS[:8])
+        reference = batches(scene, REFERENCE.make(4), 256, REFERENCE_SEEDS[:8])
+        assert_same_mean(images, reference, precision=0.02)
+
+
+def test_no_shadow_ray_leaves_the_first_vertex() -> None:
+    scene = mi.load_dict(stage())
+    later = UnderTest("pss_guided", {"nee_first_bounce": False}).make(2)
+    assert batches(scene, later, 16, [1]).any()
+    assert later.statistics.rays["shadow"] == later.statistics.connections == 0
+
+
+# ---- Where there is nothing to learn, and where it is not worth while ----
+
+
+def _directions(integrator: mi.Integrator) -> list[type]:
+    """The classes of the directions that are chosen, stage by stage; filled by renders."""
+    found, stage = [], integrator.stage
+
+    def observed(learned: str = "", **decisions: Any):
+        found.append(type(decisions.get("directions", DirectionSamples())))
+        return stage(learned, **decisions)
+
+    integrator.stage = observed
+    return found
+
+
+def _mirrors() -> dict:
+    mirror = {"type": "conductor"}
+    return stage(floor=rectangle(bsdf=mirror), wall=None, block=None)
+
+
+@pytest.mark.parametrize("parameters", [{}, TILES], ids=["surfaces", "tiles"])
+@pytest.mark.parametrize(
+    ("scene", "max_depth"),
+    [
+        ("furnace_convex", 4), ("plain", 2), ("plain", 1), ("no_light", 4), ("empty", 4),
+        ("empty_before_environment", 4), ("light_that_nothing_sees", 4), ("mirrors", 4),
+        ("delta_lights", 2),
+    ],
+)  # fmt: skip
+def test_nothing_is_guided_where_nothing_is_gained(
+    scene: str, max_depth: int, parameters: dict[str, Any]
+) -> None:
+    """The last stage is that of ``path``."""
+    if scene.startswith("furnace"):
+        scene = load(scene, width=16, height=16)
+    else:
+        scene = mi.load_dict(_mirrors() if scene == "mirrors" else HARD_CASES[scene].make())
+    integrator = UnderTest("pss_guided", parameters).make(max_depth)
+    directions = _directions(integrator)
+    images = batches(scene, integrator, 64, SEEDS[:2])
+    assert_images_are_sound(images)
+    assert integrator.guide is None and directions[-1] is DirectionSamples
+    learned = integrator.statistics.learned
+    assert learned.startswith("no guide: ") if len(directions) > 2 else learned == ""
+    reference = batches(scene, REFERENCE.make(max_depth), 64, REFERENCE_SEEDS[:2])
+    assert images.mean() == pytest.approx(reference.mean(), rel=0.1)
+
+
+# ---- State ----
+
+
+@pytest.mark.parametrize("parameters", [{}, TILES], ids=["surfaces", "tiles"])
+def test_renders_between_change_nothing(parameters: dict[str, Any]) -> None:
+    """Another scene, another film, another number of samples, another seed."""
+    scene, integrator = hidden_lamp(), insisting(**parameters)
+    first = batches(scene, integrator, 48, [7])[0]
+    batches(mi.load_dict(stage(camera=sensor(film=film(31, 9)))), integrator, 20, [7])
+    batches(scene, integrator, 64, [8])
+    wide = mi.load_dict(sensor(to_world=lookat([0, -3, 1], [0, 0, 1.5], [0, 0, 1])))
+    integrator.render(scene, wide, seed=7, spp=16)
+    again = batches(scene, integrator, 48, [7])[0]
+    np.testing.assert_allclose(again, first, rtol=1e-5, atol=1e-5 * first.mean())
+
+
+@pytest.mark.parametrize("parameters", [{}, {**TILES, "bounces": 4}], ids=["surfaces", "tiles"])
+def test_another_seed_compiles_nothing(parameters: dict[str, Any]) -> None:
+    """Other numbers of samples and of nodes share the kernels of the first renders."""
+    scene, integrator = hidden_lamp(), insisting(**parameters)
+    batches(scene, integrator, 64, SEEDS[:4])
+    before = dr.detail.launch_stats()[2]
+    batches(scene, integrator, 64, SEEDS[4:8])
+    assert dr.detail.launch_stats()[2] - before <= 1
+
+
+# ---- Parameters ----
+
+
+def test_parameters_are_shown() -> None:
+    for parameters, shown in (
+        ({}, ["regions = surfaces", "bounces = 6", "pilot_spp = 32", "max_memory = 512.0",
+              "nee_first_bounce = True"]),
+        ({"regions": "tiles"}, ["regions = tiles", "tile = 16", "bounces = 2"]),
+        ({"max_depth": 7, "bounces": 3, "nee_first_bounce": False},
+         ["max_depth = 7", "bounces = 3", "nee_first_bounce = False"]),
+    ):  # fmt: skip
+        text = str(mi.load_dict({"type": "pss_guided", **parameters}))
+        assert text.startswith("pss_guided[")
+        assert all(f"  {line}" in text for line in shown), text
+        assert ("tile =" in text) == (parameters.get("regions") == "tiles")
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value"), [("bounces", 6), ("bounces", 0), ("tile", 0), ("tile", 2.5)]
+)
+def test_wrong_values_of_tiles_are_named(parameter: str, value: Any) -> None:
+    with pytest.raises((RuntimeError, ValueError, TypeError)) as caught:
+        mi.load_dict({"type": "pss_guided", "regions": "tiles", parameter: value})
+    assert all(word in str(caught.value) for word in ('"pss_guided"', parameter, repr(value)))
