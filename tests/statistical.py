@@ -91,7 +91,6 @@ REFERENCE = UnderTest("path", draws_like_path=True)
 _TRAINED = {"pilot_spp": 32, "grid": 8}
 _REJECTING = {**_TRAINED, "rejection": True}
 _MAPPED = {**_REJECTING, "light_sampling": "uniform"}
-_TILES = {"regions": "tiles", "tile": 5}
 UNUSUAL: dict[str, UnderTest] = {
     "trained": UnderTest("neepp", _TRAINED),
     "visibility": UnderTest("neepp", {**_TRAINED, "light_sampling": "visibility"}),
@@ -109,8 +108,7 @@ UNUSUAL: dict[str, UnderTest] = {
     "power": UnderTest("composed_path", {"next_event": "power"}),
     "spatial": UnderTest("composed_path", {"next_event": "spatial"}),
     "linear": UnderTest("composed_path", {"next_event": "linear"}),
-    "tiles": UnderTest("pss_guided", _TILES, insists=True),
-    "tiles_deep": UnderTest("pss_guided", {**_TILES, "tile": 64, "bounces": 5}, insists=True),
+    "tiles": UnderTest("pss_guided", {"regions": "tiles", "tile": 5}, insists=True),
 }
 
 #: Single tests accept |z| below this (p = 6e-5); several at once, its Šidák correction.

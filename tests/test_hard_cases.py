@@ -39,11 +39,10 @@ _UNUSUAL_CASES = {
     "spatial": _SEVERAL_LIGHTS,
     "linear": ("thousand_lights", *_SEVERAL_LIGHTS),
     "tiles": (
-        "no_light", "materials", "empty_before_environment", "film_of_one_pixel",
+        "no_light", "materials", "closed_box", "empty_before_environment", "film_of_one_pixel",
         "film_of_odd_size", "cropped_film", "three_samples", "thousand_samples",
         "max_depth_unlimited", "hidden_environment",
     ),
-    "tiles_deep": ("closed_box", "cropped_film"),
 }  # fmt: skip
 HARD_PAIRS = [
     *((case, name) for case in HARD_CASES for name in UNDER_TEST),
