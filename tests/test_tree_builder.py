@@ -12,8 +12,9 @@ from mitsuba_ext.learning.tree_builder import DEPTH, Samples, TreeBuilder, cell_
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-#: Smallest cells along each axis, and what the expectation is worth in samples.
-CELLS, PRIOR = 16, 16
+#: Smallest cells along each axis, what the expectation is worth in equal samples, and how many of
+#: them are split.
+CELLS, PRIOR, SPLIT = 16, 16, 4
 
 
 def _uniform(count: int, seed: int = 0) -> np.ndarray:
@@ -84,7 +85,8 @@ def test_the_first_bit_of_a_code_is_the_side_of_the_first_split(u, code):
 
 
 @pytest.mark.parametrize("count, value", [
-    (1, 1.0), (15, [0.0] * 14 + [1.0]), (1000, 0.0), (1000, 1e30), (1000, [1.0] * 999 + [1e30]),
+    (1, 1.0), (SPLIT - 1, 1.0), (15, [0.0] * 12 + [1.0] * 3), (1000, 0.0), (1000, 1e30),
+    (1000, [1.0] * 999 + [1e30]),
 ])  # fmt: skip
 def test_few_equal_and_single_enormous_values_give_no_splits(count, value):
     assert _is_uniform(_learned(_uniform(count), value))
@@ -112,7 +114,7 @@ def test_a_split_is_kept_for_those_below_it():
     assert table[::15, ::15] == pytest.approx(np.array([[2, 0], [0, 2]]), abs=0.05)
 
 
-@pytest.mark.parametrize("count", [16, 1000])
+@pytest.mark.parametrize("count", [2 * SPLIT, 1000])
 def test_samples_of_one_cell_leave_the_others_their_prior(count):
     """The expectation of equal shares is worth so many equal samples, split by split."""
     cell = np.full((2, count), 0.5 / CELLS, np.float32)
@@ -177,7 +179,7 @@ def test_the_same_samples_in_another_order_give_the_same_trees():
     """Exactly; their mean in single precision once made a difference."""
     count, trees = 100_000, 500
     rng, u = np.random.default_rng(1), _uniform(count)
-    value, tree = rng.lognormal(0, 3, count), rng.integers(0, trees, count)
+    value, tree = rng.lognormal(0, 1, count), rng.integers(0, trees, count)
     results = []
     for order in (np.arange(count), np.argsort(value)):
         builder = TreeBuilder()
@@ -189,9 +191,28 @@ def test_the_same_samples_in_another_order_give_the_same_trees():
 # ---- Many trees ----
 
 
+def test_merged_samples_give_the_same_trees():
+    """Of each region, the samples of a cell become one."""
+    count, regions = 50_000, 70
+    rng, u = np.random.default_rng(4), _uniform(count)
+    region = mi.UInt32(rng.integers(0, regions, count).astype(np.uint32))
+    samples = _samples(u, FUNCTIONS["edge"](*u), rng.uniform(0.2, 5, count))
+    merged, merged_region = samples.merged(region)
+    cells = {(int(r), int(c)) for r, c in zip(region.numpy(), samples.code.numpy())}
+    found = zip(merged_region.numpy().tolist(), merged.code.numpy().tolist())
+    assert sorted(cells) == list(found)
+    results = []
+    for data, tree in ((samples, region), (merged, merged_region)):
+        builder = TreeBuilder()
+        builder.add(data, tree // 10, regions // 10)
+        builder.add(data, tree, regions, 1 + dr.arange(mi.UInt32, regions) // 10)
+        results.append(_arrays(builder))
+    assert len(results[0][0]) > 1000 and all(map(np.array_equal, *results))
+
+
 def test_trees_built_together_are_those_built_alone():
     """Each from its own samples; none from those of a number that is no tree's."""
-    counts = [3000, 0, 15, 60, 5000]
+    counts = [3000, 0, SPLIT - 1, 60, 5000]
     functions = [FUNCTIONS[name] for name in ("ramp", "edge", "spot", "spot", "stripes")]
     parts = [_uniform(count, seed) for seed, count in enumerate(counts)]
     tree = np.repeat(np.arange(len(counts)), counts)
@@ -206,7 +227,7 @@ def test_trees_built_together_are_those_built_alone():
     first = _add(builder, _samples(u, value), tree, len(counts))
     for index, part in enumerate(parts):
         together = _table(builder, first + index)
-        assert (together == 1).all() == (counts[index] < PRIOR)
+        assert (together == 1).all() == (counts[index] < SPLIT)
         if counts[index] > 0:
             alone = _table(_learned(part, functions[index](*part)))
             np.testing.assert_allclose(together, alone, rtol=1e-3)
@@ -257,14 +278,14 @@ def _with_expected(u, value, name: str = "ramp") -> tuple[np.ndarray, np.ndarray
     return _table(builder, first + 1), _table(builder, root)
 
 
-@pytest.mark.parametrize("count", [1, 15])
+@pytest.mark.parametrize("count", [1, SPLIT - 1])
 def test_a_tree_of_too_few_samples_is_the_expected_one(count):
     table, expected = _with_expected(_uniform(count), 1.0)
     np.testing.assert_array_equal(table, expected)
 
 
 def test_a_split_is_kept_for_those_that_are_expected_below_it():
-    table, expected = _with_expected(_uniform(20), 1.0, "stripes")
+    table, expected = _with_expected(_uniform(SPLIT), 1.0, "stripes")
     assert expected.max() > 1.9 and np.abs(table - expected).mean() < 0.2
 
 

@@ -89,13 +89,14 @@ class SurfaceRegions:
     def build(self, records: PathRecords) -> tuple[TreeBuilder, mi.UInt32, None]:
         """The trees and their roots. A region expects what the one around it found."""
         samples = Samples(records.code, records.value, records.weight)
+        samples, region = samples.merged(records.region)
         builder = TreeBuilder()
         roots = np.zeros(self.count, np.uint32)
         for level, regions in enumerate(self._levels):
             size = regions.stop - regions.start
             if size == 0:
                 continue
-            tree = dr.gather(mi.UInt32, mi.UInt32(self._numbers(level)), records.region)
+            tree = dr.gather(mi.UInt32, mi.UInt32(self._numbers(level)), region)
             expected = mi.UInt32(roots[self._parent[regions]]) if level > 0 else None
             first = builder.add(samples, tree, size, expected)
             roots[regions] = first + np.arange(size)

@@ -23,9 +23,9 @@ UNIFORM = 0
 #: Splits of a tree from root to leaf, at most.
 DEPTH = 8
 
-#: Samples in a cell that is split, at least, and what the expectation is worth in samples that all
-#: bring the same.
-_SPLIT, _PRIOR = 16, 16.0
+#: The number of samples that all bring the same stands for how certain an estimate is: so many are
+#: in a cell that is split, at least, and so many is the expectation worth.
+_SPLIT, _PRIOR = 4.0, 16.0
 
 #: A subtree that changes the mean square of the density by less than this share becomes a leaf.
 _LEAST_CHANGE = 0.05
@@ -56,8 +56,40 @@ class Samples:
         mean = dr.sum(value) / dr.opaque(mi.Float64, len(value))
         value = dr.minimum(value / dr.maximum(mean, 1e-30), _LIMIT)
         values = value, dr.square(value), mi.Float64(weight)
-        self.values = [mi.UInt64(x * unit) for x, unit in zip(values, _UNITS)]
-        dr.eval(self.values)
+        self._values = [mi.UInt64(x * unit) for x, unit in zip(values, _UNITS)]
+        dr.eval(self._values)
+
+    def merged(self, region: mi.UInt32) -> tuple[Samples, mi.UInt32]:
+        """All samples of a cell and a region as one, and the regions of those."""
+        key, running = self.in_order((region << DEPTH) | self.code)
+        index = dr.arange(mi.UInt32, len(key))
+        begin = dr.compress((index == 0) | (key != dr.gather(mi.UInt32, key, index - 1, index > 0)))
+        index = dr.arange(mi.UInt32, len(begin))
+        is_last = index == dr.opaque(mi.UInt32, len(begin) - 1)
+        end = dr.gather(mi.UInt32, begin, index + 1, ~is_last)
+        end = dr.select(is_last, dr.opaque(mi.UInt32, len(key)), end)
+        key = dr.gather(mi.UInt32, key, begin)
+        result = object.__new__(Samples)
+        result.code, result._values = key & ((1 << DEPTH) - 1), sums(running, begin, end)
+        region = key >> DEPTH
+        dr.eval(result.code, result._values, region)
+        return result, region
+
+    def in_order(self, key: mi.UInt32) -> tuple[mi.UInt32, list[mi.UInt64]]:
+        """``key`` in ascending order, and the sums of all values up to each."""
+        order = dr.argsort(key)
+        key = dr.gather(mi.UInt32, key, order)
+        running = [dr.cumsum(dr.gather(mi.UInt64, x, order)) for x in self._values]
+        dr.eval(key, running)
+        return key, running
+
+
+def sums(running: list[mi.UInt64], begin: mi.UInt32, end: mi.UInt32) -> list[mi.UInt64]:
+    """What lies in [begin, end), by running sums."""
+    return [
+        dr.gather(mi.UInt64, x, end - 1, end > 0) - dr.gather(mi.UInt64, x, begin - 1, begin > 0)
+        for x in running
+    ]
 
 
 def cell_code(u: mi.Point2f) -> mi.UInt32:
@@ -115,19 +147,16 @@ class TreeBuilder:
         """
         first_node = self.node_count
         key = (dr.minimum(tree, dr.opaque(mi.UInt32, tree_count)) << DEPTH) | samples.code
-        order = dr.argsort(key)
-        key = dr.gather(mi.UInt32, key, order)
-        running = [dr.cumsum(dr.gather(mi.UInt64, x, order)) for x in samples.values]
-        self._sorted = key, running
-        dr.eval(key, running)
+        self._sorted = samples.in_order(key)
 
         tree = dr.arange(mi.UInt32, tree_count)
         begin, end = self._lower_bound(tree << DEPTH), self._lower_bound((tree + 1) << DEPTH)
         twin = dr.full(mi.UInt32, UNIFORM, tree_count) if expected is None else expected
-        levels = [_Level(begin, end, tree << DEPTH, twin)]
+        value, square, _weight = self._sums(begin, end)
+        levels = [_Level(begin, end, tree << DEPTH, twin, _evidence(value, square))]
         while len(levels) <= DEPTH:
             level = levels[-1]
-            splits = dr.compress(level.end - level.begin >= _SPLIT)
+            splits = dr.compress(level.evidence >= _SPLIT)
             if len(splits) == 0:
                 break
             level.first_child = first_node + sum(x.count for x in levels)
@@ -154,10 +183,8 @@ class TreeBuilder:
         middle = self._lower_bound(middle_code, begin, end)
         value_l, square_l, weight_l = self._sums(begin, middle)
         value_r, square_r, weight_r = self._sums(middle, end)
-        # So many equal samples would be as uncertain
-        square = square_l + square_r
-        evidence = dr.select(square > 0, dr.square(value_l + value_r) / square, 0)
-        evidence = dr.minimum(evidence, mi.Float(end - begin))
+        evidence_l, evidence_r = _evidence(value_l, square_l), _evidence(value_r, square_r)
+        evidence = dr.gather(mi.Float, level.evidence, splits)
         mean_l, mean_r = value_l / dr.maximum(weight_l, 1), value_r / dr.maximum(weight_r, 1)
         found = dr.select(mean_l + mean_r > 0, mean_l / (mean_l + mean_r), 0.5)
         expected = dr.gather(mi.Float, self.probability, twin)
@@ -168,12 +195,16 @@ class TreeBuilder:
         level.probability = (evidence * found + _PRIOR * expected) / (evidence + _PRIOR)
         twin_l, twin_r = (dr.select(has_twins, x, twin) for x in (twins, twins + 1))
         # All at once: each of them would be a kernel of its own
-        dr.eval(begin, middle, end, code, middle_code, twin_l, twin_r, level.probability)
+        dr.eval(
+            begin, middle, end, code, middle_code, twin_l, twin_r, evidence_l, evidence_r,
+            level.probability,
+        )
         return _Level(
             _alternate(begin, middle),
             _alternate(middle, end),
             _alternate(code, middle_code),
             _alternate(twin_l, twin_r),
+            _alternate(evidence_l, evidence_r),
         )
 
     def _lower_bound(self, code, first=None, last=None) -> mi.UInt32:
@@ -187,13 +218,8 @@ class TreeBuilder:
 
     def _sums(self, begin: mi.UInt32, end: mi.UInt32) -> list[mi.Float]:
         """Of the values, the squares and the weights of the samples [begin, end)."""
-        _key, running = self._sorted
-        sums = []
-        for total, unit in zip(running, _UNITS):
-            low = dr.gather(mi.UInt64, total, begin - 1, begin > 0)
-            high = dr.gather(mi.UInt64, total, end - 1, end > 0)
-            sums.append(mi.Float(mi.Float64(high - low) / unit))
-        return sums
+        found = sums(self._sorted[1], begin, end)
+        return [mi.Float(mi.Float64(x) / unit) for x, unit in zip(found, _UNITS)]
 
     def _append(self, levels: list[_Level]) -> None:
         """Adds the nodes of a forest to those that there are, without splits that do nothing."""
@@ -231,20 +257,24 @@ class _Level:
     """The nodes of one depth: their samples, codes, and earlier nodes of the same cells (or of one
     around them)."""
 
-    def __init__(self, begin, end, code, twin) -> None:
+    def __init__(self, begin, end, code, twin, evidence) -> None:
         self.begin, self.end, self.code, self.twin = begin, end, code, twin
-        dr.eval(begin, end, code, twin)
+        self.evidence = evidence
+        dr.eval(begin, end, code, twin, evidence)
         self.count = len(begin)
         self.first_child, self.splits, self.probability = 0, mi.UInt32(), mi.Float()
+
+
+def _evidence(value: mi.Float, square: mi.Float) -> mi.Float:
+    """So many samples that all bring the same would be as uncertain."""
+    return dr.select(square > 0, dr.square(value) / square, 0)
 
 
 def _alternate(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
     """a₀, b₀, a₁, b₁, …"""
     index = dr.arange(mi.UInt32, 2 * len(a))
-    half = index >> 1
-    return dr.select(
-        (index & 1) == 1, dr.gather(mi.UInt32, b, half), dr.gather(mi.UInt32, a, half)
-    )
+    half, array = index >> 1, type(a)
+    return dr.select((index & 1) == 1, dr.gather(array, b, half), dr.gather(array, a, half))
 
 
 def joined(parts: list) -> mi.Float:
