@@ -1,0 +1,78 @@
+"""Weights of points of an interval.
+
+Source: Guo, PhD thesis, section 4.4 (Eqs. 4.4 to 4.8); Yakowitz, Krimmel and Szidarovszky,
+Weighted Monte Carlo integration, SIAM J. Numer. Anal. 15(6), 1978 (the rivals).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def cell_lengths(x: npt.ArrayLike, boundary: str) -> FloatArray:
+    """Of each point of [0, 1], the length of the cell in which none is nearer. Equal points share
+    their cell.
+
+    Parameters:
+        x: Points, of shape (N,), in any order.
+        boundary: ``"clip"`` (the cells end at 0 and 1) or ``"torus"`` (0 follows on 1).
+    """
+    x, which, counts = np.unique(np.asarray(x, float), return_inverse=True, return_counts=True)
+    middle = (x[1:] + x[:-1]) / 2
+    if boundary == "clip":
+        ends = [0.0], [1.0]
+    else:
+        # Seen from the first point, the last one lies one to the left
+        seam = (x[0] + x[-1] - 1) / 2
+        ends = [seam], [seam + 1]
+    edges = np.concatenate([ends[0], middle, ends[1]])
+    return (np.diff(edges) / counts)[which]
+
+
+def correction(x: npt.ArrayLike, count: int) -> FloatArray:
+    """g(x): what the clipped cell of an independent uniform point at ``x`` measures on average,
+    relative to 1 / ``count`` (Guo, Eq. 4.7). Near the ends it falls to 1/2."""
+    x = np.asarray(x, float)
+    y = 1 - x
+    right, left = x ** (count - 1), y ** (count - 1)
+    # N − (N + 1) x would lose digits near 1
+    return (((count + 1) * y - 1) * right + ((count + 1) * x - 1) * left + 2) / 2
+
+
+def unbiased_weights(x: npt.ArrayLike) -> FloatArray:
+    """Clipped cells, corrected such that sums are unbiased for independent uniform points
+    (Guo, Eq. 4.8). The weights do not add up to one: also a constant has variance."""
+    x = np.asarray(x, float)
+    return cell_lengths(x, "clip") / correction(x, len(x))
+
+
+def trapezoid_weights(x: npt.ArrayLike) -> tuple[FloatArray, float, float]:
+    """The trapezoidal rule through 0, the points, and 1 (Yakowitz et al.).
+
+    Returns:
+        The weights of the points, that of f(0), and that of f(1).
+    """
+    x = np.asarray(x, float)
+    low, high = float(x.min()), float(x.max())
+    weights = cell_lengths(x, "clip")
+    for end, distance in ((low, low), (high, 1 - high)):
+        at_end = x == end
+        weights[at_end] -= distance / 2 / at_end.sum()
+    return weights, low / 2, (1 - high) / 2
+
+
+def nearest_neighbour_weights(x: npt.ArrayLike, tests: npt.ArrayLike) -> FloatArray:
+    """The share of test points that are nearest to each point (Yakowitz et al.): an estimate of the
+    clipped cells that needs no diagram, in any dimension.
+
+    Parameters:
+        x, tests: Points of shape (N,) or (N, D), and (M,) or (M, D).
+    """
+    x, tests = (np.asarray(a, float) for a in (x, tests))
+    dimension = x.shape[1] if x.ndim == 2 else 1
+    _distance, nearest = cKDTree(x.reshape(-1, dimension)).query(tests.reshape(-1, dimension))
+    return np.bincount(nearest, minlength=len(x)) / len(tests)

@@ -1,0 +1,171 @@
+"""Patterns of points in the unit cube."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import qmc
+
+from .line import FloatArray
+
+#: What :func:`points` can make.
+PATTERNS = (
+    "independent", "stratified", "latin_hypercube", "halton", "hammersley", "sobol", "lattice",
+    "poisson_disk",
+)  # fmt: skip
+
+#: Candidates for each further point of a Poisson disk pattern.
+_CANDIDATES = 32
+
+#: Products that are evaluated to choose a lattice.
+_LATTICE_WORK = 1 << 22
+
+
+def points(
+    pattern: str, count: int, dimension: int = 2, seed: int | np.random.Generator = 0
+) -> FloatArray:
+    """Points in [0, 1)ᴰ. Each point alone is uniform, except with ``hammersley`` and ``lattice``,
+    which are fixed sets up to a random shift around the torus.
+
+    - ``independent``: i.i.d. uniform numbers.
+    - ``stratified``: one in each cell of a grid (jittered). Where the count is no power, the grid
+      has the next smaller number of cells along each axis but the last, which is divided such that
+      each cell has one point.
+    - ``latin_hypercube``: one in each of N slices along each axis.
+    - ``halton``: scrambled.
+    - ``hammersley``: (i / N, Halton), shifted.
+    - ``sobol``: scrambled (Owen's scrambling, in the form of random matrices and a digital shift);
+      its first two dimensions are a (0, 2)-sequence. Powers of two serve it best.
+    - ``lattice``: of rank one, with the best of many generators, shifted.
+    - ``poisson_disk``: each point is the candidate farthest from all others on the torus (Mitchell;
+      Cline, PhD dissertation, section 4.5.3). Slow: its time grows with the square of the count.
+
+    Parameters:
+        pattern: One of :data:`PATTERNS`.
+        count: Number of points N, at least 1.
+        dimension: D.
+        seed: An integer, or a generator, which is advanced.
+
+    Returns:
+        Array of shape (N, D).
+
+    Raises:
+        ValueError: There is no such pattern; the count or the dimension is below 1.
+    """
+    if pattern not in PATTERNS:
+        raise ValueError(f'points: pattern is "{pattern}", not one of {PATTERNS}')
+    if count < 1 or dimension < 1:
+        raise ValueError(f"points: {count} points in {dimension} dimensions")
+    rng = np.random.default_rng(seed)
+    x = _MAKERS[pattern](count, dimension, rng)
+    # Rounding must not reach the upper end, also not in single precision
+    return np.minimum(x, 1 - 2.0**-24)
+
+
+def shifted(points: npt.ArrayLike, shift: npt.ArrayLike) -> FloatArray:
+    """Points moved around the torus."""
+    x = (np.asarray(points, float) + shift) % 1
+    return np.where(x < 1, x, 0.0)
+
+
+def tent(points: npt.ArrayLike) -> FloatArray:
+    """1 − |2u − 1|: uniform points remain uniform, and a function of the result is the same at
+    opposite ends of the cube."""
+    return 1 - np.abs(2 * np.asarray(points, float) - 1)
+
+
+# ---- Patterns ----
+
+
+def _stratified(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
+    edge = _root(count, dimension)
+    columns = edge ** (dimension - 1)
+    # The last axis: as many cells in each column as points remain for it
+    column = np.arange(count) * columns // count
+    first = -(-np.arange(columns + 1) * count // columns)
+    rank, size = np.arange(count) - first[column], np.diff(first)[column]
+    x = rng.random((count, dimension))
+    for axis in range(dimension - 1):
+        x[:, axis] = (column // edge**axis % edge + x[:, axis]) / edge
+    x[:, -1] = (rank + x[:, -1]) / size
+    return x
+
+
+def _root(count: int, dimension: int) -> int:
+    """The largest integer whose power is at most ``count``."""
+    edge = round(count ** (1 / dimension))
+    return edge if edge**dimension <= count else edge - 1
+
+
+def _hammersley(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
+    x = np.arange(count)[:, None] / count
+    if dimension > 1:
+        x = np.hstack([x, qmc.Halton(dimension - 1, scramble=False).random(count)])
+    return shifted(x, rng.random(dimension))
+
+
+def _sobol(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
+    with warnings.catch_warnings():
+        # It warns of counts that are no power of two
+        warnings.simplefilter("ignore", UserWarning)
+        return qmc.Sobol(dimension, scramble=True, seed=rng).random(count)
+
+
+def _lattice(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
+    index = np.arange(count, dtype=np.int64)[:, None]
+    return shifted(index * _generator(count, dimension) % count / count, rng.random(dimension))
+
+
+def _generator(count: int, dimension: int) -> npt.NDArray[np.int64]:
+    """The powers of a number (Korobov) for which periodic functions of a Sobolev space are
+    integrated best: the mean of Π(1 + 2π² B₂({i zₐ / N})) is smallest."""
+    if count < 3 or dimension == 1:
+        return np.ones(dimension, np.int64)
+    most = max(1, _LATTICE_WORK // (count * dimension))
+    candidates = np.array([a for a in range(1, count // 2 + 1) if math.gcd(a, count) == 1])
+    if len(candidates) > most:
+        # Golden ones are good where not all can be tried
+        golden = count * (math.sqrt(5) - 1) / 2
+        near = np.abs(np.minimum(golden, count - golden) - candidates)
+        candidates = candidates[np.argsort(near, kind="stable")[:most]]
+    i = np.arange(count, dtype=np.int64)
+    # Of all residues i / N
+    kernel = 1 + 2 * math.pi**2 * ((i / count) ** 2 - i / count + 1 / 6)
+    best = None
+    for a in candidates.tolist():
+        z = [pow(a, power, count) for power in range(dimension)]
+        product = np.ones(count)
+        for generator in z:
+            product *= kernel[i * generator % count]
+        error = product.mean()
+        if best is None or error < best[0]:
+            best = error, z
+    return np.array(best[1], np.int64)
+
+
+def _poisson_disk(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
+    x = rng.random((count, dimension))
+    for i in range(1, count):
+        candidates = rng.random((_CANDIDATES, 1, dimension))
+        distance = np.abs(candidates - x[:i])
+        distance = np.minimum(distance, 1 - distance)
+        nearest = np.square(distance).sum(axis=2).min(axis=1)
+        x[i] = candidates[nearest.argmax(), 0]
+    return x
+
+
+_MAKERS = {
+    "independent": lambda count, dimension, rng: rng.random((count, dimension)),
+    "stratified": _stratified,
+    "latin_hypercube": lambda count, dimension, rng: qmc.LatinHypercube(
+        dimension, seed=rng
+    ).random(count),
+    "halton": lambda count, dimension, rng: qmc.Halton(dimension, seed=rng).random(count),
+    "hammersley": _hammersley,
+    "sobol": _sobol,
+    "lattice": _lattice,
+    "poisson_disk": _poisson_disk,
+}

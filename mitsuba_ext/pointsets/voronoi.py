@@ -1,0 +1,123 @@
+"""Weights of points: the measures of their Voronoi cells.
+
+Source: Guo, PhD thesis, section 4.4.1 (Eq. 4.4); that periodic cells are unbiased is ours.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import Voronoi, cKDTree
+
+from .line import FloatArray, cell_lengths
+
+BOUNDARIES = ("clip", "torus")
+
+#: Points that are nearer to the border of a clipped domain count as being so far from it: from
+#: their mirror images they have to be told apart.
+_BORDER = 1e-7
+
+#: The sum of all cells may be off by so much through rounding.
+_TOLERANCE = 1e-9
+
+
+def voronoi_weights(points: npt.ArrayLike, boundary: str = "torus") -> FloatArray:
+    """Measures of the Voronoi cells of points in [0, 1]ᴰ; they add up to one. Points that coincide
+    share their cell.
+
+    Sums Σ wᵢ f(xᵢ) with these weights are
+
+    - with ``"clip"``: consistent, but biased by what happens at the border. In one dimension,
+      :func:`~mitsuba_ext.pointsets.unbiased_weights` mends this for independent uniform points.
+    - with ``"torus"``: unbiased in every dimension for independent uniform points, and for *any*
+      points that a uniform random shift has moved around the torus
+      (:func:`~mitsuba_ext.pointsets.shifted`): no place is special. Where f differs at opposite
+      ends, evaluate it at ``tent(points)`` instead: still unbiased, and free of the seam.
+
+    Parameters:
+        points: Of shape (N,) or (N, D), with D = 1, 2 or 3.
+        boundary: ``"clip"``, or ``"torus"`` for a domain whose opposite sides are joined.
+
+    Returns:
+        Array of shape (N,).
+
+    Raises:
+        ValueError: Points are missing, not finite, or outside of the domain; D is too large; there
+            is no such boundary.
+    """
+    x = np.asarray(points, float)
+    if x.ndim not in (1, 2) or x.size == 0:
+        raise ValueError(f"voronoi_weights: points of shape (N,) or (N, D) expected, not {x.shape}")
+    if boundary not in BOUNDARIES:
+        raise ValueError(f'voronoi_weights: boundary is "{boundary}", not one of {BOUNDARIES}')
+    if not (np.isfinite(x).all() and x.min() >= 0 and x.max() <= 1):
+        raise ValueError("voronoi_weights: there are points outside of the unit cube")
+    dimension = 1 if x.ndim == 1 else x.shape[1]
+    if dimension == 1:
+        return cell_lengths(x.ravel(), boundary)
+    if dimension > 3:
+        raise ValueError(f"voronoi_weights: {dimension} dimensions; at most 3 are supported")
+    x = np.clip(x, _BORDER, 1 - _BORDER) if boundary == "clip" else x % 1
+    for margin in (3 * len(x) ** (-1 / dimension), np.inf):
+        measures = _cell_measures(x, _images(x, boundary, margin))
+        # Without an image that matters, cells are too large, and so is their sum
+        if abs(measures.sum() - 1) < _TOLERANCE:
+            break
+    return _shared(x, measures / measures.sum(), boundary)
+
+
+def _images(x: FloatArray, boundary: str, margin: float) -> FloatArray:
+    """Copies of points around the domain that are not farther from it than ``margin``: mirrored at
+    each face, or shifted by whole periods."""
+    dimension = x.shape[1]
+    if boundary == "clip":
+        # A cell ends where the mirror image of its own point is as near
+        unit = np.eye(dimension)
+        copies = [2 * side * e + x * (1 - 2 * e) for e in unit for side in (0, 1)]
+    else:
+        copies = [x + o for o in itertools.product((-1, 0, 1), repeat=dimension) if any(o)]
+    images = np.concatenate(copies)
+    return images[((images >= -margin) & (images <= 1 + margin)).all(axis=1)]
+
+
+def _cell_measures(x: FloatArray, images: FloatArray) -> FloatArray:
+    """Areas or volumes of the cells of ``x`` among ``images``: infinite for those without bounds,
+    and 0 for points that lie too close to another one."""
+    count, dimension = x.shape
+    diagram = Voronoi(np.concatenate([x, images]))
+    pair = diagram.ridge_points
+    concerns = (pair < count).any(axis=1)
+    pair, index = pair[concerns], np.flatnonzero(concerns)
+    ridges = [diagram.ridge_vertices[i] for i in index]
+    lengths = np.fromiter(map(len, ridges), int, len(ridges))
+    corner = np.fromiter(itertools.chain.from_iterable(ridges), int, lengths.sum())
+    first = np.cumsum(lengths) - lengths
+    v = diagram.vertices[corner]
+    if dimension == 2:
+        size = np.linalg.norm(v[first + 1] - v[first], axis=1)
+    else:
+        # A fan of triangles around the first corner
+        following = np.roll(np.arange(len(corner)), -1)
+        following[first + lengths - 1] = first
+        origin = np.repeat(v[first], lengths, axis=0)
+        normal = np.cross(v - origin, v[following] - origin)
+        size = np.linalg.norm(np.add.reduceat(normal, first), axis=1) / 2
+    size[np.minimum.reduceat(corner, first) < 0] = np.inf
+    # Each face is the base of two pyramids, whose apexes are the two points
+    heights = np.linalg.norm(diagram.points[pair[:, 0]] - diagram.points[pair[:, 1]], axis=1) / 2
+    measure = np.repeat(size * heights / dimension, 2)
+    return np.bincount(pair.ravel(), measure, minlength=count)[:count]
+
+
+def _shared(x: FloatArray, measures: FloatArray, boundary: str) -> FloatArray:
+    """Gives points without a cell a share of that of their nearest neighbour."""
+    is_lost = measures == 0
+    if not is_lost.any():
+        return measures
+    kept = np.flatnonzero(~is_lost)
+    tree = cKDTree(x[kept], boxsize=1.0 if boundary == "torus" else None)
+    owner = np.arange(len(x))
+    owner[is_lost] = kept[tree.query(x[is_lost])[1]]
+    return (measures / np.bincount(owner, minlength=len(x)).clip(1))[owner]
