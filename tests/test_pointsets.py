@@ -85,6 +85,7 @@ def _grid(edge: int, dimension: int, offset: float) -> np.ndarray:
     return np.array(list(itertools.product(*[(np.arange(edge) + offset) / edge] * dimension)))
 
 
+_ANGLES = np.arange(12) * np.pi / 6
 DEGENERATE = {
     "all_equal": np.full((5, 2), 0.3),
     "equal_twice": np.repeat(_sets(20, 2, 1)[0], 2, axis=0),
@@ -94,7 +95,7 @@ DEGENERATE = {
     "on_the_border": np.array([[0, 0], [1, 0], [0, 1], [1, 1], [0.5, 0], [0, 0.5], [1, 0.2]]),
     "grid": _grid(8, 2, 0.5),
     "grid_from_zero": _grid(8, 2, 0),
-    "on_a_circle": 0.5 + 0.4 * np.array([[np.cos(a), np.sin(a)] for a in np.arange(12) * np.pi / 6]),
+    "on_a_circle": 0.5 + 0.4 * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1),
     "in_a_corner": _sets(200, 2, 1)[0] * 1e-3,
     "grid_3d": _grid(3, 3, 0.5),
     "equal_3d": np.full((4, 3), 0.7),
