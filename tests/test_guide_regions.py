@@ -310,3 +310,63 @@ def test_a_tile_that_found_nothing_expects_what_its_surroundings_found() -> None
     regions, trees = _tile_trees(16, 8, 4)
     tile = regions.begin(mi.UInt32([15]))
     assert trees.density(tile, mi.Point2f(0.2, 0.5), mi.Bool(True))[0].numpy()[0] > 1.1
+
+
+def _one_tile(u: np.ndarray, value: np.ndarray, goes_on: list[np.ndarray]) -> tuple:
+    """The trees of one tile from paths of the samples ``u`` [bounces, 2, paths]; which of them went
+    on after each bounce; and a walk down the trees by the x of the samples."""
+    codes = [cell_code(mi.Point2f(sample)).numpy() for sample in u]
+    columns, history = [], np.zeros_like(codes[0])
+    recorded = np.full(len(value), True)
+    for bounce, code in enumerate(codes):
+        columns.append([x[recorded] for x in (code, history, np.full_like(code, bounce), value)])
+        history = history << 8 | code
+        recorded = recorded & goes_on[bounce]
+    code, history, bounce, value = (np.concatenate(x) for x in zip(*columns))
+    records = SimpleNamespace(
+        bounces=len(u), region=dr.zeros(mi.UInt32, len(code)), code=mi.UInt32(code),
+        history=mi.UInt32(history), bounce=mi.UInt32(bounce), value=mi.Float(value),
+        weight=dr.full(mi.Float, 1, len(code)),
+    )  # fmt: skip
+    regions, active = TileRegions(1, 1, 1), mi.Bool(True)
+    builder, roots, below = regions.build(records)
+    arrays = builder.probability, builder.child, builder.is_even, roots
+    trees = SampleTrees(*arrays, dr.full(mi.Float, 0.8, len(roots)), below)
+
+    def after(*samples: float) -> tuple[int, float]:
+        """The tree after samples with these x, and its density on the left."""
+        state = regions.begin(mi.UInt32([0]))
+        for x in samples:
+            leaf = trees.density(state, mi.Point2f(x, 0.1), active)[1]
+            state = regions.after(state, trees, leaf, active)
+        return state.numpy()[0], trees.density(state, mi.Point2f(0.2, 0.1), active)[0].numpy()[0]
+
+    return regions, after
+
+
+def test_a_tree_below_a_rare_leaf_expects_what_its_tile_found() -> None:
+    """First samples with large numbers are two of 4,000."""
+    u = np.random.default_rng(7).random((2, 2, 4000), dtype=np.float32)
+    u[0, 0] *= 0.5
+    u[0, 0, :2] += 0.5
+    everywhere = np.full(4000, True)
+    _, after = _one_tile(u, np.where(u[1, 0] < 0.25, 4.0, 0.1), [everywhere] * 2)
+    (left, density), (right, of_right) = after(0.2), after(0.8)
+    assert left != right and min(density, of_right) > 1.5
+
+
+def test_below_a_leaf_that_no_path_reached_nothing_is_guided() -> None:
+    u = np.random.default_rng(8).random((3, 2, 4000), dtype=np.float32)
+    value = np.where(u[:2, 0] < 0.5, 4.0, 0.1).prod(axis=0)
+    regions, after = _one_tile(u, value, [u[0, 0] < 0.5, u[1, 0] < 0.5, u[0, 0] < 2])
+    assert after(0.8) == after(0.2, 0.8) == (regions.count, 1)
+    assert after(0.2)[1] > 1.5 and after(0.2, 0.2)[0] > regions.count
+
+
+def test_the_third_sample_remembers_the_first() -> None:
+    u = np.random.default_rng(9).random((3, 2, 20_000), dtype=np.float32)
+    value = np.where((u[0, 0] < 0.5) == (u[2, 0] < 0.5), 4.0, 0.1)
+    value *= np.where(u[:2, 0] < 0.5, 2.0, 1.0).prod(axis=0)
+    _, after = _one_tile(u, value, [u[0, 0] < 2] * 3)
+    for second in (0.2, 0.8):
+        assert after(0.2, second)[1] > 1.5 and after(0.8, second)[1] < 0.5

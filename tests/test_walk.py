@@ -160,6 +160,28 @@ def test_a_rejected_connection_traces_no_shadow_ray_and_survivors_weigh_more(box
     assert L_half == pytest.approx(L, rel=0.02)
 
 
+def test_weights_of_guided_samples_do_not_end_paths(box):
+    """Where these are dense, throughput is low because paths matter."""
+
+    class Weighted(DirectionSamples):
+        def draw(self, *arguments):
+            *sample, _weight, state = super().draw(*arguments)
+            return *sample, mi.Float(0.1), state
+
+    def scattered(directions: DirectionSamples) -> float:
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(0, 10_000)
+        ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -0.5), dr.normalize(mi.Vector3f(0.3, 0.2, -1)))
+        ray.time = dr.zeros(mi.Float, 10_000)
+        walk = Walk(20, rr_depth=1, directions=directions)
+        sample = walk(box, sampler, ray, mi.Bool(True))
+        return float(dr.mean(mi.Float(sample.scatter_count))[0])
+
+    expected = scattered(DirectionSamples())
+    assert 0.5 < expected < 15
+    assert scattered(Weighted()) == pytest.approx(expected, rel=1e-2)
+
+
 KERNEL_SIZE = """
 import mitsuba_ext, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")

@@ -89,7 +89,7 @@ class GuideLearner(Learner):
             self._records, self._summary = None, "no guide: no path scatters"
             return {}
         bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
-        if self.guide is not None:
+        if self.guide is not None and records.count > records.first_new:
             gains = self._gains(records)
             share, bounces, gain, efficiency = _best(gains)
             effect = f"about {gain:.0%} less variance"
@@ -138,11 +138,13 @@ class GuideLearner(Learner):
         # The mean squares under uniform samples, of those that were drawn, and of other shares
         uniform, actual = by_bounce(square * drawn), by_bounce(square)
         variance = max(records.variance + (uniform - actual).sum(), 1e-30)
-        return {
+        gains = {
             share: (uniform - by_bounce(square * drawn / dr.fma(share, density, 1 - share)))
             / variance
             for share in _SHARES
         }
+        # Squares of large numbers overflow: that shows no gain
+        return {share: np.nan_to_num(gain, nan=0.0) for share, gain in gains.items()}
 
     def __str__(self) -> str:
         return self._summary

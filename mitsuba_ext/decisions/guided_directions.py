@@ -59,7 +59,6 @@ class GuidedDirections(DirectionSamples):
         state = self._regions.after(state, self._trees, leaf, active)
         return sample_1, sample_2, dr.rcp(density), state
 
-
     def density(
         self, si: mi.SurfaceInteraction3f, pixel: mi.UInt32 | None, u: mi.Point2f
     ) -> mi.Float:

@@ -11,7 +11,7 @@ from .learner import Observer
 from .tree_builder import DEPTH, cell_code, joined
 
 #: Bytes of a record, at most: what is kept of it, and what trees are built from.
-BYTES_PER_RECORD = 144
+BYTES_PER_RECORD = 320
 
 #: Paths that follow each other, and so begin close together: their mean is what errors are
 #: relative to, but for this share of the squared mean of all.

@@ -1,0 +1,224 @@
+"""What the learner of path guiding measures, what it decides from that, and how much it keeps."""
+
+from __future__ import annotations
+
+from unittest import mock
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_cases import area, diffuse, film, lookat, rectangle, sensor
+from statistical import UnderTest
+
+from mitsuba_ext.decisions import guide_learner, guiding
+from mitsuba_ext.decisions.guide_learner import GuideLearner
+from mitsuba_ext.decisions.guided_directions import GuidedDirections
+from mitsuba_ext.learning.path_records import BYTES_PER_RECORD, PathRecords
+from mitsuba_ext.learning.surface_regions import SurfaceRegions
+from mitsuba_ext.learning.tile_regions import TileRegions
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+LANES = 1 << 16
+
+
+class _Numbers:
+    """A sampler."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = np.random.default_rng(seed)
+
+    def next_1d(self) -> mi.Float:
+        return mi.Float(0.5)
+
+    def next_2d(self) -> mi.Point2f:
+        return mi.Point2f(self._random.random((2, LANES), dtype=np.float32))
+
+
+def _pixels() -> mi.UInt32:
+    return dr.arange(mi.UInt32, LANES) // (LANES // 2)
+
+
+def _brought(pixel: mi.UInt32, u: mi.Point2f) -> mi.Float:
+    """A bright pixel with little noise, and a dim one with much."""
+    bright = 10 + 10 * dr.select(u.x < 0.5, mi.Float(1), 0)
+    return dr.select(pixel == 0, bright, dr.select(u.y < 0.25, mi.Float(2), 0.6))
+
+
+def _pilot(learner: GuideLearner, seed: int, scatters: bool = True) -> None:
+    """The first of two directions decides nothing."""
+    pixel, numbers = _pixels(), _Numbers(seed)
+    learner.begin(LANES, pixel)
+    state = learner.guide and learner.guide.begin(None, None, pixel)
+    L, β, active = mi.Float(0), mi.Float(1), mi.Bool(scatters)
+    for depth in range(2):
+        sample, weight = numbers.next_2d(), mi.Float(1)
+        if learner.guide:
+            depths = mi.UInt32(depth)
+            _, sample, weight, state = learner.guide.draw(state, numbers, None, depths, active)
+        learner.direction(None, mi.UInt32(depth), sample, weight, mi.Color3f(L), active)
+        β *= weight
+    L += β * _brought(pixel, sample)
+    learner.end(mi.Color3f(L))
+
+
+def _learner(**changes) -> GuideLearner:
+    parameters = {"bounces": 2, "max_memory": 1 << 30, "pilot_samples": 3 * LANES, **changes}
+    learner = GuideLearner(lambda p, n: TileRegions(2, 1, 1), False, **parameters)
+    learner.start(None, mi.Point3f(), mi.Normal3f())
+    return learner
+
+
+def test_gain_of_each_share_is_that_of_its_density() -> None:
+    """Relative errors count; what the pilots before have drawn does not."""
+    learner, found, shares = _learner(), [], iter((0.4, 0.8))
+    drawn_by = 0.6, 0.4
+
+    def best(gains: dict[float, np.ndarray]) -> tuple[float, int, float, float]:
+        found.append(gains)
+        return next(shares), 2, 0.5, 2.0
+
+    with mock.patch.object(guide_learner, "_best", best):
+        _pilot(learner, 1)
+        learner.learn(None, is_last=False)
+        for pilot in range(2):
+            guide, share = learner.guide, drawn_by[pilot]
+            assert guide._trees._share.numpy().max() == pytest.approx(share)
+            _pilot(learner, 2 + pilot)
+            learner.learn(None, is_last=pilot == 1)
+            pixel, u = _pixels(), _Numbers(10).next_2d()
+            state = guide.begin(None, None, pixel)
+            first = guide.draw(state, _Numbers(11), None, mi.UInt32(0), mi.Bool(True))
+            tree = guide._regions.tree(first[3], None, mi.Bool(True))
+            mixed = guide._trees.density(tree, u, mi.Bool(True))[0].numpy()
+            density = (mixed - (1 - share)) / share
+            value = _brought(pixel, u).numpy().reshape(2, -1)
+            mean = value.mean(axis=1, keepdims=True)
+            scale = np.sqrt(mean**2 + 0.01 * value.mean() ** 2)
+            square, variance = (value / scale) ** 2, ((value - mean) / scale) ** 2
+            for other, gains in found[-1].items():
+                saved = square - square / (other * density + 1 - other).reshape(2, -1)
+                expected = saved.sum() / variance.sum()
+                assert gains[0] == pytest.approx(0, abs=0.01), other
+                assert gains[1] == pytest.approx(expected, abs=0.03) and expected > 0.2, other
+    assert learner._records is None, "they are not kept when the last stage begins"
+
+
+def test_most_efficient_guide_is_chosen() -> None:
+    gains = {0.4: np.array([0.3, 0.2, 0.0]), 0.6: np.array([0.35, 0.01, -0.1])}
+    share, bounces, gain, efficiency = guide_learner._best(gains)
+    assert (share, bounces, gain) == (0.4, 2, pytest.approx(0.5))
+    assert 1.7 < efficiency < 2
+    assert guide_learner._best({0.4: np.array([0.0, -0.1])})[3] < 1
+
+
+def test_gains_that_are_not_numbers_are_none() -> None:
+    """Squares of a path's radiance can overflow."""
+    learner = _learner()
+    with mock.patch(f"{__name__}._brought", lambda pixel, u: _at(u, 1e30)):
+        _pilot(learner, 1)
+        learner.learn(None, is_last=False)
+        _pilot(learner, 2)
+        learner.learn(None, is_last=False)
+    assert learner.guide is None and str(learner).startswith("no guide: ")
+
+
+def _at(u: mi.Point2f, value: float) -> mi.Float:
+    return dr.select(u.y < 0.25, mi.Float(value), 0)
+
+
+@pytest.mark.parametrize("pilot", [1, 2])
+def test_a_pilot_in_which_no_path_scatters_teaches_nothing(pilot: int) -> None:
+    """After one in which paths did: a film of a few pixels, most of which see nothing."""
+    learner = _learner()
+    for index in range(3):
+        _pilot(learner, index, scatters=index != pilot)
+        learner.learn(None, is_last=index == 2)
+    assert learner.guide is not None
+
+
+def test_stride_follows_from_the_memory() -> None:
+    for records in (6 * LANES, 6 * LANES - 1, 1000):
+        stride = -(-6 * LANES // records)
+        learner = _learner(max_memory=records * BYTES_PER_RECORD)
+        _pilot(learner, 1)
+        learner.learn(None, is_last=False)
+        assert f" {2 * -(-LANES // stride)} samples" in str(learner)
+
+
+def test_later_directions_are_not_guided() -> None:
+    learner = _learner()
+    _pilot(learner, 1)
+    learner.learn(None, is_last=True)
+    guide = GuidedDirections(learner.guide._trees, learner.guide._regions, bounces=1)
+    state, active = guide.begin(None, None, _pixels()), mi.Bool(True)
+    state = guide.draw(state, _Numbers(2), None, mi.UInt32(0), active)[3]
+    _, sample, weight, after = guide.draw(state, _Numbers(3), None, mi.UInt32(1), active)
+    assert (sample == _Numbers(3).next_2d()).numpy().all() and (weight == 1).numpy().all()
+    assert (after == state).numpy().all()
+    guided = learner.guide.draw(state, _Numbers(3), None, mi.UInt32(1), active)[2]
+    assert not (guided == 1).numpy().all()
+
+
+def test_regions_follow_the_film_and_the_pilots() -> None:
+    camera = mi.load_dict(
+        sensor(film=film(10, 6, rfilter={"type": "gaussian"}, sample_border=True))
+    )
+    made = []
+    for regions in ("tiles", "surfaces"):
+        tile = {"tile": 4} if regions == "tiles" else {}
+        integrator = mi.load_dict({"type": "pss_guided", "regions": regions, **tile})
+        (learner,) = integrator.learners(None, camera, 14 * 10 * 8)
+        assert learner.wants_scout == (regions == "surfaces")
+        with mock.patch.object(guiding, "SurfaceRegions", lambda p, n, least: least):
+            made.append(learner._make_regions(None, None))
+    assert made[0].count == 4 * 3 and made[1] == 64 / 8
+
+
+def test_memory_is_bounded_where_no_path_ends() -> None:
+    T = mi.ScalarTransform4f
+    view = lookat([0, -0.9, 0], [0, 0, 0.1], [0, 0, 1])
+    down = T().translate([0, 0, 0.95]).rotate([1, 0, 0], 180).scale([0.2, 0.2, 1])
+    scene = mi.load_dict({
+        "type": "scene",
+        "sensor": sensor(to_world=view, film=film(48, 48)),
+        "room": {"type": "cube", "flip_normals": True, "bsdf": diffuse(0.8)},
+        "lamp": rectangle(down, bsdf=diffuse(0.0), emitter=area(5.0)),
+    })  # fmt: skip
+    guided = UnderTest("pss_guided", {"max_memory": 16.0}, insists=True)
+    integrator = guided.make(8, rr_depth=100, bounces=5)
+    taken = []
+    for each in (guided.make(8, rr_depth=100, pilot_spp=0), integrator):
+        mi.render(scene, integrator=each, spp=128)
+        dr.sync_thread()
+        taken.append(each.statistics.memory)
+    assert integrator.guide is not None
+    assert taken[1] - taken[0] < 1.25 * 16 * 2**20, taken
+
+
+def test_importance_is_that_of_the_place_in_the_image() -> None:
+    """Errors are relative to the mean of 64 paths that follow each other, and to little of all."""
+    records = PathRecords(lambda si, pixel, active: pixel, bounces=2, stride=1)
+    brought = np.repeat([1.0, 4.0, 0.0], [64, 64, 32])
+    brought[:128] *= np.tile([0.5, 1.5], 64)
+    for _ in range(2):
+        records.begin(160, dr.arange(mi.UInt32, 160))
+        for depth in range(2):
+            sample, L = mi.Point2f(0.5), mi.Color3f(0)
+            records.direction(None, mi.UInt32(depth), sample, 1.0, L, mi.Bool(True))
+        records.end(mi.Color3f(mi.Float(brought)))
+    records.finish()
+    # The last group is filled up with the first paths
+    mean = np.repeat([1.0, 4.0, 0.5], [64, 64, 32])
+    importance = 1 / (mean**2 + 0.01 * brought.mean() ** 2)
+    np.testing.assert_allclose(records.importance.numpy(), np.tile(importance, 4), rtol=1e-4)
+    error = ((brought - mean) ** 2 * importance).sum()
+    assert records.variance == pytest.approx(2 * error, rel=1e-4)
+
+
+def test_regions_have_the_least_of_places() -> None:
+    p = np.array([[0.1, 0.9], [0.1, 0.9], [0.1, 0.9]]).repeat([8, 7], axis=1)
+    up = np.tile([[0], [0], [1]], 15)
+    assert SurfaceRegions(mi.Point3f(p), mi.Normal3f(up), 8).count == 5
+    assert SurfaceRegions(mi.Point3f(p), mi.Normal3f(up), 7).count == 9
