@@ -98,7 +98,7 @@ class ComposedPath(WalkIntegrator):
                 self, props, self.next_event, rejects
             )
 
-    def decisions(self, scene: mi.Scene) -> dict[str, Any]:
+    def decisions(self, scene: mi.Scene, seed: int) -> dict[str, Any]:
         return self.light_sampling.decisions(scene) if self.light_sampling else {}
 
     def pilots(self, scene: mi.Scene, spp: int) -> list[int]:

@@ -143,7 +143,7 @@ class NEEPlusPlus(WalkIntegrator):
         rejection = self.parameter(props, "rejection", False)
         self.next_event = LightSampling.from_properties(self, props, light_sampling, rejection)
 
-    def decisions(self, scene: mi.Scene) -> dict[str, Any]:
+    def decisions(self, scene: mi.Scene, seed: int) -> dict[str, Any]:
         return self.next_event.decisions(scene)
 
     def pilots(self, scene: mi.Scene, spp: int) -> list[int]:

@@ -120,7 +120,7 @@ class PSSGuided(WalkIntegrator):
 GuidedDirections`); ``None`` where nothing was guided."""
         return self.guiding.guide
 
-    def decisions(self, scene: mi.Scene) -> dict[str, Any]:
+    def decisions(self, scene: mi.Scene, seed: int) -> dict[str, Any]:
         if self.nee_first_bounce:
             return {}
         return {"next_event": LaterConnections(EmitterSampling())}

@@ -2,8 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
+
+from .decisions.camera_samples import CameraSamples
+
+
+@dataclass
+class CameraRays:
+    """The rays of a pass.
+
+    Attributes:
+        ray: The rays themselves.
+        importance: What the sensor makes of the radiance that they bring back.
+        weight: By how much a sample counts; 1.0 where all count the same.
+        position: Where on the film (in pixels) to put it.
+        pixel: The number of the ray's pixel, row by row in the film's extent.
+    """
+
+    ray: mi.RayDifferential3f
+    importance: mi.Spectrum
+    weight: mi.Float | float
+    position: mi.Point2f
+    pixel: mi.UInt32
 
 
 def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
@@ -29,8 +52,13 @@ def film_extent(film: mi.Film) -> tuple[int, int]:
 
 
 def sample_rays(
-    sensor: mi.Sensor, sampler: mi.Sampler, spp_per_pass: int, spp: int
-) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Point2f, mi.UInt32]:
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    spp_per_pass: int,
+    spp: int,
+    samples: CameraSamples,
+    first: int = 0,
+) -> CameraRays:
     """Camera rays of one pass: ``spp_per_pass`` for each pixel of the film.
 
     The random numbers are drawn in the order in which ``mi.SamplingIntegrator`` draws them, so that
@@ -40,10 +68,8 @@ def sample_rays(
         sensor, sampler: The sampler is seeded for ``width · height · spp_per_pass`` lanes.
         spp_per_pass: Samples per pixel of this pass.
         spp: Samples per pixel of the whole render; it scales the ray differentials.
-
-    Returns:
-        The rays, their importance weights, the positions on the film (in pixels) at which to put
-        what they bring back, and the number of the pixel of each (row by row in the film's extent).
+        samples: Which numbers choose the point of the aperture.
+        first: Samples per pixel that earlier passes took.
     """
     film = sensor.film()
     width, height = film_extent(film)
@@ -62,13 +88,17 @@ def sample_rays(
     offset = -mi.ScalarVector2f(film.crop_offset()) * scale
     film_sample = dr.fma(position, scale, offset)
 
-    aperture_sample = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    index = lane - pixel * dr.opaque(mi.UInt32, spp_per_pass) + dr.opaque(mi.UInt32, first)
+    state = samples.begin(pixel, index)
+    aperture_sample, weight = mi.Point2f(0.5), 1.0
+    if sensor.needs_aperture_sample():
+        aperture_sample, weight = samples.aperture(state, sampler)
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     wavelength_sample = sampler.next_1d() if mi.is_spectral else mi.Float(0)
 
-    ray, weight = sensor.sample_ray_differential(
+    ray, importance = sensor.sample_ray_differential(
         time, wavelength_sample, film_sample, aperture_sample
     )
     if ray.has_differentials:
@@ -77,26 +107,28 @@ def sample_rays(
     # A box filter ignores the offset inside the pixel: it would only add rounding errors
     if film.rfilter().is_box_filter():
         position = mi.Point2f(corner)
-    return ray, weight, position, pixel
+    return CameraRays(ray, importance, weight, position, pixel)
 
 
 def splat(
     film: mi.Film,
     block: mi.ImageBlock,
-    position: mi.Point2f,
+    rays: CameraRays,
     L: mi.Spectrum,
     valid: mi.Bool,
-    wavelengths: mi.Spectrum,
     aovs: list[mi.Float],
 ) -> None:
     """Puts samples into an image block, in the channels that the film asks for.
 
     Parameters:
-        L: Radiance times the ray's weight.
+        L: Radiance that the rays bring back.
         valid: Did the ray meet something? (alpha)
         aovs: One value per channel that the integrator announced to ``film.prepare``.
     """
-    alpha = dr.select(valid, mi.Float(1), 0)
+    L = L * rays.importance * rays.weight
+    alpha = dr.select(valid, mi.Float(rays.weight), 0)
+    aovs = [value * rays.weight for value in aovs]
+    position, wavelengths = rays.position, rays.ray.wavelengths
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         values = film.prepare_sample(
             L, wavelengths, block.channel_count(), weight=1, alpha=alpha, active=valid

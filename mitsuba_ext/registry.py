@@ -24,7 +24,7 @@ from . import runtime
 _KINDS: dict[str, str] = {"integrators": "register_integrator", "emitters": "register_emitter"}
 
 #: Variant-bound base classes, executed before the plugins that derive from them.
-_BASES = ("mitsuba_ext.integrator",)
+_BASES = ("mitsuba_ext.staged_integrator", "mitsuba_ext.integrator")
 
 _registered: set[str] = set()
 

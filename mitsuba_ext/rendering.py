@@ -21,10 +21,11 @@ import drjit as dr
 import mitsuba as mi
 
 from . import camera
+from .decisions.camera_samples import CameraSamples
 from .walk import Walk
 
 if TYPE_CHECKING:
-    from .integrator import WalkIntegrator
+    from .staged_integrator import StagedIntegrator
 
 #: Samples per pass. Tracing a pass in Python takes 5 to 70 ms (many materials take longest), the
 #: pass itself two or three seconds on two CPU cores. A GPU gets longer passes.
@@ -80,16 +81,23 @@ class RenderStatistics:
 
 @dataclass
 class Stage:
-    """One stage of a render: the walk that its samples take, and what had been learned before. A
-    scout takes one sample per pixel that is none of the image's."""
+    """One stage of a render.
+
+    Attributes:
+        walk: What its samples do.
+        learned: What had been learned before.
+        is_scout: Does it take one sample per pixel that is none of the image's?
+        camera: What chooses the points of the aperture.
+    """
 
     walk: Walk
     learned: str = ""
     is_scout: bool = False
+    camera: CameraSamples = field(default_factory=CameraSamples)
 
 
 def render(
-    integrator: WalkIntegrator,
+    integrator: StagedIntegrator,
     scene: mi.Scene,
     sensor: int | mi.Sensor,
     seed: int | mi.UInt32,
@@ -168,23 +176,34 @@ class _Job:
         limit = max(1, min(limit, self.integrator.samples_per_pass))
         pilots = self.integrator.pilots(self.scene, self.spp)
         stages = [*pilots, self.spp - sum(pilots)]
+        self.set_size = (
+            self.integrator.samples_per_set(self.spp) if self.integrator.timeout > 0 else 1
+        )
         # Independent samples can be cut anywhere, and each pass gets a seed of its own. Samples
         # that are stratified over the whole render must come in passes of equal length, to which
-        # the pilots are rounded.
-        if self.structured:
-            if len(stages) > 1:
+        # the pilots are rounded; sets of samples must not begin in the middle of a pass.
+        is_even = self.structured or self.set_size > 1
+        if is_even:
+            if self.structured and len(stages) > 1:
                 limit = min(limit, max(*stages[:-1], self.spp // _MIN_STRUCTURED_PASSES))
-            length = max(d for d in range(1, limit + 1) if self.spp % d == 0)
+            length = max(d for d in range(1, limit + 1) if self._can_be_cut(d))
             stages = [length * max(1, s // length) for s in stages[:-1]]
             stages.append(self.spp - sum(stages))
+        if self.structured:
             self.sampler.set_samples_per_wavefront(length)
             self.sampler.seed(dr.opaque(mi.UInt32, self.seed), self._lanes(length))
         self.plan = []
         for samples in stages:
-            longest = length if self.structured else _even_length(samples, limit)
+            longest = length if is_even else _even_length(samples, limit)
             passes, rest = divmod(samples, longest)
             self.plan.append([longest] * passes + ([rest] if rest else []))
         self.pass_index = 0
+
+    def _can_be_cut(self, length: int) -> bool:
+        """Into passes of this length?"""
+        if self.structured and self.spp % length != 0:
+            return False
+        return self.set_size % length == 0 or length % self.set_size == 0
 
     def _lanes(self, spp: int) -> int:
         return self.width * self.height * spp
@@ -198,7 +217,9 @@ class _Job:
             f"{len(self.plan)} stage(s), {pass_count} pass(es))",
         )
         plan = iter(enumerate(self.plan))
-        for stage in self.integrator.stages(self.scene, self.sensor, stage_samples):
+        for stage in self.integrator.stages(
+            self.scene, self.sensor, stage_samples, self.seed
+        ):
             if stage.is_scout:
                 self._run_scout(stage)
                 continue
@@ -222,6 +243,7 @@ class _Job:
         timeout = self.integrator.timeout
         is_open = is_last and timeout > 0  # is the number of passes still open?
         allowed = len(passes)
+        before = self.statistics.spp
         for index, spp in enumerate(passes):
             if index >= allowed or self._stopped(interrupt):
                 return
@@ -231,6 +253,8 @@ class _Job:
             if is_open and not compiled:
                 remaining = timeout - (end - self.start)
                 allowed = min(allowed, index + 1 + max(0, int(remaining / (end - begin))))
+                while (before + sum(passes[:allowed])) % self.set_size and allowed < len(passes):
+                    allowed += 1
                 is_open = False
             if self.integrator.progress is not None:
                 left = 0 if is_open else sum(passes[index + 1 : allowed])
@@ -246,8 +270,8 @@ class _Job:
         sampler = mi.load_dict({"type": "independent"})
         # The same for all seeds: what a scout decides changes the size of tables, and kernels
         sampler.seed(dr.opaque(mi.UInt32, 0), self._lanes(1))
-        ray, _weight, _position, pixel = camera.sample_rays(self.sensor, sampler, 1, self.spp)
-        sample = stage.walk(self.scene, sampler, mi.Ray3f(ray), mi.Bool(True), pixel)
+        rays = camera.sample_rays(self.sensor, sampler, 1, self.spp, stage.camera)
+        sample = stage.walk(self.scene, sampler, rays.ray, mi.Bool(True), rays.pixel)
         dr.eval(sample.L)
         self.statistics.compile_seconds += time.perf_counter() - begin
         dr.sync_thread()
@@ -257,14 +281,14 @@ class _Job:
         begin = time.perf_counter()
         misses = _kernel_cache_misses()
         sampler = self._pass_sampler(spp)
-        ray, weight, position, pixel = camera.sample_rays(self.sensor, sampler, spp, self.spp)
-        sample = stage.walk(self.scene, sampler, mi.Ray3f(ray), mi.Bool(True), pixel)
+        rays = camera.sample_rays(
+            self.sensor, sampler, spp, self.spp, stage.camera, self.statistics.spp
+        )
+        sample = stage.walk(self.scene, sampler, rays.ray, mi.Bool(True), rays.pixel)
         if dr.grad_enabled(sample.L):
             raise self.integrator.no_gradients()
-        aovs = self.integrator.sample_aovs(self.scene, sampler, ray)
-        camera.splat(
-            self.film, self.block, position, sample.L * weight, sample.valid, ray.wavelengths, aovs
-        )
+        aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
+        camera.splat(self.film, self.block, rays, sample.L, sample.valid, aovs)
         self._count(sample)
         if self.structured:
             sampler.advance()

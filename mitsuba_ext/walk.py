@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .decisions import AlwaysTest, DirectionSamples, EmitterSampling, SceneQuery, ShadowTest
+from .mis import power_heuristic
 
 
 @dataclass
@@ -32,6 +33,7 @@ class PathSample:
         shadow_count: Shadow rays traced.
         connection_count: Connections to a light that were considered: ``path`` traces a shadow ray
             for each of them.
+        aovs: Values of arbitrary output variables, if the walk finds any.
     """
 
     L: mi.Spectrum
@@ -39,6 +41,7 @@ class PathSample:
     scatter_count: mi.UInt32
     shadow_count: mi.UInt32
     connection_count: mi.UInt32
+    aovs: list[mi.Float] = field(default_factory=list)
 
 
 @dataclass
@@ -123,6 +126,13 @@ class Walk:
             active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             if dr.hint(self.observer is not None, mode="scalar"):
                 self.observer.vertex(si, depth, active_em)
+            if dr.hint(connects and self.next_event.gathers, mode="scalar"):
+                gathered, shadow_rays = self.next_event.gather(
+                    scene, sampler, self.query, ctx, si, bsdf, active_em & (depth == 0)
+                )
+                L = dr.fma(β, gathered, L)
+                shadow_count += shadow_rays
+                connection_count += shadow_rays
             ds, em_weight, next_event_state = self._sample_emitter(
                 connects, next_event_state, scene, sampler, si, active_em
             )
@@ -139,7 +149,7 @@ class Walk:
             # ----- Does the light reach this vertex? -----
             if dr.hint(connects, mode="scalar"):
                 bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
-                mis = dr.select(ds.delta, 1, _mis_weight(ds.pdf, bsdf_pdf))
+                mis = dr.select(ds.delta, 1, power_heuristic(ds.pdf, bsdf_pdf))
                 contribution = bsdf_value * em_weight
                 unoccluded = β * contribution * mis
                 active_em &= ds.pdf != 0
@@ -199,7 +209,7 @@ class Walk:
         ds = mi.DirectionSample3f(scene, si, prev_si)
         is_connectable = ~prev_bsdf_delta & (ds.emitter != None)  # noqa: E711
         em_pdf, state = self.next_event.pdf(state, scene, prev_si, si, ds, is_connectable)
-        mis = _mis_weight(prev_bsdf_pdf, em_pdf)
+        mis = power_heuristic(prev_bsdf_pdf, em_pdf)
         return dr.fma(β, ds.emitter.eval(si, prev_bsdf_pdf > 0) * mis, L), state
 
     def _sample_emitter(self, connects: bool, state, scene, sampler, si, active):
@@ -228,13 +238,6 @@ class Walk:
             pi = self.query.closest(scene, ray, coherent=True, active=on_emitter)
             on_emitter &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
         return ray, pi
-
-
-def _mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
-    """Power heuristic (β = 2); 0 where both densities vanish or overflow."""
-    a, b = dr.square(pdf_a), dr.square(pdf_b)
-    w = a / (a + b)
-    return dr.select(dr.isfinite(w), w, 0)
 
 
 def _emitters_can_be_hit(scene: mi.Scene) -> bool:

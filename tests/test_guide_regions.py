@@ -11,7 +11,7 @@ import pytest
 from hard_cases import diffuse, sensor, stage
 
 from mitsuba_ext.learning.path_records import PathRecords
-from mitsuba_ext.learning.sample_trees import SampleTrees
+from mitsuba_ext.learning.sample_trees import LEAF, SampleTrees
 from mitsuba_ext.learning.surface_regions import SurfaceRegions
 from mitsuba_ext.learning.tile_regions import TileRegions
 from mitsuba_ext.learning.tree_builder import cell_code
@@ -130,6 +130,9 @@ def test_records_of_a_walk_are_the_radiance_of_longer_paths() -> None:
 
 # ---- Regions of surfaces ----
 
+#: Pointers do not keep what they point to alive.
+_shapes: list[mi.Shape] = []
+
 
 def _points(count: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Points on a floor and on a wall, many of them in one corner, and normals towards the room."""
@@ -142,12 +145,16 @@ def _points(count: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     return p.astype(np.float32), n.astype(np.float32)
 
 
-def _interaction(p: np.ndarray, n: np.ndarray, side: float = 1.0) -> mi.SurfaceInteraction3f:
+def _interaction(
+    p: np.ndarray, n: np.ndarray, side: float = 1.0, bsdf: str = "diffuse"
+) -> mi.SurfaceInteraction3f:
     """Points that are seen from the normals' side, or from the other."""
     si = dr.zeros(mi.SurfaceInteraction3f, p.shape[1])
     si.p, si.n = mi.Point3f(p), mi.Normal3f(n)
     si.sh_frame = mi.Frame3f(si.n)
     si.wi = mi.Vector3f(0, 0, side)
+    _shapes.append(mi.load_dict({"type": "sphere", "bsdf": {"type": bsdf}}))
+    si.shape = mi.ShapePtr(_shapes[-1])
     return si
 
 
@@ -182,6 +189,22 @@ def test_every_point_has_a_region_and_points_elsewhere_that_of_everything(
     state = surfaces.begin(None)
     tree = surfaces.tree(state, _interaction(p, n), mi.Bool(True)).numpy()
     assert (tree == _labels(surfaces, p, n)).all()
+
+
+def test_mirrors_and_glass_neither_learn_nor_are_guided(surfaces: SurfaceRegions) -> None:
+    """Their directions do not depend on the sample."""
+    p, n = _points(20_000)
+    region = mi.UInt32(_labels(surfaces, p, n))
+    specular = [_labels(surfaces, p, n, 1.0, b) for b in ("conductor", "dielectric")]
+    assert all((label == surfaces.count).all() for label in specular)
+    assert (_labels(surfaces, p, n, 1.0, "plastic") == region.numpy()).all()
+    u = mi.Point2f(np.random.default_rng(4).random((2, 20_000), dtype=np.float32))
+    ones, spot = dr.full(mi.Float, 1, 20_000), dr.select(u.x < 0.25, mi.Float(9), 1)
+    for label, is_guided in ((region, True), (mi.UInt32(specular[0]), False)):
+        samples = SimpleNamespace(code=cell_code(u), value=spot, weight=ones, region=label)
+        builder, roots, _ = surfaces.build(samples)
+        probability = dr.gather(mi.Float, builder.probability, roots).numpy()
+        assert probability[-1] == LEAF and (probability[:-1] != LEAF).any() == is_guided
 
 
 def test_larger_regions_contain_the_smaller_ones(surfaces: SurfaceRegions) -> None:
@@ -219,7 +242,7 @@ def test_a_region_without_samples_has_the_density_of_the_one_around_it(
     builder, roots, below = surfaces.build(
         SimpleNamespace(code=cell_code(u), value=value, weight=ones, region=region)
     )
-    assert below is None and len(roots) == surfaces.count
+    assert below is None and len(roots) == surfaces.count + 1
     assert roots.numpy().max() < builder.node_count
     share = dr.full(mi.Float, 0.6, len(roots))
     trees = SampleTrees(builder.probability, builder.child, builder.is_even, roots, share)

@@ -219,7 +219,7 @@ def test_voxels_of_a_selection_without_learning_fit_into_the_memory():
         integrator = mi.load_dict(
             {"type": "composed_path", "next_event": "spatial", **parameters}
         )
-        return integrator.decisions(scene)["next_event"].rows.count
+        return integrator.decisions(scene, 0)["next_event"].rows.count
 
     assert 1 < rows(max_memory=0.5) <= 2**19 / 40 / 80 < rows()
     assert rows(grid=1) == 2

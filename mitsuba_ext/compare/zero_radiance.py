@@ -18,6 +18,7 @@ def zero_radiance_share(integrator: mi.Integrator, scene: mi.Scene, seed: int) -
     import mitsuba as mi
 
     from .. import camera
+    from ..decisions.camera_samples import CameraSamples
 
     if not isinstance(integrator, mi.SamplingIntegrator):
         return None
@@ -29,8 +30,8 @@ def zero_radiance_share(integrator: mi.Integrator, scene: mi.Scene, seed: int) -
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()
         sampler.seed(seed, width * height * spp)
-        ray, *_rest = camera.sample_rays(sensor, sampler, spp, spp)
-        L = integrator.sample(scene, sampler, ray, None, mi.Bool(True))[0]
+        rays = camera.sample_rays(sensor, sampler, spp, spp, CameraSamples())
+        L = integrator.sample(scene, sampler, rays.ray, None, mi.Bool(True))[0]
     except Exception:  # sample() of another signature, a sampler that cannot be copied, …
         return None
     return float(dr.mean(dr.select(dr.max(dr.abs(L)) == 0, mi.Float(1), mi.Float(0)))[0])

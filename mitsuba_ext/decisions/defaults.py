@@ -30,7 +30,13 @@ class DirectionSamples:
 
 class EmitterSampling:
     """Which point of which light to connect to: Mitsuba's choice (uniform, or by the emitters'
-    ``sampling_weight``)."""
+    ``sampling_weight``).
+
+    Attributes:
+        gathers: Has it a method ``gather``, which connects a path's first vertex to many points?
+    """
+
+    gathers = False
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
         """The state before the first bounce."""

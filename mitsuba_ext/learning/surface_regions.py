@@ -9,7 +9,7 @@ import numpy as np
 from .path_records import PathRecords
 from .sample_trees import SampleTrees
 from .scout import lit_normal, region
-from .tree_builder import Samples, TreeBuilder
+from .tree_builder import UNIFORM, Samples, TreeBuilder
 
 #: Voxels along each axis, level by level: each of them divides those of the one before.
 _GRIDS = (4, 8, 16, 32)
@@ -22,15 +22,16 @@ class SurfaceRegions:
     """Voxels of the region in which paths scatter, and the sides of their surfaces.
 
     The number 0 stands for everything; large voxels come after it, and smaller ones inside of them
-    after these, each where paths meet it often enough. All bounces of a path use the trees of the
-    places where they happen.
+    after these, each where paths meet it often enough. The last number stands for mirrors and
+    glass, whose directions do not depend on the sample: it has a tree without splits. All bounces
+    of a path use the trees of the places where they happen.
 
     Parameters:
         p, n: Where paths scatter, and normals on the side that is lit; not empty.
         least: How many of these a region has, at least.
 
     Attributes:
-        count: Number of trees.
+        count: Number of regions that learn.
     """
 
     def __init__(self, p: mi.Point3f, n: mi.Normal3f, least: float) -> None:
@@ -60,6 +61,7 @@ class SurfaceRegions:
             self.count += len(seen)
         self._parent = np.concatenate(parents)
         self._table = mi.UInt32(table.ravel())
+        self._specular = dr.opaque(mi.UInt32, self.count)
         dr.eval(self._table)
 
     # ---- During the walk ----
@@ -84,14 +86,16 @@ class SurfaceRegions:
         """The region by which a sample is recorded."""
         cell, side, inside = self._locate(si.p, lit_normal(si), active)
         slot = (cell.x + _GRIDS[-1] * (cell.y + _GRIDS[-1] * cell.z)) * _SIDES + side
-        return dr.gather(mi.UInt32, self._table, mi.UInt32(slot), inside)
+        region = dr.gather(mi.UInt32, self._table, mi.UInt32(slot), inside)
+        is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
+        return dr.select(is_smooth, region, self._specular)
 
     def build(self, records: PathRecords) -> tuple[TreeBuilder, mi.UInt32, None]:
         """The trees and their roots. A region expects what the one around it found."""
         samples = Samples(records.code, records.value, records.weight)
         samples, region = samples.merged(records.region)
         builder = TreeBuilder()
-        roots = np.zeros(self.count, np.uint32)
+        roots = np.full(self.count + 1, UNIFORM, np.uint32)
         for level, regions in enumerate(self._levels):
             size = regions.stop - regions.start
             if size == 0:
@@ -104,7 +108,7 @@ class SurfaceRegions:
 
     def _numbers(self, level: int) -> np.ndarray:
         """For each region, which one of a level's it lies in; too large a number for none."""
-        numbers = np.full(self.count, self.count, np.uint32)
+        numbers = np.full(self.count + 1, self.count, np.uint32)
         regions = self._levels[level]
         numbers[regions] = np.arange(regions.stop - regions.start)
         for smaller in self._levels[level + 1 :]:

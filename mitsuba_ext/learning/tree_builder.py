@@ -11,6 +11,8 @@ Source: Guo, PhD thesis, section 2.3.4 (mid-point splits, axes in turn); the est
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import drjit as dr
 import mitsuba as mi
 
@@ -49,15 +51,20 @@ class Samples:
     """
 
     def __init__(self, code: mi.UInt32, value: mi.Float, weight: mi.Float) -> None:
-        self.code = code
-        # No mean of numbers is below their largest one by more than their count
-        value = mi.Float64(value)  # so that the order of the samples does not tell in their mean
-        # Opaque: other counts share the kernel
-        mean = dr.sum(value) / dr.opaque(mi.Float64, len(value))
-        value = dr.minimum(value / dr.maximum(mean, 1e-30), _LIMIT)
-        values = value, dr.square(value), mi.Float64(weight)
-        self._values = [mi.UInt64(x * unit) for x, unit in zip(values, _UNITS)]
-        dr.eval(self._values)
+        self.code, self._value, self._weight = code, value, weight
+        # In double precision, so that the order of the samples does not tell; opaque: other counts
+        # share the kernel
+        mean = dr.sum(mi.Float64(value)) / dr.opaque(mi.Float64, len(value))
+        self._scale = dr.rcp(dr.maximum(mean, 1e-30))
+
+    def in_order(self, key: mi.UInt32) -> tuple[mi.UInt32, list[mi.UInt64]]:
+        """``key`` in ascending order, and up to each the sums of all values, squares and weights,
+        in units."""
+        order = dr.argsort(key)
+        key = dr.gather(mi.UInt32, key, order)
+        # One after the other: they are the largest arrays of all
+        running = [dr.cumsum(x) for x in self._fixed(order)]
+        return key, running
 
     def merged(self, region: mi.UInt32) -> tuple[Samples, mi.UInt32]:
         """All samples of a cell and a region as one, and the regions of those."""
@@ -69,19 +76,33 @@ class Samples:
         end = dr.gather(mi.UInt32, begin, index + 1, ~is_last)
         end = dr.select(is_last, dr.opaque(mi.UInt32, len(key)), end)
         key = dr.gather(mi.UInt32, key, begin)
-        result = object.__new__(Samples)
-        result.code, result._values = key & ((1 << DEPTH) - 1), sums(running, begin, end)
-        region = key >> DEPTH
-        dr.eval(result.code, result._values, region)
-        return result, region
+        code, region, values = key & ((1 << DEPTH) - 1), key >> DEPTH, sums(running, begin, end)
+        dr.eval(code, region, values)
+        return _MergedSamples(code, values), region
 
-    def in_order(self, key: mi.UInt32) -> tuple[mi.UInt32, list[mi.UInt64]]:
-        """``key`` in ascending order, and the sums of all values up to each."""
-        order = dr.argsort(key)
-        key = dr.gather(mi.UInt32, key, order)
-        running = [dr.cumsum(dr.gather(mi.UInt64, x, order)) for x in self._values]
-        dr.eval(key, running)
-        return key, running
+    def _fixed(self, order: mi.UInt32) -> Iterator[mi.UInt64]:
+        """Values, squares and weights in units, in another order."""
+        weight = dr.gather(mi.Float, self._weight, order)
+        # No mean of numbers is below their largest one by more than their count
+        value = mi.Float64(dr.gather(mi.Float, self._value, order)) * self._scale
+        value = dr.minimum(value, _LIMIT)
+        for x, unit in zip((value, dr.square(value), mi.Float64(weight)), _UNITS):
+            yield mi.UInt64(x * unit)
+
+
+class _MergedSamples(Samples):
+    """Sums of samples.
+
+    Parameters:
+        code: Their cells.
+        values: Sums of values, squares and weights, in units.
+    """
+
+    def __init__(self, code: mi.UInt32, values: list[mi.UInt64]) -> None:
+        self.code, self._values = code, values
+
+    def _fixed(self, order):
+        return (dr.gather(mi.UInt64, x, order) for x in self._values)
 
 
 def sums(running: list[mi.UInt64], begin: mi.UInt32, end: mi.UInt32) -> list[mi.UInt64]:

@@ -7,7 +7,6 @@ import warnings
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import qmc
 
 from .line import FloatArray
 
@@ -100,10 +99,18 @@ def _root(count: int, dimension: int) -> int:
     return edge if edge**dimension <= count else edge - 1
 
 
+def _latin_hypercube(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
+    return _qmc().LatinHypercube(dimension, seed=rng).random(count)
+
+
+def _halton(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
+    return _qmc().Halton(dimension, seed=rng).random(count)
+
+
 def _hammersley(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
     x = np.arange(count)[:, None] / count
     if dimension > 1:
-        x = np.hstack([x, qmc.Halton(dimension - 1, scramble=False).random(count)])
+        x = np.hstack([x, _qmc().Halton(dimension - 1, scramble=False).random(count)])
     return shifted(x, rng.random(dimension))
 
 
@@ -111,7 +118,7 @@ def _sobol(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
     with warnings.catch_warnings():
         # It warns of counts that are no power of two
         warnings.simplefilter("ignore", UserWarning)
-        return qmc.Sobol(dimension, scramble=True, seed=rng).random(count)
+        return _qmc().Sobol(dimension, scramble=True, seed=rng).random(count)
 
 
 def _lattice(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
@@ -157,13 +164,18 @@ def _poisson_disk(count: int, dimension: int, rng: np.random.Generator) -> Float
     return x
 
 
+def _qmc():
+    # Imported where it is needed: it takes longer to load than all of this package
+    from scipy.stats import qmc
+
+    return qmc
+
+
 _MAKERS = {
     "independent": lambda count, dimension, rng: rng.random((count, dimension)),
     "stratified": _stratified,
-    "latin_hypercube": lambda count, dimension, rng: qmc.LatinHypercube(
-        dimension, seed=rng
-    ).random(count),
-    "halton": lambda count, dimension, rng: qmc.Halton(dimension, seed=rng).random(count),
+    "latin_hypercube": _latin_hypercube,
+    "halton": _halton,
     "hammersley": _hammersley,
     "sobol": _sobol,
     "lattice": _lattice,
