@@ -22,12 +22,13 @@ import mitsuba as mi  # isort: skip
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "scenes"
 
-#: ``path``, the strongest selection that learns nothing, rejection alone, and learned selection.
+#: ``path``, the strongest selection of lights that learns nothing, learned selection with
+#: rejection, and path guiding.
 INTEGRATORS = {
     "path": "path",
     "spatial": "composed_path:next_event=spatial",
-    "rejection": "neepp:light_sampling=uniform,rejection=true",
     "neepp": "neepp",
+    "pss_guided": "pss_guided",
 }
 
 #: Our scenes, at their own size.
