@@ -16,7 +16,7 @@ from ..parameters import read_parameter
 from ..pointsets import PATTERNS, points, voronoi_weights
 
 #: How the points of a set are weighed.
-WEIGHTS = ("none", "voronoi", "torus", "tent")
+WEIGHTS = ("none", "voronoi", "torus", "unbiased")
 
 #: Points of all sets together, and sets at most. With few sets, pixels share the luck of one.
 _POINTS, _MOST_SETS = 1 << 14, 64
@@ -48,7 +48,7 @@ class WeightedSets:
     Parameters:
         pattern: See :func:`mitsuba_ext.pointsets.points`.
         weights: ``none`` (1/N); ``voronoi`` (cells that end at the border: biased); ``torus``
-            (periodic cells); ``tent`` (the same, and the points are folded: no seam).
+            (periodic cells); ``unbiased`` (the same, and the points are folded: no seam).
         count: Points of a set, N.
         dimension: 1 or 2.
         seed: Another seed gives other sets.
@@ -95,14 +95,14 @@ class WeightedSets:
         if self._kind != "voronoi":
             u += shift
             u -= dr.floor(u)
-        if self._kind == "tent":
+        if self._kind == "unbiased":
             u = 1 - dr.abs(2 * u - 1)
         # Rounding must not reach the upper end
         u = dr.minimum(u, dr.one_minus_epsilon(mi.Float))
         return (u if self._dimension == 2 else u.x), weight
 
 
-_BOUNDARIES = {"voronoi": "clip", "torus": "torus", "tent": "torus"}
+_BOUNDARIES = {"voronoi": "clip", "torus": "torus", "unbiased": "torus"}
 
 #: Rows of two or four numbers are read at once.
 _PADS = {1: ((0, 0), (0, 0), (0, 0)), 2: ((0, 0), (0, 0), (0, 1))}

@@ -27,7 +27,7 @@ def points(
     pattern: str, count: int, dimension: int = 2, seed: int | np.random.Generator = 0
 ) -> FloatArray:
     """Points in [0, 1)ᴰ. Each point alone is uniform, except with ``hammersley`` and ``lattice``,
-    which are fixed sets up to a random shift around the torus.
+    which are fixed sets up to a random shift around the torus and the order of their axes.
 
     - ``independent``: i.i.d. uniform numbers.
     - ``stratified``: one in each cell of a grid (jittered). Where the count is no power, the grid
@@ -111,7 +111,7 @@ def _hammersley(count: int, dimension: int, rng: np.random.Generator) -> FloatAr
     x = np.arange(count)[:, None] / count
     if dimension > 1:
         x = np.hstack([x, _qmc().Halton(dimension - 1, scramble=False).random(count)])
-    return shifted(x, rng.random(dimension))
+    return shifted(x[:, rng.permutation(dimension)], rng.random(dimension))
 
 
 def _sobol(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
@@ -123,7 +123,9 @@ def _sobol(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
 
 def _lattice(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
     index = np.arange(count, dtype=np.int64)[:, None]
-    return shifted(index * _generator(count, dimension) % count / count, rng.random(dimension))
+    # No direction of the cube is preferred: a lattice can suit an integrand, and its mirror image not
+    generator = rng.permutation(_generator(count, dimension)) * rng.choice([-1, 1], dimension)
+    return shifted(index * generator % count / count, rng.random(dimension))
 
 
 def _generator(count: int, dimension: int) -> npt.NDArray[np.int64]:

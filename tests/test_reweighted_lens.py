@@ -1,0 +1,168 @@
+"""Weighted points of the aperture: unbiased, whole sets, and better where defocus makes the noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_cases import area, diffuse, film, lookat, sensor, stage
+from statistical import SEEDS, assert_images_are_sound, assert_same_mean, batches
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+PATH = {"type": "path", "max_depth": 3}
+
+
+def lens(nested: dict | None = PATH, **parameters: Any) -> mi.Integrator:
+    children = {"nested": nested} if nested else {}
+    return mi.load_dict({"type": "reweighted_lens", **parameters, **children})
+
+
+def thin_lens(**parameters: Any) -> dict[str, Any]:
+    view = lookat([0, -4, 0], [0, 0, 0], [0, 0, 1])
+    optics = {"aperture_radius": 0.4, "focus_distance": 2.5}
+    return sensor("thinlens", to_world=view, **optics, **parameters)
+
+
+def bokeh(**parameters: Any) -> mi.Scene:
+    """Small lamps far out of focus: all of the noise is that of the lens."""
+    lamps = {
+        f"lamp_{i}": {
+            "type": "sphere", "center": [x, 0, z], "radius": 0.08, "emitter": area(5.0 + i),
+        }
+        for i, (x, z) in enumerate([(-0.8, 0.5), (0.1, -0.3), (0.7, 0.6), (0.5, -0.8)])
+    }  # fmt: skip
+    return mi.load_dict({"type": "scene", "sensor": thin_lens(**parameters), **lamps})
+
+
+# ---- The mean ----
+
+
+@pytest.mark.parametrize("pattern, weights", [
+    ("independent", "none"), ("independent", "torus"), ("independent", "unbiased"),
+    ("stratified", "unbiased"), ("sobol", "torus"), ("lattice", "none"), ("halton", "unbiased"),
+])  # fmt: skip
+def test_mean_is_that_of_the_nested_integrator(pattern, weights):
+    """With few samples, where weights differ most; over borders that a filter needs."""
+    scene = bokeh(film=film(16, 16, rfilter={"type": "gaussian"}, sample_border=True))
+    integrator = lens(pattern=pattern, weights=weights)
+    reference = batches(scene, mi.load_dict(PATH), 256, range(1001, 1013))
+    assert_same_mean(batches(scene, integrator, 7, range(1, 49)), reference, 0.03)
+
+
+@pytest.mark.parametrize("nested", [
+    {"type": "volpath", "max_depth": 4},
+    {"type": "neepp", "max_depth": 4},
+    {"type": "pss_guided", "max_depth": 4},
+    {"type": "composed_path", "max_depth": 4, "hide_emitters": True},
+], ids=lambda nested: nested["type"])  # fmt: skip
+def test_mean_with_other_integrators(nested):
+    camera = thin_lens(film=film(16, 16))
+    wall = {"type": "rectangle", "bsdf": diffuse(0.5),
+            "to_world": lookat([0, 1, 0], [0, 0, 0], [0, 0, 1]).scale(3)}  # fmt: skip
+    scene = mi.load_dict(stage(camera=camera, back=wall))
+    reference = batches(scene, mi.load_dict(nested), 64, range(1001, 1013))
+    assert reference.mean() > 0
+    assert_same_mean(batches(scene, lens(nested), 64, SEEDS[:12]), reference, 0.03)
+
+
+# ---- Sets ----
+
+WHITE = {"type": "constant", "radiance": 1.0}
+
+
+@pytest.mark.parametrize("spp", [1, 2, 64, 1500])
+@pytest.mark.parametrize("weights", ["voronoi", "torus", "unbiased"])
+def test_a_constant_has_no_noise(spp, weights):
+    """The weights of each pixel add up to one, also of several sets."""
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": thin_lens(film=film(5, 3)), "light": WHITE}
+    )
+    (image,) = batches(scene, lens(weights=weights, pattern="independent"), spp, [1])
+    np.testing.assert_allclose(image, 1, rtol=1e-4)
+
+
+@pytest.mark.parametrize("sampler", ["independent", "stratified", "multijitter", "ldsampler"])
+def test_a_timeout_and_passes_keep_sets_whole(sampler, monkeypatch):
+    from mitsuba_ext import rendering
+
+    monkeypatch.setattr(rendering, "_PASS_SAMPLES", dict.fromkeys(rendering._PASS_SAMPLES, 15 * 40))
+    monkeypatch.setattr(rendering, "_PASS_SPP", 1)
+    camera = thin_lens(film=film(5, 3), sampler={"type": sampler})
+    scene = mi.load_dict({"type": "scene", "sensor": camera, "light": WHITE})
+    integrator = lens(pattern="independent", timeout=0.02)
+    (image,) = batches(scene, integrator, 4096, [1])
+    assert integrator.statistics.spp < 4096 and integrator.statistics.spp % 64 == 0
+    np.testing.assert_allclose(image, 1, rtol=1e-4)
+    (image,) = batches(scene, lens(pattern="independent"), 256, [1])
+    np.testing.assert_allclose(image, 1, rtol=1e-4)
+
+
+def test_alpha_and_aovs_have_the_weights_too() -> None:
+    camera = thin_lens(film=film(5, 3, pixel_format="rgba"))
+    wall = {"type": "rectangle", "to_world": lookat([0, 1, 0], [0, 0, 0], [0, 0, 1]).scale(9)}
+    scene = mi.load_dict({"type": "scene", "sensor": camera, "light": WHITE, "wall": wall})
+    nested = {"type": "aov", "aovs": "nn:sh_normal", "image": PATH}
+    integrator = lens(nested, pattern="independent")
+    (image,) = batches(scene, integrator, 16, [1])
+    assert integrator.aov_names() == mi.load_dict(nested).aov_names()
+    np.testing.assert_allclose(image[..., 3], 1, rtol=1e-4)
+    np.testing.assert_allclose(image[..., -2], -1, rtol=1e-4)
+
+
+# ---- Variance ----
+
+
+@pytest.mark.parametrize("pattern, weights, factor", [
+    ("independent", "unbiased", 1.5), ("stratified", "none", 3), ("stratified", "unbiased", 3),
+    ("sobol", "none", 5), ("lattice", "none", 5),
+])  # fmt: skip
+def test_sets_lower_the_noise_of_defocus(pattern, weights, factor):
+    scene = bokeh(film=film(16, 16))
+    plain = batches(scene, mi.load_dict(PATH), 64, range(1, 17)).var(axis=0).mean()
+    weighted = batches(scene, lens(pattern=pattern, weights=weights), 64, range(1, 17))
+    assert factor * weighted.var(axis=0).mean() < plain
+
+
+def test_seeds_are_independent_and_repeatable() -> None:
+    scene = bokeh(film=film(16, 16))
+    a, b, other = batches(scene, lens(), 16, [1, 1, 2])
+    np.testing.assert_allclose(a, b, rtol=1e-5)
+    assert_images_are_sound(np.stack([a, other]))
+    assert np.abs(a - other).mean() > 0.01 * a.mean()
+
+
+# ---- What a user meets ----
+
+
+def test_without_an_aperture_the_nested_integrator_goes_on_alone() -> None:
+    scene = mi.load_dict(stage(camera=sensor(film=film(9, 7))))
+    image, same = (batches(scene, i, 16, [3])[0] for i in (lens(), mi.load_dict(PATH)))
+    np.testing.assert_allclose(image, same, rtol=1e-4, atol=1e-5)
+
+
+def test_a_scene_names_it() -> None:
+    scene = mi.load_string("""
+        <scene version="3.0.0">
+            <integrator type="reweighted_lens">
+                <string name="pattern" value="sobol"/>
+                <string name="weights" value="torus"/>
+                <integrator type="path"><integer name="max_depth" value="2"/></integrator>
+            </integrator>
+        </scene>""")
+    shown = str(scene.integrator())
+    assert "pattern = sobol" in shown and "weights = torus" in shown and "PathIntegrator" in shown
+
+
+@pytest.mark.parametrize("make, says", [
+    (lambda: lens(None), "exactly one"), (lambda: lens(other=PATH), "exactly one"),
+    (lambda: lens({"type": "prb"}), "none for gradients"),
+    (lambda: lens({"type": "ptracer"}), "samples camera rays"),
+    (lambda: lens(pattern="sobel"), "one of independent"),
+    (lambda: lens(weights="area"), "one of none"), (lambda: lens(patern="sobol"), "patern"),
+])  # fmt: skip
+def test_errors_say_what_is_wrong(make, says):
+    with pytest.raises(Exception, match=says):
+        make()

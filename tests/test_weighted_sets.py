@@ -1,0 +1,68 @@
+"""Weighted sets on the device: what kernels draw from them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy import stats
+
+from mitsuba_ext.decisions.weighted_sets import WEIGHTS, WeightedSets
+from mitsuba_ext.pointsets import PATTERNS
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def _drawn(sets: WeightedSets, users: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Whole sets of so many users: points [user, N, D], and weights [user, N]."""
+    rng = np.random.default_rng(seed)
+    choice = mi.UInt32(np.repeat(rng.integers(0, 2**32, users, np.uint32), sets.count))
+    shift = mi.Point2f(np.repeat(rng.random((2, users), np.float32), sets.count, axis=1))
+    index = dr.tile(dr.arange(mi.UInt32, sets.count), users)
+    u, weight = sets.draw(choice, shift, index, mi.Bool(True))
+    dimension = 2 if isinstance(u, mi.Point2f) else 1
+    u = np.asarray(u.numpy()).reshape(dimension, users, sets.count)
+    return np.moveaxis(u, 0, -1), weight.numpy().reshape(users, sets.count)
+
+
+@pytest.mark.parametrize("weights", WEIGHTS)
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("dimension", [1, 2])
+def test_weights_of_a_set_add_up_to_one(pattern, weights, dimension):
+    if dimension == 1 and pattern not in ("independent", "lattice"):
+        pytest.skip("the same code")
+    for count in (1, 2, 15):
+        sets = WeightedSets(pattern, weights, count, dimension, seed=3)
+        u, weight = _drawn(sets, 100)
+        assert u.min() >= 0 and u.max() < 1 and weight.min() > 0
+        np.testing.assert_allclose(weight.mean(axis=1), 1, rtol=1e-5)
+        if weights == "none":
+            np.testing.assert_array_equal(weight, 1)
+
+
+@pytest.mark.parametrize("weights", ["none", "torus", "unbiased"])
+def test_each_point_is_uniform_whatever_its_weight(weights):
+    sets = WeightedSets("stratified", weights, 9, 2, seed=1)
+    u, weight = _drawn(sets, 20_000)
+    for index in (0, 8):
+        for axis in range(2):
+            assert stats.kstest(u[:, index, axis], "uniform").pvalue > 6e-5
+    # The weight says nothing about the place
+    for region in (u < 0.1).all(axis=-1), (np.abs(u - 0.5) < 0.2).all(axis=-1):
+        sums = (weight * region).mean(axis=1) - region.mean()
+        expected = (0.1**2, 0.4**2)[int(region.mean() > 0.05)]
+        z = ((weight * region).mean(axis=1).mean() - expected) / (
+            sums.std(ddof=1) / np.sqrt(len(sums))
+        )
+        assert abs(z) < 4
+
+
+def test_seeds_give_sets_of_their_own() -> None:
+    u, weight = _drawn(WeightedSets("independent", "voronoi", 16, 2, seed=5), 50)
+    again, _ = _drawn(WeightedSets("independent", "voronoi", 16, 2, seed=5), 50)
+    other, _ = _drawn(WeightedSets("independent", "voronoi", 16, 2, seed=6), 50)
+    np.testing.assert_array_equal(u, again)
+    assert not np.isclose(u, other).any()
+    # Several sets, not one: users differ, although nothing is shifted
+    assert len(np.unique(u[:, 0, 0])) > 10
