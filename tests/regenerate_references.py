@@ -70,6 +70,8 @@ REGRESSIONS = {
         Regression("pss_guided", "door_ajar", {"pilot_spp": 96}, spp=384),
         Regression("pss_guided", "door_ajar", {"pilot_spp": 96, "regions": "tiles", "tile": 8},
                    spp=384),
+        Regression("reweighted_direct", "cornell_box", {"light_samples": 16}, spp=32),
+        Regression("reweighted_lens", "defocus", {"nested": "path"}),
     )
 }  # fmt: skip
 
@@ -79,8 +81,12 @@ def render(regression: Regression, seeds: range) -> np.ndarray:
     from statistical import batches, load
 
     scene = load(regression.scene, width=32, height=18)
-    integrator = {"type": regression.integrator, "max_depth": regression.max_depth}
-    integrator |= regression.parameters
+    integrator = {"type": regression.integrator, **regression.parameters}
+    depth = {"max_depth": regression.max_depth}
+    if "nested" in integrator:
+        integrator["nested"] = {"type": integrator["nested"], **depth}
+    else:
+        integrator |= depth
     return batches(scene, mi.load_dict(integrator), regression.spp, seeds)
 
 

@@ -81,6 +81,7 @@ UNDER_TEST: dict[str, UnderTest] = {
     "composed_path": UnderTest("composed_path", draws_like_path=True),
     "neepp": UnderTest("neepp"),
     "pss_guided": UnderTest("pss_guided", insists=True),
+    "reweighted_direct": UnderTest("reweighted_direct", {"light_samples": 4}),
 }
 
 #: What they are compared with.

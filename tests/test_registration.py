@@ -13,7 +13,7 @@ LLVM_VARIANTS = [name for name in runtime.SUPPORTED_VARIANTS if name.startswith(
 
 #: Some integrators have no depth of their own: they nest another one.
 LOAD_ALL = """
-WRAPPERS = ("variance",)
+WRAPPERS = ("variance", "reweighted_lens")
 
 def load_all():
     from mitsuba_ext import registry

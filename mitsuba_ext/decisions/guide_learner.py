@@ -20,8 +20,8 @@ from .guided_directions import GuidedDirections, Regions
 _FIRST_SHARE, _SHARES = 0.6, (0.4, 0.6, 0.8)
 
 #: What guiding the first direction of a path and each further one costs, in units of the time of a
-#: path (measured: 0 to 5 %, and 1 to 8 %); and the efficiency that it must reach.
-_COST, _COST_OF_BOUNCE, _LEAST_EFFICIENCY = 0.03, 0.04, 1.02
+#: path (measured: 0 to 10 %, and 1 to 8 %); and the efficiency that it must reach.
+_COST, _COST_OF_BOUNCE, _LEAST_EFFICIENCY = 0.05, 0.05, 1.02
 
 
 class GuideLearner(Learner):

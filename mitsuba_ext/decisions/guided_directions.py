@@ -53,11 +53,20 @@ class GuidedDirections(DirectionSamples):
 
     def draw(self, state, sampler, si, depth, active):
         sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
-        active = active & (depth < self._bounces)
+        # A branch: later bounces are to cost nothing
+        sample_2, weight, state = dr.if_stmt(
+            (state, si, sample_2),
+            active & (depth < self._bounces),
+            self._guide,
+            lambda state, si, sample: (sample, mi.Float(1), state),
+        )
+        return sample_1, sample_2, weight, state
+
+    def _guide(self, state, si, sample):
+        active = mi.Bool(True)
         tree = self._regions.tree(state, si, active)
-        sample_2, density, leaf = self._trees.sample(tree, sample_2, active)
-        state = self._regions.after(state, self._trees, leaf, active)
-        return sample_1, sample_2, dr.rcp(density), state
+        sample, density, leaf = self._trees.sample(tree, sample, active)
+        return sample, dr.rcp(density), self._regions.after(state, self._trees, leaf, active)
 
     def density(
         self, si: mi.SurfaceInteraction3f, pixel: mi.UInt32 | None, u: mi.Point2f

@@ -19,7 +19,7 @@ from ..pointsets import PATTERNS, points, voronoi_weights
 WEIGHTS = ("none", "voronoi", "torus", "unbiased")
 
 #: Points of all sets together, and sets at most. With few sets, pixels share the luck of one.
-_POINTS, _MOST_SETS = 1 << 14, 64
+_POINTS, _MOST_SETS = 1 << 13, 32
 
 #: A pattern whose points are slow to find.
 _SLOW, _FEW_SETS = "poisson_disk", 2
