@@ -1,9 +1,9 @@
 """Weighted points against their rivals on integrals whose value is known.
 
-The plots follow Figs. 4.2 to 4.4 of Guo's PhD thesis: its function of one variable, a picture, other
-functions, densities that are not uniform, and batches. ``examples/reweighting.py`` writes them to
-``examples/figures``, and tables to the terminal (about three minutes); ``--bias`` instead measures
-how many standard errors those from independent points are off (half an hour).
+The plots follow Figs. 4.2 to 4.4 of Guo's PhD thesis: its function of one variable, a picture,
+other functions, densities that are not uniform, and batches. ``examples/reweighting.py`` writes
+them to ``examples/figures``, and tables to the terminal (about three minutes); ``--bias`` instead
+measures how many standard errors those from independent points are off (half an hour).
 """
 
 from __future__ import annotations
@@ -175,8 +175,8 @@ def errors(
 
 
 def report(title: str, tables: dict[str, dict[str, np.ndarray]], counts: list[int]) -> None:
-    """Prints, of each function, the slope of the MSE over the last three quarters of the counts, and
-    how many times fewer samples than plain Monte Carlo have the same error."""
+    """Prints, of each function, the slope of the MSE over the last three quarters of the counts,
+    and how many times fewer samples than plain Monte Carlo have the same error."""
     for name, estimators in tables.items():
         plain = np.mean(estimators["independent"] ** 2, axis=1) * counts
         click.echo(f"\n{title}, {name}: MSE at N = {counts[-1]}, slope, samples saved")
@@ -242,8 +242,8 @@ def densities(counts: list[int], repetitions: int) -> dict[str, dict[str, np.nda
 
 
 def batches(total: int, sizes: list[int], repetitions: int) -> dict[str, dict[str, np.ndarray]]:
-    """Fig. 4.3 (b): the same number of samples in batches of several sizes; the mean of all batches'
-    estimates. What is biased does not profit from many."""
+    """Fig. 4.3 (b): the same number of samples in batches of several sizes; the mean of what they
+    estimate. What is biased does not profit from many."""
     f, integral = LINE["exp"]
     result: dict[str, np.ndarray] = {}
     for (row, size), column in itertools.product(enumerate(sizes), range(repetitions)):

@@ -1,4 +1,4 @@
-"""Many connections of the first vertex, from weighted sets: unbiased, and worth it in soft shadows."""
+"""Many connections of the first vertex: unbiased, and worth it in soft shadows."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ def direct(max_depth: int = 2, **parameters: Any) -> mi.Integrator:
 @pytest.fixture(scope="module")
 def reference() -> np.ndarray:
     mi.set_variant("llvm_ad_rgb")
-    return batches(load("cornell_box", width=32, height=32), REFERENCE.make(3), 256, REFERENCE_SEEDS)
+    scene = load("cornell_box", width=32, height=32)
+    return batches(scene, REFERENCE.make(3), 256, REFERENCE_SEEDS)
 
 
 @pytest.mark.parametrize("pattern, weights, count", [

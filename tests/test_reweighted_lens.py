@@ -1,4 +1,4 @@
-"""Weighted points of the aperture: unbiased, whole sets, and better where defocus makes the noise."""
+"""Weighted points of the aperture: unbiased, whole sets, and better where all is defocus."""
 
 from __future__ import annotations
 

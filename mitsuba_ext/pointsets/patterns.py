@@ -123,7 +123,7 @@ def _sobol(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
 
 def _lattice(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
     index = np.arange(count, dtype=np.int64)[:, None]
-    # No direction of the cube is preferred: a lattice can suit an integrand, and its mirror image not
+    # No direction is preferred: a lattice can suit an integrand, and its mirror image not
     generator = rng.permutation(_generator(count, dimension)) * rng.choice([-1, 1], dimension)
     return shifted(index * generator % count / count, rng.random(dimension))
 
