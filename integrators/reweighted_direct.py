@@ -31,13 +31,13 @@ class ReweightedDirect(WalkIntegrator):
        - How the points of a set are distributed: :monosp:`independent`, :monosp:`stratified`,
          :monosp:`latin_hypercube`, :monosp:`halton`, :monosp:`hammersley`, :monosp:`sobol`,
          :monosp:`lattice` or :monosp:`poisson_disk`; see
-         :monosp:`mitsuba_ext.pointsets.points`. (Default: @PATTERN@)
+         :monosp:`mitsuba_ext.pointsets.points`. (Default: lattice)
      * - weights
        - |string|
        - How they are weighed: :monosp:`none` (all alike), :monosp:`torus` (by the areas of periodic
          Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points that are folded,
          so that opposite edges need not be alike), or :monosp:`voronoi` (by cells that end at the
-         border, as in the thesis: slightly biased). (Default: @WEIGHTS@)
+         border, as in the thesis: slightly biased). (Default: none)
      * - light_samples
        - |int|
        - Points of a set: connections of the first vertex. (Default: 256)

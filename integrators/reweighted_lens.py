@@ -38,13 +38,13 @@ class ReweightedLens(StagedIntegrator):
        - How the points of a set are distributed: :monosp:`independent`, :monosp:`stratified`,
          :monosp:`latin_hypercube`, :monosp:`halton`, :monosp:`hammersley`, :monosp:`sobol`,
          :monosp:`lattice` or :monosp:`poisson_disk`; see
-         :monosp:`mitsuba_ext.pointsets.points`. (Default: @PATTERN@)
+         :monosp:`mitsuba_ext.pointsets.points`. (Default: lattice)
      * - weights
        - |string|
        - How they are weighed: :monosp:`none` (all alike), :monosp:`torus` (by the areas of periodic
          Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points that are folded,
          so that opposite edges need not be alike), or :monosp:`voronoi` (by cells that end at the
-         border, as in the thesis: slightly biased). (Default: @WEIGHTS@)
+         border, as in the thesis: slightly biased). (Default: none)
      * - timeout
        - |float|
        - Seconds after which to stop, 0 or less for no limit. Sets, which then have at most 64
@@ -71,7 +71,7 @@ class ReweightedLens(StagedIntegrator):
         .. code-tab:: xml
 
             <integrator type="reweighted_lens">
-                <string name="pattern" value="stratified"/>
+                <string name="pattern" value="sobol"/>
                 <integrator type="path">
                     <integer name="max_depth" value="8"/>
                 </integrator>
@@ -80,7 +80,7 @@ class ReweightedLens(StagedIntegrator):
         .. code-tab:: python
 
             'type': 'reweighted_lens',
-            'pattern': 'stratified',
+            'pattern': 'sobol',
             'nested': {
                 'type': 'path',
                 'max_depth': 8
@@ -89,7 +89,7 @@ class ReweightedLens(StagedIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.set_kind = SetKind(self.name, props, pattern="stratified", weights="unbiased")
+        self.set_kind = SetKind(self.name, props, pattern="lattice", weights="none")
         self.nested = self._nested(props)
 
     def _nested(self, props: mi.Properties) -> mi.SamplingIntegrator:
