@@ -64,11 +64,13 @@ def render(
     return np.array(images), float(np.median(seconds))
 
 
-def relmse(images: np.ndarray, reference: np.ndarray) -> float:
-    """Without the largest 0.1 %."""
+def errors(images: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
+    """relMSE and MSE, both without the largest 0.1 %."""
     mean = reference.mean(axis=0) if reference.ndim == 4 else reference
-    error = (images - reference) ** 2 / (mean**2 + 1e-2 * mean.mean() ** 2)
-    return float(np.sort(error.ravel())[: int(0.999 * error.size)].mean())
+    square = (images - reference) ** 2
+    relative = square / (mean**2 + 1e-2 * mean.mean() ** 2)
+    kept = int(0.999 * square.size)
+    return tuple(float(np.sort(x.ravel())[:kept].mean()) for x in (relative, square))
 
 
 def direct(scene: mi.Scene, count: int, seeds: range) -> dict[tuple[str, str], float]:
@@ -81,15 +83,15 @@ def direct(scene: mi.Scene, count: int, seeds: range) -> dict[tuple[str, str], f
 
     exact, _ = render(scene, integrator("sobol", "none", 4096), 4, seeds)
     return {
-        (p, w): relmse(render(scene, integrator(p, w, count), 4, seeds)[0], exact)
+        (p, w): errors(render(scene, integrator(p, w, count), 4, seeds)[0], exact)[0]
         for p, w in itertools.product(PATTERNS, WEIGHTS)
     }
 
 
 def compare(
     kind: str, file: Path, count: int, seeds: range
-) -> dict[str, tuple[float, float]]:
-    """What is rendered with → error of the whole image, and seconds."""
+) -> dict[str, tuple[float, float, float]]:
+    """What is rendered with → relMSE and MSE of the whole image, and seconds."""
     depth = 2 if kind == "direct" else 6
     path = {"type": "path", "max_depth": depth}
     spp = 4 * count if kind == "direct" else count
@@ -98,7 +100,7 @@ def compare(
     result = {}
     for sampler in SAMPLERS:
         images, seconds = render(load(file, sampler), path, spp, seeds)
-        result[f"path, {sampler}"] = relmse(images, reference), seconds
+        result[f"path, {sampler}"] = *errors(images, reference), seconds
     for pattern, weights in itertools.product(PATTERNS, WEIGHTS):
         if kind == "direct":
             integrator = {"type": "reweighted_direct", "max_depth": depth, "light_samples": count,
@@ -108,7 +110,7 @@ def compare(
             integrator = {"type": "reweighted_lens", "pattern": pattern, "weights": weights,
                           "nested": path}  # fmt: skip
             images, seconds = render(scene, integrator, spp, seeds)
-        result[f"{pattern}, {weights}"] = relmse(images, reference), seconds
+        result[f"{pattern}, {weights}"] = *errors(images, reference), seconds
     return result
 
 
@@ -125,21 +127,24 @@ def main(kind: str, names: tuple[str, ...], counts: tuple[int, ...], seeds: int)
     for name, file in scenes.items():
         for count in counts:
             table = compare(kind, file, count, range(seeds))
-            error_0, seconds_0 = table["path, independent"]
-            click.echo(f"\n{name}, {count} samples: relMSE, gain, time, efficiency beside path")
-            for label, (error, seconds) in table.items():
+            error_0, mse_0, seconds_0 = table["path, independent"]
+            click.echo(
+                f"\n{name}, {count} samples: relMSE; gain beside path in relMSE and MSE, time, "
+                f"efficiency"
+            )
+            for label, (error, mse, seconds) in table.items():
                 click.echo(
-                    f"  {label:28s} {error:9.2e} {error_0 / error:7.2f} {seconds / seconds_0:6.2f} "
-                    f"{error_0 * seconds_0 / (error * seconds):7.2f}"
+                    f"  {label:28s} {error:9.2e} {error_0 / error:7.2f} {mse_0 / mse:7.2f} "
+                    f"{seconds / seconds_0:6.2f} {error_0 * seconds_0 / (error * seconds):7.2f}"
                 )
-            gains.setdefault(name, {})[count] = {k: error_0 / e for k, (e, _) in table.items()}
+            gains.setdefault(name, {})[count] = {k: mse_0 / row[1] for k, row in table.items()}
             if kind == "direct":
-                errors = direct(load(file), count, range(seeds))
-                plain = errors["independent", "none"]
+                alone = direct(load(file), count, range(seeds))
+                plain = alone["independent", "none"]
                 click.echo(f"{name}, {count} light samples: gain over independent ones, alone")
-                for label, error in errors.items():
+                for label, error in alone.items():
                     click.echo(f"  {', '.join(label):28s} {plain / error:7.2f}")
-                gains[name][count] = {", ".join(k): plain / e for k, e in errors.items()}
+                gains[name][count] = {", ".join(k): plain / e for k, e in alone.items()}
     plot(kind, gains)
 
 

@@ -202,6 +202,8 @@ def plot(title: str, tables: dict[str, dict[str, np.ndarray]], counts: list[int]
             panel.loglog(counts, np.mean(table**2, axis=1), style, c=f"C{index % 10}",
                          lw=1 + index // 10, label=estimator)  # fmt: skip
         panel.set(title=name, xlabel="N", ylabel="MSE")
+        # Below that, it is rounding
+        panel.set_ylim(bottom=max(1e-20, panel.get_ylim()[0]))
     figure.tight_layout()
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=5, fontsize=8)

@@ -31,7 +31,7 @@ class ReweightedDirect(WalkIntegrator):
        - How the points of a set are distributed: :monosp:`independent`, :monosp:`stratified`,
          :monosp:`latin_hypercube`, :monosp:`halton`, :monosp:`hammersley`, :monosp:`sobol`,
          :monosp:`lattice` or :monosp:`poisson_disk`; see
-         :monosp:`mitsuba_ext.pointsets.points`. (Default: lattice)
+         :monosp:`mitsuba_ext.pointsets.points`. (Default: hammersley)
      * - weights
        - |string|
        - How they are weighed: :monosp:`none` (all alike), :monosp:`torus` (by the areas of periodic
@@ -92,7 +92,7 @@ class ReweightedDirect(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.set_kind = SetKind(self.name, props, pattern="lattice", weights="none")
+        self.set_kind = SetKind(self.name, props, pattern="hammersley", weights="none")
         self.camera_samples = self.parameter(props, "camera_samples", 0, minimum=0)
         self.light_samples = self.parameter(props, "light_samples", 256, minimum=1)
 
