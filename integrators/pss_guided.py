@@ -54,7 +54,7 @@ class PSSGuided(WalkIntegrator):
      * - max_memory
        - |float|
        - Memory for what is recorded and learned, in MiB. Where the pilots need more, they record
-         a part of their paths. (Default: 512)
+         a part of their paths. Trees of tiles of a few pixels come on top. (Default: 512)
      * - max_depth
        - |int|
        - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 adds direct
@@ -89,7 +89,8 @@ class PSSGuided(WalkIntegrator):
     :monosp:`integrator.statistics.learned` tells, and :monosp:`integrator.guide` holds what was
     learned (see examples/learned_samples.py).
 
-    The number that chooses a lobe of the BSDF is not guided. Participating media are ignored, as by
+    The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass (with
+    tiles they are, in vain). Participating media are ignored, as by
     :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized
     variants. Nested in :monosp:`moment` there is no pilot.
 

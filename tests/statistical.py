@@ -81,7 +81,6 @@ UNDER_TEST: dict[str, UnderTest] = {
     "composed_path": UnderTest("composed_path", draws_like_path=True),
     "neepp": UnderTest("neepp"),
     "pss_guided": UnderTest("pss_guided", insists=True),
-    "reweighted_direct": UnderTest("reweighted_direct", {"light_samples": 4}),
 }
 
 #: What they are compared with.
@@ -110,6 +109,7 @@ UNUSUAL: dict[str, UnderTest] = {
     "spatial": UnderTest("composed_path", {"next_event": "spatial"}),
     "linear": UnderTest("composed_path", {"next_event": "linear"}),
     "tiles": UnderTest("pss_guided", {"regions": "tiles", "tile": 5}, insists=True),
+    "many_connections": UnderTest("reweighted_direct", {"light_samples": 4}),
 }
 
 #: Single tests accept |z| below this (p = 6e-5); several at once, its Šidák correction.

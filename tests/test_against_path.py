@@ -299,10 +299,9 @@ def test_aov_shows_the_image_of_the_nested_integrator(name: str) -> None:
     assert_same_image(images[0][..., :3], images[1])
 
 
-@pytest.mark.parametrize("name", [name for name in UNDER_TEST if name != "reweighted_direct"])
+@pytest.mark.parametrize("name", UNDER_TEST)
 def test_moment_sees_single_samples(name: str) -> None:
-    """Nothing is learned there, so the image is that of ``path`` (but for an integrator that takes
-    many light samples all the same)."""
+    """Nothing is learned there, so the image is that of ``path``."""
     scene = mi.load_dict(stage())
     images = [
         batches(scene, mi.load_dict({"type": "moment", "image": inner.make(4)}), 16, [5])[0]

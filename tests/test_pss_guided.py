@@ -223,14 +223,15 @@ def test_renders_between_change_nothing(parameters: dict[str, Any]) -> None:
     np.testing.assert_allclose(again, first, rtol=1e-5, atol=1e-5 * first.mean())
 
 
-@pytest.mark.parametrize("parameters", [{}, TILES], ids=["surfaces", "tiles"])
-def test_another_seed_compiles_nothing(parameters: dict[str, Any]) -> None:
-    """Other numbers of samples and of nodes share the kernels of the first renders."""
+@pytest.mark.parametrize("parameters, few", [({}, 1), (TILES, 8)], ids=["surfaces", "tiles"])
+def test_another_seed_compiles_little(parameters: dict[str, Any], few: int) -> None:
+    """Other numbers of samples and of nodes share the kernels of the first renders; but a forest
+    in which a single node is split has its own."""
     scene, integrator = hidden_lamp(), insisting(**parameters)
     batches(scene, integrator, 64, SEEDS[:4])
     before = dr.detail.launch_stats()[2]
     batches(scene, integrator, 64, SEEDS[4:8])
-    assert dr.detail.launch_stats()[2] - before <= 1
+    assert dr.detail.launch_stats()[2] - before <= few
 
 
 # ---- Parameters ----

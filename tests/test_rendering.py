@@ -66,7 +66,7 @@ class _TwoStages:
     def pilots(self, scene, spp):
         return [self.pilot_spp]
 
-    def stages(self, scene, sensor, samples):
+    def stages(self, scene, sensor, samples, seed):
         yield Stage(_Constant(1.0))
         yield Stage(_Constant(3.0), "something")
 
