@@ -89,10 +89,10 @@ class PSSGuided(WalkIntegrator):
     :monosp:`integrator.statistics.learned` tells, and :monosp:`integrator.guide` holds what was
     learned (see examples/learned_samples.py).
 
-    The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass (with
-    tiles they are, in vain). Participating media are ignored, as by
-    :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized
-    variants. Nested in :monosp:`moment` there is no pilot.
+    The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass
+    (with tiles they are, in vain). Participating media are ignored, as by :monosp:`path`. Gradients
+    are not supported (use :monosp:`prb`), nor are scalar and polarized variants. Nested in
+    :monosp:`moment` there is no pilot.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of
     film tiles. Regions of surfaces, the estimates, and the measurement of the gain are ours.

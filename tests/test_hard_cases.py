@@ -43,8 +43,8 @@ _UNUSUAL_CASES = {
         "film_of_odd_size", "cropped_film", "three_samples", "thousand_samples",
         "max_depth_unlimited", "hidden_environment",
     ),
-    # Not "constant_environment": there, Mitsuba's `direct` gives 0.5129 with light samples alone and
-    # 0.5057 with BSDF samples alone, and what `path` gives is a matter of their weights
+    # Not "constant_environment": there, Mitsuba's `direct` gives 0.5129 with light samples alone
+    # and 0.5057 with BSDF samples alone, and what `path` gives is a matter of their weights
     "many_connections": (
         *_SEVERAL_LIGHTS, "plain", "scaled_by_1e4", "radiance_1e6", "lamp_of_radius_1e-4",
         "light_that_nothing_sees", "sun_of_one_texel", "closed_box", "empty", "degenerate_light",
