@@ -66,6 +66,9 @@ class _TwoStages:
     def pilots(self, scene, spp):
         return [self.pilot_spp]
 
+    def samples_per_set(self, spp):
+        return 1
+
     def stages(self, scene, sensor, samples, seed):
         yield Stage(_Constant(1.0))
         yield Stage(_Constant(3.0), "something")
