@@ -145,7 +145,8 @@ def main(kind: str, names: tuple[str, ...], counts: tuple[int, ...], seeds: int)
                 for label, error in alone.items():
                     click.echo(f"  {', '.join(label):28s} {plain / error:7.2f}")
                 gains[name][count] = {", ".join(k): plain / e for k, e in alone.items()}
-    plot(kind, gains)
+    if len(counts) > 1:
+        plot(kind, gains)
 
 
 def plot(kind: str, gains: dict[str, dict[int, dict[str, float]]]) -> None:
