@@ -1,8 +1,8 @@
 """Registers every plugin of the package in each variant that is selected.
 
-A plugin is a file in ``integrators/`` or ``emitters/``: the file's name is the plugin's name in a
-scene, and the one class that the file defines and decorates with :func:`plugin` is what Mitsuba
-instantiates. Deleting the file removes the plugin.
+A plugin is a file in ``integrators/``, ``emitters/``, ``bsdfs/`` or ``shapes/``: the file's name is
+the plugin's name in a scene, and the one class that the file defines and decorates with
+:func:`plugin` is what Mitsuba instantiates. Deleting the file removes the plugin.
 
 Mitsuba's base classes differ from variant to variant, so a class body binds to the variant that is
 active when it runs. The plugin files are therefore executed once per variant (as Mitsuba does with
@@ -21,7 +21,12 @@ import mitsuba as mi
 from . import runtime
 
 #: Folder of the plugins → Mitsuba's function that registers them.
-_KINDS: dict[str, str] = {"integrators": "register_integrator", "emitters": "register_emitter"}
+_KINDS: dict[str, str] = {
+    "integrators": "register_integrator",
+    "emitters": "register_emitter",
+    "bsdfs": "register_bsdf",
+    "shapes": "register_shape",
+}
 
 #: Variant-bound base classes, executed before the plugins that derive from them.
 _BASES = ("mitsuba_ext.staged_integrator", "mitsuba_ext.integrator")
@@ -37,7 +42,7 @@ def plugin(cls: type) -> type:
 
 
 def plugin_names() -> dict[str, list[str]]:
-    """The names that a scene can use, by kind: ``{"integrators": [...], "emitters": [...]}``."""
+    """The names that a scene can use, by kind: ``{"integrators": [...], …}``."""
     return {kind: [path.stem for path in plugin_files(kind)] for kind in _KINDS}
 
 

@@ -1,0 +1,1 @@
+"""The BSDFs that a scene can name: one file each."""

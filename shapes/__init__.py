@@ -1,0 +1,1 @@
+"""The shapes that a scene can name: one file each."""
