@@ -1,8 +1,8 @@
-"""Patterns and weights of light samples and of lens samples, on scenes.
+"""Patterns and weights of the samples of lights, lens, time and wavelengths, on scenes.
 
-``examples/reweighted_rendering.py direct`` and ``… lens`` print, for each scene, the error and the
-time of all patterns and weights, and of ``path`` with Mitsuba's samplers (five minutes each); they
-plot the former to ``examples/figures``.
+``examples/reweighted_rendering.py direct`` (or ``lens``, ``time``, ``wavelength``) prints, for each
+scene, the error and the time of all patterns and weights, and of the path tracer with Mitsuba's
+samplers (five minutes per scene); it plots the former to ``examples/figures``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,14 @@ SCENES: dict[str, dict[str, Path]] = {
         **{n: SHARED / n / "scene.xml" for n in ("cornell-box", "kitchen", "living-room")},
     },
     "lens": {"defocus": ROOT / "scenes" / "defocus.xml"},
+    "time": {n: ROOT / "scenes" / f"{n}.xml" for n in ("fast_balls", "fan")},
+    "wavelength": {n: ROOT / "scenes" / f"{n}.xml" for n in ("prism", "flint")},
 }
+
+#: What is compared with: moving shapes and dispersion are seen by integrators of ours only.
+PATH = {"direct": "path", "lens": "path", "time": "composed_path", "wavelength": "composed_path"}
+
+MAX_DEPTH = {"direct": 2, "lens": 6, "time": 4, "wavelength": 12}
 
 WIDTH, HEIGHT = 160, 90
 
@@ -51,17 +58,12 @@ def load(file: Path, sampler: str = "independent") -> mi.Scene:
     return mi.load_string(text, **{k: str(v) for k, v in size.items()})
 
 
-def render(
-    scene: mi.Scene, integrator: dict[str, Any], spp: int, seeds: range
-) -> tuple[np.ndarray, float]:
-    """Images of several seeds, and the median time of one, compilation excluded."""
-    made, images, seconds = mi.load_dict(integrator), [], []
-    mi.render(scene, integrator=made, seed=10**6, spp=spp).numpy()
-    for seed in seeds:
-        begin = time.perf_counter()
-        images.append(mi.render(scene, integrator=made, seed=seed, spp=spp).numpy()[..., :3])
-        seconds.append(time.perf_counter() - begin)
-    return np.array(images), float(np.median(seconds))
+def render(scene: mi.Scene, integrator: dict[str, Any], spp: int, seeds: range) -> np.ndarray:
+    """Images of several seeds."""
+    made = mi.load_dict(integrator)
+    return np.array([
+        mi.render(scene, integrator=made, seed=seed, spp=spp).numpy()[..., :3] for seed in seeds
+    ])  # fmt: skip
 
 
 def errors(images: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
@@ -81,52 +83,72 @@ def direct(scene: mi.Scene, count: int, seeds: range) -> dict[tuple[str, str], f
         return {"type": "reweighted_direct", "max_depth": 2, "light_samples": light_samples,
                 "pattern": pattern, "weights": weights}  # fmt: skip
 
-    exact, _ = render(scene, integrator("sobol", "none", 4096), 4, seeds)
+    exact = render(scene, integrator("sobol", "none", 4096), 4, seeds)
     return {
-        (p, w): errors(render(scene, integrator(p, w, count), 4, seeds)[0], exact)[0]
+        (p, w): errors(render(scene, integrator(p, w, count), 4, seeds), exact)[0]
         for p, w in itertools.product(PATTERNS, WEIGHTS)
     }
 
 
+def reweighted(kind: str, pattern: str, weights: str, count: int) -> dict[str, Any]:
+    own = {"type": f"reweighted_{kind}", "pattern": pattern, "weights": weights}
+    if kind == "direct":
+        return {**own, "max_depth": MAX_DEPTH[kind], "light_samples": count}
+    return {**own, "nested": path_of(kind)}
+
+
 def compare(
-    kind: str, file: Path, count: int, seeds: range
+    kind: str, file: Path, count: int, seeds: range, reference: np.ndarray
 ) -> dict[str, tuple[float, float, float]]:
-    """What is rendered with → relMSE and MSE of the whole image, and seconds."""
-    depth = 2 if kind == "direct" else 6
-    path = {"type": "path", "max_depth": depth}
-    spp = 4 * count if kind == "direct" else count
+    """What is rendered with → relMSE and MSE of the whole image, and the median time of one,
+    compilation excluded. They take turns."""
+    path, is_direct = path_of(kind), kind == "direct"
+    spp = 4 * count if is_direct else count
+    jobs = {f"path, {name}": (load(file, name), mi.load_dict(path), spp) for name in SAMPLERS}
     scene = load(file)
-    reference = render(scene, path, 4096 if kind == "direct" else 16384, range(7000, 7001))[0][0]
-    result = {}
-    for sampler in SAMPLERS:
-        images, seconds = render(load(file, sampler), path, spp, seeds)
-        result[f"path, {sampler}"] = *errors(images, reference), seconds
-    for pattern, weights in itertools.product(PATTERNS, WEIGHTS):
-        if kind == "direct":
-            integrator = {"type": "reweighted_direct", "max_depth": depth, "light_samples": count,
-                          "pattern": pattern, "weights": weights}  # fmt: skip
-            images, seconds = render(scene, integrator, 4, seeds)
-        else:
-            integrator = {"type": "reweighted_lens", "pattern": pattern, "weights": weights,
-                          "nested": path}  # fmt: skip
-            images, seconds = render(scene, integrator, spp, seeds)
-        result[f"{pattern}, {weights}"] = *errors(images, reference), seconds
-    return result
+    for pattern, weights in combinations(kind):
+        integrator = mi.load_dict(reweighted(kind, pattern, weights, count))
+        jobs[f"{pattern}, {weights}"] = scene, integrator, 4 if is_direct else count
+    images: dict[str, list[np.ndarray]] = {label: [] for label in jobs}
+    seconds: dict[str, list[float]] = {label: [] for label in jobs}
+    for seed in (10**6, *seeds):
+        for label, (scene, integrator, samples) in jobs.items():
+            begin = time.perf_counter()
+            image = mi.render(scene, integrator=integrator, seed=seed, spp=samples).numpy()
+            if seed in seeds:
+                seconds[label].append(time.perf_counter() - begin)
+                images[label].append(image[..., :3])
+    return {
+        label: (*errors(np.array(images[label]), reference), float(np.median(seconds[label])))
+        for label in jobs
+    }
+
+
+def path_of(kind: str) -> dict[str, Any]:
+    return {"type": PATH[kind], "max_depth": MAX_DEPTH[kind]}
+
+
+def combinations(kind: str) -> list[tuple[str, str]]:
+    """All patterns with all weights that the technique knows."""
+    weights = [w for w in WEIGHTS if not (kind == "wavelength" and w == "unbiased")]
+    return list(itertools.product(PATTERNS, weights))
 
 
 @click.command()
-@click.argument("kind", type=click.Choice(["direct", "lens"]))
+@click.argument("kind", type=click.Choice(list(SCENES)))
 @click.argument("names", nargs=-1)
 @click.option("--samples", "counts", default=[16, 64, 256], multiple=True, show_default=True)
 @click.option("--seeds", default=3, show_default=True)
 def main(kind: str, names: tuple[str, ...], counts: tuple[int, ...], seeds: int) -> None:
     """Compares patterns and weights on the scenes NAMES (all that there are, if none is given)."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant("llvm_ad_spectral" if kind == "wavelength" else "llvm_ad_rgb")
     scenes = {n: f for n, f in SCENES[kind].items() if f.exists() and (not names or n in names)}
     gains: dict[str, dict[int, dict[str, float]]] = {}
     for name, file in scenes.items():
+        spp = 4096 if kind == "direct" else 16384
+        reference = render(load(file), path_of(kind), spp, range(7000, 7001))[0]
         for count in counts:
-            table = compare(kind, file, count, range(seeds))
+            table = compare(kind, file, count, range(seeds), reference)
             error_0, mse_0, seconds_0 = table["path, independent"]
             click.echo(
                 f"\n{name}, {count} samples: relMSE; gain beside path in relMSE and MSE, time, "
@@ -154,11 +176,11 @@ def plot(kind: str, gains: dict[str, dict[int, dict[str, float]]]) -> None:
     figure, axes = plt.subplots(1, len(gains), figsize=(5 * len(gains), 4.5), squeeze=False)
     for panel, (name, by_count) in zip(axes.flat, gains.items()):
         counts = sorted(by_count)
-        for i, pattern in enumerate(PATTERNS):
-            for weights, style in zip(WEIGHTS, ("-", "--", ":", "-.")):
-                label = f"{pattern}, {weights}"
-                panel.loglog(counts, [by_count[n][label] for n in counts], style, c=f"C{i}",
-                             label=label)  # fmt: skip
+        for pattern, weights in combinations(kind):
+            label = f"{pattern}, {weights}"
+            style = dict(zip(WEIGHTS, ("-", "--", ":", "-.")))[weights]
+            panel.loglog(counts, [by_count[n][label] for n in counts], style,
+                         c=f"C{PATTERNS.index(pattern)}", label=label)  # fmt: skip
         panel.set(title=name, xlabel="samples", ylabel="gain")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.tight_layout(rect=(0, 0.25, 1, 1))

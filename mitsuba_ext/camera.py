@@ -18,6 +18,7 @@ class CameraRays:
         ray: The rays themselves.
         importance: What the sensor makes of the radiance that they bring back.
         weight: By how much a sample counts; 1.0 where all count the same.
+        hero_weight: The same where one of the four wavelengths is left, relative to ``weight``.
         position: Where on the film (in pixels) to put it.
         pixel: The number of the ray's pixel, row by row in the film's extent.
     """
@@ -25,6 +26,7 @@ class CameraRays:
     ray: mi.RayDifferential3f
     importance: mi.Spectrum
     weight: mi.Float | float
+    hero_weight: mi.Float | float
     position: mi.Point2f
     pixel: mi.UInt32
 
@@ -68,7 +70,7 @@ def sample_rays(
         sensor, sampler: The sampler is seeded for ``width · height · spp_per_pass`` lanes.
         spp_per_pass: Samples per pixel of this pass.
         spp: Samples per pixel of the whole render; it scales the ray differentials.
-        samples: Which numbers choose the point of the aperture.
+        samples: Which numbers choose aperture, time and wavelengths.
         first: Samples per pixel that earlier passes took.
     """
     film = sensor.film()
@@ -89,14 +91,29 @@ def sample_rays(
     film_sample = dr.fma(position, scale, offset)
 
     index = lane - pixel * dr.opaque(mi.UInt32, spp_per_pass) + dr.opaque(mi.UInt32, first)
-    state = samples.begin(pixel, index)
-    aperture_sample, weight = mi.Point2f(0.5), 1.0
+    weight, hero_weight = 1.0, 1.0
+    aperture_sample = mi.Point2f(0.5)
     if sensor.needs_aperture_sample():
-        aperture_sample, weight = samples.aperture(state, sampler)
+        if samples.aperture is None:
+            aperture_sample = sampler.next_2d()
+        else:
+            aperture_sample, weight = samples.aperture.draw(pixel, index)
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
-        time += sampler.next_1d() * sensor.shutter_open_time()
-    wavelength_sample = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+        if samples.time is None:
+            time_sample = sampler.next_1d()
+        else:
+            time_sample, time_weight = samples.time.draw(pixel, index)
+            weight *= time_weight
+        time += time_sample * sensor.shutter_open_time()
+    wavelength_sample = mi.Float(0)
+    if mi.is_spectral:
+        if samples.wavelength is None:
+            wavelength_sample = sampler.next_1d()
+        else:
+            wavelength_sample, hero, all_four = samples.wavelength.draw(pixel, index)
+            weight *= all_four
+            hero_weight = hero / all_four
 
     ray, importance = sensor.sample_ray_differential(
         time, wavelength_sample, film_sample, aperture_sample
@@ -107,7 +124,7 @@ def sample_rays(
     # A box filter ignores the offset inside the pixel: it would only add rounding errors
     if film.rfilter().is_box_filter():
         position = mi.Point2f(corner)
-    return CameraRays(ray, importance, weight, position, pixel)
+    return CameraRays(ray, importance, weight, hero_weight, position, pixel)
 
 
 def splat(

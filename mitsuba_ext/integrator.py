@@ -11,6 +11,8 @@ from typing import Any
 import mitsuba as mi
 
 from . import camera
+from .decisions.defaults import SceneQuery
+from .decisions.moving_scene import refuse_movers, scene_query
 from .learning.learner import Learner, Observers
 from .learning.scout import SCOUT_DEPTH, NoConnections, Scout
 from .rendering import Stage
@@ -63,14 +65,16 @@ class WalkIntegrator(StagedIntegrator):
     ) -> Iterator[Stage]:
         """Between the stages, learners turn observations into tables."""
         width, height = camera.film_extent(sensor.film())
-        decisions = self.decisions(scene, seed)
+        decisions = {"query": self._query(scene), **self.decisions(scene, seed)}
         *pilots, _rest = samples
         learners = self.learners(scene, sensor, width * height * sum(pilots))
         p, n = mi.Point3f(), mi.Normal3f()
         if any(learner.wants_scout for learner in learners):
             scout = Scout()
             depth = min(SCOUT_DEPTH, self.max_depth)
-            walk = Walk(depth, depth, next_event=NoConnections(), observer=scout)
+            walk = Walk(
+                depth, depth, next_event=NoConnections(), query=decisions["query"], observer=scout
+            )
             yield Stage(walk, is_scout=True)
             p, n = scout.vertices()
         for learner in learners:
@@ -91,7 +95,8 @@ class WalkIntegrator(StagedIntegrator):
         """One sample, for integrators that nest this one and draw its samples (``moment``; ``aov``
         calls :meth:`render`). Nothing is learned there: each decision that needs a pilot falls
         back to its default."""
-        walk = self.stage(**self.decisions(scene, 0)).walk
+        decisions = {"query": self._query(scene), **self.decisions(scene, 0)}
+        walk = self.stage(**decisions).walk
         sample = walk(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
         return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
 
@@ -114,6 +119,12 @@ class WalkIntegrator(StagedIntegrator):
         return {**parameters, "aovs": ", ".join(self.aov_names())} if self._aovs else parameters
 
     # ---- Helpers ----
+
+    def _query(self, scene: mi.Scene) -> SceneQuery:
+        """How rays meet ``scene``. The output variables are Mitsuba's, which knows no motion."""
+        if self._aovs is not None:
+            refuse_movers(scene, f'"{self.name}": the parameter "aovs"', "leave it out")
+        return scene_query(scene)
 
     def _aov_integrator(self, aovs: str) -> mi.Integrator | None:
         return mi.load_dict({"type": "aov", "aovs": aovs}) if aovs else None

@@ -29,7 +29,9 @@ _KINDS: dict[str, str] = {
 }
 
 #: Variant-bound base classes, executed before the plugins that derive from them.
-_BASES = ("mitsuba_ext.staged_integrator", "mitsuba_ext.integrator")
+_BASES = (
+    "mitsuba_ext.staged_integrator", "mitsuba_ext.integrator", "mitsuba_ext.reweighted_camera",
+)  # fmt: skip
 
 _registered: set[str] = set()
 

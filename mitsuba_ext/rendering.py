@@ -87,7 +87,7 @@ class Stage:
         walk: What its samples do.
         learned: What had been learned before.
         is_scout: Does it take one sample per pixel that is none of the image's?
-        camera: What chooses the points of the aperture.
+        camera: What chooses points of the aperture, times and wavelengths.
     """
 
     walk: Walk
@@ -284,7 +284,9 @@ class _Job:
         rays = camera.sample_rays(
             self.sensor, sampler, spp, self.spp, stage.camera, self.statistics.spp
         )
-        sample = stage.walk(self.scene, sampler, rays.ray, mi.Bool(True), rays.pixel)
+        sample = stage.walk(
+            self.scene, sampler, rays.ray, mi.Bool(True), rays.pixel, rays.hero_weight
+        )
         if dr.grad_enabled(sample.L):
             raise self.integrator.no_gradients()
         aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]

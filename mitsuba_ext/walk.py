@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .decisions import AlwaysTest, DirectionSamples, EmitterSampling, SceneQuery, ShadowTest
+from .dispersion import Heroes
 from .mis import power_heuristic
 
 
@@ -76,9 +77,11 @@ class Walk:
         ray: mi.Ray3f,
         active: mi.Bool,
         pixel: mi.UInt32 | None = None,
+        hero_weight: mi.Float | float = 1.0,
     ) -> PathSample:
         """Traces one path for each lane of ``ray``. ``pixel`` is where on the film it begins, row
-        by row; a walk without decisions that learn can do without."""
+        by row; a walk without decisions that learn can do without. ``hero_weight`` multiplies what
+        reaches the camera by paths of which only one wavelength is left (see ``dispersion.py``)."""
         # What the scene lacks is left out of the kernel: these are Python booleans
         has_emitters = len(scene.emitters()) > 0
         connects = has_emitters and self.max_depth > 1
@@ -86,12 +89,13 @@ class Walk:
         sees_environment = scene.environment() is not None and not self.hide_emitters
 
         # --------------------- Configure the loop state ----------------------
-        ctx = mi.BSDFContext()
+        heroes = Heroes(scene, hero_weight)
+        ctx = heroes.context()
         ray = mi.Ray3f(ray)
         L = mi.Spectrum(0)                              # Radiance accumulator
         β = mi.Spectrum(1)                              # Path throughput weight
         η = mi.Float(1)                                 # Product of relative indices of refraction
-        guidance = mi.Float(1)                          # Part of β that is due to guided samples
+        guidance = mi.Float(1)                          # Part of β that says nothing about its use
         depth = mi.UInt32(0)                            # Depth of the current vertex
         valid = mi.Bool(sees_environment and self.max_depth > 0)  # Has the path met anything?
         prev_si = dr.zeros(mi.Interaction3f)            # Previous scattering event
@@ -102,6 +106,7 @@ class Walk:
         directions_state = self.directions.begin(sampler, ray, pixel)
         next_event_state = self.next_event.begin(sampler, ray)
         shadow_state = self.shadow_test.begin(sampler, ray)
+        hero_is_alone = heroes.begin()
         if dr.hint(self.observer is not None, mode="scalar"):
             self.observer.begin(dr.width(ray), pixel)
 
@@ -128,7 +133,7 @@ class Walk:
                 self.observer.vertex(si, depth, active_em)
             if dr.hint(connects and self.next_event.gathers, mode="scalar"):
                 gathered, shadow_rays = self.next_event.gather(
-                    scene, sampler, self.query, ctx, si, bsdf, active_em & (depth == 0)
+                    scene, sampler, self.query, ctx, heroes, si, bsdf, active_em & (depth == 0)
                 )
                 L = dr.fma(β, gathered, L)
                 shadow_count += shadow_rays
@@ -144,6 +149,10 @@ class Walk:
             )
             bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
                 ctx, si, wo, sample_1, sample_2
+            )
+            bsdf_value = heroes.connect(hero_is_alone, bsdf_value, bsdf, si, wo)
+            bsdf_weight, hero_count, hero_is_alone = heroes.scatter(
+                hero_is_alone, bsdf_weight, bsdf, si, bs
             )
 
             # ----- Does the light reach this vertex? -----
@@ -175,7 +184,7 @@ class Walk:
             bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)
             ray = si.spawn_ray(si.to_world(bs.wo))
             β *= bsdf_weight * directions_weight
-            guidance *= directions_weight
+            guidance *= directions_weight * hero_count
             η *= bs.eta
             valid |= si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
@@ -185,7 +194,8 @@ class Walk:
             depth[si.is_valid()] += 1
 
             # ----- Russian roulette -----
-            # Where guided samples are dense, paths have little throughput because they matter
+            # Where guided samples are dense, paths have little throughput because they matter; a
+            # hero has more since it stands for four
             β_max = dr.max(β)
             rr_probability = dr.minimum(β_max / guidance * dr.square(η), 0.95)
             rr_active = depth >= self.rr_depth

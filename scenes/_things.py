@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from _geometry import Mesh, block, box, join, lathe, rounded, tube
+from _geometry import Mesh, block, box, convex, join, lathe, rounded, tube
 
 
 def pot() -> dict[str, Mesh]:
@@ -44,6 +44,16 @@ def tableware() -> dict[str, Mesh]:
         "dish": lathe(rounded(dish)),
         "planter": lathe(rounded(planter, 1)),
     }
+
+
+def prism() -> dict[str, Mesh]:
+    """A prism of 60 degrees around the origin, 0.4 m wide, 0.5 m high; the edge opposite of the base
+    is at +y."""
+    angles = np.radians([90, 210, 330])
+    corners = 0.4 / np.sqrt(3) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    points = np.array([(x, y, z) for z in (-0.25, 0.25) for x, y in corners])
+    loops = [[0, 1, 2], [3, 4, 5], [0, 1, 4, 3], [1, 2, 5, 4], [2, 0, 3, 5]]
+    return {"prism": convex(points, loops)}
 
 
 def plant() -> dict[str, Mesh]:

@@ -42,6 +42,7 @@ class Regression:
     parameters: dict[str, Any] = field(default_factory=dict)
     max_depth: int = 6
     spp: int = 128
+    variant: str = "llvm_ad_rgb"
 
     @property
     def name(self) -> str:
@@ -72,6 +73,11 @@ REGRESSIONS = {
                    spp=384),
         Regression("reweighted_direct", "cornell_box", {"light_samples": 16}, spp=32),
         Regression("reweighted_lens", "defocus", {"nested": "path"}),
+        Regression("reweighted_time", "fan", {"nested": "composed_path"}),
+        Regression("composed_path", "fast_balls"),
+        Regression("composed_path", "flint", variant="llvm_ad_spectral"),
+        Regression("reweighted_wavelength", "prism", {"nested": "composed_path"},
+                   variant="llvm_ad_spectral"),
     )
 }  # fmt: skip
 
@@ -80,6 +86,8 @@ def render(regression: Regression, seeds: range) -> np.ndarray:
     """Images of independent seeds: [seed, height, width, channel]."""
     from statistical import batches, load
 
+    mi.set_variant(regression.variant)
+    mi.set_log_level(mi.LogLevel.Warn)
     scene = load(regression.scene, width=32, height=18)
     integrator = {"type": regression.integrator, **regression.parameters}
     depth = {"max_depth": regression.max_depth}
@@ -111,8 +119,6 @@ def main() -> None:
     unknown = set(sys.argv[1:]) - set(REGRESSIONS)
     if unknown:
         sys.exit(f"no such reference: {', '.join(unknown)}; there are {', '.join(REGRESSIONS)}")
-    mi.set_variant("llvm_ad_rgb")
-    mi.set_log_level(mi.LogLevel.Warn)
     for name in sys.argv[1:] or REGRESSIONS:
         regenerate(REGRESSIONS[name])
 

@@ -13,11 +13,13 @@ LLVM_VARIANTS = [name for name in runtime.SUPPORTED_VARIANTS if name.startswith(
 
 #: Some integrators have no depth of their own: they nest another one.
 LOAD_ALL = """
-WRAPPERS = ("variance", "reweighted_lens")
+WRAPPERS = ("variance", "reweighted_lens", "reweighted_time", "reweighted_wavelength")
 
 def load_all():
     from mitsuba_ext import registry
     for name in registry.plugin_names()["integrators"]:
+        if name == "reweighted_wavelength" and not mi.is_spectral:
+            continue
         if name in WRAPPERS:
             integrator = mi.load_dict({"type": name, "nested": {"type": "path", "max_depth": 3}})
         else:

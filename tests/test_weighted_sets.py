@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from mitsuba_ext.decisions.weighted_sets import WEIGHTS, WeightedSets
-from mitsuba_ext.pointsets import PATTERNS
+from mitsuba_ext.pointsets import PATTERNS, voronoi_weights
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -17,12 +17,13 @@ pytestmark = pytest.mark.usefixtures("variant")
 def _drawn(sets: WeightedSets, users: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Whole sets of so many users: points [user, N, D], and weights [user, N]."""
     rng = np.random.default_rng(seed)
-    choice = mi.UInt32(np.repeat(rng.integers(0, 2**32, users, np.uint32), sets.count))
+    number = sets.choose(mi.Float(np.repeat(rng.random(users, np.float32), sets.count)))
     shift = mi.Point2f(np.repeat(rng.random((2, users), np.float32), sets.count, axis=1))
     index = dr.tile(dr.arange(mi.UInt32, sets.count), users)
-    u, weight = sets.draw(choice, shift, index, mi.Bool(True))
+    u, weight = sets.draw(number, shift, index, mi.Bool(True))
     dimension = 2 if isinstance(u, mi.Point2f) else 1
     u = np.asarray(u.numpy()).reshape(dimension, users, sets.count)
+    weight = dr.full(mi.Float, 1.0, users * sets.count) * weight  # there may be none
     return np.moveaxis(u, 0, -1), weight.numpy().reshape(users, sets.count)
 
 
@@ -66,3 +67,43 @@ def test_seeds_give_sets_of_their_own() -> None:
     assert not np.isclose(u, other).any()
     # Several sets, not one: users differ, although nothing is shifted
     assert len(np.unique(u[:, 0, 0])) > 10
+
+
+def test_all_sets_are_used_alike() -> None:
+    sets = WeightedSets("independent", "none", 16, 2, seed=5)
+    sample = mi.Float((np.arange(3200) + 0.5) / 3200)
+    assert (np.bincount(sets.choose(sample).numpy()) == 100).all()
+    assert sets.choose(mi.Float(np.nextafter(np.float32(1), np.float32(0)))).numpy() == 31
+
+
+def test_weights_are_those_of_the_points_that_are_drawn() -> None:
+    for kind, boundary in (("voronoi", "clip"), ("torus", "torus")):
+        u, weight = _drawn(WeightedSets("independent", kind, 8, 2, seed=1), 5)
+        for x, w in zip(u, weight):
+            np.testing.assert_allclose(w, 8 * voronoi_weights(x, boundary), rtol=1e-4)
+
+
+def test_only_voronoi_points_stay_where_they_are() -> None:
+    for kind in WEIGHTS:
+        u, _ = _drawn(WeightedSets("poisson_disk", kind, 8, 2, seed=1), 20)
+        assert (len(np.unique(u[:, 0, 0].round(5))) <= 2) == (kind == "voronoi")
+
+
+def test_the_order_of_points_is_random() -> None:
+    """That of a sampler, or of sets for another purpose, must not agree with it."""
+    u, _ = _drawn(WeightedSets("lattice", "voronoi", 64, 1, seed=1), 50)
+    first = u[:, :8, 0].mean(axis=1)
+    assert abs(first.mean() - 0.5) < 0.1 and first.std() > 0.05
+
+
+def test_a_second_weight_is_that_of_places_modulo_a_period() -> None:
+    sets = WeightedSets("independent", "torus", 12, 1, seed=3, periods=4)
+    index, zero = dr.arange(mi.UInt32, 12), dr.zeros(mi.UInt32, 12)
+    u, weight, folded = sets.draw(zero, mi.Point2f(0.3), index, mi.Bool(True))
+    np.testing.assert_allclose(weight, 12 * voronoi_weights(u.numpy()), rtol=1e-4)
+    np.testing.assert_allclose(folded, 12 * voronoi_weights(u.numpy() * 4 % 1), rtol=1e-3)
+    # Equidistant points come in fours that are the same: none of them weighs nothing
+    sets = WeightedSets("lattice", "torus", 64, 1, seed=3, periods=4)
+    index, zero = dr.arange(mi.UInt32, 64), dr.zeros(mi.UInt32, 64)
+    _u, _weight, folded = sets.draw(zero, mi.Point2f(0.3), index, mi.Bool(True))
+    np.testing.assert_allclose(folded, 1, rtol=1e-3)

@@ -1,49 +1,52 @@
-"""Which numbers choose what a camera ray is besides its place on the film."""
+"""Which numbers choose what a camera ray is, besides its place on the film."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .weighted_sets import WeightedSets
 
 
-class CameraSamples:
-    """Those of the sampler, each with the same weight. This is Mitsuba's choice, and leaves no code
-    of its own in the kernel."""
-
-    def begin(self, pixel: mi.UInt32, index: mi.UInt32) -> Any:
-        """The state of rays: ``index`` numbers the samples of each pixel in the whole render."""
-        return ()
-
-    def aperture(
-        self, state: Any, sampler: mi.Sampler
-    ) -> tuple[mi.Point2f, mi.Float | float]:
-        """The numbers that choose the point of the aperture, and the factor by which everything is
-        multiplied that the ray brings back."""
-        return sampler.next_2d(), 1.0
-
-
-class WeightedLens(CameraSamples):
-    """Points of the aperture from weighted sets: each pixel chooses and shifts them at random.
+class PixelSets:
+    """Numbers for one purpose from weighted sets: each pixel chooses and shifts them at random.
 
     Parameters:
-        sets: Of two dimensions. After the last sample of a set, a pixel begins another.
-        seed: That of the render.
+        sets: After the last sample of a set, a pixel begins another.
+        seed: Integers; no two purposes may have the same.
     """
 
-    def __init__(self, sets: WeightedSets, seed: int) -> None:
+    def __init__(self, sets: WeightedSets, seed: list[int]) -> None:
         self._sets = sets
-        self._seed, self._count = (dr.opaque(mi.UInt32, x) for x in (seed, sets.count))
+        key = int(np.random.SeedSequence(seed).generate_state(1)[0])
+        self._key, self._count = (dr.opaque(mi.UInt32, n) for n in (key, sets.count))
 
-    def begin(self, pixel, index):
-        number = index // self._count
-        choice, key = mi.sample_tea_32(pixel, self._seed + 0x9E3779B9 * number)
-        shift = mi.Point2f(mi.sample_tea_float32(key, choice), mi.sample_tea_float32(choice, key))
-        return choice, shift, index - number * self._count
+    def draw(self, pixel: mi.UInt32, index: mi.UInt32) -> tuple[Any, ...]:
+        """The point and its weights (:meth:`WeightedSets.draw`) of the sample ``index``, of those
+        of the whole render, of each pixel."""
+        turn = index // self._count
+        a, b = mi.sample_tea_32(pixel, self._key + 0x9E3779B9 * turn)
+        shift = mi.Point2f(mi.sample_tea_float32(a, b), mi.sample_tea_float32(b, a))
+        number = self._sets.choose(mi.sample_tea_float32(b, a + 1))
+        return self._sets.draw(number, shift, index - turn * self._count, mi.Bool(True))
 
-    def aperture(self, state, sampler):
-        choice, shift, index = state
-        return self._sets.draw(choice, shift, index, mi.Bool(True))
+
+@dataclass
+class CameraSamples:
+    """Where numbers of camera rays come from: ``None`` stands for the sensor's sampler, which is
+    Mitsuba's choice.
+
+    Attributes:
+        aperture: Points of the aperture, in two dimensions.
+        time: Times of the shutter interval.
+        wavelength: What chooses the four wavelengths u + k/4, with a second weight for spectra that
+            all four find: they repeat themselves after 1/4.
+    """
+
+    aperture: PixelSets | None = None
+    time: PixelSets | None = None
+    wavelength: PixelSets | None = None

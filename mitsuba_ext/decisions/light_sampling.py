@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
+from ..bounds import scene_bounds
 from ..learning.learner import Learner
 from ..learning.voxel_grid import VoxelGrid
 from ..lights.light_cells import LightCells
@@ -87,7 +88,7 @@ class LightSampling:
         if self.light_sampling == "power":
             cells = LightCells(scene, None)
             return {"next_event": LightSelection(OneRow(), cells, power_weights(scene, cells))}
-        if self.light_sampling == "spatial" and scene.shapes() and scene.bbox().valid():
+        if self.light_sampling == "spatial" and scene_bounds(scene).valid():
             cells = LightCells(scene, None)
             rows = self._voxel_rows(scene, cells.count)
             return {"next_event": LightSelection(rows, cells, spatial_weights(scene, rows, cells))}

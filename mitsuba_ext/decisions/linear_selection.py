@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..bounds import scene_bounds, shape_bounds
 from ..lights.division import emitter_shapes
 from ..lights.environment import some_wavelengths
 from ..lights.light_cells import LightCells
@@ -77,7 +78,7 @@ class LinearSelection(EmitterSampling):
 
     def _tabulate(self, scene: mi.Scene) -> None:
         """The tables of the estimates: each row is one fetch of four, four, and two numbers."""
-        bbox = scene.bbox()
+        bbox = scene_bounds(scene)
         has_extent = bbox.valid()
         sphere = bbox.bounding_sphere() if has_extent else mi.ScalarBoundingSphere3f(0.0, 1.0)
         extent = float(np.abs([bbox.min, bbox.max]).max()) if has_extent else 1.0
@@ -250,7 +251,7 @@ def _row(
 
 
 def _bounding_sphere(shape: mi.Shape) -> tuple[np.ndarray, float]:
-    bbox = shape.bbox()
+    bbox = shape_bounds(shape)
     low, high = np.array(bbox.min, dtype=np.float64), np.array(bbox.max, dtype=np.float64)
     center = 0.5 * (low + high)
     if shape.class_name() == "Sphere":

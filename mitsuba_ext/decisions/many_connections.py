@@ -8,6 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..dispersion import Heroes
 from ..mis import power_heuristic
 from .defaults import EmitterSampling, SceneQuery
 from .weighted_sets import WeightedSets
@@ -34,22 +35,25 @@ class ManyConnections(EmitterSampling):
         sampler: mi.Sampler,
         query: SceneQuery,
         ctx: mi.BSDFContext,
+        heroes: Heroes,
         si: mi.SurfaceInteraction3f,
         bsdf: mi.BSDFPtr,
         active: mi.Bool,
     ) -> tuple[mi.Spectrum, mi.UInt32]:
         """The light that reaches ``si`` and is scattered to the camera, and the number of shadow
         rays that were traced for it."""
-        choice = mi.UInt32(sampler.next_1d() * 4294967040.0)
+        number = self._sets.choose(sampler.next_1d())
         shift = sampler.next_2d()
         total, shadow_count, index = mi.Spectrum(0), mi.UInt32(0), mi.UInt32(0)
         count = mi.Float(self._count)
         active = mi.Bool(active)
         while active:
-            u, weight = self._sets.draw(choice, shift, index, active)
+            u, weight = self._sets.draw(number, shift, index, active)
             ds, em_weight = scene.sample_emitter_direction(si, u, False, active)
             wo = si.to_local(ds.d)
             bsdf_value, bsdf_pdf = bsdf.eval_pdf(ctx, si, wo, active)
+            # At the first vertex all wavelengths are there, and what begins here has no past
+            bsdf_value = heroes.connect(heroes.begin(), bsdf_value, bsdf, si, wo)
             bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
             mis = dr.select(ds.delta, 1, power_heuristic(count * ds.pdf, bsdf_pdf))
             contribution = bsdf_value * em_weight * (mis * weight)

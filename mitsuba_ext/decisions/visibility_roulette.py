@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..bounds import scene_bounds
 from ..learning.learner import Learner
 from ..learning.visibility_map import VisibilityMap
 from ..learning.voxel_grid import EMPTY
@@ -116,11 +117,12 @@ class VisibilityLearner(Learner):
 
 def has_lights_at_points(scene: mi.Scene) -> bool:
     """Is there a light that the map can cover: not at infinity, nor outside its voxels?"""
-    if not scene.shapes() or not scene.bbox().valid():
+    bounds = scene_bounds(scene)
+    if not bounds.valid():
         return False
     at_point = int(mi.EmitterFlags.DeltaPosition)
     return any(
         mi.has_flag(e.flags(), mi.EmitterFlags.Surface)
-        or (int(e.flags()) & at_point and scene.bbox().contains(e.bbox().min))
+        or (int(e.flags()) & at_point and bounds.contains(e.bbox().min))
         for e in scene.emitters()
     )

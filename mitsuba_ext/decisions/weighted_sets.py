@@ -26,19 +26,26 @@ _SLOW, _FEW_SETS = "poisson_disk", 2
 
 
 class SetKind:
-    """The parameters ``pattern`` and ``weights`` of a plugin.
+    """The parameters ``pattern`` and ``weights`` of a plugin, with its defaults.
 
     Raises:
         TypeError, ValueError: A parameter has a wrong type or value.
     """
 
-    def __init__(self, plugin: str, props: mi.Properties, pattern: str, weights: str) -> None:
+    def __init__(
+        self,
+        plugin: str,
+        props: mi.Properties,
+        pattern: str,
+        weights: str,
+        accepted: tuple[str, ...] = WEIGHTS,
+    ) -> None:
         self.pattern = read_parameter(plugin, props, "pattern", pattern, choices=PATTERNS)
-        self.weights = read_parameter(plugin, props, "weights", weights, choices=WEIGHTS)
+        self.weights = read_parameter(plugin, props, "weights", weights, choices=accepted)
 
-    def sets(self, count: int, dimension: int, seed: int) -> WeightedSets:
+    def sets(self, count: int, dimension: int, seed: Any, periods: int = 1) -> WeightedSets:
         """Sets of ``count`` points; another seed gives others."""
-        return WeightedSets(self.pattern, self.weights, count, dimension, seed)
+        return WeightedSets(self.pattern, self.weights, count, dimension, seed, periods)
 
 
 class WeightedSets:
@@ -51,47 +58,66 @@ class WeightedSets:
             (periodic cells); ``unbiased`` (the same, and the points are folded: no seam).
         count: Points of a set, N.
         dimension: 1 or 2.
-        seed: Another seed gives other sets.
+        seed: Another seed (an integer, or several) gives other sets.
+        periods: With more than 1, in one dimension: points get a second weight, for integrands that
+            repeat themselves so often in [0, 1). Their place counts modulo 1 / periods.
     """
 
     def __init__(
-        self, pattern: str, weights: str, count: int, dimension: int, seed: int
+        self,
+        pattern: str,
+        weights: str,
+        count: int,
+        dimension: int,
+        seed: Any,
+        periods: int = 1,
     ) -> None:
         self.count, self._kind, self._dimension = count, weights, dimension
+        self._weight_count = 1 if periods == 1 else 2
         most = _FEW_SETS if pattern == _SLOW else _MOST_SETS
         self._set_count = min(max(2, _POINTS // count), most)
         rng = np.random.default_rng(seed)
-        table = np.ones((self._set_count, count, dimension + 1), np.float32)
+        # Rows of two or four numbers are read at once
+        columns = dimension + self._weight_count
+        table = np.ones((self._set_count, count, columns + columns % 2), np.float32)
         for rows in table:
             x = points(pattern, count, dimension, rng)
             # Their order must not be that of another sampler
             rng.shuffle(x)
-            rows[:, :-1] = x
+            rows[:, :dimension] = x
             if weights != "none":
-                rows[:, -1] = count * voronoi_weights(x, _BOUNDARIES[weights])
-        self._table = mi.Float(np.ascontiguousarray(np.pad(table, _PADS[dimension]).ravel()))
+                rows[:, dimension] = count * voronoi_weights(x, _BOUNDARIES[weights])
+                if periods > 1:
+                    rows[:, dimension + 1] = _periodic_weights(x, periods)
+        self._table = mi.Float(np.ascontiguousarray(table.ravel()))
         self._opaque_count, self._opaque_sets = (
             dr.opaque(mi.UInt32, n) for n in (count, self._set_count)
         )
         dr.eval(self._table)
 
+    def choose(self, sample: mi.Float) -> mi.UInt32:
+        """One of the sets, for a number in [0, 1)."""
+        sets = self._opaque_sets
+        return dr.minimum(mi.UInt32(sample * mi.Float(sets)), sets - 1)
+
     def draw(
-        self, choice: mi.UInt32, shift: mi.Point2f, index: mi.UInt32, active: mi.Bool
-    ) -> tuple[Any, mi.Float]:
-        """The point ``index`` of a set, and its weight times N.
+        self, number: mi.UInt32, shift: mi.Point2f, index: mi.UInt32, active: mi.Bool
+    ) -> tuple[Any, ...]:
+        """The point ``index`` of a set, its weight times N, and with ``periods`` its second weight
+        times N. The weights are 1.0 where there are none.
 
         Parameters:
-            choice: Any number; it decides which set.
+            number: Which set.
             shift: In [0, 1)ᴰ.
             index: Below N.
         """
-        row = (choice % self._opaque_sets) * self._opaque_count + index
+        row = number * self._opaque_count + index
+        columns = self._dimension + self._weight_count
+        entry = dr.gather(mi.Point2f if columns == 2 else mi.Vector4f, self._table, row, active)
         if self._dimension == 1:
-            entry = dr.gather(mi.Point2f, self._table, row, active)
-            u, weight = mi.Point2f(entry.x, 0), entry.y
+            u, shift = entry.x, shift.x
         else:
-            entry = dr.gather(mi.Vector4f, self._table, row, active)
-            u, weight = mi.Point2f(entry.x, entry.y), entry.z
+            u = mi.Point2f(entry.x, entry.y)
         if self._kind != "voronoi":
             u += shift
             u -= dr.floor(u)
@@ -99,10 +125,15 @@ class WeightedSets:
             u = 1 - dr.abs(2 * u - 1)
         # Rounding must not reach the upper end
         u = dr.minimum(u, dr.one_minus_epsilon(mi.Float))
-        return (u if self._dimension == 2 else u.x), weight
+        weights = [entry[self._dimension + i] for i in range(self._weight_count)]
+        return (u, *([1.0] * len(weights) if self._kind == "none" else weights))
+
+
+def _periodic_weights(x: np.ndarray, periods: int) -> np.ndarray:
+    # Points that differ by rounding only must share their cell. None weighs nothing: weights of
+    # both kinds are divided by each other
+    place = np.round(x.ravel() * periods % 1, 9) % 1
+    return np.maximum(len(x) * voronoi_weights(place), 1e-6)
 
 
 _BOUNDARIES = {"voronoi": "clip", "torus": "torus", "unbiased": "torus"}
-
-#: Rows of two or four numbers are read at once.
-_PADS = {1: ((0, 0), (0, 0), (0, 0)), 2: ((0, 0), (0, 0), (0, 1))}

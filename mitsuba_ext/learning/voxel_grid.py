@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..bounds import scene_bounds
+
 #: Index of the voxels that hold nothing.
 EMPTY = 0xFFFFFFFF
 
@@ -31,7 +33,7 @@ class VoxelGrid:
 
     def __init__(self, scene: mi.Scene, resolution: int) -> None:
         self.resolution = resolution
-        bbox = scene.bbox()
+        bbox = scene_bounds(scene)
         if not bbox.valid():
             raise ValueError("a scene without geometry has no voxels")
         extent = bbox.max - bbox.min

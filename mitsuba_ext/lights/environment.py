@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..bounds import scene_bounds
 from .searching import ONE_MINUS_EPSILON, alias_tables
 from .spectra import brightness, some_wavelengths
 from .sun import SunDisk
@@ -52,7 +53,7 @@ class EnvironmentBins:
         self.emitter = scene.environment()
         self.pointer = mi.EmitterPtr(self.emitter)
         self._is_map = self.emitter.class_name() == "EnvironmentMapEmitter"
-        bbox = scene.bbox()
+        bbox = scene_bounds(scene)
         sphere = bbox.bounding_sphere() if bbox.valid() else mi.ScalarBoundingSphere3f(0.0, 1.0)
         # Samples lie behind everything, also after rounding
         self._center, self._radius = mi.Point3f(sphere.center), mi.Float(1.001 * sphere.radius)

@@ -13,6 +13,22 @@ from scipy.spatial import cKDTree
 FloatArray = npt.NDArray[np.float64]
 
 
+def checked_points(function: str, x: npt.ArrayLike, most_axes: int = 1) -> FloatArray:
+    """The points as an array of shape (N,), or with two axes also (N, D).
+
+    Raises:
+        ValueError: They have another shape, are missing, or outside of the unit cube.
+    """
+    x = np.asarray(x, float)
+    if not 1 <= x.ndim <= most_axes or x.size == 0:
+        shapes = "(N,) or (N, D)" if most_axes == 2 else "(N,)"
+        raise ValueError(f"{function}: points of shape {shapes} expected, not {x.shape}")
+    # Also NaN is not inside
+    if not (x.min() >= 0 and x.max() <= 1):
+        raise ValueError(f"{function}: there are points outside of the unit cube, or NaN")
+    return x
+
+
 def cell_lengths(x: npt.ArrayLike, boundary: str) -> FloatArray:
     """Of each point of [0, 1], the length of the cell in which none is nearer. Equal points share
     their cell.
@@ -46,7 +62,7 @@ def correction(x: npt.ArrayLike, count: int) -> FloatArray:
 def unbiased_weights(x: npt.ArrayLike) -> FloatArray:
     """Clipped cells, corrected such that sums are unbiased for independent uniform points
     (Guo, Eq. 4.8). The weights do not add up to one: also a constant has variance."""
-    x = np.asarray(x, float)
+    x = checked_points("unbiased_weights", x)
     return cell_lengths(x, "clip") / correction(x, len(x))
 
 
@@ -56,7 +72,7 @@ def trapezoid_weights(x: npt.ArrayLike) -> tuple[FloatArray, float, float]:
     Returns:
         The weights of the points, that of f(0), and that of f(1).
     """
-    x = np.asarray(x, float)
+    x = checked_points("trapezoid_weights", x)
     low, high = float(x.min()), float(x.max())
     weights = cell_lengths(x, "clip")
     for end, distance in ((low, low), (high, 1 - high)):
@@ -72,7 +88,11 @@ def nearest_neighbour_weights(x: npt.ArrayLike, tests: npt.ArrayLike) -> FloatAr
     Parameters:
         x, tests: Points of shape (N,) or (N, D), and (M,) or (M, D).
     """
-    x, tests = (np.asarray(a, float) for a in (x, tests))
-    dimension = x.shape[1] if x.ndim == 2 else 1
-    _distance, nearest = cKDTree(x.reshape(-1, dimension)).query(tests.reshape(-1, dimension))
+    x, tests = (checked_points("nearest_neighbour_weights", a, 2) for a in (x, tests))
+    x, tests = (a.reshape(len(a), -1) for a in (x, tests))
+    if x.shape[1] != tests.shape[1]:
+        raise ValueError(
+            f"nearest_neighbour_weights: points have {x.shape[1]} dimensions, tests {tests.shape[1]}"
+        )
+    _distance, nearest = cKDTree(x).query(tests)
     return np.bincount(nearest, minlength=len(x)) / len(tests)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 import warnings
 
 import numpy as np
@@ -26,13 +27,14 @@ _LATTICE_WORK = 1 << 22
 def points(
     pattern: str, count: int, dimension: int = 2, seed: int | np.random.Generator = 0
 ) -> FloatArray:
-    """Points in [0, 1)ᴰ. Each point alone is uniform, except with ``hammersley`` and ``lattice``,
-    which are fixed sets up to a random shift around the torus and the order of their axes.
+    """Points in [0, 1)ᴰ. A point of them that is chosen at random is uniform: plain means are
+    unbiased. ``hammersley`` and ``lattice`` are fixed sets up to a random shift around the torus
+    and the order (``lattice``: also the direction) of their axes.
 
     - ``independent``: i.i.d. uniform numbers.
     - ``stratified``: one in each cell of a grid (jittered). Where the count is no power, the grid
       has the next smaller number of cells along each axis but the last, which is divided such that
-      each cell has one point.
+      each cell has one point: some columns, chosen at random, have one more than others.
     - ``latin_hypercube``: one in each of N slices along each axis.
     - ``halton``: scrambled.
     - ``hammersley``: (i / N, Halton), shifted.
@@ -52,12 +54,13 @@ def points(
         Array of shape (N, D).
 
     Raises:
-        ValueError: There is no such pattern; the count or the dimension is below 1.
+        ValueError: There is no such pattern; the count or the dimension is no integer, or below 1.
     """
     if pattern not in PATTERNS:
         raise ValueError(f'points: pattern is "{pattern}", not one of {PATTERNS}')
-    if count < 1 or dimension < 1:
-        raise ValueError(f"points: {count} points in {dimension} dimensions")
+    for name, value in (("count", count), ("dimension", dimension)):
+        if not isinstance(value, numbers.Integral) or value < 1:
+            raise ValueError(f"points: {name} is {value}, not an integer of at least 1")
     rng = np.random.default_rng(seed)
     x = _MAKERS[pattern](count, dimension, rng)
     # Rounding must not reach the upper end, also not in single precision
@@ -67,7 +70,8 @@ def points(
 def shifted(points: npt.ArrayLike, shift: npt.ArrayLike) -> FloatArray:
     """Points moved around the torus."""
     x = (np.asarray(points, float) + shift) % 1
-    return np.where(x < 1, x, 0.0)
+    # Next to 0 on its left, the remainder is rounded to 1
+    return np.where(x == 1, 0.0, x)
 
 
 def tent(points: npt.ArrayLike) -> FloatArray:
@@ -83,13 +87,13 @@ def _stratified(count: int, dimension: int, rng: np.random.Generator) -> FloatAr
     edge = _root(count, dimension)
     columns = edge ** (dimension - 1)
     # The last axis: as many cells in each column as points remain for it
-    column = np.arange(count) * columns // count
-    first = -(-np.arange(columns + 1) * count // columns)
-    rank, size = np.arange(count) - first[column], np.diff(first)[column]
+    size = count // columns + (rng.permutation(columns) < count % columns)
+    column = np.repeat(np.arange(columns), size)
+    rank = np.arange(count) - (np.cumsum(size) - size)[column]
     x = rng.random((count, dimension))
     for axis in range(dimension - 1):
         x[:, axis] = (column // edge**axis % edge + x[:, axis]) / edge
-    x[:, -1] = (rank + x[:, -1]) / size
+    x[:, -1] = (rank + x[:, -1]) / size[column]
     return x
 
 

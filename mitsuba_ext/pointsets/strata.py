@@ -5,13 +5,12 @@ Source: Guo, PhD thesis, section 4.4.4.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
 
-from .line import FloatArray, cell_lengths, unbiased_weights
+from .line import FloatArray, checked_points, unbiased_weights
 
 #: What makes weights of points in [0, 1].
 Weigher = Callable[[FloatArray], FloatArray]
@@ -28,9 +27,10 @@ def stratum_weights(
         weigher: Weights of points of a single stratum, scaled to [0, 1].
 
     Raises:
-        ValueError: A stratum has no point: its part of the integral would be lost.
+        ValueError: A stratum has no point: its part of the integral would be lost. Points are
+            outside, or edges not as they should be.
     """
-    x, edges = np.asarray(x, float), np.asarray(edges, float)
+    x, edges = checked_points("stratum_weights", x), _checked_edges("stratum_weights", edges)
     weights, counts = _within(x, edges, weigher)
     if (counts == 0).any():
         raise ValueError(f"stratum_weights: no point in {np.sum(counts == 0)} of the strata")
@@ -46,8 +46,13 @@ def piecewise_points(
         u: Points of shape (N,).
         edges: Limits of the K pieces, ascending from 0 to 1.
         probabilities: Of the pieces, of shape (K,), with sum 1.
+
+    Raises:
+        ValueError: These are not as they should be.
     """
-    return np.interp(np.asarray(u, float), np.cumsum([0, *np.asarray(probabilities)]), edges)
+    u = checked_points("piecewise_points", u)
+    edges, probabilities = _checked_pieces("piecewise_points", edges, probabilities)
+    return np.interp(u, np.cumsum([0, *probabilities]), edges)
 
 
 def piecewise_weights(
@@ -64,16 +69,32 @@ def piecewise_weights(
         x: Points in [0, 1], of shape (N,).
         edges, probabilities: As in :func:`piecewise_points`.
         weigher: Weights of points of a single piece, scaled to [0, 1].
+
+    Raises:
+        ValueError: These are not as they should be.
     """
-    x, edges = np.asarray(x, float), np.asarray(edges, float)
+    x = checked_points("piecewise_weights", x)
+    edges, probabilities = _checked_pieces("piecewise_weights", edges, probabilities)
     weights, counts = _within(x, edges, weigher)
     is_met = -np.expm1(len(x) * np.log1p(-np.minimum(probabilities, 1 - 1e-16)))
     return weights / is_met[_stratum(x, edges)]
 
 
-def cell_weigher(boundary: str) -> Weigher:
-    """Plain cells of points, to weigh strata with."""
-    return functools.partial(cell_lengths, boundary=boundary)
+def _checked_edges(function: str, edges: npt.ArrayLike) -> FloatArray:
+    edges = np.asarray(edges, float)
+    ascend = edges.ndim == 1 and len(edges) > 1 and (np.diff(edges) > 0).all()
+    if not (ascend and edges[0] == 0 and edges[-1] == 1):
+        raise ValueError(f"{function}: edges are {edges}, not ascending from 0 to 1")
+    return edges
+
+
+def _checked_pieces(
+    function: str, edges: npt.ArrayLike, probabilities: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    edges, p = _checked_edges(function, edges), np.asarray(probabilities, float)
+    if p.shape != (len(edges) - 1,) or not ((p >= 0).all() and abs(p.sum() - 1) < 1e-9):
+        raise ValueError(f"{function}: probabilities are {p}, not {len(edges) - 1} with sum 1")
+    return edges, p
 
 
 def _within(

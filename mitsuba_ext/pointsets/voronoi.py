@@ -9,15 +9,20 @@ import itertools
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import Voronoi, cKDTree
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import QhullError, Voronoi, cKDTree
 
-from .line import FloatArray, cell_lengths
+from .line import FloatArray, cell_lengths, checked_points
 
 BOUNDARIES = ("clip", "torus")
 
 #: Points that are nearer to the border of a clipped domain count as being so far from it: from
 #: their mirror images they have to be told apart.
 _BORDER = 1e-7
+
+#: Points that are nearer to each other coincide, by dimension: Qhull could not tell them apart.
+_SPACING = {2: 1e-10, 3: 1e-7}
 
 #: The sum of all cells may be off by so much through rounding.
 _TOLERANCE = 1e-9
@@ -44,28 +49,48 @@ def voronoi_weights(points: npt.ArrayLike, boundary: str = "torus") -> FloatArra
         Array of shape (N,).
 
     Raises:
-        ValueError: Points are missing, not finite, or outside of the domain; D is too large; there
-            is no such boundary.
+        ValueError: Points are missing or outside of the domain; D is too large; there is no such
+            boundary; the cells that were found do not fill the domain.
     """
-    x = np.asarray(points, float)
-    if x.ndim not in (1, 2) or x.size == 0:
-        raise ValueError(f"voronoi_weights: points of shape (N,) or (N, D) expected, not {x.shape}")
+    x = checked_points("voronoi_weights", points, 2)
     if boundary not in BOUNDARIES:
         raise ValueError(f'voronoi_weights: boundary is "{boundary}", not one of {BOUNDARIES}')
-    if not (np.isfinite(x).all() and x.min() >= 0 and x.max() <= 1):
-        raise ValueError("voronoi_weights: there are points outside of the unit cube")
     dimension = 1 if x.ndim == 1 else x.shape[1]
-    if dimension == 1:
-        return cell_lengths(x.ravel(), boundary)
     if dimension > 3:
         raise ValueError(f"voronoi_weights: {dimension} dimensions; at most 3 are supported")
-    x = np.clip(x, _BORDER, 1 - _BORDER) if boundary == "clip" else x % 1
-    for margin in (3 * len(x) ** (-1 / dimension), np.inf):
-        measures = _cell_measures(x, _images(x, boundary, margin))
+    if boundary == "torus":
+        x = x % 1
+    if dimension == 1:
+        return cell_lengths(x.ravel(), boundary)
+    if boundary == "clip":
+        x = np.clip(x, _BORDER, 1 - _BORDER)
+    places, which = _places(x, boundary)
+    return (_measures(places, boundary) / np.bincount(which))[which]
+
+
+def _places(x: FloatArray, boundary: str) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """The places where there are points, and which of them is that of each point."""
+    places, which = np.unique(x, axis=0, return_inverse=True)
+    tree = cKDTree(places, boxsize=1.0 if boundary == "torus" else None)
+    pairs = tree.query_pairs(_SPACING[x.shape[1]], output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(places), len(places)))
+    _count, group = connected_components(graph, directed=False)
+    _group, first = np.unique(group, return_index=True)
+    return places[first], group[which.ravel()]
+
+
+def _measures(x: FloatArray, boundary: str) -> FloatArray:
+    """Areas or volumes of the cells of points that do not coincide; they add up to one."""
+    for margin in (3 * len(x) ** (-1 / x.shape[1]), np.inf):
+        try:
+            measures = _cell_measures(x, _images(x, boundary, margin))
+        except QhullError:
+            # Points on a line, say, whose images beside it are farther away
+            continue
         # Without an image that matters, cells are too large, and so is their sum
         if abs(measures.sum() - 1) < _TOLERANCE:
-            break
-    return _shared(x, measures / measures.sum(), boundary)
+            return measures / measures.sum()
+    raise ValueError("voronoi_weights: no cells that fill the domain; are points very close?")
 
 
 def _images(x: FloatArray, boundary: str, margin: float) -> FloatArray:
@@ -83,8 +108,7 @@ def _images(x: FloatArray, boundary: str, margin: float) -> FloatArray:
 
 
 def _cell_measures(x: FloatArray, images: FloatArray) -> FloatArray:
-    """Areas or volumes of the cells of ``x`` among ``images``: infinite for those without bounds,
-    and 0 for points that lie too close to another one."""
+    """Areas or volumes of the cells of ``x`` among ``images``: infinite for those without bounds."""
     count, dimension = x.shape
     diagram = Voronoi(np.concatenate([x, images]))
     pair = diagram.ridge_points
@@ -109,15 +133,3 @@ def _cell_measures(x: FloatArray, images: FloatArray) -> FloatArray:
     heights = np.linalg.norm(diagram.points[pair[:, 0]] - diagram.points[pair[:, 1]], axis=1) / 2
     measure = np.repeat(size * heights / dimension, 2)
     return np.bincount(pair.ravel(), measure, minlength=count)[:count]
-
-
-def _shared(x: FloatArray, measures: FloatArray, boundary: str) -> FloatArray:
-    """Gives points without a cell a share of that of their nearest neighbour."""
-    is_lost = measures == 0
-    if not is_lost.any():
-        return measures
-    kept = np.flatnonzero(~is_lost)
-    tree = cKDTree(x[kept], boxsize=1.0 if boundary == "torus" else None)
-    owner = np.arange(len(x))
-    owner[is_lost] = kept[tree.query(x[is_lost])[1]]
-    return (measures / np.bincount(owner, minlength=len(x)).clip(1))[owner]

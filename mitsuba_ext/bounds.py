@@ -1,0 +1,27 @@
+"""Where the things of a scene are.
+
+Mitsuba 3.9.1 merges meshes of one material when it loads a scene, and a rectangle that was merged
+is missing in the box of the result, and in that of the scene (``Mesh::merge`` looks at a member
+which rectangles do not fill). Vertices tell the truth.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+
+def scene_bounds(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
+    """The box of all shapes; not valid where there are none."""
+    box = mi.ScalarBoundingBox3f()
+    for shape in scene.shapes():
+        box.expand(shape_bounds(shape))
+    return box
+
+
+def shape_bounds(shape: mi.Shape) -> mi.ScalarBoundingBox3f:
+    """The box of one shape."""
+    if not shape.is_mesh() or shape.vertex_count() == 0:
+        return shape.bbox()
+    vertices = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
+    return mi.ScalarBoundingBox3f(vertices.min(axis=0), vertices.max(axis=0))

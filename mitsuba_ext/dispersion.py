@@ -1,0 +1,111 @@
+"""What the random walk and dispersive BSDFs agree on.
+
+A ray carries four wavelengths. The first, the *hero*, chooses lobes and directions. Reflection
+leads all four the same way. Refraction by a dispersive interface does not: only the hero goes on,
+and weighs four times as much. That is unbiased, since the hero is distributed as each of the
+others, and since whether a path has passed such an interface does not depend on wavelengths.
+
+Source: A. Wilkie, S. Nawaz, M. Droske, A. Weidlich, J. Hanika, *Hero Wavelength Spectral Sampling*,
+2014.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+#: A bit that Mitsuba does not use. In the flags of a BSDF, which every wrapper hands on: it
+#: disperses. In the ``type_mask`` of a ``BSDFContext``, of which only bits of lobes are looked at:
+#: the caller lets only the hero be refracted. A dispersive BSDF refuses to work for any other.
+DISPERSES = 1 << 30
+
+#: The mask of callers who ask for everything, and know nothing of us.
+_EVERYTHING = 0xFFFFFFFF
+
+
+def knows_heroes(ctx: mi.BSDFContext) -> bool:
+    """Does the caller let only the hero be refracted?"""
+    return bool(ctx.type_mask & DISPERSES) and ctx.type_mask != _EVERYTHING
+
+
+def disperses(shapes: Iterable[mi.Shape]) -> bool:
+    """May any of these shapes disperse light? ``children`` of shapes are looked at too; what an
+    instance shows cannot be seen from outside, so that it may."""
+    return any(
+        bool(shape.bsdf() and shape.bsdf().flags() & DISPERSES)
+        or shape.class_name() == "Instance"
+        or disperses(getattr(shape, "children", ()))
+        for shape in shapes
+    )
+
+
+class Heroes:
+    """Lets only the hero be refracted by what disperses. Where nothing does, no code is left.
+
+    Its state says whether only the hero is left of a path: a mask, or ``()`` where nothing
+    disperses.
+
+    Parameters:
+        scene: What the paths are in.
+        hero_weight: What multiplies the throughput where only the hero is left, besides 4.
+    """
+
+    def __init__(self, scene: mi.Scene, hero_weight: mi.Float | float = 1.0) -> None:
+        self._is_needed = mi.is_spectral and disperses(scene.shapes())
+        self._count = dr.size_v(mi.Spectrum)
+        self._factor = self._count * hero_weight
+
+    def context(self) -> mi.BSDFContext:
+        """What BSDFs are to be asked with."""
+        ctx = mi.BSDFContext()
+        if self._is_needed:
+            ctx.type_mask |= DISPERSES
+        return ctx
+
+    def begin(self) -> Any:
+        """The state before the first bounce."""
+        return mi.Bool(False) if self._is_needed else ()
+
+    def connect(
+        self,
+        is_alone: Any,
+        bsdf_value: mi.Spectrum,
+        bsdf: mi.BSDFPtr,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+    ) -> mi.Spectrum:
+        """The value of a BSDF by which the throughput is to be multiplied for a connection."""
+        if not self._is_needed:
+            return bsdf_value
+        return self._collapse(bsdf_value, self._refracts(bsdf, si, wo), is_alone)
+
+    def scatter(
+        self,
+        is_alone: Any,
+        bsdf_weight: mi.Spectrum,
+        bsdf: mi.BSDFPtr,
+        si: mi.SurfaceInteraction3f,
+        bs: mi.BSDFSample3f,
+    ) -> tuple[mi.Spectrum, mi.Float | float, Any]:
+        """The same for a BSDF sample; how much more what is left of the wavelengths counts by now,
+        which is no reason to let a path live longer; and the new state."""
+        if not self._is_needed:
+            return bsdf_weight, 1.0, is_alone
+        # What passes a hole of a mask is not refracted
+        refracts = self._refracts(bsdf, si, bs.wo)
+        refracts &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        weight = self._collapse(bsdf_weight, refracts, is_alone)
+        return weight, dr.select(refracts & ~is_alone, self._factor, 1), is_alone | refracts
+
+    def _refracts(self, bsdf, si, wo) -> mi.Bool:
+        """Connections and samples must agree, for their MIS weights to add up: what counts is where
+        ``wo`` points, not which lobe of the BSDF it belongs to."""
+        crosses = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) < 0
+        return crosses & ((bsdf.flags() & DISPERSES) != 0)
+
+    def _collapse(self, value, refracts, is_alone) -> mi.Spectrum:
+        hero = dr.select(is_alone, value[0], value[0] * self._factor)
+        return dr.select(refracts, mi.Spectrum([hero] + [0] * (self._count - 1)), value)

@@ -1,0 +1,477 @@
+"""Moving shapes: the image is the average of images at rest, each at the pose of its time."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_cases import area, bitmap, diffuse, film, lookat, rectangle, sensor
+from scipy.spatial.transform import Rotation, Slerp
+from statistical import (
+    REFERENCE,
+    REFERENCE_SEEDS,
+    SEEDS,
+    UNDER_TEST,
+    UNUSUAL,
+    assert_same_image,
+    assert_same_mean,
+    batches,
+)
+
+from mitsuba_ext.decisions.defaults import SceneQuery
+from mitsuba_ext.decisions.moving_scene import refuse_movers, scene_query
+from mitsuba_ext.motion import Motion, PoseTable
+
+Scene = dict[str, Any]
+Pose = Callable[[float], np.ndarray]
+
+
+@pytest.fixture(autouse=True)
+def quiet(variant: str) -> None:
+    # Spheres say that rotations round
+    mi.set_log_level(mi.LogLevel.Error)
+
+
+# ---- Motions: as parameters, and as poses that are computed here ----
+
+
+def uniform(translate, axis, angle, center, begin=0.0, end=1.0) -> tuple[Scene, Pose]:
+    def pose(time: float) -> np.ndarray:
+        x = np.clip((time - begin) / (end - begin), 0, 1)
+        unit = np.array(axis) / np.linalg.norm(axis)
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_rotvec(unit * np.radians(x * angle)).as_matrix()
+        matrix[:3, 3] = x * np.array(translate) + center - matrix[:3, :3] @ center
+        return matrix
+
+    parameters = {"translate": translate, "axis": axis, "angle": angle, "center": center,
+                  "begin": begin, "end": end}  # fmt: skip
+    return parameters, pose
+
+
+def keyed(times, rotations: Rotation, positions) -> tuple[Scene, Pose]:
+    slerp, positions = Slerp(times, rotations), np.array(positions)
+
+    def pose(time: float) -> np.ndarray:
+        time = np.clip(time, times[0], times[-1])
+        matrix = np.eye(4)
+        matrix[:3, :3] = slerp(time).as_matrix()
+        matrix[:3, 3] = [np.interp(time, times, column) for column in positions.T]
+        return matrix
+
+    parameters: Scene = {}
+    for i, time in enumerate(times):
+        parameters[f"time_{i}"] = float(time)
+        parameters[f"pose_{i}"] = mi.ScalarTransform4f(pose(time))
+    return parameters, pose
+
+
+SPIN = uniform([0.5, -0.3, 0.2], [0, 0.4, 1], 420.0, [0.1, 0, 0.5])
+SLIDE = uniform([0, -0.8, 0], [0, 0, 1], 0.0, [0, 0, 0], begin=0.1, end=0.6)
+
+
+def keys() -> tuple[Scene, Pose]:
+    rotations = Rotation.from_rotvec([[0, 0, 0], [0, 0.5, 1.2], [-0.6, 0.5, 2.9], [0, 1, 2]])
+    positions = [[-0.3, 0, 0], [0.4, 0, 0.2], [0.3, -0.6, 0.5], [0, 0.1, 0.3]]
+    return keyed([0.1, 0.4, 0.7, 0.9], rotations, positions)
+
+
+def at(pose: np.ndarray, *rest: mi.ScalarTransform4f) -> mi.ScalarTransform4f:
+    return functools.reduce(lambda a, b: a @ b, rest, mi.ScalarTransform4f(pose))
+
+
+# ---- Scenes ----
+
+
+def pair(pose: np.ndarray) -> Scene:
+    """A block and a ball."""
+    T = mi.ScalarTransform4f
+    return {
+        "block": {"type": "cube", "bsdf": diffuse(0.2, 0.7, 0.3),
+                  "to_world": at(pose, T().translate([0.4, 0, 0.4]).scale([0.25, 0.15, 0.3]))},
+        "ball": {"type": "sphere", "bsdf": {"type": "roughconductor", "alpha": 0.2},
+                 "to_world": at(pose, T().translate([-0.35, 0.1, 0.5]).scale(0.25))},
+    }  # fmt: skip
+
+
+def plate(pose: np.ndarray) -> Scene:
+    T = mi.ScalarTransform4f
+    bsdf = {"type": "twosided", "bsdf": diffuse(0.8, 0.4, 0.1)}
+    to_world = at(pose, T().translate([-0.6, 0.4, 0.9]).rotate([1, 0, 0], 60).scale(0.3))
+    return {"plate": {"type": "rectangle", "bsdf": bsdf, "to_world": to_world}}
+
+
+def room(camera: Scene, **things: Any) -> Scene:
+    """A floor, a mirror behind, and a lamp (large, as the mirror's caustic is sampled badly)."""
+    T = mi.ScalarTransform4f
+    upright = T().translate([0, 1.5, 1]).rotate([1, 0, 0], 90)
+    return {
+        "type": "scene",
+        "sensor": camera,
+        "floor": rectangle(T().scale([2, 2, 1]), bsdf=diffuse()),
+        "mirror": rectangle(upright, T().scale([2, 1, 1]), bsdf={"type": "conductor"}),
+        "lamp": rectangle(
+            T().translate([-0.3, 0, 1.9]).rotate([1, 0, 0], 180).scale(0.9),
+            bsdf=diffuse(0.0),
+            emitter=area(1.5),
+        ),
+        **things,
+    }
+
+
+def camera(begin: float = 0.0, end: float = 1.0, plugin: str = "perspective", **changes) -> Scene:
+    return sensor(plugin, shutter_open=begin, shutter_close=end, **changes)
+
+
+def sky() -> Scene:
+    """Not uniform: where nothing is noisy, rounding errors of long sums stand out."""
+    pixels = np.random.default_rng(4).uniform(0.2, 0.6, size=(8, 16, 3))
+    return {"type": "envmap", "bitmap": bitmap(pixels)}
+
+
+LENS = {"plugin": "thinlens", "aperture_radius": 0.15, "focus_distance": 4.0}
+
+#: Shutter, other parameters of the camera, what else is in the scene (made in the variant), and
+#: what moves how.
+CASES: dict[str, tuple] = {
+    "turns_more_than_once": ((0.0, 1.0), {}, dict, lambda: [(SPIN, pair)]),
+    "keys_under_sky": ((0.0, 1.0), {}, lambda: {"lamp": sky()}, lambda: [(keys(), pair)]),
+    "two_through_a_lens": (
+        (0.2, 0.7), LENS, lambda: {"sky": sky()}, lambda: [(SPIN, pair), (SLIDE, plate)],
+    ),
+}  # fmt: skip
+
+
+def moving_scene(case: str) -> mi.Scene:
+    shutter, changes, things, movers = CASES[case]
+    moving = {
+        f"moving_{i}": {"type": "moving", **parameters, **make(np.eye(4))}
+        for i, ((parameters, _), make) in enumerate(movers())
+    }
+    return mi.load_dict(room(camera(*shutter, **changes), **things(), **moving))
+
+
+def resting_scene(case: str, time: float) -> mi.Scene:
+    _, changes, things, movers = CASES[case]
+    resting: Scene = {}
+    for (_, pose), make in movers():
+        resting.update(make(pose(time)))
+    return mi.load_dict(room(camera(**changes), **things(), **resting))
+
+
+@functools.cache
+def reference(case: str) -> np.ndarray:
+    """Of ``path``: each seed's image is the average over 64 times, in the middle of strata."""
+    (begin, end), *_ = CASES[case]
+    images = []
+    for i in range(64):
+        scene = resting_scene(case, begin + (end - begin) * (i + 0.5) / 64)
+        seeds = [seed + 100 * i for seed in REFERENCE_SEEDS[:4]]
+        images.append(batches(scene, REFERENCE.make(4), 32, seeds))
+    return np.mean(images, axis=0)
+
+
+INTEGRATORS = {
+    **dict.fromkeys(CASES, ["composed_path"]),
+    "two_through_a_lens": ["composed_path", "pss_guided", "rejecting", "many_connections"],
+}
+
+
+@pytest.mark.parametrize(
+    ("case", "name"), [(case, name) for case, names in INTEGRATORS.items() for name in names]
+)
+def test_image_is_the_average_of_images_at_rest(case: str, name: str) -> None:
+    integrator = {**UNDER_TEST, **UNUSUAL}[name].make(4)
+    images = batches(moving_scene(case), integrator, 1024, SEEDS[:5])
+    assert_same_mean(images, reference(case), precision=0.003, tile=4)
+
+
+def test_integrators_that_nest_ours_see_motion() -> None:
+    scene = moving_scene("keys_under_sky")
+    inner = UNDER_TEST["composed_path"].make(4)
+    moment = mi.load_dict({"type": "moment", "image": inner})
+    images = [batches(scene, integrator, 16, [5])[0] for integrator in (moment, inner)]
+    assert_same_image(images[0][..., :3], images[1])
+
+
+def test_blur_is_not_what_is_seen_at_one_time() -> None:
+    """Otherwise the tests of the mean would test nothing."""
+    case = "turns_more_than_once"
+    image = batches(resting_scene(case, 0.5), REFERENCE.make(4), 256, [1])[0]
+    assert np.abs(image - reference(case).mean(axis=0)).mean() > 0.05 * image.mean()
+
+
+@pytest.mark.parametrize("time", [-1.0, 0.35, 2.0])
+def test_closed_shutter_shows_the_pose_of_its_time(time: float) -> None:
+    """With the numbers of ``path``; before the motion and after it, its ends."""
+    things = {"moving": {"type": "moving", **keys()[0], **pair(np.eye(4))}}
+    moving = mi.load_dict(room(camera(time, time), **things))
+    resting = mi.load_dict(room(camera(0.0, 0.0), **pair(keys()[1](time))))
+    image = batches(moving, UNDER_TEST["composed_path"].make(4), 16, [5])[0]
+    assert_same_image(image, batches(resting, REFERENCE.make(4), 16, [5])[0])
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"], indirect=True)
+def test_closed_shutter_in_variant(variant: str) -> None:
+    test_closed_shutter_shows_the_pose_of_its_time(0.35)
+
+
+@pytest.mark.parametrize("distance", [0.0, 100.0, 3000.0])
+def test_moving_things_do_not_shadow_themselves(distance: float) -> None:
+    """A convex thing under a uniform sky is as bright as its albedo; acne would be darker."""
+    T = mi.ScalarTransform4f
+    thing = {"type": "cube", "bsdf": diffuse(0.5), "to_world": T().translate([distance] * 3)}
+    around = [distance] * 3
+    scene = mi.load_dict({
+        "type": "scene",
+        "sensor": camera(0.0, 1.0, to_world=lookat([distance + 6, distance + 5, distance + 4],
+                                                   [distance + 1] * 3, [0, 0, 1]), fov=8.0),
+        "sky": {"type": "constant"},
+        "moving": {"type": "moving", "axis": [1, 1, 1], "angle": 700.0, "center": around,
+                   "thing": thing},
+    })  # fmt: skip
+    image = batches(scene, UNDER_TEST["composed_path"].make(6), 64, [1])[0]
+    assert image[4:12, 4:12].mean() == pytest.approx(0.5, rel=0.005)
+
+
+# ---- Interactions ----
+
+
+FIELDS = ("t", "time", "p", "n", "uv", "dp_du", "dp_dv", "dn_du", "dn_dv", "wi", "prim_index")
+
+
+def test_interactions_are_those_of_things_at_the_pose() -> None:
+    parameters, pose = keys()
+    time = 0.55
+
+    def things(pose: np.ndarray) -> Scene:
+        T = mi.ScalarTransform4f
+        group = {"type": "shapegroup", "a": {"type": "cylinder", "radius": 0.2}}
+        return {**pair(pose), **plate(pose), "group": {**group, "id": "group"},
+                "one": {"type": "instance", "group": {"type": "ref", "id": "group"},
+                        "to_world": at(pose, T().translate([0.2, 0.6, 0]).scale(0.7))}}  # fmt: skip
+
+    moving = mi.load_dict({
+        "type": "scene", "floor": rectangle(),
+        "moving": {"type": "moving", **parameters, **things(np.eye(4))},
+    })  # fmt: skip
+    resting = mi.load_dict({"type": "scene", "floor": rectangle(), **things(pose(time))})
+    rng = np.random.default_rng(1)
+    o = rng.normal(size=(3, 20_000)) * 3
+    d = rng.uniform(-0.8, 0.8, size=o.shape) + [[0], [0], [0.5]] - o
+    ray = mi.Ray3f(mi.Point3f(o), dr.normalize(mi.Vector3f(d)))
+    ray.time = mi.Float(time)
+    query = scene_query(moving)
+    si = query.interaction(query.closest(moving, ray, False, mi.Bool(True)), ray)
+    wanted = resting.ray_intersect(ray)
+
+    def agree(a: Any, b: Any) -> np.ndarray:
+        same = np.isclose(np.array(a), np.array(b), rtol=2e-3, atol=2e-3)
+        return np.broadcast_to(same, (*same.shape[:-1], dr.width(ray)))
+
+    hit = np.array(wanted.is_valid())
+    assert 0.2 < hit.mean() < 0.95
+    assert (np.array(si.is_valid()) == hit).mean() > 0.999
+    # At edges, one finds another face than the other
+    for field in FIELDS:
+        same = agree(getattr(si, field), getattr(wanted, field))[..., hit]
+        assert same.mean() > 0.997, f"{field}: {same.mean()}"
+    for axis in "stn":
+        same = agree(getattr(si.sh_frame, axis), getattr(wanted.sh_frame, axis))[..., hit]
+        assert same.mean() > 0.997, f"sh_frame.{axis}: {same.mean()}"
+    assert len(np.unique(np.array(dr.reinterpret_array(mi.UInt32, si.shape)))) > 4
+
+
+def test_shadow_rays_carry_the_time() -> None:
+    si = dr.zeros(mi.SurfaceInteraction3f, 2)
+    si.time = mi.Float(0.25, 0.75)
+    assert np.array(si.spawn_ray_to(mi.Point3f(1, 2, 3)).time).tolist() == [0.25, 0.75]
+
+
+def test_scene_at_rest_gets_the_default_query() -> None:
+    """So that nothing of all this is in its kernels."""
+    assert type(scene_query(mi.load_dict(room(camera(), **pair(np.eye(4)))))) is SceneQuery
+
+
+# ---- Poses and bounds ----
+
+
+MOTIONS = {
+    "turn": Motion.uniform(0.2, 1.5, [1, 2, 3], [9, 1, 2], [1, -1, 0.5]),
+    "keys": Motion.keyed([0, 0.5, 0.7, 2], [
+        np.block([[Rotation.from_rotvec(turn).as_matrix(), np.array([position]).T],
+                  [np.zeros((1, 3)), np.ones((1, 1))]])
+        for turn, position in [([0, 0, 0], [0, 1, 0]), ([1, 2, 0], [1, 1, 1]),
+                               ([0, -1, 2], [0, 3, 0]), ([3, 0, 0], [2, 2, 2])]
+    ]),
+    "line": Motion.uniform(-1, 1, [1, 0, 0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("make", [lambda: SPIN, lambda: SLIDE, keys], ids=["spin", "slide", "keys"])
+def test_poses_are_those_computed_by_hand(make: Callable) -> None:
+    parameters, pose = make()
+    shape = mi.load_dict({"type": "moving", **parameters, "cube": {"type": "cube"}})
+    points = np.random.default_rng(2).normal(size=(5, 3))
+    for time in np.linspace(-0.2, 1.2, 29):
+        wanted = points @ pose(time)[:3, :3].T + pose(time)[:3, 3]
+        np.testing.assert_allclose(shape.motion.move(points, time), wanted, atol=1e-5)
+
+
+def test_device_knows_the_poses() -> None:
+    motions = list(MOTIONS.values())
+    table = PoseTable(motions)
+    times = np.linspace(-2, 3, 101)
+    p = np.array([[0.3, 0.2, 0.1]])
+    for index, motion in enumerate(motions):
+        pose = table.pose(mi.UInt32(index), mi.Float(times))
+        si = dr.zeros(mi.SurfaceInteraction3f, len(times))
+        si.p = mi.Point3f(*p[0].tolist())
+        wanted = np.concatenate([motion.move(p, time) for time in times])
+        moved = pose.to_world(si).p
+        np.testing.assert_allclose(np.array(moved).T, wanted, atol=5e-6)
+        ray = pose.to_rest(mi.Ray3f(moved, mi.Vector3f(0, 0, 1)))
+        np.testing.assert_allclose(np.array(ray.o).T, np.tile(p, (len(times), 1)), atol=5e-6)
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_bounds_hold_all_poses_tightly(name: str) -> None:
+    motion = MOTIONS[name]
+    corners = np.random.default_rng(3).normal(size=(8, 3))
+    low, high = motion.bounds(corners)
+    moved = np.concatenate([motion.move(corners, time) for time in np.linspace(-2, 3, 3001)])
+    assert (moved >= low - 1e-9).all() and (moved <= high + 1e-9).all()
+    assert np.abs(np.concatenate([moved.min(0) - low, high - moved.max(0)])).max() < 0.01
+
+
+def test_scene_is_as_large_as_the_motion() -> None:
+    shape = {"type": "moving", "translate": [0, 5, 0], "cube": {"type": "cube"}}
+    box = mi.load_dict({"type": "scene", "moving": shape}).bbox()
+    np.testing.assert_allclose([list(box.min), list(box.max)], [[-1] * 3, [1, 6, 1]], atol=1e-5)
+
+
+# ---- Scenes as files, and errors ----
+
+
+XML = """<scene version="3.0.0">
+    <bsdf type="diffuse" id="paint"/>
+    <shape type="shapegroup" id="group"><shape type="sphere"/></shape>
+    <shape type="moving" id="a">
+        <vector name="axis" value="0, 0, 2"/><float name="angle" value="90"/>
+        <point name="center" value="1, 2, 3"/><vector name="translate" value="0, 0, 1"/>
+        <shape type="cube"><ref id="paint"/></shape>
+        <shape type="cube"><ref id="paint"/></shape>
+        <ref id="group"/><shape type="instance"><ref id="group"/></shape>
+    </shape>
+    <shape type="moving" id="b">
+        <transform name="pose_0"><rotate z="1" angle="20"/></transform>
+        <float name="time_0" value="0.5"/>
+        <transform name="pose_1"><translate x="1"/></transform><float name="time_1" value="2"/>
+        <shape type="cube"><ref id="paint"/></shape>
+    </shape>
+    <shape type="cube"><ref id="paint"/></shape>
+</scene>"""
+
+
+def test_files_and_dictionaries_say_the_same(tmp_path) -> None:
+    """With all of Mitsuba's optimisations: nothing that moves is merged with anything."""
+    T = mi.ScalarTransform4f
+    file = tmp_path / "scene.xml"
+    file.write_text(XML)
+    scene = mi.load_file(str(file))
+    assert len(scene.shapes()) == 3
+    shapes = {shape.id(): shape for shape in scene.shapes()}
+    assert len(shapes["a"].at_rest.shapes()) == 3 and len(shapes["b"].at_rest.shapes()) == 1
+    cube = {"type": "cube"}
+    dictionaries = {
+        "a": {"axis": [0, 0, 2], "angle": 90, "center": [1, 2, 3], "translate": [0, 0, 1]},
+        "b": {"pose_0": T().rotate([0, 0, 1], 20), "time_0": 0.5,
+              "pose_1": T().translate([1, 0, 0]), "time_1": 2.0},
+    }  # fmt: skip
+    for name, parameters in dictionaries.items():
+        motion = mi.load_dict({"type": "moving", **parameters, "cube": cube}).motion
+        for key, value in vars(motion).items():
+            np.testing.assert_allclose(getattr(shapes[name].motion, key), value, atol=1e-7)
+    assert "segments = 1" in str(shapes["b"])
+
+
+def _errors() -> dict[str, tuple[Scene, str]]:
+    T = mi.ScalarTransform4f
+    cube = {"type": "cube"}
+    line = {"translate": [1, 0, 0]}
+    poses = {"pose_0": T(), "time_0": 0.0, "pose_1": T(), "time_1": 1.0, "cube": cube}
+    return {
+        "typo": ({**line, "cube": cube, "angel": 3.0}, "angel"),
+        "to_world": ({**line, "cube": cube, "to_world": T()}, "to_world"),
+        "no_motion": ({"cube": cube}, "no motion is given"),
+        "no_angle": ({"axis": [0, 0, 1], "cube": cube}, '"angle"'),
+        "no_axis": ({**line, "angle": 3.0, "cube": cube}, "angle"),
+        "zero_axis": ({"axis": [0, 0, 0], "angle": 1.0, "cube": cube}, "must not be zero"),
+        "backwards": ({**line, "begin": 2.0, "cube": cube}, '"begin" is 2'),
+        "not_a_number": ({"translate": [float("nan"), 0, 0], "cube": cube}, "finite"),
+        "mixed": ({**line, **poses}, "exclude each other"),
+        "gap": ({**poses, "pose_3": T(), "time_3": 4.0}, "pose_3"),
+        "one_pose": ({"pose_0": T(), "time_0": 0.0, "cube": cube}, "two at least"),
+        "order": ({**poses, "time_1": 0.0}, '"time_1" is 0'),
+        "scale": ({**poses, "pose_1": T().scale(2)}, "must be rigid"),
+        "mirror": ({**poses, "pose_1": T().scale([-1, 1, 1])}, "must be rigid"),
+        "nothing": (line, "nothing is nested"),
+        "material": ({**line, "cube": cube, "paint": {"type": "diffuse"}}, "must be a shape"),
+        "emitter": ({**line, "lamp": {**cube, "light": area(1.0)}}, "emitters cannot move"),
+        "sensor": ({**line, "meter": {"type": "rectangle", "sensor": {"type": "irradiancemeter"}}},
+                   "sensors cannot move"),
+        "nested": ({**line, "inner": {"type": "moving", **line, "cube": cube}}, "another one"),
+        "attribute": ({**line, "mesh": _coloured_mesh()}, '"vertex_color"'),
+    }  # fmt: skip
+
+
+def _coloured_mesh() -> mi.Mesh:
+    mesh = mi.Mesh("mesh", 3, 1)
+    mesh.add_attribute("vertex_color", 3, [0.0] * 9)
+    return mesh
+
+
+@pytest.mark.parametrize("case", [
+    "typo", "to_world", "no_motion", "no_angle", "no_axis", "zero_axis", "backwards",
+    "not_a_number", "mixed", "gap", "one_pose", "order", "scale", "mirror", "nothing", "material",
+    "emitter", "sensor", "nested", "attribute",
+])  # fmt: skip
+def test_what_cannot_move_is_refused(case: str) -> None:
+    parameters, message = _errors()[case]
+    with pytest.raises((ValueError, RuntimeError), match=message):
+        mi.load_dict({"type": "moving", **parameters})
+
+
+def test_shape_cannot_be_in_two_places() -> None:
+    cube = mi.load_dict({"type": "cube"})
+    moving = {"type": "moving", "translate": [1, 0, 0], "cube": cube}
+    for other in (cube, moving):
+        scene = mi.load_dict({"type": "scene", "moving": moving, "other": other}, optimize=False)
+        with pytest.raises(ValueError, match="elsewhere in the scene"):
+            scene_query(scene)
+
+
+def test_instance_needs_its_group() -> None:
+    group = mi.load_dict({"type": "shapegroup", "cube": {"type": "cube"}})
+    instance = {"type": "instance", "group": group}
+    scene = mi.load_dict({
+        "type": "scene", "group": group,
+        "moving": {"type": "moving", "translate": [1, 0, 0], "instance": instance},
+    })  # fmt: skip
+    with pytest.raises(ValueError, match="its shapegroup must be nested too"):
+        scene_query(scene)
+
+
+def test_what_does_not_see_motion_is_refused() -> None:
+    moving = {"type": "moving", "translate": [1, 0, 0], "cube": {"type": "cube"}}
+    scene = mi.load_dict({"type": "scene", "moving": moving, "sensor": sensor(film=film(4, 4))})
+    integrator = mi.load_dict({"type": "composed_path", "aovs": "depth:depth"})
+    with pytest.raises(NotImplementedError, match='"composed_path": the parameter "aovs" does not'):
+        integrator.render(scene, spp=1)
+    with pytest.raises(NotImplementedError, match="X does not see .*: do Y"):
+        refuse_movers(scene, "X", "do Y")
+    refuse_movers(mi.load_dict({"type": "scene"}), "X", "do Y")
