@@ -44,8 +44,12 @@ class ReweightedTime(ReweightedCamera):
          :monosp:`composed_path`. To see :monosp:`moving` shapes, it has to be one of ours.
 
     **Use it when** the noise is that of motion: fast shapes (:monosp:`moving`), long streaks, hard
-    edges. **Not when** it is that of the light on them; other times change nothing about that. With a sensor whose shutter does not stay open (:monosp:`shutter_open`,
-    :monosp:`shutter_close`), the nested integrator goes on alone, and a warning says so.
+    edges. **Not when** it is that of the light on them; other times change nothing about that. With
+    a sensor whose shutter does not stay open (:monosp:`shutter_open`, :monosp:`shutter_close`), the
+    nested integrator goes on alone, and a warning says so.
+
+    A :monosp:`box` filter of the film suits it best. A wider filter gives samples random weights,
+    and these keep part of the noise, however well times are distributed.
 
     Sets have as many times as a pixel has samples, at most 1024 (then there are several for each
     pixel). The weights concern all channels, alpha and AOVs too. Other dimensions of a sample are

@@ -76,7 +76,8 @@ class ReweightedCamera(StagedIntegrator):
         if self._is_staged:
             stages = self.nested.stages(scene, sensor, samples, seed)
         else:
-            refuse_movers(scene, self._name_of_nested(), f'nest "composed_path" in "{self.name}"')
+            nested = f'"{self.name}": an integrator of Mitsuba\'s own, which is nested in it,'
+            refuse_movers(scene, nested, 'nest "composed_path"')
             stages = iter([Stage(_NestedWalk(self.nested, sensor.get_medium()))])
         reason = self.reason_to_do_nothing(sensor)
         if reason is not None:
@@ -122,13 +123,11 @@ class ReweightedCamera(StagedIntegrator):
             )
         return children[0]
 
-    def _name_of_nested(self) -> str:
-        return f'"{self.nested.class_name()}", which is one of Mitsuba\'s own integrators,'
-
     @property
     def _is_staged(self) -> bool:
         """Is the nested integrator one of ours, which can learn in pilots?"""
-        return isinstance(self.nested, StagedIntegrator)
+        # Not by class: once another variant is selected, the module's name is that one's class
+        return hasattr(self.nested, "stages")
 
 
 class _NestedWalk:

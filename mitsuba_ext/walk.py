@@ -168,7 +168,7 @@ class Walk:
                 unoccluded, active_em, shadow_state = self._shadow_roulette(
                     shadow_state, next_event_state, sampler, si, ds, unoccluded, active_em
                 )
-                visible = active_em & ~self.query.occluded(scene, si, ds.p, active_em)
+                visible = active_em & ~self.query.occluded(scene, si, ds, active_em)
                 L[visible] += unoccluded
                 shadow_count += dr.select(active_em, 1, 0)
                 if dr.hint(self.observer is not None, mode="scalar"):

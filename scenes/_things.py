@@ -47,8 +47,7 @@ def tableware() -> dict[str, Mesh]:
 
 
 def prism() -> dict[str, Mesh]:
-    """A prism of 60 degrees around the origin, 0.4 m wide, 0.5 m high; the edge opposite of the base
-    is at +y."""
+    """A prism of 60 degrees around the origin, 0.4 m wide, 0.5 m high; its base faces -y."""
     angles = np.radians([90, 210, 330])
     corners = 0.4 / np.sqrt(3) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     points = np.array([(x, y, z) for z in (-0.25, 0.25) for x, y in corners])

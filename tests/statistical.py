@@ -258,11 +258,16 @@ def compare(a: np.ndarray, b: np.ndarray, tile: int = 8) -> Comparison:
 
 
 def assert_same_mean(
-    a: np.ndarray, b: np.ndarray, precision: float = 0.02, tile: int = 8
+    a: np.ndarray,
+    b: np.ndarray,
+    precision: float = 0.02,
+    tile: int = 8,
+    tolerance: float = 0.0,
 ) -> Comparison:
-    """Fails if the means differ, or are known so badly that the test says nothing."""
-    assert_images_are_sound(a)
-    assert_images_are_sound(b)
+    """Fails if the means differ, or are known so badly that the test says nothing. ``tolerance`` is
+    for colours outside of the gamut."""
+    assert_images_are_sound(a, tolerance)
+    assert_images_are_sound(b, tolerance)
     result = compare(a, b, tile)
     assert np.abs(result.regions).max() < sidak(result.regions.size), str(result)
     assert np.abs(result.tiles).max() < sidak(result.tiles.size), str(result)

@@ -68,6 +68,8 @@ for variant in {LLVM_VARIANTS!r} * 2:
         "i": {{"type": "neepp"}}}})
     image = mi.render(scene, spp=4).numpy()
     assert (image > 0).all(), image
+    nested = mi.load_dict({{"type": "reweighted_lens", "nested": {{"type": "pss_guided"}}}})
+    assert nested.pilots(scene, 256), "it learns, whatever variants there were before"
     kept[variant] = scene  # earlier variants' objects live on
 """)
 

@@ -48,8 +48,8 @@ def test_mean_is_that_of_the_nested_integrator(pattern, weights):
     """With few samples, where weights differ most; over borders that a filter needs."""
     scene = bokeh(film=film(32, 32, rfilter={"type": "gaussian"}, sample_border=True))
     integrator = lens(pattern=pattern, weights=weights)
-    reference = batches(scene, mi.load_dict(PATH), 256, range(1001, 1013))
-    assert_same_mean(batches(scene, integrator, 7, range(1, 49)), reference, 0.03)
+    reference = batches(scene, mi.load_dict(PATH), 256, range(1001, 1025))
+    assert_same_mean(batches(scene, integrator, 7, range(1, 97)), reference, 0.03)
 
 
 @pytest.mark.parametrize("nested", [

@@ -93,7 +93,7 @@ def test_lens_and_time_work_together() -> None:
     }
     assert_same_mean(images["both"], images["path"], 0.03)
     noise = {name: image.var(axis=0).mean() for name, image in images.items()}
-    assert noise["both"] < 0.8 * min(noise["time"], noise["lens"])
+    assert noise["both"] < min(0.5 * noise["lens"], noise["time"])
 
 
 def test_seeds_are_independent_and_repeatable() -> None:
@@ -111,8 +111,8 @@ def test_without_an_open_shutter_the_nested_integrator_goes_on_alone() -> None:
 
 
 def test_integrators_of_mitsuba_are_refused_where_shapes_move() -> None:
-    with pytest.raises(Exception, match="composed_path"):
-        mi.render(streaks(film=film(4, 4)), integrator=timed({"type": "path"}), spp=1)
+    with pytest.raises(NotImplementedError, match="composed_path"):
+        timed({"type": "path"}).render(streaks(film=film(4, 4)), spp=1)
 
 
 def test_a_scene_names_it() -> None:

@@ -80,9 +80,9 @@ class _RecordingQuery(SceneQuery):
         self.recorder.write(mi.UInt32(0 if coherent else 1), ray.o.x, active)
         return super().closest(scene, ray, coherent, active)
 
-    def occluded(self, scene, si, p, active):
-        self.shadow.write(mi.UInt32(0), p.x, active)
-        return super().occluded(scene, si, p, active)
+    def occluded(self, scene, si, ds, active):
+        self.shadow.write(mi.UInt32(0), ds.p.x, active)
+        return super().occluded(scene, si, ds, active)
 
 
 @pytest.fixture

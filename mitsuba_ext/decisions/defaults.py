@@ -116,7 +116,23 @@ class SceneQuery:
         return pi.compute_surface_interaction(ray, mi.RayFlags.All)
 
     def occluded(
-        self, scene: mi.Scene, si: mi.SurfaceInteraction3f, p: mi.Point3f, active: mi.Bool
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        ds: mi.DirectionSample3f,
+        active: mi.Bool,
     ) -> mi.Bool:
-        """Is there anything between ``si`` and the point ``p``?"""
-        return scene.ray_test(si.spawn_ray_to(p), active=active)
+        """Is there anything between ``si`` and the light that ``ds`` is about?"""
+        return scene.ray_test(self.shadow_ray(scene, si, ds), active=active)
+
+    def shadow_ray(
+        self, scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f
+    ) -> mi.Ray3f:
+        """The ray from ``si`` to the light that ``ds`` is about."""
+        ray = si.spawn_ray_to(ds.p)
+        if any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters()):
+            # Mitsuba puts ds.p behind the bounds of the scene, which it knows wrongly where
+            # rectangles were merged (``bounds.py``): its shadow rays may end before a wall
+            is_infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+            ray.maxt = dr.select(is_infinite, dr.largest(mi.Float), ray.maxt)
+        return ray

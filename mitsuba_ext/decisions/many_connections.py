@@ -58,7 +58,7 @@ class ManyConnections(EmitterSampling):
             mis = dr.select(ds.delta, 1, power_heuristic(count * ds.pdf, bsdf_pdf))
             contribution = bsdf_value * em_weight * (mis * weight)
             is_tested = active & (ds.pdf != 0) & (dr.max(dr.abs(contribution)) > 0)
-            total[is_tested & ~query.occluded(scene, si, ds.p, is_tested)] += contribution
+            total[is_tested & ~query.occluded(scene, si, ds, is_tested)] += contribution
             shadow_count += dr.select(is_tested, 1, 0)
             index += 1
             active &= index < self._count

@@ -92,8 +92,8 @@ class MovingSceneQuery(SceneQuery):
         si = super().interaction(pi, ray)
         return dr.if_stmt((owner, si), moves, self._to_world, lambda _owner, si: si)
 
-    def occluded(self, scene, si, p, active):
-        ray = si.spawn_ray_to(p)
+    def occluded(self, scene, si, ds, active):
+        ray = self.shadow_ray(scene, si, ds)
         occluded = scene.ray_test(ray, active=active)
         for index, (at_rest, box) in enumerate(zip(self._scenes, self._boxes)):
             occluded = dr.if_stmt(

@@ -91,8 +91,7 @@ def nearest_neighbour_weights(x: npt.ArrayLike, tests: npt.ArrayLike) -> FloatAr
     x, tests = (checked_points("nearest_neighbour_weights", a, 2) for a in (x, tests))
     x, tests = (a.reshape(len(a), -1) for a in (x, tests))
     if x.shape[1] != tests.shape[1]:
-        raise ValueError(
-            f"nearest_neighbour_weights: points have {x.shape[1]} dimensions, tests {tests.shape[1]}"
-        )
+        shapes = f"{x.shape} and {tests.shape}"
+        raise ValueError(f"nearest_neighbour_weights: points and tests have shapes {shapes}")
     _distance, nearest = cKDTree(x).query(tests)
     return np.bincount(nearest, minlength=len(x)) / len(tests)

@@ -24,8 +24,9 @@ _BORDER = 1e-7
 #: Points that are nearer to each other coincide, by dimension: Qhull could not tell them apart.
 _SPACING = {2: 1e-10, 3: 1e-7}
 
-#: The sum of all cells may be off by so much through rounding.
-_TOLERANCE = 1e-9
+#: The sum of all cells may be off by so much through rounding; and if no image is left out, by so
+#: much where points are close.
+_TOLERANCE, _MOST = 1e-9, 1e-5
 
 
 def voronoi_weights(points: npt.ArrayLike, boundary: str = "torus") -> FloatArray:
@@ -81,14 +82,14 @@ def _places(x: FloatArray, boundary: str) -> tuple[FloatArray, npt.NDArray[np.in
 
 def _measures(x: FloatArray, boundary: str) -> FloatArray:
     """Areas or volumes of the cells of points that do not coincide; they add up to one."""
-    for margin in (3 * len(x) ** (-1 / x.shape[1]), np.inf):
+    for margin, tolerance in ((3 * len(x) ** (-1 / x.shape[1]), _TOLERANCE), (np.inf, _MOST)):
         try:
             measures = _cell_measures(x, _images(x, boundary, margin))
         except QhullError:
             # Points on a line, say, whose images beside it are farther away
             continue
         # Without an image that matters, cells are too large, and so is their sum
-        if abs(measures.sum() - 1) < _TOLERANCE:
+        if abs(measures.sum() - 1) < tolerance:
             return measures / measures.sum()
     raise ValueError("voronoi_weights: no cells that fill the domain; are points very close?")
 
@@ -108,7 +109,8 @@ def _images(x: FloatArray, boundary: str, margin: float) -> FloatArray:
 
 
 def _cell_measures(x: FloatArray, images: FloatArray) -> FloatArray:
-    """Areas or volumes of the cells of ``x`` among ``images``: infinite for those without bounds."""
+    """Areas or volumes of the cells of ``x`` among ``images``: infinite for those without bounds,
+    and 0 for points that Qhull takes for one of their neighbours."""
     count, dimension = x.shape
     diagram = Voronoi(np.concatenate([x, images]))
     pair = diagram.ridge_points
