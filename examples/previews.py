@@ -1,8 +1,10 @@
-"""Renders the pictures of the README: ``.venv/bin/python examples/previews.py`` (25 minutes)."""
+"""Renders the pictures of the README: ``.venv/bin/python examples/previews.py`` (30 minutes)."""
 
 from __future__ import annotations
 
 from pathlib import Path
+
+import click
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 
@@ -20,15 +22,26 @@ PICTURES = {
     "sunny_gloss": 1024,
     "many_lamps": 2048,
     "window": 2048,
+    "defocus": 2048,
+    "fast_balls": 512,
+    "fan": 512,
+    "flint": 1024,
 }
 
+#: These need wavelengths.
+SPECTRAL = {"flint"}
 
-def main() -> None:
-    """Writes ``scenes/previews/NAME.png`` for each picture, 180 pixels high."""
-    mi.set_variant("llvm_ad_rgb")
+
+@click.command()
+@click.argument("names", nargs=-1)
+def main(names: tuple[str, ...]) -> None:
+    """Writes scenes/previews/NAME.png for the scenes NAMES (all, if none is given), 180 pixels
+    high."""
     folder = SCENES / "previews"
     folder.mkdir(exist_ok=True)
-    for name, spp in PICTURES.items():
+    for name in names or PICTURES:
+        mi.set_variant("llvm_ad_spectral" if name in SPECTRAL else "llvm_ad_rgb")
+        spp = PICTURES[name]
         width = 216 if name == "cornell_box" else 320
         scene = mi.load_file(
             str(SCENES / f"{name}.xml"), width=width, height=180, integrator="neepp"
