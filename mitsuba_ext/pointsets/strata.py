@@ -107,10 +107,10 @@ def _within(
     for index, chosen in enumerate(np.split(order, np.cumsum(counts)[:-1])):
         low, high = edges[index : index + 2]
         if len(chosen):
-            local = np.clip((x[chosen] - low) / (high - low), 0, 1)
-            weights[chosen] = (high - low) * weigher(local)
+            weights[chosen] = (high - low) * weigher((x[chosen] - low) / (high - low))
     return weights, counts
 
 
 def _stratum(x: FloatArray, edges: FloatArray) -> npt.NDArray[np.int64]:
-    return np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
+    # 1 belongs to the last one
+    return np.minimum(np.searchsorted(edges, x, side="right") - 1, len(edges) - 2)
