@@ -44,7 +44,8 @@ class ReweightedDirect(WalkIntegrator):
      * - camera_samples
        - |int|
        - Samples per pixel, where :monosp:`render` is not told how many; 0 for as many as the
-         sensor's sampler takes, which are 4 if it does not say either. (Default: 0)
+         sensor's sampler takes, which are 4 if it does not say either. Not where it is nested in
+         another integrator. (Default: 0)
      * - max_depth
        - |int|
        - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 is direct

@@ -17,8 +17,8 @@ class ReweightedLens(ReweightedCamera):
     ---------------------------------------------------
 
     Renders depth of field with the nested integrator, but takes the points of the aperture from
-    well distributed sets, which can be weighed by the cells of the points. Each pixel has a set of
-    its own for all of its samples, moved at random.
+    well distributed sets, which can be weighed by the cells of the points. Each pixel has one set
+    for all of its samples, chosen and moved at random.
 
     .. pluginparameters::
 
@@ -48,10 +48,12 @@ class ReweightedLens(ReweightedCamera):
     that. Without an aperture (a :monosp:`perspective` sensor), the nested integrator goes on
     alone, and a warning says so.
 
-    Sets have as many points as a pixel has samples, at most 1024 (then there are several for each
-    pixel). The weights concern all channels, alpha and AOVs too. Other dimensions of a sample are
-    those of the sensor's sampler. An integrator of ours that is nested learns as it does alone; its
-    own timeout is ignored. Gradients are not supported (use :monosp:`prb`).
+    Sets have as many points as a pixel has samples, at most 1024 (then there are several for
+    each pixel). There are 32 sets (2 of :monosp:`poisson_disk`); with :monosp:`voronoi` weights
+    they are not moved. The weights concern all channels, alpha and AOVs too. Other dimensions
+    of a sample are those of the sensor's sampler. An integrator of ours that is nested learns
+    as it does alone; its own timeout is ignored. Inside of :monosp:`moment`, nothing is
+    reweighted. Gradients are not supported (use :monosp:`prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.3; periodic cells, and that they
     are unbiased, are ours.

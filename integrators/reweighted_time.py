@@ -17,8 +17,8 @@ class ReweightedTime(ReweightedCamera):
     --------------------------------------------
 
     Renders motion blur with the nested integrator, but takes the times of the shutter interval from
-    well distributed sets, which can be weighed by the cells of the times. Each pixel has a set of
-    its own for all of its samples, moved at random.
+    well distributed sets, which can be weighed by the cells of the times. Each pixel has one
+    set for all of its samples, chosen and moved at random.
 
     .. pluginparameters::
 
@@ -51,11 +51,13 @@ class ReweightedTime(ReweightedCamera):
     A :monosp:`box` filter of the film suits it best. A wider filter gives samples random weights,
     and these keep part of the noise, however well times are distributed.
 
-    Sets have as many times as a pixel has samples, at most 1024 (then there are several for each
-    pixel). The weights concern all channels, alpha and AOVs too. Other dimensions of a sample are
-    those of the sensor's sampler, or of a :monosp:`reweighted_lens` or
-    :monosp:`reweighted_wavelength` that is nested. An integrator of ours that is nested learns as
-    it does alone; its own timeout is ignored. Gradients are not supported (use :monosp:`prb`).
+    Sets have as many times as a pixel has samples, at most 1024 (then there are several for
+    each pixel). There are 32 sets (2 of :monosp:`poisson_disk`); with :monosp:`voronoi` weights
+    they are not moved. The weights concern all channels, alpha and AOVs too. Other dimensions
+    of a sample are those of the sensor's sampler, or of a :monosp:`reweighted_lens` or
+    :monosp:`reweighted_wavelength` that is nested. An integrator of ours that is nested learns
+    as it does alone; its own timeout is ignored. Inside of :monosp:`moment`, nothing is
+    reweighted. Gradients are not supported (use :monosp:`prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.1; periodic cells, and that they
     are unbiased, are ours.

@@ -18,7 +18,7 @@ class ReweightedWavelength(ReweightedCamera):
 
     Renders in spectral variants with the nested integrator, but takes the numbers that choose the
     wavelengths from well distributed sets, which can be weighed by the cells of the numbers. Each
-    pixel has a set of its own for all of its samples, moved at random.
+    pixel has one set for all of its samples, chosen and moved at random.
 
     .. pluginparameters::
 
@@ -51,11 +51,15 @@ class ReweightedWavelength(ReweightedCamera):
     A number u chooses four wavelengths, u + k/4. Where all four survive, light repeats itself after
     1/4, and the cells are those of the numbers modulo 1/4; where a path has been refracted by
     dispersive glass, one is left, and the cells are those of the whole circle. Both are used in one
-    image. Sets have as many numbers as a pixel has samples, at most 1024 (then there are several
-    for each pixel). The weights concern all channels, alpha and AOVs too. Other dimensions of a
-    sample are those of the sensor's sampler, or of a :monosp:`reweighted_lens` or
+    image.
+
+    Sets have as many numbers as a pixel has samples, at most 1024 (then there are several for each
+    pixel). There are 32 sets (2 of :monosp:`poisson_disk`); with :monosp:`voronoi` weights they are
+    not moved. The weights concern all channels, alpha and AOVs too. Other dimensions of a sample
+    are those of the sensor's sampler, or of a :monosp:`reweighted_lens` or
     :monosp:`reweighted_time` that is nested. An integrator of ours that is nested learns as it does
-    alone; its own timeout is ignored. Gradients are not supported (use :monosp:`prb`).
+    alone; its own timeout is ignored. Inside of :monosp:`moment`, nothing is reweighted. Gradients
+    are not supported (use :monosp:`prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.2; periodic cells, that they are
     unbiased, and cells modulo 1/4 are ours.

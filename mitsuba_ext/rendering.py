@@ -182,22 +182,29 @@ class _Job:
         # Independent samples can be cut anywhere, and each pass gets a seed of its own. Samples
         # that are stratified over the whole render must come in passes of equal length, to which
         # the pilots are rounded; sets of samples must not begin in the middle of a pass.
-        is_even = self.structured or self.set_size > 1
-        if is_even:
-            if self.structured and len(stages) > 1:
+        if not self.structured:
+            taken = [sum(stages[:index]) for index in range(len(stages))]
+            self.plan = [self._passes(*part, limit) for part in zip(taken, stages)]
+        else:
+            if len(stages) > 1:
                 limit = min(limit, max(*stages[:-1], self.spp // _MIN_STRUCTURED_PASSES))
             length = max(d for d in range(1, limit + 1) if self._can_be_cut(d))
             stages = [length * max(1, s // length) for s in stages[:-1]]
             stages.append(self.spp - sum(stages))
-        if self.structured:
+            self.plan = [[length] * (samples // length) for samples in stages]
             self.sampler.set_samples_per_wavefront(length)
             self.sampler.seed(dr.opaque(mi.UInt32, self.seed), self._lanes(length))
-        self.plan = []
-        for samples in stages:
-            longest = length if is_even else _even_length(samples, limit)
-            passes, rest = divmod(samples, longest)
-            self.plan.append([longest] * passes + ([rest] if rest else []))
         self.pass_index = 0
+
+    def _passes(self, taken: int, samples: int, limit: int) -> list[int]:
+        """The lengths of passes of a stage, none above ``limit``, after ``taken`` samples."""
+        if self.set_size == 1:
+            length, first = _even_length(samples, limit), 0
+        else:
+            length = max(d for d in range(1, limit + 1) if self._can_be_cut(d))
+            first = min(samples, -taken % length)
+        passes, rest = divmod(samples - first, length)
+        return [n for n in (first, *[length] * passes, rest) if n]
 
     def _can_be_cut(self, length: int) -> bool:
         """Into passes of this length?"""

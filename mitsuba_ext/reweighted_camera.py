@@ -48,14 +48,15 @@ class ReweightedCamera(StagedIntegrator):
     accepted_weights = WEIGHTS
 
     def __init__(self, props: mi.Properties) -> None:
+        if "hide_emitters" in props:
+            raise ValueError(
+                f'"{props.plugin_name()}": "hide_emitters" is for the nested integrator to know'
+            )
         super().__init__(props)
         self.set_kind = SetKind(
             self.name, props, self.default_pattern, self.default_weights, self.accepted_weights
         )
         self.nested = self._nested(props)
-        if self._is_staged:
-            # Sets of all purposes must be cut alike
-            self.nested.timeout = self.timeout
 
     def reason_to_do_nothing(self, sensor: mi.Sensor) -> str | None:
         """Why the numbers do not matter, and what to do about it; ``None`` if they do."""
@@ -74,6 +75,8 @@ class ReweightedCamera(StagedIntegrator):
         self, scene: mi.Scene, sensor: mi.Sensor, samples: list[int], seed: int
     ) -> Iterator[Stage]:
         if self._is_staged:
+            # Sets of all purposes must be cut alike
+            self.nested.timeout = self.timeout
             stages = self.nested.stages(scene, sensor, samples, seed)
         else:
             nested = f'"{self.name}": an integrator of Mitsuba\'s own, which is nested in it,'
@@ -114,12 +117,14 @@ class ReweightedCamera(StagedIntegrator):
         if (
             len(children) != 1
             or not isinstance(children[0], mi.SamplingIntegrator)
-            or isinstance(children[0], (mi.CppADIntegrator, type(self)))
+            or isinstance(children[0], mi.CppADIntegrator)
+            or self.purpose in _purposes(children[0])
         ):
             found = ", ".join(child.class_name() for child in children) or "none"
             raise ValueError(
                 f'"{self.name}": exactly one integrator that samples camera rays, such as "path" '
-                f'or "volpath", must be nested in it (none for gradients); found {found}'
+                f'or "volpath", must be nested in it (none for gradients, and none in which a '
+                f'"{self.name}" is nested already); found {found}'
             )
         return children[0]
 
@@ -128,6 +133,13 @@ class ReweightedCamera(StagedIntegrator):
         """Is the nested integrator one of ours, which can learn in pilots?"""
         # Not by class: once another variant is selected, the module's name is that one's class
         return hasattr(self.nested, "stages")
+
+
+def _purposes(integrator: mi.Integrator) -> list[str]:
+    """What an integrator, and those that are nested in it, take from weighted sets."""
+    if not hasattr(integrator, "purpose"):
+        return []
+    return [integrator.purpose, *_purposes(integrator.nested)]
 
 
 class _NestedWalk:

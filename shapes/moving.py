@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_ext import registry
+from mitsuba_ext.bounds import shape_bounds
 from mitsuba_ext.motion import Motion
 from mitsuba_ext.parameters import read_parameter
 
@@ -65,7 +66,8 @@ class Moving(mi.Mesh):
 
     **Use it when** something moves or turns visibly between the sensor's :monosp:`shutter_open` and
     :monosp:`shutter_close`, which must be set: they are both 0 by default, and such a sensor sees
-    the shapes at rest. Before the motion and after it, the shapes rest at its two ends.
+    the shapes where they are at time 0. Before the motion and after it, the shapes rest at its two
+    ends.
     **Not when** light sources or the camera move, or shapes deform: that is not supported.
 
     Only integrators of this package see these shapes. **Mitsuba's own**, such as :monosp:`path` or
@@ -80,8 +82,10 @@ class Moving(mi.Mesh):
 
     A nested shape may be nowhere else in the scene. Emitters, sensors, and meshes with vertex
     attributes cannot be nested; participating media are ignored, as by :monosp:`path`. The scene's
-    bounds include all of the motion. Nested shapes do not show up in :monosp:`mi.traverse`.
-    Textures that depend on the position in the world do not move along.
+    bounds include all of the motion. Nested shapes do not show up in :monosp:`mi.traverse`:
+    what it shows is a placeholder, which keeps their place. Textures that depend on the position in
+    the world do not move along. An instance of a group that holds a :monosp:`merge` of rectangles
+    may be cut off, as Mitsuba 3.9.1 does not know its bounds.
 
     Source: R. L. Cook, T. Porter, L. Carpenter, *Distributed Ray Tracing*, 1984; K. Shoemake,
     *Animating Rotation with Quaternion Curves*, 1985 (slerp).
@@ -178,7 +182,7 @@ class Moving(mi.Mesh):
                 )
 
     def _corners(self) -> np.ndarray:
-        boxes = [child.bbox() for child in self.children if _has_extent(child)]
+        boxes = [shape_bounds(child) for child in self.children if _has_extent(child)]
         return np.array([list(box.corner(i)) for box in boxes for i in range(8)], dtype=np.float64)
 
     def _span(self, low: np.ndarray, high: np.ndarray) -> None:
@@ -281,4 +285,4 @@ class Moving(mi.Mesh):
 
 def _has_extent(shape: mi.Shape) -> bool:
     """Is it anywhere? A shapegroup is only where its instances are."""
-    return shape.class_name() != "ShapeGroupPlugin" and shape.bbox().valid()
+    return shape.class_name() != "ShapeGroupPlugin" and shape_bounds(shape).valid()

@@ -51,7 +51,7 @@ class _Constant:
     def __init__(self, value: float) -> None:
         self.value = value
 
-    def __call__(self, scene, sampler, ray, active, pixel):
+    def __call__(self, scene, sampler, ray, active, pixel, hero_weight):
         zero = dr.zeros(mi.UInt32, dr.width(ray))
         return PathSample(mi.Color3f(self.value), mi.Bool(True), zero, zero, zero)
 

@@ -1,4 +1,5 @@
-"""The decisions that Mitsuba's ``path`` takes. They leave no code of their own in the kernel."""
+"""The decisions that Mitsuba's ``path`` takes. They leave no code of their own in the kernel, but
+for shadow rays to lights at infinity."""
 
 from __future__ import annotations
 
