@@ -14,7 +14,6 @@ from mitsuba_ext import registry
 from mitsuba_ext.batches import Batches, batch_seeds, each_batch, sample_count
 from mitsuba_ext.camera import develop as develop_film
 from mitsuba_ext.camera import find_sensor
-from mitsuba_ext.decisions.moving_scene import refuse_movers
 from mitsuba_ext.parameters import read_parameter
 from mitsuba_ext.rendering import RenderStatistics
 
@@ -150,9 +149,6 @@ class Variance(mi.AdjointIntegrator):
                 f'"{self.name}": does not work with the film "{film.class_name()}": use an '
                 f'"hdrfilm".'
             )
-        if not hasattr(self.nested, "stages"):
-            nested = f'"{self.name}": an integrator of Mitsuba\'s own, which is nested in it,'
-            refuse_movers(scene, nested, 'nest "composed_path"')
         batch_count, batch_spp = self._plan(sensor, spp)
         seeds = batch_seeds(seed, batch_count)
         batches = None

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from .camera import find_sensor
+from .decisions.moving_scene import check_motion_is_seen
 
 
 class Batches:
@@ -104,7 +105,11 @@ def each_batch(
         seeds: Of the batches. All different, and such that the integrator's own use of a seed does
             not make images depend on each other: :func:`batch_seeds`.
         batches: Earlier ones, to go on from.
+
+    Raises:
+        NotImplementedError: Something moves, and the integrator does not see it.
     """
+    check_motion_is_seen(integrator, scene)
     sensor = find_sensor(scene, sensor)
     batch_spp = sample_count(sensor, batch_spp)
     # Whatever AOVs an earlier render left there

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .decisions.camera_samples import PixelSets
-from .decisions.moving_scene import refuse_movers
+from .decisions.moving_scene import check_motion_is_seen
 from .decisions.weighted_sets import WEIGHTS, SetKind
 from .rendering import Stage
 from .staged_integrator import StagedIntegrator
@@ -79,8 +79,7 @@ class ReweightedCamera(StagedIntegrator):
             self.nested.timeout = self.timeout
             stages = self.nested.stages(scene, sensor, samples, seed)
         else:
-            nested = f'"{self.name}": an integrator of Mitsuba\'s own, which is nested in it,'
-            refuse_movers(scene, nested, 'nest "composed_path"')
+            check_motion_is_seen(self.nested, scene)
             stages = iter([Stage(_NestedWalk(self.nested, sensor.get_medium()))])
         reason = self.reason_to_do_nothing(sensor)
         if reason is not None:

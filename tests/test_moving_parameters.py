@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hard_cases import area, diffuse, film, sensor
 
+from mitsuba_ext.compare.timing import timed_render
 from mitsuba_ext.decisions.moving_scene import refuse_movers, scene_query
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -140,6 +141,11 @@ def test_what_does_not_see_motion_is_refused() -> None:
     integrator = mi.load_dict({"type": "composed_path", "aovs": "depth:depth"})
     with pytest.raises(NotImplementedError, match='"composed_path": the parameter "aovs" does not'):
         integrator.render(scene, spp=1)
+    variance = mi.load_dict({"type": "variance", "nested": {"type": "path"}})
+    with pytest.raises(NotImplementedError, match='"PathIntegrator".*: use "composed_path"'):
+        variance.render(scene, spp=4)
+    with pytest.raises(NotImplementedError, match='"PathIntegrator".*: use "composed_path"'):
+        timed_render(mi.load_dict({"type": "path"}), scene, seed=0, spp=1)
     with pytest.raises(NotImplementedError, match="X does not see .*: do Y"):
         refuse_movers(scene, "X", "do Y")
     refuse_movers(mi.load_dict({"type": "scene"}), "X", "do Y")

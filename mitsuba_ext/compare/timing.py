@@ -6,6 +6,7 @@ import time
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..batches import sample_count
+from ..decisions.moving_scene import check_motion_is_seen
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -42,9 +43,15 @@ class Timed(NamedTuple):
 
 
 def timed_render(integrator: mi.Integrator, scene: mi.Scene, seed: int, spp: int) -> Timed:
-    """Renders (``spp`` 0: as many samples as the scene's sampler says) and waits for the image."""
+    """Renders (``spp`` 0: as many samples as the scene's sampler says) and waits for the image.
+
+    Raises:
+        NotImplementedError: Something moves, and the integrator does not see it.
+    """
     import drjit as dr
     import mitsuba as mi
+
+    check_motion_is_seen(integrator, scene)
 
     dr.detail.malloc_clear_statistics()
     # The history costs nothing that could be measured

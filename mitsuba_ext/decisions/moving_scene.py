@@ -48,6 +48,17 @@ def refuse_movers(scene: mi.Scene, what: str, instead: str) -> None:
         )
 
 
+def check_motion_is_seen(integrator: mi.Integrator, scene: mi.Scene) -> None:
+    """
+    Raises:
+        NotImplementedError: Something moves in ``scene``, and the integrator is one of Mitsuba's
+            own, which would render it without that.
+    """
+    if type(integrator).__module__.split(".")[0] == "mitsuba":
+        name = f'"{integrator.class_name()}", an integrator of Mitsuba\'s own,'
+        refuse_movers(scene, name, 'use "composed_path"')
+
+
 class MovingSceneQuery(SceneQuery):
     """Static scene and moving things.
 
