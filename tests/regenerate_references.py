@@ -72,7 +72,7 @@ REGRESSIONS = {
         Regression("pss_guided", "door_ajar", {"pilot_spp": 96, "regions": "tiles", "tile": 8},
                    spp=384),
         Regression("reweighted_direct", "cornell_box", {"light_samples": 16}, spp=32),
-        Regression("reweighted_lens", "defocus", {"nested": "path"}),
+        Regression("reweighted_lens", "defocus", {"nested": "path"}, spp=512),
         Regression("reweighted_time", "fan", {"nested": "composed_path"}),
         Regression("composed_path", "fast_balls"),
         Regression("composed_path", "flint", variant="llvm_ad_spectral"),

@@ -49,7 +49,8 @@ def test_render_agrees_with_its_reference(name: str) -> None:
     regression = REGRESSIONS[name]
     reference = _read(regression)
     images = render(regression, range(_SEED, _SEED + 1))
-    assert_images_are_sound(images)
+    # Colours of single wavelengths are outside of the gamut
+    assert_images_are_sound(images, tolerance=9 if "spectral" in regression.variant else 0)
     mean, variance = reference[..., :3], reference[..., 3:6]
     assert images[0].shape == mean.shape
 
