@@ -190,9 +190,18 @@ def plot(kind: str, gains: dict[str, dict[int, dict[str, float]]]) -> None:
             style = dict(zip(WEIGHTS, ("-", "--", ":", "-.")))[weights]
             panel.loglog(counts, [by_count[n][label] for n in counts], style,
                          c=f"C{PATTERNS.index(pattern)}", label=label)  # fmt: skip
+        for sampler, marker in zip(SAMPLERS[1:], "os^D"):
+            if (label := f"path, {sampler}") in by_count[counts[0]]:
+                panel.loglog(counts, [by_count[n][label] for n in counts], c="k", lw=0.7,
+                             marker=marker, ms=4, label=label)  # fmt: skip
         panel.set(title=name, xlabel="samples", ylabel="gain")
+        panel.set_xticks(counts, [str(n) for n in counts])
+        panel.minorticks_off()
+        low, high = panel.get_ylim()
+        ticks = [t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200) if low < t < high]
+        panel.set_yticks(ticks, [f"{t:g}" for t in ticks])
     handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.tight_layout(rect=(0, 0.25, 1, 1))
+    figure.tight_layout(rect=(0, 0.28, 1, 1))
     figure.legend(handles, labels, loc="lower center", ncols=8 if len(gains) > 2 else 4, fontsize=7)
     figure.savefig(FIGURES / f"reweighted_{kind}.svg")
 
