@@ -67,7 +67,8 @@ class ReweightedDirect(WalkIntegrator):
 
     **Use it when** the noise is that of soft shadows and large lights, and edges, defocus or
     materials do not ask for many camera samples. **Not when** most light is indirect (then more
-    camera samples serve better), or with many lights (use :monosp:`neepp`).
+    camera samples serve better), or with many lights (use :monosp:`neepp`). Compare it with
+    :monosp:`path` and a :monosp:`multijitter` sampler, which is hard to beat.
 
     Each vertex moves its set around the torus at random, so that errors of neighbouring pixels do
     not depend on each other. The BSDF sample of the first vertex, which goes on as the path, has

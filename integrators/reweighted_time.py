@@ -43,10 +43,12 @@ class ReweightedTime(ReweightedCamera):
        - The integrator to render with, exactly one: any that samples camera rays, such as
          :monosp:`composed_path`. To see :monosp:`moving` shapes, it has to be one of ours.
 
-    **Use it when** the noise is that of motion: fast shapes (:monosp:`moving`), long streaks, hard
-    edges. **Not when** it is that of the light on them; other times change nothing about that. With
-    a sensor whose shutter does not stay open (:monosp:`shutter_open`, :monosp:`shutter_close`), the
-    nested integrator goes on alone, and a warning says so.
+    **Use it when** the sensor's sampler is :monosp:`independent` and the noise is that of motion:
+    fast shapes (:monosp:`moving`), long streaks, hard edges. **Not when** it is that of the light
+    on them; other times change nothing about that. A :monosp:`multijitter` sampler distributes
+    times, and all else, as well. With a sensor whose shutter does not stay open
+    (:monosp:`shutter_open`, :monosp:`shutter_close`), the nested integrator goes on alone, and a
+    warning says so.
 
     A :monosp:`box` filter of the film suits it best. A wider filter gives samples random weights,
     and these keep part of the noise, however well times are distributed.

@@ -45,8 +45,8 @@ class ReweightedWavelength(ReweightedCamera):
          (:monosp:`dispersive_dielectric`), it has to be one of ours.
 
     **Use it when** the noise is coloured: dispersive glass, lamps and filters with narrow spectra.
-    **Not when** it is that of light on things. In RGB variants there are no wavelengths: an error
-    says so.
+    **Not when** it is that of light on things, or of reflection and refraction in glass. In RGB
+    variants there are no wavelengths: an error says so.
 
     A number u chooses four wavelengths, u + k/4. Where all four survive, light repeats itself after
     1/4, and the cells are those of the numbers modulo 1/4; where a path has been refracted by
