@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,6 +20,9 @@ import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
+
+# What a shell runs in the background ignores Ctrl-C, and so would all that the tests interrupt
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture
