@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import DEFAULT_VARIANT
-from hard_cases import film, lookat, sensor
-from statistical import batches
+from hard_cases import HARD_CASES, film, lookat, sensor
+from statistical import THRESHOLD, assert_images_are_sound, batches, z_welch
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -121,3 +121,22 @@ def test_a_purpose_is_served_once():
 def test_emitters_are_hidden_by_the_nested_integrator(name):
     with pytest.raises(Exception, match="nested integrator to know"):
         mi.load_dict(nest((name,), hide_emitters=True))
+
+
+@pytest.mark.parametrize("case", [
+    "plain", "scaled_by_1e4", "materials", "closed_box", "film_of_one_pixel", "cropped_film",
+    "one_sample", "max_depth_unlimited", "hidden_environment",
+])  # fmt: skip
+def test_hard_case_has_the_mean_of_path(case):
+    hard = HARD_CASES[case]
+    scene = hard.make()
+    optics = {"aperture_radius": 1e-3, "focus_distance": 1.0, "shutter_close": 0.5}
+    scene["sensor"] = {**scene["sensor"], "type": "thinlens", **optics}
+    scene = mi.load_dict(scene, optimize=False)
+    own = {"type": "composed_path", "max_depth": hard.max_depth, **hard.parameters}
+    integrator = mi.load_dict(nest(("time", "lens"), own, pattern="stratified", weights="torus"))
+    images = batches(scene, integrator, hard.spp, range(1, 7))
+    assert_images_are_sound(images)
+    path = batches(scene, mi.load_dict({**own, "type": "path"}), hard.spp, range(101, 107))
+    means = [x.mean(axis=(1, 2, 3))[:, None] for x in (images, path)]
+    assert abs(z_welch(*means)[0]) < THRESHOLD
