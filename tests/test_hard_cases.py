@@ -91,7 +91,7 @@ def test_hard_case_has_sound_pixels_and_the_mean_of_path(case: str, name: str) -
         path = REFERENCE.make(hard.max_depth, **hard.parameters)
         assert_same_image(images[0], batches(scene, path, hard.spp, seeds)[0])
     else:
-        _assert_same_mean(images.mean(axis=(1, 2, 3)), _means_of_path(case), hard.precision)
+        assert_same_mean_of_case(images.mean(axis=(1, 2, 3)), _means_of_path(case), hard.precision)
 
 
 @pytest.mark.parametrize("name", ["composed_path", "neepp", "pss_guided", "many_connections"])
@@ -116,7 +116,7 @@ def test_no_sky_leaks_through_a_roof(light: dict, name: str) -> None:
     assert image.mean() < 0.01  # the roof ends somewhere
 
 
-def _assert_same_mean(a: np.ndarray, b: np.ndarray, precision: float) -> None:
+def assert_same_mean_of_case(a: np.ndarray, b: np.ndarray, precision: float) -> None:
     z = z_welch(a[:, None], b[:, None])[0]
     assert abs(z) < THRESHOLD, f"mean {a.mean():.6g}, path {b.mean():.6g}: z = {z:.2f}"
     error = math.hypot(a.std(ddof=1), b.std(ddof=1)) / math.sqrt(len(a)) / b.mean()
