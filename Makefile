@@ -1,7 +1,8 @@
 # Needs: Debian or Ubuntu (others: see mitsuba_ext/llvm.py), make, apt, Python >= 3.9 with venv.
 #
 #   make demo    compares our integrator with `path` on two of our scenes, in about three minutes
-#   make test    runs the default tests
+#   make test    runs the default tests, on all cores
+#   make test-slow  runs the long statistics, and what else takes long
 #   make bench   runs the benchmarks on our scenes, and on ../shared/scenes where it exists; writes a
 #                report, and the figures of the README
 #   make lint    checks the code's style
@@ -17,14 +18,21 @@ DEMO_OUT := out/demo
 DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml scenes/rooms.xml path neepp \
         --sweep 4,16,64 --seeds 3 --reference-spp 1024 --out $(DEMO_OUT)
 
-.PHONY: demo test bench lint setup clean
+# A process for each core (memory: 1 GiB each), each with one thread of Dr.Jit; what one has not begun
+# another takes over.
+PYTEST := $(BIN)/python -m pytest -q -n logical --maxprocesses 8 --dist worksteal
+
+.PHONY: demo test test-slow bench lint setup clean
 
 demo: setup
 	$(DEMO)
 	@echo "Open $(DEMO_OUT)/report.html in a browser."
 
 test: setup
-	$(BIN)/python -m pytest -q
+	$(PYTEST)
+
+test-slow: setup
+	$(PYTEST) -m slow
 
 bench: setup
 	$(BIN)/python examples/benchmark.py

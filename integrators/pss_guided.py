@@ -51,6 +51,11 @@ class PSSGuided(WalkIntegrator):
        - Samples per pixel from which is learned, at most a quarter of all. They count towards the
          image. With 0, or where they are fewer than 3, nothing is guided. A sampler that is
          stratified over all samples may need longer pilots. (Default: 32)
+     * - always_guide
+       - |bool|
+       - Guide all :monosp:`bounces`, also where the pilots show that it does not pay? Then
+         images of different seeds, or the frames of an animation, are all made in the same way and
+         by the same kernels. (Default: false)
      * - max_memory
        - |float|
        - Memory for what is recorded and learned, in MiB. Where the pilots need more, they record
@@ -120,6 +125,12 @@ class PSSGuided(WalkIntegrator):
         """What the last render has learned (:class:`~mitsuba_ext.decisions.guided_directions.\
 GuidedDirections`); ``None`` where nothing was guided."""
         return self.guiding.guide
+
+    @property
+    def learner(self):
+        """Who learned in the last render (:class:`~mitsuba_ext.decisions.guide_learner.\
+GuideLearner`), with what it measured; ``None`` where there was no pilot."""
+        return self.guiding.learner
 
     def decisions(self, scene: mi.Scene, seed: int) -> dict[str, Any]:
         if self.nee_first_bounce:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import subprocess
 import sys
@@ -25,6 +26,14 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def share_of_the_cores() -> None:
+    """Several workers share the machine: together they use each core once."""
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    dr.set_thread_count(max(1, cores // workers))
+
+
 @pytest.fixture
 def variant(request: pytest.FixtureRequest) -> Iterator[str]:
     """Selects a variant, ``llvm_ad_rgb`` unless the test is parametrised (``indirect=True``).
@@ -32,12 +41,11 @@ def variant(request: pytest.FixtureRequest) -> Iterator[str]:
     Modules that render name it once: ``pytestmark = pytest.mark.usefixtures("variant")``.
     """
     name = getattr(request, "param", DEFAULT_VARIANT)
+    if mi.variant() not in (None, name):
+        _clean_up()
     mi.set_variant(name)
     mi.set_log_level(mi.LogLevel.Warn)
     yield name
-    if name != DEFAULT_VARIANT:
-        _clean_up()
-        mi.set_variant(DEFAULT_VARIANT)
 
 
 @pytest.fixture(scope="session")

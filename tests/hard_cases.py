@@ -23,19 +23,21 @@ class HardCase:
     Attributes:
         make: Makes the scene's dictionary in the active variant.
         precision: Relative standard error of the mean that the comparison must reach.
-        spp: Samples per pixel of one seed.
+        spp: Samples per pixel of one render.
         parameters: Of the integrators.
         is_black: The image must be zero everywhere.
-        seeds: Renders of each integrator: few, as a failure here is a large deviation.
+        seeds: Renders of the integrator; one where its pixels tell the noise.
+        unit: Edge of the squares of pixels whose errors do not depend on each other.
     """
 
     make: Callable[[], Scene]
     precision: float = 0.02
-    spp: int = 256
+    spp: int = 1024
     max_depth: int = 4
     parameters: dict[str, Any] = field(default_factory=dict)
     is_black: bool = False
-    seeds: int = 6
+    seeds: int = 1
+    unit: int = 1
 
 
 def rgb(*value: float) -> Scene:
@@ -308,7 +310,7 @@ HARD_CASES: dict[str, HardCase] = {
     "radiance_1e-4": HardCase(lambda: stage(radiance=1e-4)),
     "radiance_1e6": HardCase(lambda: stage(radiance=1e6)),
     "lamp_of_radius_1e-4": HardCase(lambda: _small_lamp(1e-4)),
-    "thousand_lights": HardCase(_many_lights, seeds=4),  # seconds to trace
+    "thousand_lights": HardCase(_many_lights),  # seconds to trace
     "no_light": HardCase(lambda: stage(light={}), is_black=True),
     "light_that_nothing_sees": HardCase(_hidden_light, is_black=True),
     "lights_seen_directly_only": HardCase(stage, max_depth=1, precision=0.03),
@@ -338,14 +340,16 @@ HARD_CASES: dict[str, HardCase] = {
     "degenerate_light": HardCase(_degenerate_light),
     "instances": HardCase(_instances),
     "medium": HardCase(_medium),
-    "film_of_one_pixel": HardCase(_film(1, 1), spp=65536, precision=0.03),
-    "film_of_odd_size": HardCase(_film(37, 23, rfilter={"type": "gaussian"})),
+    "film_of_one_pixel": HardCase(_film(1, 1), spp=65536, precision=0.03, seeds=6),
+    "film_of_odd_size": HardCase(
+        _film(37, 23, rfilter={"type": "gaussian"}), spp=256, unit=4
+    ),
     "cropped_film": HardCase(
         _film(31, 29, crop_offset_x=5, crop_offset_y=9, crop_width=13, crop_height=11,
-              rfilter={"type": "gaussian"}, sample_border=True)
+              rfilter={"type": "gaussian"}, sample_border=True), unit=3,
     ),  # fmt: skip
-    "three_samples": HardCase(_film(64, 64), spp=3),
-    "one_sample": HardCase(_film(64, 64), spp=1),
+    "three_samples": HardCase(_film(64, 64), spp=3, seeds=2, precision=0.03),
+    "one_sample": HardCase(_film(64, 64), spp=1, seeds=2, precision=0.05),
     "thousand_samples": HardCase(_film(11, 9), spp=1000),
     "max_depth_0": HardCase(stage, max_depth=0, is_black=True),
     "max_depth_2": HardCase(stage, max_depth=2),

@@ -35,7 +35,7 @@ CHANNELS = ["R", "G", "B", "variance.R", "variance.G", "variance.B", "tile", "im
 
 @dataclass(frozen=True)
 class Regression:
-    """An integrator on a scene that shows what it is for."""
+    """An integrator on a scene that shows what it is for. ``is_slow``: not in ``make test``."""
 
     integrator: str
     scene: str
@@ -43,6 +43,7 @@ class Regression:
     max_depth: int = 6
     spp: int = 128
     variant: str = "llvm_ad_rgb"
+    is_slow: bool = False
 
     @property
     def name(self) -> str:
@@ -63,14 +64,14 @@ REGRESSIONS = {
         Regression("composed_path", "rooms", {"next_event": "linear"}),
         Regression("neepp", "door_ajar"),
         Regression("neepp", "rooms"),
-        Regression("neepp", "rooms", {"light_sampling": "visibility"}, spp=256),
-        Regression("neepp", "many_lamps", spp=384),
+        Regression("neepp", "rooms", {"light_sampling": "visibility"}, spp=256, is_slow=True),
+        Regression("neepp", "many_lamps", spp=384, is_slow=True),
         Regression("neepp", "window"),
         Regression("neepp", "open"),
         # Longer pilots than by default: the film is small
         Regression("pss_guided", "door_ajar", {"pilot_spp": 96}, spp=384),
         Regression("pss_guided", "door_ajar", {"pilot_spp": 96, "regions": "tiles", "tile": 8},
-                   spp=384),
+                   spp=384, is_slow=True),
         Regression("reweighted_direct", "cornell_box", {"light_samples": 16}, spp=32),
         Regression("reweighted_lens", "defocus", {"nested": "path"}, spp=512),
         Regression("reweighted_time", "fan", {"nested": "composed_path"}),

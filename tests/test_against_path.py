@@ -10,121 +10,112 @@ import numpy as np
 import pytest
 from hard_cases import diffuse, film, lookat, sensor, stage
 from statistical import (
-    REFERENCE,
     REFERENCE_SEEDS,
     SEEDS,
-    UNDER_TEST,
-    UNUSUAL,
     assert_same_image,
     assert_same_mean,
+    assert_same_pixels_on_average,
     batches,
     load,
 )
+from techniques import DEFAULTS, FOLLOWERS, REFERENCE, SCENES, TECHNIQUES, pairs
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 WIDTH, HEIGHT = 32, 18
 
-#: Scene, max_depth, samples per pixel, and the relative standard error to be reached. Heavy tails
-#: (a small sun through glass, caustics) are tested with short paths.
-SCENES: dict[str, tuple[str, int, int, float]] = {
-    "cornell_box": ("cornell_box", 6, 256, 0.002),
-    "door_ajar": ("door_ajar", 6, 128, 0.01),
-    "rooms": ("rooms", 4, 128, 0.015),
-    "mirrors_and_glass": ("mirrors_and_glass", 3, 128, 0.015),
-    "sunny_gloss": ("sunny_gloss", 2, 128, 0.012),
-    "window": ("window", 3, 64, 0.012),
+#: The relative standard error of the image mean that z-tests reach, at most: quickly, and over many
+#: seeds. The paper's law is noisy.
+PRECISION = {
+    "cornell_box": (0.004, 0.002),
+    "door_ajar": (0.03, 0.012),
+    "rooms": (0.02, 0.01),
+    "mirrors_and_glass": (0.03, 0.012),
+    "sunny_gloss": (0.02, 0.008),
+    "window": (0.025, 0.012),
 }
 
 
-@functools.cache
-def _images(scene: str, name: str, variant: str) -> np.ndarray:
-    """Of an integrator under test, an unusual one, or ``path``, which has the most seeds: it costs
-    least, and all are compared with it."""
-    file, max_depth, spp, _ = SCENES[scene]
-    seeds = {"path": REFERENCE_SEEDS, **dict.fromkeys(UNUSUAL, SEEDS[:8])}.get(name, SEEDS[:10])
-    integrator = {"path": REFERENCE, **UNDER_TEST, **UNUSUAL}[name].make(max_depth)
-    return batches(load(file, width=WIDTH, height=HEIGHT), integrator, spp, seeds)
-
-
-def _check_mean(scene: str, name: str, variant: str = "llvm_ad_rgb", precision: float = 0) -> None:
-    images = [_images(scene, n, variant) for n in (name, "path")]
-    assert_same_mean(*images, precision=precision or SCENES[scene][3])
+def _scene(name: str) -> mi.Scene:
+    """With a filter that keeps pixels independent of each other."""
+    return load(name, width=WIDTH, height=HEIGHT, rfilter="box")
 
 
 # ---- The mean: other random numbers, other seeds ----
 
 
-#: Those that draw the numbers of ``path`` are compared image by image, which is sharper.
-_MEAN_CASES = [
-    (scene, name)
-    for scene in SCENES
-    for name, under_test in UNDER_TEST.items()
-    if scene == "cornell_box" or not under_test.draws_like_path
-]
+@functools.cache
+def _image_of_path(scene: str, variant: str) -> np.ndarray:
+    max_depth, spp = SCENES[scene]
+    return batches(_scene(scene), REFERENCE.make(max_depth), 2 * spp, REFERENCE_SEEDS[:1])
 
 
-@pytest.mark.parametrize(("scene", "name"), _MEAN_CASES)
-def test_mean_is_that_of_path(scene: str, name: str) -> None:
-    _check_mean(scene, name)
-
-
-#: The paper's law is so noisy that its mean is known well enough in one scene only. Skies are
-#: divided, and their directions rejected, where light sampling is learned.
-_UNUSUAL_CASES = [
-    *(("door_ajar" if "paper" in name else "rooms", name) for name in UNUSUAL),
-    *(("window", name) for name in ("visibility", "grid_64", "rejecting_floor")),
-]
-
-
-@pytest.mark.parametrize(("scene", "name"), _UNUSUAL_CASES)
-def test_mean_is_that_of_path_with_unusual_parameters(scene: str, name: str) -> None:
-    """Grids that are far too coarse and far too fine, the paper's law, rejection without regard to
-    what was learned, lights that are chosen in other ways."""
-    _check_mean(scene, name, precision=0.03)
-
-
-IN_VARIANTS = pytest.mark.parametrize(
-    ("variant", "scene"),
-    [("llvm_ad_mono", "cornell_box"), ("llvm_ad_spectral", "cornell_box")],
-    indirect=["variant"],
-)
+def _check_mean(scene: str, name: str, variant: str = "llvm_ad_rgb", spp: int = 0) -> None:
+    max_depth, default_spp = SCENES[scene]
+    technique, expected = TECHNIQUES[name], _image_of_path(scene, variant)
+    images = batches(_scene(scene), technique.make(max_depth), spp or default_spp, SEEDS[:1])
+    precision = PRECISION[scene][0] * (2 if "law" in technique.parameters else 1)
+    assert_same_pixels_on_average(images, expected, precision)
 
 
 @pytest.mark.parametrize(
-    "name", [name for name, under_test in UNDER_TEST.items() if not under_test.draws_like_path]
+    ("scene", "name"), [case for case in pairs("scenes") if case.values[-1] not in FOLLOWERS]
 )
-@IN_VARIANTS
-def test_mean_is_that_of_path_in_variant(variant: str, scene: str, name: str) -> None:
-    _check_mean(scene, name, variant, precision=0.012)
+def test_mean_is_that_of_path(scene: str, name: str) -> None:
+    """Also with grids that are far too coarse and far too fine, the paper's law, rejection without
+    regard to what was learned, lights that are chosen in other ways."""
+    _check_mean(scene, name)
+
+
+@pytest.mark.parametrize(
+    ("variant", "name"),
+    [case for case in pairs("variants") if case.values[-1] not in FOLLOWERS],
+    indirect=["variant"],
+)
+def test_mean_is_that_of_path_in_variant(variant: str, name: str) -> None:
+    _check_mean("cornell_box", name, variant)
+
+
+@functools.cache
+def _means_of_path(scene: str) -> np.ndarray:
+    max_depth, spp = SCENES[scene]
+    return batches(_scene(scene), REFERENCE.make(max_depth), spp // 2, REFERENCE_SEEDS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("name", DEFAULTS)
+def test_mean_is_that_of_path_over_many_seeds(scene: str, name: str) -> None:
+    max_depth, spp = SCENES[scene]
+    images = batches(_scene(scene), TECHNIQUES[name].make(max_depth), spp // 2, SEEDS)
+    assert_same_mean(images, _means_of_path(scene), PRECISION[scene][1])
 
 
 @pytest.mark.parametrize(
     ("name", "sampler"),
-    [("neepp", "multijitter"), ("neepp", "ldsampler"), ("pss_guided", "multijitter"),
-     ("pss_guided", "stratified"), ("tiles", "ldsampler")],
+    [
+        ("neepp", "multijitter"),
+        ("pss_guided", "stratified"),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("neepp", "ldsampler"), ("pss_guided", "multijitter"), ("tiles", "ldsampler"),
+            )
+        ),
+    ],
 )  # fmt: skip
-def test_structured_samples_over_several_passes_keep_the_mean(
-    name: str, sampler: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_structured_samples_over_several_passes_keep_the_mean(name: str, sampler: str) -> None:
     """Sixteen samples, cut in several passes: each pass gets samples of its own."""
-    from mitsuba_ext import rendering
-
-    monkeypatch.setattr(rendering, "_PASS_SAMPLES", dict.fromkeys(rendering._PASS_SAMPLES, 1024))
-    monkeypatch.setattr(rendering, "_PASS_SPP", 1)
-    integrator = {**UNDER_TEST, **UNUSUAL}[name].make(4)
+    integrator = TECHNIQUES[name].make(4)
+    integrator.samples_per_pass = 4
     scene = mi.load_dict(stage(camera=sensor(sampler=sampler)))
-    images = batches(scene, integrator, 16, SEEDS)
+    images = batches(scene, integrator, 16, SEEDS[:6])
     assert integrator.statistics.passes >= 4
-    scene = mi.load_dict(stage())
-    reference = batches(scene, REFERENCE.make(4), 64, REFERENCE_SEEDS)
-    assert_same_mean(images, reference, precision=0.02)
+    reference = batches(mi.load_dict(stage()), REFERENCE.make(4), 1024, REFERENCE_SEEDS[:1])
+    assert_same_pixels_on_average(images, reference, precision=0.02)
 
 
 # ---- The image: the same random numbers ----
-
-FOLLOWERS = [name for name, under_test in UNDER_TEST.items() if under_test.draws_like_path]
-
 
 def _assert_image_of_path(
     name: str, scene: mi.Scene, spp: int = 16, max_depth: int = 4, **parameters: Any
@@ -132,7 +123,7 @@ def _assert_image_of_path(
     """One pass with the seed of ``path``."""
     image, path = (
         batches(scene, integrator.make(max_depth, **parameters), spp, [5])[0]
-        for integrator in (UNDER_TEST[name], REFERENCE)
+        for integrator in (TECHNIQUES[name], REFERENCE)
     )
     assert path.any(), "a black image proves nothing"
     assert_same_image(image, path)
@@ -142,14 +133,14 @@ def _assert_image_of_path(
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("name", FOLLOWERS)
 def test_image_is_that_of_path(name: str, scene: str) -> None:
-    scene, max_depth, _, _ = SCENES[scene]
+    max_depth, _ = SCENES[scene]
     _assert_image_of_path(name, load(scene, width=WIDTH, height=HEIGHT), max_depth=max_depth)
 
 
-@IN_VARIANTS
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"], indirect=True)
 @pytest.mark.parametrize("name", FOLLOWERS)
-def test_image_is_that_of_path_in_variant(variant: str, scene: str, name: str) -> None:
-    _assert_image_of_path(name, load(scene, width=WIDTH, height=HEIGHT), max_depth=6)
+def test_image_is_that_of_path_in_variant(variant: str, name: str) -> None:
+    _assert_image_of_path(name, load("cornell_box", width=WIDTH, height=HEIGHT), max_depth=6)
 
 
 @pytest.mark.parametrize("name", FOLLOWERS)
@@ -264,9 +255,10 @@ def test_roulette_rejects_shadow_rays_where_most_are_blocked() -> None:
     """Otherwise the tests of its mean would test nothing."""
     scene = load("door_ajar", width=WIDTH, height=HEIGHT)
     rays = {}
-    gamblers = [name for name in UNUSUAL if UNUSUAL[name].parameters.get("rejection")]
+    gamblers = [name for name, technique in TECHNIQUES.items()
+                if technique.parameters.get("rejection")]  # fmt: skip
     for name in ("composed_path", *gamblers):
-        integrator = {**UNDER_TEST, **UNUSUAL}[name].make(6)
+        integrator = TECHNIQUES[name].make(6)
         batches(scene, integrator, 128, [5])
         rays[name] = integrator.statistics.rays["shadow"]
     for name in gamblers:
@@ -283,7 +275,7 @@ def test_output_variables_are_those_of_mitsuba(name: str) -> None:
     scene = mi.load_dict(stage())
     path = {"type": "path", "max_depth": 4}
     aov = mi.load_dict({"type": "aov", "aovs": AOVS, "image": path})
-    own = UNDER_TEST[name].make(4, aovs=AOVS)
+    own = TECHNIQUES[name].make(4, aovs=AOVS)
     images = [batches(scene, integrator, 16, [5])[0] for integrator in (own, aov)]
     assert images[0].shape[-1] == 3 + 1 + 3 + 3
     assert_same_image(*images)
@@ -291,26 +283,26 @@ def test_output_variables_are_those_of_mitsuba(name: str) -> None:
         assert_same_image(*(image[..., channel] for image in images))
 
 
-@pytest.mark.parametrize("name", UNDER_TEST)
+@pytest.mark.parametrize("name", DEFAULTS)
 def test_aov_shows_the_image_of_the_nested_integrator(name: str) -> None:
-    scene, inner = mi.load_dict(stage()), UNDER_TEST[name].make(4)
+    scene, inner = mi.load_dict(stage()), TECHNIQUES[name].make(4)
     aov = mi.load_dict({"type": "aov", "aovs": AOVS, "image": inner})
     images = [batches(scene, integrator, 16, [5])[0] for integrator in (aov, inner)]
     assert_same_image(images[0][..., :3], images[1])
 
 
-@pytest.mark.parametrize("name", UNDER_TEST)
+@pytest.mark.parametrize("name", DEFAULTS)
 def test_moment_sees_single_samples(name: str) -> None:
     """Nothing is learned there, so the image is that of ``path``."""
     scene = mi.load_dict(stage())
     images = [
         batches(scene, mi.load_dict({"type": "moment", "image": inner.make(4)}), 16, [5])[0]
-        for inner in (UNDER_TEST[name], REFERENCE)
+        for inner in (TECHNIQUES[name], REFERENCE)
     ]
     assert images[0].shape[-1] > 3
     assert_same_image(*images)
 
 
 def test_output_variables_have_names() -> None:
-    integrator = UNDER_TEST["composed_path"].make(4, aovs="depth:depth,nn:sh_normal")
+    integrator = TECHNIQUES["composed_path"].make(4, aovs="depth:depth,nn:sh_normal")
     assert integrator.aov_names() == ["depth.T", "nn.X", "nn.Y", "nn.Z"]

@@ -14,7 +14,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from glass_objects import WRAPPERS, wrapped
-from statistical import UNDER_TEST, UNUSUAL, batches, compare, sidak, z_exact, z_welch
+from statistical import batches, compare_pixels, sidak, z_exact, z_welch
+from techniques import TECHNIQUES
 
 from mitsuba_ext.dispersion import DISPERSES, Heroes, disperses
 from mitsuba_ext.glass import GLASSES
@@ -28,9 +29,13 @@ ROUGH = {
 }  # fmt: skip
 GLASS = {"smooth": SMOOTH, "rough": ROUGH}
 #: The same numbers would be no second opinion.
-SEEDS, OTHER_SEEDS = range(1, 13), range(101, 113)
+SEED, OTHER_SEED = 1, 101
 BANDS = np.array([360, 470, 530, 600, 830])
-CASES = [("smooth", None), ("rough", None), *(("rough", wrapper) for wrapper in WRAPPERS)]
+CASES = [
+    ("smooth", None),
+    ("rough", None),
+    *(pytest.param("rough", wrapper, marks=pytest.mark.slow) for wrapper in WRAPPERS),
+]
 
 
 def stage(bsdf: dict[str, Any], connects: bool = True, **others: Any) -> mi.Scene:
@@ -74,16 +79,13 @@ def wavelengths(sampler: mi.Sampler, spread: bool = True) -> tuple[mi.Spectrum, 
     return mi.sample_rgb_spectrum(dr.select(numbers < 1, numbers, numbers - 1))
 
 
-def means(trace, seeds: range, count: int = 1 << 14) -> np.ndarray:
-    """What ``trace(sampler)`` returns, averaged over the paths: [seed, …]."""
-    results = []
-    for seed in seeds:
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed, count)
-        values = [dr.mean(value) for value in trace(sampler)]
-        dr.eval(values)
-        results.append([value[0] for value in values])
-    return np.array(results)
+def means(trace, seed: int, batch_count: int = 12, count: int = 1 << 14) -> np.ndarray:
+    """What ``trace(sampler)`` returns, averaged over the paths of each batch: [batch, …]."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, batch_count * count)
+    values = [mi.Float(value) for value in trace(sampler)]
+    dr.eval(values)
+    return np.stack([v.numpy().reshape(batch_count, -1).mean(axis=1) for v in values], axis=1)
 
 
 def assert_agree(a: np.ndarray, b: np.ndarray, precision: float) -> None:
@@ -115,7 +117,7 @@ def test_one_wavelength_is_that_of_path_with_its_index(variant: str, glass, wrap
     path = mi.load_dict({"type": "path", "max_depth": 8})
     theirs = GLASS[glass]["type"].replace("dispersive_", "")
     constant = stage(wrapped(wrapper, {**GLASS[glass], "type": theirs, "int_ior": index}))
-    assert_agree(means(with_walk, SEEDS), means(with_path, OTHER_SEEDS), precision=0.02)
+    assert_agree(means(with_walk, SEED), means(with_path, OTHER_SEED), precision=0.02)
 
 
 @pytest.mark.parametrize("glass, wrapper", CASES)
@@ -133,7 +135,7 @@ def test_bands_of_wavelengths_have_their_light(variant: str, glass: str, wrapper
 
         return trace
 
-    assert_agree(means(bands(True), SEEDS), means(bands(False), OTHER_SEEDS), precision=0.05)
+    assert_agree(means(bands(True), SEED), means(bands(False), OTHER_SEED), precision=0.05)
 
 
 @pytest.mark.parametrize("glass", GLASS)
@@ -148,11 +150,11 @@ def test_connections_and_scattering_agree(variant: str, glass: str) -> None:
         return [dr.mean(dr.select(λ < 530.0, L, 0)), dr.mean(dr.select(λ < 530.0, 0, L))]
 
     scene = stage(GLASS[glass])
-    both = means(trace, SEEDS)
+    both = means(trace, SEED)
     # Something has to be connected to
     nothing = {"type": "point", "intensity": 1e-9, "position": [0, 0, -9]}
     scene = stage(GLASS[glass], connects=False, nothing=nothing)
-    assert_agree(both, means(trace, OTHER_SEEDS), precision=0.05)
+    assert_agree(both, means(trace, OTHER_SEED), precision=0.05)
 
 
 # ---- Exact answers ----
@@ -187,25 +189,31 @@ WHITE = {
 @pytest.mark.parametrize("name", WHITE)
 def test_white_stays_white_behind_several_pieces_of_glass(variant: str, name: str) -> None:
     """Where the sky is all there is, glass cannot be seen, and has no colour."""
-    images = batches(furnace(WHITE[name]), UNDER_TEST["composed_path"].make(), 256, SEEDS)
+    (image,) = batches(furnace(WHITE[name]), TECHNIQUES["composed_path"].make(), 3072, [SEED])
     # Channels of single wavelengths may be negative: their means, not their signs, are looked at
-    means = images.mean(axis=(1, 2))
-    for channel in means.T:
+    for channel in image.reshape(-1, 3).T:
         z, error = z_exact(channel, 1.0, allowance=1e-3)
-        assert abs(z) < sidak(3) and error < 0.005, (z, error, channel)
+        assert abs(z) < sidak(3) and error < 0.005, (z, error, channel.mean())
 
 
 # ---- Integrators ----
 
 
-@pytest.mark.parametrize("name", ["neepp", "pss_guided", "many_connections"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "neepp",
+        pytest.param("pss_guided", marks=pytest.mark.slow),
+        pytest.param("many_connections", marks=pytest.mark.slow),
+    ],
+)
 def test_techniques_keep_the_mean(variant: str, name: str) -> None:
     turned = mi.ScalarTransform4f().translate([-1.3, -1, 0]).rotate([1, 1, 0], 40).scale(0.4)
     gem = {"type": "cube", "bsdf": SMOOTH, "to_world": turned}
     scene = stage(ROUGH, sensor=sensor(), gem=gem)
-    ours = batches(scene, {**UNDER_TEST, **UNUSUAL}[name].make(8), 64, SEEDS[:8])
-    reference = batches(scene, UNDER_TEST["composed_path"].make(8), 256, range(101, 109))
-    result = compare(ours, reference)
+    ours = batches(scene, TECHNIQUES[name].make(8), 512, [SEED])
+    reference = batches(scene, TECHNIQUES["composed_path"].make(8), 2048, [OTHER_SEED])
+    result = compare_pixels(ours, reference)
     assert np.abs(result.regions).max() < sidak(result.regions.size), str(result)
     assert np.abs(result.tiles).max() < sidak(result.tiles.size), str(result)
     assert result.precision < 0.02, str(result)
@@ -300,8 +308,8 @@ def test_instances_disperse(variant: str) -> None:
         "type": "scene", "group": group, "ball": instance, "sky": {"type": "constant"},
         "sensor": sensor(),
     })  # fmt: skip
-    means = batches(scene, UNDER_TEST["composed_path"].make(), 64, SEEDS).mean(axis=(1, 2))
-    assert abs(z_exact(means[:, 1], 1.0, allowance=1e-3)[0]) < 4
+    (image,) = batches(scene, TECHNIQUES["composed_path"].make(), 768, [SEED])
+    assert abs(z_exact(image[..., 1].ravel(), 1.0, allowance=1e-3)[0]) < 4
 
 
 def test_other_scenes_in_memory_do_no_harm(variant: str) -> None:
@@ -309,7 +317,7 @@ def test_other_scenes_in_memory_do_no_harm(variant: str) -> None:
     glass, other = furnace(SMOOTH), furnace({"type": "diffuse"})
 
     def render(scene: mi.Scene, name: str) -> np.ndarray:
-        return batches(scene, UNDER_TEST[name].make() if name in UNDER_TEST
+        return batches(scene, TECHNIQUES[name].make() if name in TECHNIQUES
                        else mi.load_dict({"type": name}), 4, [1])  # fmt: skip
 
     a, b = render(other, "path"), render(other, "composed_path")

@@ -7,8 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
+
+@pytest.mark.slow
 def test_notebook_runs_at_a_small_size(tmp_path):
     notebook = json.loads((EXAMPLES / "compare.ipynb").read_text(encoding="utf-8"))
     cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from unittest import mock
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import area, diffuse, film, lookat, rectangle, sensor
-from statistical import UnderTest
 
-from mitsuba_ext.decisions import guide_learner, guiding
-from mitsuba_ext.decisions.guide_learner import GuideLearner
+from mitsuba_ext.decisions import DirectionSamples
+from mitsuba_ext.decisions.guide_learner import GuideLearner, most_efficient
 from mitsuba_ext.decisions.guided_directions import GuidedDirections
 from mitsuba_ext.learning.path_records import BYTES_PER_RECORD, PathRecords
 from mitsuba_ext.learning.surface_regions import SurfaceRegions
@@ -46,7 +45,9 @@ def _brought(pixel: mi.UInt32, u: mi.Point2f) -> mi.Float:
     return dr.select(pixel == 0, bright, dr.select(u.y < 0.25, mi.Float(2), 0.6))
 
 
-def _pilot(learner: GuideLearner, seed: int, scatters: bool = True) -> None:
+def _pilot(
+    learner: GuideLearner, seed: int, scatters: bool = True, brought: Callable = _brought
+) -> None:
     """The first of two directions decides nothing."""
     pixel, numbers = _pixels(), _Numbers(seed)
     learner.begin(LANES, pixel)
@@ -59,67 +60,86 @@ def _pilot(learner: GuideLearner, seed: int, scatters: bool = True) -> None:
             _, sample, weight, state = learner.guide.draw(state, numbers, None, depths, active)
         learner.direction(None, mi.UInt32(depth), sample, weight, mi.Color3f(L), active)
         β *= weight
-    L += β * _brought(pixel, sample)
+    L += β * brought(pixel, sample)
     learner.end(mi.Color3f(L))
 
 
-def _learner(**changes) -> GuideLearner:
+def _learner(kind: type[GuideLearner] = GuideLearner, **changes) -> GuideLearner:
     parameters = {"bounces": 2, "max_memory": 1 << 30, "pilot_samples": 3 * LANES, **changes}
-    learner = GuideLearner(lambda p, n: TileRegions(2, 1, 1), False, **parameters)
+    learner = kind(lambda p, n: TileRegions(2, 1, 1), False, **parameters)
     learner.start(None, mi.Point3f(), mi.Normal3f())
     return learner
 
 
+class _Listening(GuideLearner):
+    """Keeps the gains that it found."""
+
+    def gains(self, records: PathRecords) -> dict[float, np.ndarray]:
+        self.found = super().gains(records)
+        return self.found
+
+
 def test_gain_of_each_share_is_that_of_its_density() -> None:
     """Relative errors count; what the pilots before have drawn does not."""
-    learner, found, shares = _learner(), [], iter((0.4, 0.8))
-    drawn_by = 0.6, 0.4
-
-    def best(gains: dict[float, np.ndarray]) -> tuple[float, int, float, float]:
-        found.append(gains)
-        return next(shares), 2, 0.5, 2.0
-
-    with mock.patch.object(guide_learner, "_best", best):
-        _pilot(learner, 1)
-        learner.learn(None, is_last=False)
-        for pilot in range(2):
-            guide, share = learner.guide, drawn_by[pilot]
-            assert guide._trees._share.numpy().max() == pytest.approx(share)
-            _pilot(learner, 2 + pilot)
-            learner.learn(None, is_last=pilot == 1)
-            pixel, u = _pixels(), _Numbers(10).next_2d()
-            state = guide.begin(None, None, pixel)
-            first = guide.draw(state, _Numbers(11), None, mi.UInt32(0), mi.Bool(True))
-            tree = guide._regions.tree(first[3], None, mi.Bool(True))
-            mixed = guide._trees.density(tree, u, mi.Bool(True))[0].numpy()
-            density = (mixed - (1 - share)) / share
-            value = _brought(pixel, u).numpy().reshape(2, -1)
-            mean = value.mean(axis=1, keepdims=True)
-            scale = np.sqrt(mean**2 + 0.01 * value.mean() ** 2)
-            square, variance = (value / scale) ** 2, ((value - mean) / scale) ** 2
-            for other, gains in found[-1].items():
-                saved = square - square / (other * density + 1 - other).reshape(2, -1)
-                expected = saved.sum() / variance.sum()
-                assert gains[0] == pytest.approx(0, abs=0.01), other
-                assert gains[1] == pytest.approx(expected, abs=0.03) and expected > 0.2, other
-    assert learner._records is None, "they are not kept when the last stage begins"
+    learner = _learner(_Listening, always=True)
+    _pilot(learner, 1)
+    learner.learn(None, is_last=False)
+    for pilot in range(2):
+        guide = learner.guide
+        share = guide.trees.share.numpy().max()
+        assert share == pytest.approx(learner.guidance.share if learner.guidance else 0.6)
+        _pilot(learner, 2 + pilot)
+        learner.learn(None, is_last=pilot == 1)
+        pixel, u = _pixels(), _Numbers(10).next_2d()
+        state = guide.begin(None, None, pixel)
+        first = guide.draw(state, _Numbers(11), None, mi.UInt32(0), mi.Bool(True))
+        tree = guide.regions.tree(first[3], None, mi.Bool(True))
+        mixed = guide.trees.density(tree, u, mi.Bool(True))[0].numpy()
+        density = (mixed - (1 - share)) / share
+        value = _brought(pixel, u).numpy().reshape(2, -1)
+        mean = value.mean(axis=1, keepdims=True)
+        scale = np.sqrt(mean**2 + 0.01 * value.mean() ** 2)
+        square, variance = (value / scale) ** 2, ((value - mean) / scale) ** 2
+        for other, gains in learner.found.items():
+            saved = square - square / (other * density + 1 - other).reshape(2, -1)
+            expected = saved.sum() / variance.sum()
+            assert gains[0] == pytest.approx(0, abs=0.01), other
+            assert gains[1] == pytest.approx(expected, abs=0.03) and expected > 0.2, other
 
 
 def test_most_efficient_guide_is_chosen() -> None:
     gains = {0.4: np.array([0.3, 0.2, 0.0]), 0.6: np.array([0.35, 0.01, -0.1])}
-    share, bounces, gain, efficiency = guide_learner._best(gains)
-    assert (share, bounces, gain) == (0.4, 2, pytest.approx(0.5))
-    assert 1.7 < efficiency < 2
-    assert guide_learner._best({0.4: np.array([0.0, -0.1])})[3] < 1
+    guidance = most_efficient(gains)
+    assert guidance[:3] == (0.4, 2, pytest.approx(0.5)) and 1.7 < guidance.efficiency < 2
+    assert most_efficient({0.4: np.array([0.0, -0.1])}).efficiency < 1
+    assert most_efficient(gains, all_bounces=True)[:2] == (0.4, 3)
+
+
+class _Measured(GuideLearner):
+    """Finds other gains than its pilots."""
+
+    gain = 0.0
+
+    def gains(self, records: PathRecords) -> dict[float, np.ndarray]:
+        return {share: np.full(2, self.gain) for share in super().gains(records)}
+
+
+@pytest.mark.parametrize("always", [False, True])
+def test_a_guide_that_does_not_pay_is_given_up_unless_told_otherwise(always: bool) -> None:
+    learner = _learner(_Measured, always=always)
+    for seed in range(2):
+        _pilot(learner, seed)
+        decisions = learner.learn(None, is_last=False)
+    assert (learner.guide is not None) == always
+    assert (type(decisions["directions"]) is DirectionSamples) == (not always)
+    assert learner.guidance.gain == 0 and str(learner).startswith("no guide: ") == (not always)
 
 
 def test_gains_that_are_not_numbers_are_none() -> None:
     """Squares of a path's radiance can overflow."""
     learner = _learner()
-    with mock.patch(f"{__name__}._brought", lambda pixel, u: _at(u, 1e30)):
-        _pilot(learner, 1)
-        learner.learn(None, is_last=False)
-        _pilot(learner, 2)
+    for seed in (1, 2):
+        _pilot(learner, seed, brought=lambda pixel, u: _at(u, 1e30))
         learner.learn(None, is_last=False)
     assert learner.guide is None and str(learner).startswith("no guide: ")
 
@@ -144,14 +164,14 @@ def test_stride_follows_from_the_memory() -> None:
         learner = _learner(max_memory=records * BYTES_PER_RECORD)
         _pilot(learner, 1)
         learner.learn(None, is_last=False)
-        assert f" {2 * -(-LANES // stride)} samples" in str(learner)
+        assert learner.sample_count == 2 * -(-LANES // stride)
 
 
 def test_later_directions_are_not_guided() -> None:
     learner = _learner()
     _pilot(learner, 1)
     learner.learn(None, is_last=True)
-    guide = GuidedDirections(learner.guide._trees, learner.guide._regions, bounces=1)
+    guide = GuidedDirections(learner.guide.trees, learner.guide.regions, bounces=1)
     state, active = guide.begin(None, None, _pixels()), mi.Bool(True)
     state = guide.draw(state, _Numbers(2), None, mi.UInt32(0), active)[3]
     _, sample, weight, after = guide.draw(state, _Numbers(3), None, mi.UInt32(1), active)
@@ -165,15 +185,18 @@ def test_regions_follow_the_film_and_the_pilots() -> None:
     camera = mi.load_dict(
         sensor(film=film(10, 6, rfilter={"type": "gaussian"}, sample_border=True))
     )
+    # Two voxels with the least number of places, and one with less
+    p = np.array([[0.1, 0.9, 0.1], [0.1, 0.9, 0.9], [0.1, 0.9, 0.1]]).repeat([8, 8, 7], axis=1)
+    up = np.tile([[0], [0], [1]], 23)
     made = []
     for regions in ("tiles", "surfaces"):
         tile = {"tile": 4} if regions == "tiles" else {}
         integrator = mi.load_dict({"type": "pss_guided", "regions": regions, **tile})
         (learner,) = integrator.learners(None, camera, 14 * 10 * 8)
         assert learner.wants_scout == (regions == "surfaces")
-        with mock.patch.object(guiding, "SurfaceRegions", lambda p, n, least: least):
-            made.append(learner._make_regions(None, None))
-    assert made[0].count == 4 * 3 and made[1] == 64 / 8
+        made.append(learner.make_regions(mi.Point3f(p), mi.Normal3f(up)))
+    assert made[0].count == 4 * 3
+    assert made[1].count == SurfaceRegions(mi.Point3f(p), mi.Normal3f(up), 64 / 8).count == 9
 
 
 def test_memory_is_bounded_where_no_path_ends() -> None:
@@ -186,10 +209,10 @@ def test_memory_is_bounded_where_no_path_ends() -> None:
         "room": {"type": "cube", "flip_normals": True, "bsdf": diffuse(0.8)},
         "lamp": rectangle(down, bsdf=diffuse(0.0), emitter=area(5.0)),
     })  # fmt: skip
-    guided = UnderTest("pss_guided", {"max_memory": 16.0}, insists=True)
-    integrator = guided.make(8, rr_depth=100, bounces=5)
+    guided = {"type": "pss_guided", "max_memory": 16.0, "max_depth": 8, "rr_depth": 100}
+    integrator = mi.load_dict({**guided, "always_guide": True, "bounces": 5})
     taken = []
-    for each in (guided.make(8, rr_depth=100, pilot_spp=0), integrator):
+    for each in (mi.load_dict({**guided, "pilot_spp": 0}), integrator):
         mi.render(scene, integrator=each, spp=128)
         dr.sync_thread()
         taken.append(each.statistics.memory)

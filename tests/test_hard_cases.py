@@ -10,51 +10,22 @@ import numpy as np
 import pytest
 from hard_cases import HARD_CASES, stage
 from statistical import (
-    REFERENCE,
-    REFERENCE_SEEDS,
     SEEDS,
     THRESHOLD,
-    UNDER_TEST,
-    UNUSUAL,
     assert_images_are_sound,
     assert_same_image,
+    assert_same_pixels_on_average,
     batches,
     z_welch,
 )
+from techniques import DEFAULTS, REFERENCE, TECHNIQUES, pairs
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-BOTH = pytest.mark.parametrize("name", UNDER_TEST)
+EACH_DEFAULT = pytest.mark.parametrize("name", DEFAULTS)
 
-_SEVERAL_LIGHTS = ("delta_lights", "textured_two_sided_lights", "materials", "no_light")
-
-#: Settings that need not see all cases, and those that matter to them. With the default parameters
-#: no shadow ray is rejected: gamble on them too. Films matter to tiles.
-_UNUSUAL_CASES = {
-    "rejecting_floor": (
-        *_SEVERAL_LIGHTS, "plain", "scaled_by_1e-3", "scaled_by_1e4", "moved_by_1e3_sizes",
-        "radiance_1e6", "lamp_of_radius_1e-4", "light_that_nothing_sees", "sun_of_one_texel",
-        "smooth_normal_lamp", "closed_box", "degenerate_light", "one_sample", "max_depth_2",
-    ),
-    "spatial": _SEVERAL_LIGHTS,
-    "linear": ("thousand_lights", *_SEVERAL_LIGHTS),
-    "tiles": (
-        "no_light", "materials", "closed_box", "empty_before_environment", "film_of_one_pixel",
-        "film_of_odd_size", "cropped_film", "three_samples", "thousand_samples",
-        "max_depth_unlimited", "hidden_environment",
-    ),
-    "many_connections": (
-        *_SEVERAL_LIGHTS, "plain", "scaled_by_1e4", "radiance_1e6", "lamp_of_radius_1e-4",
-        "light_that_nothing_sees", "sun_of_one_texel", "closed_box", "empty", "degenerate_light",
-        "constant_environment",
-        "instances", "medium", "film_of_one_pixel", "film_of_odd_size", "cropped_film",
-        "one_sample", "max_depth_0", "max_depth_unlimited", "thin_lens", "hidden_emitters",
-    ),
-}  # fmt: skip
-HARD_PAIRS = [
-    *((case, name) for case in HARD_CASES for name in UNDER_TEST),
-    *((case, name) for name, cases in _UNUSUAL_CASES.items() for case in cases),
-]
+#: Seeds of the references; a film of one pixel has several.
+_REFERENCE_SEEDS = range(1001, 1007)
 
 
 def _scene(case: str) -> mi.Scene:
@@ -64,34 +35,42 @@ def _scene(case: str) -> mi.Scene:
 
 
 @functools.cache
-def _means_of_path(case: str) -> np.ndarray:
+def _images_of_path(case: str) -> np.ndarray:
     hard = HARD_CASES[case]
     path = REFERENCE.make(hard.max_depth, **hard.parameters)
-    images = batches(_scene(case), path, hard.spp, REFERENCE_SEEDS[: hard.seeds])
-    return images.mean(axis=(1, 2, 3))
+    seeds = _REFERENCE_SEEDS if _is_one_pixel(case) else _REFERENCE_SEEDS[:1]
+    return batches(_scene(case), path, max(hard.spp, 1024), seeds)
 
 
-@pytest.mark.parametrize(("case", "name"), HARD_PAIRS)
+def _is_one_pixel(case: str) -> bool:
+    return case == "film_of_one_pixel"
+
+
+@pytest.mark.parametrize(("case", "name"), pairs("cases"))
 def test_hard_case_has_sound_pixels_and_the_mean_of_path(case: str, name: str) -> None:
     """Where the integrator draws the numbers of ``path``: the image of ``path``."""
-    hard, under_test = HARD_CASES[case], {**UNDER_TEST, **UNUSUAL}[name]
-    if not under_test.can_render(hard.max_depth):
-        pytest.skip(f"{name} cannot render max_depth={hard.max_depth}")
-    integrator = under_test.make(hard.max_depth, **hard.parameters)
-    seeds = [SEEDS[0]] if under_test.draws_like_path else SEEDS[: hard.seeds]
+    hard, technique = HARD_CASES[case], TECHNIQUES[name]
+    integrator = technique.make(hard.max_depth, **hard.parameters)
     scene = _scene(case)
-    images = batches(scene, integrator, hard.spp, seeds)
+    if technique.draws_like_path:
+        # The same scene object: Mitsuba loads in parallel, so the order of the lights varies
+        path, spp = REFERENCE.make(hard.max_depth, **hard.parameters), min(hard.spp, 64)
+        images, expected = (batches(scene, i, spp, SEEDS[:1]) for i in (integrator, path))
+        assert_images_are_sound(images)
+        assert images.any() != hard.is_black, "a black image proves nothing"
+        assert_same_image(images[0], expected[0])
+        return
+    images = batches(scene, integrator, hard.spp, SEEDS[: hard.seeds])
     assert_images_are_sound(images)
     if hard.is_black:
         assert not images.any()
-        return
-    assert images.any(), "a black image proves nothing"
-    if under_test.draws_like_path:
-        # The same scene object: Mitsuba loads in parallel, so the order of the lights varies
-        path = REFERENCE.make(hard.max_depth, **hard.parameters)
-        assert_same_image(images[0], batches(scene, path, hard.spp, seeds)[0])
+    elif _is_one_pixel(case):
+        means = (i.mean(axis=(1, 2, 3)) for i in (images, _images_of_path(case)))
+        assert_same_mean_of_case(*means, hard.precision)
     else:
-        assert_same_mean_of_case(images.mean(axis=(1, 2, 3)), _means_of_path(case), hard.precision)
+        assert_same_pixels_on_average(
+            images, _images_of_path(case), hard.precision, unit=hard.unit
+        )
 
 
 @pytest.mark.parametrize("name", ["composed_path", "neepp", "pss_guided", "many_connections"])
@@ -112,7 +91,7 @@ def test_no_sky_leaks_through_a_roof(light: dict, name: str) -> None:
               "film": {"type": "hdrfilm", "width": 8, "height": 8}}  # fmt: skip
     ball = {"type": "sphere", "radius": 0.2, "bsdf": {"type": "conductor"}}
     scene = mi.load_dict({"type": "scene", "sensor": camera, "light": light, "ball": ball, **sides})
-    image = batches(scene, {**UNDER_TEST, **UNUSUAL}[name].make(4), 64, [1])
+    image = batches(scene, TECHNIQUES[name].make(4), 64, [1])
     assert image.mean() < 0.01  # the roof ends somewhere
 
 
@@ -123,55 +102,52 @@ def assert_same_mean_of_case(a: np.ndarray, b: np.ndarray, precision: float) -> 
     assert error <= precision, f"too noisy to say anything: relative standard error {error:.2%}"
 
 
-@BOTH
-@pytest.mark.parametrize("seed", [0, 2**32 - 1])
-def test_extreme_seeds_give_images_of_their_own(name: str, seed: int) -> None:
+@EACH_DEFAULT
+def test_extreme_seeds_give_images_of_their_own(name: str) -> None:
     """The seed as a number and as a Dr.Jit value is the same seed, and no other one's twin."""
-    scene, integrator = _scene("plain"), UNDER_TEST[name].make(4)
-    image, other = batches(scene, integrator, 16, [seed, 1])
-    assert_images_are_sound(image)
-    assert abs(image.mean() / other.mean() - 1) < 0.2
-    assert np.abs(image - other).mean() > 0.01 * image.mean()
-    array = np.array(mi.render(scene, integrator=integrator, seed=mi.UInt32(seed), spp=16))
-    np.testing.assert_allclose(array, image, rtol=1e-5)
+    scene, integrator = _scene("plain"), TECHNIQUES[name].make(4)
+    seeds = [0, 2**32 - 1, 1]
+    images = batches(scene, integrator, 16, seeds)
+    assert_images_are_sound(images)
+    for image, other in zip(images, images[[2, 2, 0]]):
+        assert abs(image.mean() / other.mean() - 1) < 0.2
+        assert np.abs(image - other).mean() > 0.01 * image.mean()
+    for seed, image in zip(seeds[:2], images):
+        array = np.array(mi.render(scene, integrator=integrator, seed=mi.UInt32(seed), spp=16))
+        np.testing.assert_allclose(array, image, rtol=1e-5)
 
 
-@BOTH
-def test_passes_of_one_render_draw_different_numbers(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@EACH_DEFAULT
+def test_passes_of_one_render_draw_different_numbers(name: str) -> None:
     """Sixteen passes of one sample are as exact as one pass of sixteen, not as one sample."""
-    from mitsuba_ext import rendering
-
-    scene, integrator = _scene("plain"), UNDER_TEST[name].make(4)
-    in_one = batches(scene, integrator, 16, SEEDS[:8])
-    limits = dict.fromkeys(rendering._PASS_SAMPLES, 16 * 16)
-    monkeypatch.setattr(rendering, "_PASS_SAMPLES", limits)
-    monkeypatch.setattr(rendering, "_PASS_SPP", 1)
-    in_many = batches(scene, integrator, 16, SEEDS[:8])
+    scene, integrator = _scene("plain"), TECHNIQUES[name].make(4)
+    in_one = batches(scene, integrator, 16, SEEDS[:4])
+    integrator.samples_per_pass = 1
+    in_many = batches(scene, integrator, 16, SEEDS[:4])
     assert integrator.statistics.passes == 16
     noise = [images.std(axis=0, ddof=1).mean() for images in (in_one, in_many)]
     assert 0.8 < noise[1] / noise[0] < 1.25
 
 
-@BOTH
+@EACH_DEFAULT
 def test_same_seed_gives_the_same_image(name: str) -> None:
     scene = _scene("plain")
-    first, second = (batches(scene, UNDER_TEST[name].make(4), 64, [7])[0] for _ in range(2))
+    first, second = (batches(scene, TECHNIQUES[name].make(4), 64, [7])[0] for _ in range(2))
     np.testing.assert_allclose(first, second, rtol=1e-5, atol=1e-5 * first.mean())
 
 
-@BOTH
-@pytest.mark.parametrize("first", ["closed_box", "empty", "constant_environment"])
-def test_nothing_learned_in_one_scene_is_left_in_the_next(name: str, first: str) -> None:
-    used, fresh = UNDER_TEST[name].make(4), UNDER_TEST[name].make(4)
-    batches(_scene(first), used, 16, [1])
+@EACH_DEFAULT
+def test_nothing_learned_in_one_scene_is_left_in_the_next(name: str) -> None:
     scene = _scene("plain")
-    images = [batches(scene, integrator, 16, [2])[0] for integrator in (used, fresh)]
-    np.testing.assert_allclose(*images, rtol=1e-5, atol=1e-5 * images[0].mean())
+    (fresh,) = batches(scene, TECHNIQUES[name].make(4), 16, [2])
+    for first in ("closed_box", "empty", "constant_environment"):
+        used = TECHNIQUES[name].make(4)
+        batches(_scene(first), used, 16, [1])
+        (image,) = batches(scene, used, 16, [2])
+        np.testing.assert_allclose(image, fresh, rtol=1e-5, atol=1e-5 * fresh.mean())
 
 
-@BOTH
+@EACH_DEFAULT
 def test_gradients_are_refused_with_a_hint_at_prb(name: str) -> None:
     import drjit as dr
 
@@ -180,13 +156,13 @@ def test_gradients_are_refused_with_a_hint_at_prb(name: str) -> None:
     key = "light.emitter.radiance.value"
     dr.enable_grad(parameters[key])
     parameters.update()
-    image = mi.render(scene, parameters, integrator=UNDER_TEST[name].make(3), spp=4)
+    image = mi.render(scene, parameters, integrator=TECHNIQUES[name].make(3), spp=4)
     with pytest.raises((NotImplementedError, RuntimeError)) as caught:
         dr.backward(dr.sum(image))
     assert _mentions(caught.value, NotImplementedError, name, "prb")
     with pytest.raises((NotImplementedError, RuntimeError)) as caught:
         dr.forward(parameters[key])
-        dr.forward_to(mi.render(scene, parameters, integrator=UNDER_TEST[name].make(3), spp=4))
+        dr.forward_to(mi.render(scene, parameters, integrator=TECHNIQUES[name].make(3), spp=4))
     assert _mentions(caught.value, NotImplementedError, name, "prb")
 
 
@@ -242,7 +218,7 @@ _WRONG_GUIDING = [
     (ValueError, {"max_memory": 0.0}),
     (ValueError, {"max_memory": math.nan}),
 ]
-WRONG_VALUES = [(name, *wrong) for name in UNDER_TEST for wrong in _WRONG]
+WRONG_VALUES = [(name, *wrong) for name in DEFAULTS for wrong in _WRONG]
 WRONG_VALUES += [("neepp", *wrong) for wrong in _WRONG_REJECTION]
 WRONG_VALUES += [("pss_guided", *wrong) for wrong in _WRONG_GUIDING]
 WRONG_VALUES += [("composed_path", ValueError, {"shadow_test": "sometimes"})]
@@ -255,8 +231,8 @@ def test_wrong_value_is_named_with_its_parameter_and_plugin(
 ) -> None:
     ((parameter, value),) = wrong.items()
     with pytest.raises((TypeError, ValueError, RuntimeError)) as caught:
-        mi.load_dict({"type": UNDER_TEST[name].plugin, **wrong})
-    assert _mentions(caught.value, kind, f'"{UNDER_TEST[name].plugin}"', parameter, repr(value))
+        mi.load_dict({"type": TECHNIQUES[name].plugin, **wrong})
+    assert _mentions(caught.value, kind, f'"{TECHNIQUES[name].plugin}"', parameter, repr(value))
 
 
 @pytest.mark.parametrize(
@@ -275,4 +251,4 @@ def test_unknown_parameter_is_refused(plugin: str, unknown: str) -> None:
 
 def test_missing_sensor_is_named() -> None:
     with pytest.raises(ValueError, match="there is no sensor 1: the scene has 1"):
-        UNDER_TEST["neepp"].make(2).render(_scene("plain"), sensor=1, spp=1)
+        TECHNIQUES["neepp"].make(2).render(_scene("plain"), sensor=1, spp=1)

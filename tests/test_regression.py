@@ -44,7 +44,10 @@ def _z(deviation: np.ndarray, variance: np.ndarray) -> np.ndarray:
     return stats.norm.isf(stats.t.sf(t, SEED_COUNT - 1))
 
 
-@pytest.mark.parametrize("name", REGRESSIONS)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.slow) if regression.is_slow else name
+    for name, regression in REGRESSIONS.items()
+])  # fmt: skip
 def test_render_agrees_with_its_reference(name: str) -> None:
     regression = REGRESSIONS[name]
     reference = _read(regression)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -24,6 +24,22 @@ _FIRST_SHARE, _SHARES = 0.6, (0.4, 0.6, 0.8)
 _COST, _COST_OF_BOUNCE, _LEAST_EFFICIENCY = 0.05, 0.05, 1.02
 
 
+class Guidance(NamedTuple):
+    """How to guide, and what that is worth.
+
+    Attributes:
+        share: The share of the samples that trees decide.
+        bounces: How many directions of a path are guided.
+        gain: By how much the variance is lower, relatively.
+        efficiency: Relative to no guide.
+    """
+
+    share: float
+    bounces: int
+    gain: float
+    efficiency: float
+
+
 class GuideLearner(Learner):
     """Learns trees of primary samples in the pilots. The second pilot draws from the trees of the
     first one, and so shows what they are worth: if too little, learning ends there. The same
@@ -35,9 +51,12 @@ class GuideLearner(Learner):
         bounces: How many directions of a path are guided, at most.
         max_memory: Bytes for what is recorded, and for what is built from it.
         pilot_samples: Samples of all pilots together.
+        always: Guide all ``bounces``, also where the second pilot shows that it does not pay?
 
     Attributes:
         guide (GuidedDirections): What was learned; ``None`` where nothing is guided.
+        guidance (Guidance): The last choice; ``None`` before the second pilot has shown a gain.
+        sample_count (int): How many samples of directions the trees were built from.
     """
 
     def __init__(
@@ -47,19 +66,24 @@ class GuideLearner(Learner):
         bounces: int,
         max_memory: int,
         pilot_samples: int,
+        always: bool = False,
     ) -> None:
-        self._make_regions, self.wants_scout = regions, wants_scout
+        self.make_regions, self.wants_scout = regions, wants_scout
         self.bounces, self.max_memory, self.pilot_samples = bounces, max_memory, pilot_samples
+        self.always = always
         self.guide: GuidedDirections | None = None
+        self.guidance: Guidance | None = None
+        self.sample_count = 0
         self._records: PathRecords | None = None
         self._share, self._summary = _FIRST_SHARE, ""
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
-        self.guide, self._records = None, None
+        self.guide, self.guidance, self._records = None, None, None
+        self.sample_count = 0
         self._summary = "no guide: no path scatters"
         if self.wants_scout and dr.width(p) == 0:
             return {}
-        self._regions = self._make_regions(p, n)
+        self._regions = self.make_regions(p, n)
         most = self.pilot_samples * self.bounces * BYTES_PER_RECORD
         self._records = PathRecords(self._regions.label, self.bounces, -(-most // self.max_memory))
         return {}
@@ -89,11 +113,12 @@ class GuideLearner(Learner):
             self._records, self._summary = None, "no guide: no path scatters"
             return {}
         bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
+        self.sample_count = records.count
         if self.guide is not None and records.count > records.first_new:
-            gains = self._gains(records)
-            share, bounces, gain, efficiency = _best(gains)
+            self.guidance = most_efficient(self.gains(records), all_bounces=self.always)
+            share, bounces, gain, efficiency = self.guidance
             effect = f"about {gain:.0%} less variance"
-            if efficiency < _LEAST_EFFICIENCY:
+            if efficiency < _LEAST_EFFICIENCY and not self.always:
                 self.guide, self._records = None, None
                 self._summary = f"no guide: with {self._regions}, {effect}"
                 return {"directions": DirectionSamples()}
@@ -118,7 +143,7 @@ class GuideLearner(Learner):
             self._records = None
         return {"directions": self.guide}
 
-    def _gains(self, records: PathRecords) -> dict[float, np.ndarray]:
+    def gains(self, records: PathRecords) -> dict[float, np.ndarray]:
         """By how much, relatively, the trees that drew the last samples lower the variance: for
         each share that they could decide, by bounce."""
         new = dr.arange(mi.UInt32, records.count - records.first_new)
@@ -150,14 +175,21 @@ class GuideLearner(Learner):
         return self._summary
 
 
-def _best(gains: dict[float, np.ndarray]) -> tuple[float, int, float, float]:
-    """The most efficient way to guide: the trees' share, how many bounces, by how much their
-    variance is lower, and the efficiency relative to no guide."""
+def most_efficient(
+    gains: Mapping[float, np.ndarray], all_bounces: bool = False
+) -> Guidance:
+    """The most efficient way to guide.
+
+    Parameters:
+        gains: By how much, relatively, the variance is lower: for each share, by bounce.
+        all_bounces: Choose among those that guide all bounces?
+    """
     candidates = []
     for share, by_bounce in gains.items():
         for index, gain in enumerate(np.cumsum(by_bounce)):
+            if all_bounces and index < len(by_bounce) - 1:
+                continue
             cost = 1 + _COST + _COST_OF_BOUNCE * index
             efficiency = 1 / (max(1 - gain, 1e-3) * cost)
-            candidates.append((efficiency, share, index + 1, float(gain)))
-    efficiency, share, bounces, gain = max(candidates)
-    return share, bounces, gain, efficiency
+            candidates.append(Guidance(share, index + 1, float(gain), efficiency))
+    return max(candidates, key=lambda guidance: (guidance.efficiency, guidance[:3]))

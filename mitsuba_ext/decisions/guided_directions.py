@@ -39,24 +39,24 @@ class GuidedDirections(DirectionSamples):
     after a bounce is divided by the density of its sample; MIS weights remain those of uniform
     samples, which is unbiased, as they add up to one in each direction.
 
-    Parameters:
+    Parameters (and attributes):
         trees: Densities of samples.
         regions: Which of them a sample is drawn from.
         bounces: How many directions of a path are guided.
     """
 
     def __init__(self, trees: SampleTrees, regions: Regions, bounces: int) -> None:
-        self._trees, self._regions, self._bounces = trees, regions, bounces
+        self.trees, self.regions, self.bounces = trees, regions, bounces
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
-        return self._regions.begin(pixel)
+        return self.regions.begin(pixel)
 
     def draw(self, state, sampler, si, depth, active):
         sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
         # A branch: later bounces are to cost nothing
         sample_2, weight, state = dr.if_stmt(
             (state, si, sample_2),
-            active & (depth < self._bounces),
+            active & (depth < self.bounces),
             self._guide,
             lambda state, si, sample: (sample, mi.Float(1), state),
         )
@@ -64,9 +64,9 @@ class GuidedDirections(DirectionSamples):
 
     def _guide(self, state, si, sample):
         active = mi.Bool(True)
-        tree = self._regions.tree(state, si, active)
-        sample, density, leaf = self._trees.sample(tree, sample, active)
-        return sample, dr.rcp(density), self._regions.after(state, self._trees, leaf, active)
+        tree = self.regions.tree(state, si, active)
+        sample, density, leaf = self.trees.sample(tree, sample, active)
+        return sample, dr.rcp(density), self.regions.after(state, self.trees, leaf, active)
 
     def density(
         self, si: mi.SurfaceInteraction3f, pixel: mi.UInt32 | None, u: mi.Point2f
@@ -74,8 +74,8 @@ class GuidedDirections(DirectionSamples):
         """The density of ``u`` among the samples that choose the first direction, for paths that
         begin in ``pixel`` of the film (row by row) and meet ``si`` first."""
         active = mi.Bool(True)
-        tree = self._regions.tree(self._regions.begin(pixel), si, active)
-        return self._trees.density(tree, u, active)[0]
+        tree = self.regions.tree(self.regions.begin(pixel), si, active)
+        return self.trees.density(tree, u, active)[0]
 
 
 class LaterConnections(EmitterSampling):

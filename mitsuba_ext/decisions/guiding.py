@@ -36,8 +36,14 @@ class Guiding:
         else:
             self.bounces = get(props, "bounces", 6, minimum=1, maximum=64)
         self.pilot_spp = get(props, "pilot_spp", 32, minimum=0)
+        self.always_guide = get(props, "always_guide", False)
         self.max_memory = get(props, "max_memory", 512.0, minimum=1e-3)
         self._learner: GuideLearner | None = None
+
+    @property
+    def learner(self) -> GuideLearner | None:
+        """Who learned in the last render; ``None`` where there was no pilot."""
+        return self._learner
 
     @property
     def guide(self) -> GuidedDirections | None:
@@ -76,6 +82,7 @@ class Guiding:
             min(self.bounces, max_depth - 1),
             int(self.max_memory * 2**20),
             samples,
+            self.always_guide,
         )
         return [self._learner]
 

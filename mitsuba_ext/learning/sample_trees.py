@@ -74,13 +74,13 @@ class SampleTrees:
                 dr.scatter(self._values, dr.gather(mi.UInt32, value, node), slot)
         # Nothing is read of a tree without a split
         is_leaf = dr.gather(mi.Float, probability, root) < 0
-        self._share = dr.select(is_leaf, 0, share)
-        dr.eval(self._nodes, self._share, self._values)
+        self.share = dr.select(is_leaf, 0, share)
+        dr.eval(self._nodes, self.share, self._values)
 
     @property
     def bytes(self) -> int:
         """Memory that the trees take."""
-        return 4 * (len(self._nodes) + len(self._share) + len(self._values))
+        return 4 * (len(self._nodes) + len(self.share) + len(self._values))
 
     def sample(
         self, tree: mi.UInt32, u: mi.Point2f, active: mi.Bool
@@ -91,7 +91,7 @@ class SampleTrees:
             The sample in [0, 1)², its density, and the number of its leaf. In inactive lanes they
             are ``u``, 1 and the tree's number.
         """
-        share = dr.gather(mi.Float, self._share, tree, active)
+        share = dr.gather(mi.Float, self.share, tree, active)
         by_tree = u.x < share
         # The number that chose between the two densities is as good as new in its part
         x = dr.select(by_tree, u.x / share, (u.x - share) / (1 - share))
@@ -104,7 +104,7 @@ class SampleTrees:
         self, tree: mi.UInt32, u: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Float, mi.UInt32]:
         """The density of a sample, and the number of its leaf."""
-        share = dr.gather(mi.Float, self._share, tree, active)
+        share = dr.gather(mi.Float, self.share, tree, active)
         _point, density, leaf = self._descend(tree, u, mi.Bool(False), active & (share > 0))
         return dr.fma(share, density, 1 - share), leaf
 

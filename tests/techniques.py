@@ -1,0 +1,224 @@
+"""The table of techniques: what must have the mean of ``path``, and which tests are run on it.
+
+A new technique takes one row. ``make test`` runs what ``checks`` names; what only ``thorough``
+names is marked ``slow`` and is run by ``.ci/run`` after that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import mitsuba as mi
+import pytest
+from hard_cases import HARD_CASES
+
+#: The scenes of the z-tests: max_depth, and samples per pixel of a render. Heavy tails (a small sun
+#: through glass, caustics) are tested with short paths.
+SCENES: dict[str, tuple[int, int]] = {
+    "cornell_box": (6, 512),
+    "door_ajar": (6, 512),
+    "rooms": (4, 512),
+    "mirrors_and_glass": (3, 512),
+    "sunny_gloss": (2, 512),
+    "window": (3, 256),
+}
+
+FURNACES = (
+    "furnace_box", "furnace_convex", "furnace_glass", "furnace_isothermal", "furnace_lamps",
+)  # fmt: skip
+
+DEPTHS = (1, 2, 3, 6, -1)
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What is run on a technique.
+
+    Attributes:
+        scenes: Its mean is that of ``path``.
+        variants: In these variants too.
+        furnaces, depths: Furnaces with an exact answer, and at which ``max_depth``.
+        cases: Hard cases.
+    """
+
+    scenes: Iterable[str] = ()
+    variants: Iterable[str] = ()
+    furnaces: Iterable[str] = ()
+    depths: Iterable[int] = ()
+    cases: Iterable[str] = ()
+
+
+@dataclass(frozen=True)
+class Technique:
+    """A way to render.
+
+    Attributes:
+        plugin: The name of the integrator.
+        parameters: Besides ``max_depth``.
+        is_default: Is it a plugin with its default parameters? Then it is also asked for seeds,
+            errors, gradients, AOVs.
+        draws_like_path: At the same seed, does it draw the numbers that ``path`` draws? Images are
+            compared then, which is sharper than means.
+        checks, thorough: What is run on it.
+    """
+
+    plugin: str
+    parameters: dict[str, Any] = field(default_factory=dict)
+    is_default: bool = False
+    draws_like_path: bool = False
+    checks: Checks = Checks()
+    thorough: Checks = Checks()
+
+    def make(self, max_depth: int = -1, **parameters: Any) -> mi.Integrator:
+        """The integrator; it takes the place of the scene's own in ``mi.render``."""
+        return mi.load_dict(
+            {"type": self.plugin, "max_depth": max_depth, **self.parameters, **parameters}
+        )
+
+
+EVERYTHING = Checks(
+    SCENES, ("llvm_ad_mono", "llvm_ad_spectral"), FURNACES, DEPTHS, tuple(HARD_CASES)
+)
+
+#: On what learners have failed: nothing to learn from, one pixel, lights of all kinds and sizes.
+_LEARNERS = (
+    "plain", "scaled_by_1e4", "lamp_of_radius_1e-4", "no_light", "light_that_nothing_sees",
+    "delta_lights", "constant_environment", "sun_of_one_texel", "textured_two_sided_lights",
+    "materials", "closed_box", "empty", "degenerate_light", "instances", "film_of_one_pixel",
+    "cropped_film", "one_sample", "max_depth_0", "max_depth_unlimited", "hidden_environment",
+)  # fmt: skip
+
+_SEVERAL_LIGHTS = ("delta_lights", "textured_two_sided_lights", "materials", "no_light")
+
+# Settings under which more is learned or gambled: unbiased all the same. The films of the tests
+# are so small that the default pilot learns little.
+_TRAINED = {"pilot_spp": 32, "grid": 8}
+_REJECTING = {**_TRAINED, "rejection": True}
+_MAPPED = {**_REJECTING, "light_sampling": "uniform"}
+#: Every connection is tested with the same small probability.
+_FLOOR = {"slope": 0.0, "floor": 0.1}
+
+
+def _neepp(scene: str, cases: Iterable[str] = (), **parameters: Any) -> Technique:
+    return Technique("neepp", parameters, checks=Checks([scene], cases=cases))
+
+
+TECHNIQUES: dict[str, Technique] = {
+    "composed_path": Technique(
+        "composed_path", is_default=True, draws_like_path=True,
+        checks=Checks(SCENES, EVERYTHING.variants, FURNACES, [2, -1], HARD_CASES),
+        thorough=EVERYTHING,
+    ),
+    "neepp": Technique(
+        "neepp", is_default=True,
+        checks=Checks(
+            ["rooms", "window"], ["llvm_ad_spectral"], FURNACES[2:], [3, -1], _LEARNERS
+        ),
+        thorough=EVERYTHING,
+    ),
+    # On films of a few pixels guiding gains little
+    "pss_guided": Technique(
+        "pss_guided", {"always_guide": True}, is_default=True,
+        checks=Checks(
+            ["cornell_box", "door_ajar"], ["llvm_ad_spectral"], FURNACES[3:], [2, -1], _LEARNERS
+        ),
+        thorough=EVERYTHING,
+    ),
+    "tiles": Technique(
+        "pss_guided", {"always_guide": True, "regions": "tiles", "tile": 5},
+        checks=Checks(
+            ["rooms"],
+            cases=(
+                "no_light", "materials", "empty_before_environment", "film_of_one_pixel",
+                "film_of_odd_size", "cropped_film", "three_samples", "max_depth_unlimited",
+            ),
+        ),
+        thorough=Checks(cases=("closed_box", "thousand_samples", "hidden_environment")),
+    ),
+    "many_connections": Technique(
+        "reweighted_direct", {"light_samples": 4},
+        checks=Checks(
+            ["rooms"], furnaces=["furnace_lamps"], depths=[-1],
+            cases=(
+                *_SEVERAL_LIGHTS, "scaled_by_1e4", "lamp_of_radius_1e-4", "sun_of_one_texel",
+                "constant_environment", "empty", "film_of_odd_size", "one_sample", "max_depth_0",
+                "thin_lens",
+            ),
+        ),
+        thorough=Checks(
+            cases=(
+                "plain", "radiance_1e6", "light_that_nothing_sees", "closed_box",
+                "degenerate_light", "instances", "medium", "film_of_one_pixel", "cropped_film",
+                "max_depth_unlimited", "hidden_emitters",
+            )
+        ),
+    ),
+    # Lights by power, by distance, by a loop over all of them; nothing is learned
+    "power": Technique("composed_path", {"next_event": "power"}, checks=Checks(["rooms"])),
+    "spatial": Technique(
+        "composed_path", {"next_event": "spatial"}, checks=Checks(["rooms"], cases=_SEVERAL_LIGHTS)
+    ),
+    "linear": Technique(
+        "composed_path", {"next_event": "linear"},
+        checks=Checks(["rooms"], cases=_SEVERAL_LIGHTS),
+        thorough=Checks(cases=["thousand_lights"]),
+    ),
+    "trained": _neepp("rooms", **_TRAINED),
+    "visibility": _neepp("window", **_TRAINED, light_sampling="visibility"),
+    "grid_64": _neepp("window", pilot_spp=16, grid=64),
+    "grid_1": _neepp("rooms", **{**_TRAINED, "grid": 1}),
+    "rejecting": _neepp("rooms", **_REJECTING),
+    # The paper's law is so noisy that its mean is known well enough in one scene only
+    "rejecting_paper": _neepp("door_ajar", **{**_REJECTING, "law": "paper", "grid": 4}),
+    "rejecting_floor": Technique(
+        "neepp", {**_REJECTING, **_FLOOR},
+        checks=Checks(
+            ["window"], furnaces=["furnace_lamps"], depths=[-1],
+            cases=(*_SEVERAL_LIGHTS, "scaled_by_1e-3", "moved_by_1e3_sizes", "sun_of_one_texel",
+                   "smooth_normal_lamp", "one_sample"),
+        ),
+        thorough=Checks(
+            ["rooms"], furnaces=["furnace_isothermal"], depths=[-1],
+            cases=("plain", "scaled_by_1e4", "radiance_1e6", "lamp_of_radius_1e-4",
+                   "light_that_nothing_sees", "closed_box", "degenerate_light", "max_depth_2"),
+        ),
+    ),
+    # Rejection alone, by the map of pairs of voxels
+    "mapped": _neepp("rooms", **_MAPPED),
+    "mapped_paper": _neepp("door_ajar", **{**_MAPPED, "law": "paper", "grid": 4}),
+    "mapped_floor": Technique(
+        "neepp", {**_MAPPED, **_FLOOR},
+        checks=Checks(["rooms"], furnaces=["furnace_lamps"], depths=[-1]),
+        thorough=Checks(furnaces=["furnace_isothermal"], depths=[-1]),
+    ),
+}  # fmt: skip
+
+#: What they are compared with.
+REFERENCE = Technique("path", draws_like_path=True)
+
+DEFAULTS = [name for name, technique in TECHNIQUES.items() if technique.is_default]
+FOLLOWERS = [name for name, technique in TECHNIQUES.items() if technique.draws_like_path]
+
+
+def pairs(*columns: str) -> list:
+    """Parameters of a test: the values of ``columns`` of :class:`Checks`, and the technique's name.
+    Those that only its ``thorough`` column names are marked ``slow``."""
+    found = []
+    for name, technique in TECHNIQUES.items():
+        quick = _product(technique.checks, columns)
+        found += [pytest.param(*values, name) for values in quick]
+        found += [
+            pytest.param(*values, name, marks=pytest.mark.slow)
+            for values in _product(technique.thorough, columns)
+            if values not in quick
+        ]
+    return found
+
+
+def _product(checks: Checks, columns: tuple[str, ...]) -> list[tuple]:
+    rows: list[tuple] = [()]
+    for column in columns:
+        rows = [(*row, value) for row in rows for value in getattr(checks, column)]
+    return rows
