@@ -135,8 +135,9 @@ class DispersiveRoughDielectric(mi.BSDF):
         if self._samples_visible:
             value *= facets.smith_g1(bs.wo, m)
         else:
-            value *= facets.G(si.wi, bs.wo, m) * dr.dot(si.wi, m)
-            value /= dr.select(active, cos_θ * mi.Frame3f.cos_theta(m), 1)
+            # Mitsuba's weight forgets that the facets are drawn from a rougher distribution
+            value *= facets.eval(m) * facets.G(si.wi, bs.wo, m) * dr.dot(si.wi, m)
+            value /= dr.select(active, cos_θ * pdf, 1)
         return bs, dr.select(active, value, 0)
 
     def eval_pdf(self, ctx, si, wo, active=True):
