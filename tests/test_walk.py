@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 
@@ -216,6 +217,20 @@ def test_what_the_scene_lacks_is_not_in_the_kernel():
     assert none < point < area, "no lights; lights that cannot be hit; lights that can"
     assert area < two_areas, "the choice between lights"
     assert area < environment, "the environment"
+
+
+def test_no_scene_is_freed_while_calls_are_traced(box):
+    """Dr.Jit calls the methods of all living BSDFs. It ends the process if a BSDF in Python dies
+    between two of them, as part of garbage that the collector finds."""
+    found = []
+
+    class Asking(DirectionSamples):
+        def draw(self, *arguments):
+            found.append(gc.isenabled())
+            return super().draw(*arguments)
+
+    _trace(box, directions=Asking())
+    assert found and not any(found) and gc.isenabled()
 
 
 @pytest.mark.usefixtures("variant")
