@@ -9,17 +9,17 @@ selected later. Scenes then name the plugins as they name Mitsuba's own::
     image = mi.render(mi.load_file("scenes/door_ajar.xml", integrator="neepp"))
 """
 
-from . import runtime
+from pathlib import Path
 
-runtime.prepare()  # chooses the LLVM library, so it must come before the first import of drjit
-
-import mitsuba  # noqa: E402
-
-from . import registry  # noqa: E402
-
-runtime.guard(mitsuba)
-registry.install()
+from . import mitsuba_import
 
 __version__ = "0.1.0"
 
 __all__ = ["__version__"]
+
+# The folders of plugins are part of an installed package. In a source tree they are beside it.
+_folder = Path(__file__).parent
+if not (_folder / "integrators").is_dir():
+    __path__.append(str(_folder.parent))
+
+mitsuba_import.prepare()

@@ -18,8 +18,13 @@ import time
 from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from . import llvm, runtime
+from . import __version__, llvm, runtime
+from .processes import python_command
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 #: Seconds after which the remaining plugins are not tried.
 RENDER_BUDGET = 120.0
@@ -45,24 +50,25 @@ def main(variant: str | None = None) -> int:
     ]
     healthy = True
     for title, part in parts:
-        print(title)
+        print(title, flush=True)
         try:
             for line in part():
                 healthy &= not line.startswith("!")
                 print("  " + line, flush=True)
         except Exception as error:  # the report goes on, whatever a part runs into
             healthy = False
-            print(f"  ! {type(error).__name__}: {error}")
+            print(f"  ! {type(error).__name__}: {error}", flush=True)
     print("Everything works." if healthy else "Lines that start with ! need attention.")
     return 0 if healthy else 1
 
 
 def _versions() -> Iterator[str]:
-    for name in ("mitsuba_ext", "mitsuba", "drjit", "numpy", "OpenEXR"):
+    yield f"mitsuba_ext {__version__} ({Path(__file__).parent})"
+    for name in ("mitsuba", "drjit", "numpy", "OpenEXR"):
         try:
             yield f"{name} {metadata.version(name)}"
         except metadata.PackageNotFoundError:
-            yield f"{name}: no package metadata (run from its source folder?)"
+            yield f"{name}: no package metadata (built from source?)"
     yield f"Python {platform.python_version()} ({sys.executable})"
     yield platform.platform()
 
@@ -157,17 +163,17 @@ def _renders(variant: str) -> Iterator[str]:
 
 
 def _line(result: dict) -> str:
-    if "refused" in result:  # e.g. it needs another integrator inside: no failure
-        return f"{result['name']}: not built with default parameters: {result['refused']}"
+    if "refused" in result:  # e.g. it needs a spectral variant: no failure
+        return f"{result['name']}: not tried: {result['refused']}"
     if "error" in result:
         return f"! {result['name']}: {result['error']}"
     mark = "" if result["finite"] else "! not finite: "
-    return f"{mark}{result['name']}: mean {result['mean']:.4f}, {result['seconds']:.2f} s"
+    return f"{mark}{result['label']}: mean {result['mean']:.4f}, {result['seconds']:.2f} s"
 
 
 def _render_elsewhere(variant: str, names: list[str], timeout: float) -> list[dict]:
     """Results for the first one or more of ``names``, in their order."""
-    command = [sys.executable, "-m", "mitsuba_ext.doctor", variant, *names]
+    command = python_command("mitsuba_ext.doctor", variant, *names)
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
         try:
             code = subprocess.run(command, stdout=out, stderr=err, timeout=timeout).returncode
@@ -179,7 +185,7 @@ def _render_elsewhere(variant: str, names: list[str], timeout: float) -> list[di
         lines = [line for line in out.read().splitlines() if line.startswith("{")]
         results = [json.loads(line) for line in lines]
         last_words = err.read().strip().splitlines()[-1:]
-    if code != 0 and len(results) < len(names):
+    if len(results) < len(names):
         error = ": ".join([reason, *last_words])
         results.append({"name": names[len(results)], "error": error})
     return results
@@ -196,13 +202,14 @@ def _render_here(variant: str, names: list[str]) -> None:
     import numpy as np
 
     mi.set_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error)  # "… reweights nothing", and stdout is for the results
     description = mi.cornell_box()
     description["sensor"]["film"].update(width=32, height=32)
     scene = mi.load_dict(description)
     for name in names:
         result: dict = {"name": name}
         try:
-            integrator = mi.load_dict({"type": name})
+            result["label"], integrator = _make(name)
         except Exception as error:
             result["refused"] = str(error).strip().splitlines()[0]
             print(json.dumps(result), flush=True)
@@ -218,6 +225,20 @@ def _render_here(variant: str, names: list[str]) -> None:
         except Exception as error:
             result["error"] = f"{type(error).__name__}: {error}"
         print(json.dumps(result), flush=True)
+
+
+def _make(name: str) -> tuple[str, mi.Integrator]:
+    """The integrator with default parameters, and what to call it. What does not work alone is
+    tried around another one."""
+    import mitsuba as mi
+
+    manager = mi.PluginManager.instance()
+    try:
+        return name, manager.create_object(mi.Properties(name))
+    except Exception:  # a plugin's constructor may raise anything
+        properties = mi.Properties(name)
+        properties["nested"] = manager.create_object(mi.Properties("composed_path"))
+        return f"{name} around composed_path", manager.create_object(properties)
 
 
 if __name__ == "__main__":

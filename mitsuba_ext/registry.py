@@ -15,10 +15,12 @@ import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
-
-import mitsuba as mi
+from typing import TYPE_CHECKING
 
 from . import runtime
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 #: Folder of the plugins → Mitsuba's function that registers them.
 _KINDS: dict[str, str] = {
@@ -38,6 +40,8 @@ _registered: set[str] = set()
 
 def plugin(cls: type) -> type:
     """Class decorator: makes ``cls`` the plugin that its file is named after."""
+    import mitsuba as mi
+
     _, kind, name = cls.__module__.rsplit(".", 2)
     getattr(mi, _KINDS[kind])(name, lambda props: cls(props))
     return cls
@@ -57,16 +61,21 @@ def plugin_files(kind: str) -> list[Path]:
 
 def install() -> None:
     """Registers the plugins now, if a variant is active, and whenever one is selected later."""
+    import mitsuba as mi
+
     mi.detail.add_variant_callback(lambda _old, new: _register(new))
     if mi.variant() is not None:
         _register(mi.variant())
 
 
 def _register(variant: str) -> None:
+    import mitsuba as mi
+
     if variant in _registered:
         return
     if variant in runtime.SUPPORTED_VARIANTS:
         runtime.check(variant)
+        runtime.check_meshes(mi.Mesh)
         for module in (*_BASES, *_plugin_modules()):
             _execute(module)
     else:
@@ -88,6 +97,7 @@ def _execute(module: str) -> None:
 
 def _register_refusals(variant: str) -> None:
     """Where our plugins cannot run, their names exist and say so."""
+    import mitsuba as mi
 
     def refuse(name: str) -> Callable[[mi.Properties], None]:
         def constructor(_props: mi.Properties) -> None:

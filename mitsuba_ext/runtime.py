@@ -1,19 +1,21 @@
 """Refuses what cannot work (Mitsuba's version, the LLVM library) before it fails in a worse way.
 
-``import mitsuba_ext`` calls :func:`prepare` before it imports Mitsuba, and :func:`check` for every
-variant that is selected.
+``mitsuba_import.py`` calls :func:`prepare` before Dr.Jit and Mitsuba are imported, and
+``registry.py`` calls :func:`check` for every variant that is selected.
 """
 
 from __future__ import annotations
 
-import importlib
+import contextlib
 import os
 import re
 import sys
+from collections.abc import Iterator
 from importlib import metadata
 from types import ModuleType
 
 from . import llvm
+from .errors import InstallationError
 
 #: The variants in which the plugins work.
 SUPPORTED_VARIANTS: tuple[str, ...] = (
@@ -38,9 +40,10 @@ def prepare() -> None:
     without any usable library passes: CUDA variants need none, and :func:`check` refuses the rest.
 
     Raises:
-        RuntimeError: Mitsuba's version is not supported, or Dr.Jit lacks a system library.
+        InstallationError: Mitsuba's version is not supported.
     """
-    _check_mitsuba()
+    with contextlib.suppress(metadata.PackageNotFoundError):  # built from source: checked later
+        check_version(metadata.version("mitsuba"))
     if "drjit" in sys.modules:
         return
     if sys.platform != "win32" and not os.environ.get(llvm.VARIABLE):
@@ -49,20 +52,59 @@ def prepare() -> None:
             usable = llvm.usable_library()
             if usable:
                 os.environ[llvm.VARIABLE] = usable.path
-    _import_drjit()
 
 
-def _import_drjit() -> None:
-    """Imports Dr.Jit, as Mitsuba is about to do, for the sake of a better message."""
+@contextlib.contextmanager
+def missing_library_is_named() -> Iterator[None]:
+    """Around the import of Dr.Jit: a better message where a system library is missing.
+
+    Raises:
+        InstallationError: What is missing, and how to get it.
+    """
     try:
-        importlib.import_module("drjit")
+        yield
     except (ImportError, NameError) as error:  # NameError: of its own, on the way to its message
         if llvm.lacks_system_library():
-            raise RuntimeError(
+            raise InstallationError(
                 "Dr.Jit cannot be imported because libatomic.so.1 is missing. To fix this, "
                 f"{llvm.install_command(with_llvm=llvm.usable_library() is None)}."
             ) from error
         raise
+
+
+def check_version(found: str) -> None:
+    """Refuses versions of Mitsuba that the package was not written for.
+
+    Args:
+        found: The version, e.g. ``"3.9.1"``. A pre-release counts as what it precedes.
+
+    Raises:
+        InstallationError: Which versions work, and how to get one.
+    """
+    numbers = tuple(map(int, re.findall(r"\d+", found)[:3]))
+    if not MITSUBA_VERSIONS[0] <= numbers < MITSUBA_VERSIONS[1]:
+        raise _wrong_version(found)
+
+
+def check_meshes(mesh: type) -> None:
+    """Refuses development builds of Mitsuba 3.10, which call themselves 3.9.1.
+
+    Args:
+        mesh: The class ``mi.Mesh`` of the active variant.
+
+    Raises:
+        InstallationError: Which versions work, and how to get one.
+    """
+    if not hasattr(mesh, "vertex_positions_buffer"):
+        raise _wrong_version("a development build of a later one")
+
+
+def _wrong_version(found: str) -> InstallationError:
+    first, end = (".".join(map(str, version)) for version in MITSUBA_VERSIONS)
+    return InstallationError(
+        f"mitsuba_ext works with Mitsuba from {first} up to, not including, {end}, but "
+        f'{found} is installed: run `pip install "mitsuba>={first},<{end}"`.'
+    )
 
 
 def check(variant: str) -> None:
@@ -72,12 +114,12 @@ def check(variant: str) -> None:
         variant: A name such as ``"llvm_ad_rgb"``. Variants that need no LLVM pass.
 
     Raises:
-        RuntimeError: The library found, why it will not do, and how to get one that does.
+        InstallationError: The library found, why it will not do, and how to get one that does.
     """
     if variant.startswith("llvm_"):
         problem = llvm_problem()
         if problem:
-            raise RuntimeError(f"{variant}: {problem}")
+            raise InstallationError(f"{variant}: {problem}")
 
 
 def guard(mitsuba: ModuleType) -> None:
@@ -166,21 +208,3 @@ def _remedy(library: llvm.Library | None, loaded: bool) -> str:
         )
     unset = f" and unset {llvm.VARIABLE}" if set_by_user else ""
     return llvm.install_command() + unset
-
-
-def _check_mitsuba() -> None:
-    first, end = (".".join(map(str, version)) for version in MITSUBA_VERSIONS)
-    wanted = f'pip install "mitsuba>={first},<{end}"'
-    try:
-        found = metadata.version("mitsuba")
-    except metadata.PackageNotFoundError:
-        module = sys.modules.get("mitsuba")  # built from source, and on PYTHONPATH
-        found = getattr(module, "__version__", None)
-        if found is None:
-            return  # `import mitsuba` speaks for itself
-    numbers = tuple(map(int, re.findall(r"\d+", found)[:3]))
-    if not MITSUBA_VERSIONS[0] <= numbers < MITSUBA_VERSIONS[1]:
-        raise RuntimeError(
-            f"mitsuba_ext works with Mitsuba from {first} up to, not including, {end}, but "
-            f"{found} is installed: run `{wanted}`."
-        )

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .content_hash import hash_parsed_scene
+from .errors import InputError
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -25,10 +26,6 @@ SETTINGS = ("max_depth", "rr_depth", "hide_emitters")
 
 #: How Mitsuba's integrators print a depth without limit.
 _UNLIMITED = 2**32 - 1
-
-
-class InputError(ValueError):
-    """Something that the user gave cannot be used. The message is one line: what, and where."""
 
 
 def one_line(error: BaseException | str) -> str:
@@ -77,6 +74,12 @@ def scene_name(source: str | Path | Mapping[str, Any] | None) -> str:
     return generic or path.stem
 
 
+def check_scene_file(path: Path) -> None:
+    """Raises :class:`InputError` where there is no file, before Mitsuba is imported."""
+    if not path.is_file():
+        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such scene'}")
+
+
 def load_scene(
     source: str | Path | Mapping[str, Any],
     size: tuple[int, int] | None = None,
@@ -100,8 +103,8 @@ def load_scene(
 
     is_dict = isinstance(source, Mapping)
     path = None if is_dict else Path(source)
-    if path is not None and not path.is_file():
-        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such scene'}")
+    if path is not None:
+        check_scene_file(path)
     label = "the scene" if is_dict else str(path)
     strings = {key: _as_xml(value) for key, value in (parameters or {}).items()}
     if is_dict and strings:

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any, Union
 from xml.etree import ElementTree
 
 from .content_hash import hash_code
-from .scenes import InputError, one_line
+from .errors import InputError
+from .names import unknown_integrator
+from .scenes import one_line
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -173,8 +175,7 @@ def make_integrator(
         integrator = mi.PluginManager.instance().create_object(properties)
     except Exception as error:  # a plugin's constructor may raise anything
         if "not found!" in str(error) and f'Plugin "{name}"' in str(error):
-            message = f'unknown integrator "{name}"'
-            raise InputError(f"{message} ('mitsuba-ext list' shows ours)") from error
+            raise unknown_integrator(name) from error
         raise InputError(f'integrator "{name}": {one_line(error)}') from error
     if not isinstance(integrator, mi.Integrator):
         raise InputError(f'"{name}" is a plugin of Mitsuba, but not an integrator')

@@ -131,5 +131,5 @@ def run(capsys):
 
 
 def in_subprocess(*arguments, **options) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "mitsuba_ext.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "mitsuba_ext", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)

@@ -234,7 +234,7 @@ def troubled(scene, folder, kind: str, **options) -> subprocess.Popen:
     plugin = folder / "trouble.py"
     plugin.write_text(TROUBLE)
     arguments = ["compare", scene, "path", "trouble", "--spp", "2", "--out", folder / "out"]
-    command = [sys.executable, "-m", "mitsuba_ext.cli", *map(str, arguments), f"--plugin={plugin}"]
+    command = [sys.executable, "-m", "mitsuba_ext", *map(str, arguments), f"--plugin={plugin}"]
     return subprocess.Popen(
         command, env={**os.environ, "TROUBLE": kind}, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, **options,

@@ -395,7 +395,7 @@ def test_bad_input_is_one_line_and_exit_code_2(run, files, monkeypatch, argument
 @pytest.mark.parametrize("name", ["cut.png", "cut.exr", "cut.npz"])
 def test_damaged_file_is_one_line_from_the_process(files, name):
     # In a process of its own: libraries write to the terminal past Python
-    command = [sys.executable, "-m", "mitsuba_ext.cli", "diff", str(files / name), "good.exr"]
+    command = [sys.executable, "-m", "mitsuba_ext", "diff", str(files / name), "good.exr"]
     result = subprocess.run(command, capture_output=True, text=True, cwd=files)
     assert result.returncode == 2
     assert result.stdout == "" and result.stderr.count("\n") == 1

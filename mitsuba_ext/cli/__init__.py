@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import click
 
 from .. import __version__
+from ..errors import InputError, InstallationError
 from .common import INTERRUPTED
 from .compare import compare
 from .diff import diff
@@ -41,8 +42,6 @@ for command in (render, compare, diff, list_plugins, doctor):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command and returns its exit code."""
-    from ..scenes import InputError
-
     try:
         # Called by the shell, and not from Python: the process is ours to divide
         obj = SUPERVISED if arguments is None else None
@@ -56,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             _complain(error.format_message())
         return 2
-    except InputError as error:
+    except (InputError, InstallationError) as error:
         _complain(str(error))
         return 2
     except BrokenPipeError:

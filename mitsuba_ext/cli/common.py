@@ -86,7 +86,8 @@ def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
     """Selects a variant, then imports the modules: their classes bind to it."""
     import mitsuba as mi
 
-    from ..scenes import InputError, one_line
+    from ..errors import InputError
+    from ..scenes import one_line
 
     if variant not in mi.variants():
         raise InputError(f'unknown variant "{variant}" (there are: {", ".join(mi.variants())})')
@@ -94,7 +95,8 @@ def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
         mi.set_variant(variant)
     except (ImportError, RuntimeError) as error:
         raise InputError(f'the variant "{variant}" does not start: {one_line(error)}') from error
-    sys.path.insert(0, "")  # as python -m does: modules beside the user
+    if plugins:
+        sys.path.insert(0, "")  # as python -m does: modules beside the user
     for name in plugins:
         try:
             _import_module(name)

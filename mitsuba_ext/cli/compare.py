@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from ..names import check_integrator
 from . import supervisor
 from .common import (
     INTERRUPTED,
@@ -88,6 +89,14 @@ def compare(
     holds one. All get max_depth and rr_depth of the scene's integrator unless they set their own.
     Ratios are relative to the first integrator.
     """
+    from ..scenes import check_scene_file
+
+    scenes, integrators = _sort_out(names)
+    if not plugins:
+        for specification in (*integrators, reference_integrator):
+            check_integrator(specification)
+    for scene in scenes:
+        check_scene_file(scene)
     from ..compare import Comparison, SceneSetup, budgets, show
 
     given = {
@@ -101,7 +110,6 @@ def compare(
         raise click.UsageError(f"give one of {', '.join(given)}")
     if reference and reference_spp:
         raise click.UsageError("--reference and --reference-spp exclude each other")
-    scenes, integrators = _sort_out(names)
     if worker is not None:
         supervisor.follow_parent()
     elif context.obj == supervisor.SUPERVISED:

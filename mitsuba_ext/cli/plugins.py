@@ -6,6 +6,11 @@ import click
 
 from .common import console_for_tables
 
+_MITSUBA_PLUGINS = "https://mitsuba.readthedocs.io/en/stable/src/plugin_reference.html"
+_MITSUBA_INTEGRATORS = (
+    "https://mitsuba.readthedocs.io/en/stable/src/generated/plugins_integrators.html"
+)
+
 
 @click.command("list", short_help="Show the plugins, or the parameters of one.")
 @click.argument("name", required=False)
@@ -27,8 +32,7 @@ def list_plugins(name: str | None) -> int:
         return 0
     file = next((path for paths in files.values() for path in paths if path.stem == name), None)
     if file is None:
-        known = ", ".join(sorted(path.stem for paths in files.values() for path in paths))
-        raise click.UsageError(f'no plugin "{name}" (there are: {known})')
+        raise _no_page(name, sorted(path.stem for paths in files.values() for path in paths))
     page = pages.read_page(file)
     if page.title:
         console.print(page.title, style="bold", highlight=False, markup=False)
@@ -41,3 +45,19 @@ def list_plugins(name: str | None) -> int:
         console.print(parameters)
     console.print(page.text, highlight=False, markup=False)
     return 0
+
+
+def _no_page(name: str, ours: list[str]) -> click.UsageError:
+    from .. import names
+
+    if name in names.MITSUBA_INTEGRATORS:
+        return click.UsageError(
+            f'"{name}" is an integrator of Mitsuba\'s own: its page is in {_MITSUBA_INTEGRATORS}, '
+            f"and 'mitsuba-ext render --integrator {name}' uses it"
+        )
+    if names.is_file_of_mitsuba(name):
+        return click.UsageError(
+            f'"{name}" is a plugin of Mitsuba\'s own: its page is in {_MITSUBA_PLUGINS}'
+        )
+    hint = names.did_you_mean(name, [*ours, *names.MITSUBA_INTEGRATORS])
+    return click.UsageError(f'no plugin "{name}"{hint} (there are: {", ".join(ours)})')

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from ..names import check_integrator
 from .common import INTERRUPTED, MAX_SEED, progress_bars, scene_options, select_variant
 
 
@@ -50,9 +51,13 @@ def render(
     variant: str,
 ) -> int:
     """Render SCENE (an XML file) to an image."""
+    if specification and not plugins:
+        check_integrator(specification)
+    from ..scenes import InputError, check_scene_file, load_scene, one_line
+
+    check_scene_file(scene)
     from ..batches import sample_count
     from ..compare import images, machine, timing
-    from ..scenes import InputError, load_scene, one_line
     from ..specifications import make_named
 
     if spp is not None and seconds is not None:

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import click
 
+from ..processes import python_command
 from .common import INTERRUPTED
 
 #: What the context's ``obj`` is in a process that was started from a shell.
@@ -68,7 +69,7 @@ def _work(arguments: Sequence[str], job: str) -> int | None:
     """Runs a worker; ``None`` if a second Ctrl-C killed it."""
     from ..compare import runs
 
-    command = [sys.executable, "-m", "mitsuba_ext.cli", *arguments, f"--worker={job}"]
+    command = python_command("mitsuba_ext", *arguments, f"--worker={job}")
     # In a session of its own, it gets signals from here alone: each of them once
     worker = subprocess.Popen(
         command, start_new_session=True, env={**os.environ, runs.SESSION_VARIABLE: runs.SESSION}

@@ -1,0 +1,86 @@
+"""What happens around the import of Dr.Jit and Mitsuba, whoever imports them.
+
+Before Dr.Jit is imported, an LLVM library that works is chosen; after Mitsuba is imported, the
+plugins are registered. ``import mitsuba_ext`` itself imports neither, because that takes most of a
+second: commands that only print, such as ``mitsuba-ext list``, do not need them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+from . import runtime
+
+
+def prepare() -> None:
+    """Registers the plugins if Mitsuba is imported already, else as soon as it is.
+
+    Raises:
+        InstallationError: Mitsuba is imported, and its version is not supported.
+    """
+    if "mitsuba" in sys.modules:
+        runtime.prepare()
+        _register()
+    else:
+        sys.meta_path.insert(0, _Finder())
+
+
+def _register() -> None:
+    from . import registry
+
+    mitsuba = sys.modules["mitsuba"]  # which is not the module that was executed
+    runtime.check_version(mitsuba.__version__)
+    runtime.guard(mitsuba)
+    registry.install()
+
+
+@contextlib.contextmanager
+def _around_drjit() -> Iterator[None]:
+    runtime.prepare()
+    with runtime.missing_library_is_named():
+        yield
+
+
+@contextlib.contextmanager
+def _around_mitsuba() -> Iterator[None]:
+    runtime.prepare()
+    yield
+    _register()
+
+
+class _Finder:
+    """Finds Dr.Jit and Mitsuba as the other finders of ``sys.meta_path`` do, and adds to what
+    happens when they are executed."""
+
+    _AROUND: dict[str, Callable[[], AbstractContextManager[None]]] = {
+        "drjit": _around_drjit,
+        "mitsuba": _around_mitsuba,
+    }
+
+    def __init__(self) -> None:
+        self._searching: set[str] = set()
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        if name not in self._AROUND or name in self._searching:
+            return None
+        self._searching.add(name)
+        try:
+            spec = importlib.util.find_spec(name)  # asks this finder too
+        finally:
+            self._searching.remove(name)
+        if spec is None or spec.loader is None:
+            return spec
+        execute, around = spec.loader.exec_module, self._AROUND[name]
+
+        def exec_module(module: ModuleType) -> None:
+            with around():
+                execute(module)
+
+        spec.loader.exec_module = exec_module  # type: ignore[method-assign]
+        return spec
