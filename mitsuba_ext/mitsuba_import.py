@@ -25,7 +25,6 @@ def prepare() -> None:
         InstallationError: Mitsuba is imported, and its version is not supported.
     """
     if "mitsuba" in sys.modules:
-        runtime.prepare()
         _register()
     else:
         sys.meta_path.insert(0, _Finder())
@@ -42,14 +41,15 @@ def _register() -> None:
 
 @contextlib.contextmanager
 def _around_drjit() -> Iterator[None]:
-    runtime.prepare()
+    runtime.check_installed_version()
+    runtime.choose_llvm()
     with runtime.missing_library_is_named():
         yield
 
 
 @contextlib.contextmanager
 def _around_mitsuba() -> Iterator[None]:
-    runtime.prepare()
+    runtime.check_installed_version()
     yield
     _register()
 

@@ -1,7 +1,7 @@
 """Refuses what cannot work (Mitsuba's version, the LLVM library) before it fails in a worse way.
 
-``mitsuba_import.py`` calls :func:`prepare` before Dr.Jit and Mitsuba are imported, and
-``registry.py`` calls :func:`check` for every variant that is selected.
+``mitsuba_import.py`` calls the functions that come before and after the import of Dr.Jit and
+Mitsuba, ``registry.py`` those for every variant that is selected.
 """
 
 from __future__ import annotations
@@ -32,20 +32,13 @@ SUPPORTED_VARIANTS: tuple[str, ...] = (
 MITSUBA_VERSIONS = ((3, 9, 1), (3, 10))
 
 
-def prepare() -> None:
-    """Checks Mitsuba's version and chooses an LLVM library that works.
+def choose_llvm() -> None:
+    """Chooses an LLVM library that works, before Dr.Jit is imported.
 
-    The choice is a value for ``DRJIT_LIBLLVM_PATH``, made only where the user has not set it,
-    Dr.Jit is not imported yet, and what Dr.Jit would take by itself does not work. A machine
-    without any usable library passes: CUDA variants need none, and :func:`check` refuses the rest.
-
-    Raises:
-        InstallationError: Mitsuba's version is not supported.
+    The choice is a value for ``DRJIT_LIBLLVM_PATH``, made only where the user has not set it and
+    what Dr.Jit would take by itself does not work. A machine without any usable library passes:
+    CUDA variants need none, and :func:`check` refuses the rest.
     """
-    with contextlib.suppress(metadata.PackageNotFoundError):  # built from source: checked later
-        check_version(metadata.version("mitsuba"))
-    if "drjit" in sys.modules:
-        return
     if sys.platform != "win32" and not os.environ.get(llvm.VARIABLE):
         default = llvm.default_library()
         if default is None or llvm.fault(default):
@@ -70,6 +63,12 @@ def missing_library_is_named() -> Iterator[None]:
                 f"{llvm.install_command(with_llvm=llvm.usable_library() is None)}."
             ) from error
         raise
+
+
+def check_installed_version() -> None:
+    """Calls :func:`check_version`, where Mitsuba is an installed package."""
+    with contextlib.suppress(metadata.PackageNotFoundError):  # built from source, or not there
+        check_version(metadata.version("mitsuba"))
 
 
 def check_version(found: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from pathlib import Path
 import pytest
 
 from mitsuba_ext import llvm, runtime
+from mitsuba_ext.errors import InstallationError
 
 ROOT = Path(__file__).parents[1]
 
@@ -202,13 +204,10 @@ def test_remedy_is_a_package_where_no_usable_library_exists(
 
 
 def test_missing_system_library_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(_name: str) -> None:
-        raise NameError("name '_drjit_ext' is not defined")  # what Dr.Jit 1.5 raises
-
-    monkeypatch.setattr(runtime.importlib, "import_module", fails)
     monkeypatch.setattr(llvm, "lacks_system_library", lambda: True)
-    with pytest.raises(RuntimeError, match=r"libatomic\.so\.1 is missing.*libatomic"):
-        runtime._import_drjit()
+    with pytest.raises(InstallationError, match=r"libatomic\.so\.1 is missing.*libatomic"):
+        with runtime.missing_library_is_named():
+            raise NameError("name '_drjit_ext' is not defined")  # what Dr.Jit 1.5 raises
 
 
 def test_probe_that_cannot_import_drjit_says_nothing_about_the_library(
@@ -235,18 +234,43 @@ def test_ensure_without_a_usable_library_is_one_sentence(fake: Path) -> None:
     assert str(fake) in process.stderr
 
 
-@pytest.mark.parametrize("version", ["3.8.0", "3.9.0", "3.10.0", "4.0.1"])
+@pytest.mark.parametrize(
+    "version", ["3.8.0", "3.9.0", "3.10.0", "3.10rc1", "3.10.0rc1", "3.10.0.dev2+g1234", "4.0.1"]
+)
 def test_other_versions_of_mitsuba_are_refused(
     version: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(metadata, "version", lambda _: version)
-    with pytest.raises(RuntimeError, match=rf"{version} is installed: run `pip install"):
-        runtime.prepare()
+    with pytest.raises(InstallationError, match=rf"{re.escape(version)} is installed: run `pip"):
+        runtime.check_installed_version()
 
 
-@pytest.mark.parametrize("version", ["3.9.1", "3.9.12", "3.9.1.dev0"])
+@pytest.mark.parametrize("version", ["3.9.1", "3.9.12", "3.9.1.dev0", "3.9.2rc1"])
 def test_our_versions_of_mitsuba_are_accepted(
     version: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(metadata, "version", lambda _: version)
-    runtime.prepare()
+    runtime.check_installed_version()
+
+
+def test_development_build_with_other_meshes_is_refused() -> None:
+    class Mesh:
+        """Of Mitsuba 3.10; builds of it called themselves 3.9.1."""
+
+        def positions(self) -> None: ...
+
+    with pytest.raises(InstallationError, match=r"3\.10, but a development build"):
+        runtime.check_meshes(Mesh)
+
+
+@pytest.mark.parametrize("command", ["render", "compare"])
+def test_other_version_of_mitsuba_is_one_sentence_on_the_command_line(
+    command: str, run, make_scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(metadata, "version", lambda _: "3.10.0")
+    monkeypatch.delitem(sys.modules, "mitsuba")  # as if nothing had imported it yet
+    options = {"render": ["-o", tmp_path / "image.exr"], "compare": ["path", "--spp", "1"]}
+    code, out, err = run(command, make_scene(), *options[command])
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert 'but 3.10.0 is installed: run `pip install "mitsuba>=3.9.1,<3.10"`' in err
