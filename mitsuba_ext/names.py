@@ -6,10 +6,10 @@ Nothing here needs Mitsuba, which takes a second to import: a typing error is re
 from __future__ import annotations
 
 import difflib
-import importlib.util
 import re
 import sys
 from collections.abc import Iterable
+from importlib.machinery import PathFinder
 from pathlib import Path
 
 from . import registry
@@ -57,8 +57,8 @@ def check_integrator(specification: str) -> None:
 
 
 def is_file_of_mitsuba(name: str) -> bool:
-    """Is there a plugin in C++ of this name? Where Mitsuba is not installed, there may be."""
-    spec = importlib.util.find_spec("mitsuba")
+    """Is there a plugin in C++ of this name? Where Mitsuba is not found, there may be."""
+    spec = PathFinder.find_spec("mitsuba")
     if spec is None or not spec.submodule_search_locations:
         return True
     folder = Path(spec.submodule_search_locations[0]) / "plugins"

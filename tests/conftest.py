@@ -133,3 +133,10 @@ def run(capsys):
 def in_subprocess(*arguments, **options) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "mitsuba_ext", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
+
+
+@pytest.fixture(autouse=True)
+def kernels_are_cached(monkeypatch):
+    """Whether a kernel is in the cache depends on what ran before: ``render`` does not speak of
+    it."""
+    monkeypatch.setattr(sys.modules["mitsuba_ext.cli.render"], "kernels_compiled", lambda: 0)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import PATH, in_subprocess
 
-from mitsuba_ext import pages
+from mitsuba_ext import names, pages
 from mitsuba_ext.compare import load_scene, read_exr, write_exr
 
 # ---- render ----
@@ -47,6 +50,29 @@ def test_render_keeps_aovs_in_an_exr_and_leaves_them_out_of_a_png(run, make_scen
     assert run("render", scene, "-o", tmp_path / "image.exr")[0] == 0
     assert "d.T" in read_exr(tmp_path / "image.exr")[0]
     assert run("render", scene, "-o", tmp_path / "image.png")[0] == 0
+
+
+def test_first_render_says_that_it_compiles(run, make_scene, tmp_path, monkeypatch):
+    counts = iter([5, 7])  # two kernels of the scene were not in the cache
+    command = sys.modules["mitsuba_ext.cli.render"]
+    monkeypatch.setattr(command, "kernels_compiled", lambda: next(counts))
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr")
+    assert (code, err.count("\n")) == (0, 1) and err.startswith("compiling kernels")
+
+
+def test_misspelt_integrator_gets_a_suggestion(run, make_scene, tmp_path):
+    for integrator, meant in (("neeep:max_depth=2", "neepp"), ("paht", "path")):
+        arguments = ("render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", integrator)
+        assert f'did you mean "{meant}"?' in run(*arguments)[2]
+
+
+def test_modules_beside_the_user_are_found(run, make_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_plugin_beside.py").write_text("raise RuntimeError('found')")
+    output = tmp_path / "a.exr"
+    *_, err = run("render", make_scene(), "-o", output, "--plugin", "my_plugin_beside")
+    assert 'the plugin "my_plugin_beside": found' in err
 
 
 def test_render_replaces_an_integrator_that_does_not_exist_here(run, make_scene, tmp_path):
@@ -259,12 +285,58 @@ def test_no_traceback_from_the_process(tmp_path):
 # ---- list, pages ----
 
 
-def test_list_and_help_need_neither_variant_nor_llvm():
-    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": "/none/libLLVM.so"}
-    for arguments in (["list"], ["--help"], ["render", "--help"], ["--version"]):
-        result = in_subprocess(*arguments, env=environment)
-        assert result.returncode == 0, result.stderr
-        assert result.stdout  # on stderr, Dr.Jit itself may complain about LLVM
+def test_what_only_prints_starts_without_mitsuba(make_scene, tmp_path):
+    """Nor does it need a variant, LLVM, or the packages that are slow to import."""
+    render = ["render", str(make_scene()), "-o", str(tmp_path / "image.exr"), "--integrator"]
+    command_lines = [
+        ["--help"], ["--version"], ["render", "--help"], ["list"], ["list", "neepp"],
+        ["list", "path"], ["list", "neeep"], [*render, "neeep"], ["render", "none.xml", "-o", "a"],
+        ["compare", render[1], "path", "neeep", "--spp=1"],
+    ]  # fmt: skip
+    code = f"""
+import sys
+from mitsuba_ext import cli
+for command_line in {command_lines}:
+    cli.main(command_line)
+    for name in ("mitsuba", "drjit", "scipy", "matplotlib"):
+        assert name not in sys.modules, (command_line, name)
+assert "rich" in sys.modules
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.count("Usage:") == 2
+    assert result.stderr.count('unknown integrator "neeep": did you mean "neepp"?') == 2
+
+
+def test_list_says_whose_plugin_a_name_is_or_what_it_may_have_meant(run):
+    for name, message in (
+        ("path", '"path" is an integrator of Mitsuba\'s own'),
+        ("sphere", '"sphere" is a plugin of Mitsuba\'s own'),
+        ("neeep", 'no plugin "neeep": did you mean "neepp"?'),
+        ("Volpath", 'did you mean "volpath"?'),
+        ("something", "(there are: composed_path,"),
+    ):
+        code, out, err = run("list", name)
+        assert (code, out) == (2, "") and message in err, err
+
+
+def test_every_integrator_of_mitsuba_is_known_by_name(variant):
+    import mitsuba as mi
+
+    refused = []
+    for name in names.MITSUBA_INTEGRATORS:
+        if name == "aov":  # ends the process where it has no parameters
+            continue
+        try:
+            made = mi.PluginManager.instance().create_object(mi.Properties(name))
+            assert isinstance(made, mi.Integrator)
+        except RuntimeError as error:
+            refused.append(name)
+            assert "not found" not in str(error)
+    assert set(refused) <= {"moment", "stokes"}  # which nest others
+    files = Path(mi.__file__).parent / "python" / "ad" / "integrators"
+    python = {file.stem for file in files.glob("*.py")} - {"__init__", "common"}
+    assert python <= set(names.MITSUBA_INTEGRATORS)
 
 
 def test_list_shows_every_plugin(run):

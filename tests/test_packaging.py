@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib.util
 import inspect
+import os
 import re
 import shutil
 import subprocess
@@ -71,21 +72,73 @@ def test_plugin_folders_are_part_of_the_package_and_keep_their_sources() -> None
         assert Path(module.origin).parent.name == kind
 
 
-@pytest.mark.slow
-def test_wheel_works_in_another_environment(tmp_path: Path) -> None:
-    """Built from the tree, installed elsewhere: the plugins are registered and render, and a
-    comparison writes its report."""
-    tree = tmp_path / "tree"  # a copy: setuptools reuses what an earlier build left in build/
+@pytest.fixture
+def source_tree(tmp_path: Path) -> Path:
+    """What a clone or a zip of the sources holds."""
+    tree = tmp_path / "tree"
     for source in SOURCES:
         shutil.copytree(source, tree / source.name)
-    for name in ("pyproject.toml", "setup.py", "LICENSE"):
-        shutil.copy(ROOT / name, tree)
-    command = [sys.executable, "-m", "build", "--wheel", "--outdir", str(tmp_path), str(tree)]
-    subprocess.run(command, check=True)
+    return tree
+
+
+def test_other_processes_run_the_package_of_their_parent(source_tree: Path, tmp_path: Path) -> None:
+    """That of an installed command, and not the one in the current folder."""
+    packages = tmp_path / "packages"
+    shutil.copytree(SOURCES[0], packages / "mitsuba_ext")
+    for source in SOURCES[1:]:
+        shutil.copytree(source, packages / "mitsuba_ext" / source.name)
+    (packages / "worker.py").write_text("""
+import importlib.util, sys
+print(__name__, sys.argv[1:], importlib.util.find_spec("mitsuba_ext.integrators.neepp").origin)
+""")
+    command = tmp_path / "command"
+    command.write_text("""
+import subprocess
+from mitsuba_ext.processes import python_command
+subprocess.run(python_command("worker", "1 + 1", "'"))
+""")
+    result = _run(source_tree, command, PYTHONPATH=str(packages))
+    plugin = packages / "mitsuba_ext" / "integrators" / "neepp.py"
+    assert result.stdout == f"""__main__ ['1 + 1', "'"] {plugin}\n""", result.stderr
+
+
+def test_no_process_is_started_with_what_the_current_folder_holds() -> None:
+    for file in SOURCES[0].rglob("*.py"):
+        assert '"-m"' not in file.read_text(), f"{file}: use python_command"
+
+
+def test_source_tree_that_is_not_installed_finds_its_plugins(source_tree: Path) -> None:
+    code = """
+import mitsuba_ext
+from mitsuba_ext import cli, registry
+print(*registry.plugin_files("integrators"))
+cli.main(["list"])
+"""
+    output = _run(source_tree, "-c", code).stdout
+    assert str(source_tree / "integrators" / "neepp.py") in output
+    assert "Next event estimation++" in output
+    assert _run(source_tree, "-m", "mitsuba_ext", "--version").stdout.startswith("mitsuba-ext")
+
+
+def _run(folder: Path, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        cwd=folder, env={**os.environ, **environment}, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_archive_and_wheel_work_in_another_environment(source_tree: Path, tmp_path: Path) -> None:
+    """Built from the sources and installed elsewhere: the plugins are registered and render, and a
+    comparison writes its report, also where the source tree is the current folder."""
+    for name in ("pyproject.toml", "setup.py", "LICENSE", "README.md"):
+        shutil.copy(ROOT / name, source_tree)
+    archive = shutil.make_archive(str(tmp_path / "sources"), "zip", tmp_path, source_tree.name)
+    # An archive of the sources, and a wheel made from that
+    subprocess.run([sys.executable, "-m", "build", "--outdir", tmp_path, source_tree], check=True)
     (wheel,) = tmp_path.glob("*.whl")
     venv.create(tmp_path / "venv", with_pip=True)
-    python = tmp_path / "venv" / "bin" / "python"
-    subprocess.run([str(python), "-m", "pip", "install", "--quiet", str(wheel)], check=True)
+    binaries = tmp_path / "venv" / "bin"
     code = """
 import inspect, pathlib, sys
 import mitsuba_ext
@@ -97,9 +150,16 @@ assert "mitsuba_ext" in inspect.getsource(registry)
 assert any(registry.plugin_names().values())
 sys.exit(doctor.main())
 """
-    subprocess.run([str(python), "-c", code], cwd=tmp_path, check=True)
     scene = tmp_path / "scene.xml"
     scene.write_text(SCENE.format(integrator="", film="", body=""))
-    arguments = ["compare", scene, "path", "--spp=2", "--seeds=1", "--reference-spp=8", "--out=out"]
-    subprocess.run([python, "-m", "mitsuba_ext.cli", *arguments], cwd=tmp_path, check=True)
-    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+    arguments = ["compare", scene, "path", "--spp=2", "--seeds=1", "--reference-spp=8"]
+    for source in (wheel, archive):
+        install = [binaries / "python", "-m", "pip", "install", "--quiet", "--force-reinstall"]
+        options = [] if source == wheel else ["--no-deps"]
+        subprocess.run([*install, *options, source], check=True)
+        subprocess.run([binaries / "python", "-c", code], cwd=tmp_path, check=True)
+        out = tmp_path / Path(source).suffix
+        subprocess.run(
+            [binaries / "mitsuba-ext", *arguments, f"--out={out}"], cwd=source_tree, check=True
+        )
+        assert (out / "report.html").stat().st_size > 10_000

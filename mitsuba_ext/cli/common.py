@@ -114,6 +114,14 @@ def _import_module(name: str) -> None:
     spec.loader.exec_module(module)
 
 
+def kernels_compiled() -> int:
+    """How many kernels were not in Dr.Jit's cache, so that this process had to compile them."""
+    import drjit as dr
+
+    _launches, _loaded, compiled = dr.detail.launch_stats()
+    return compiled
+
+
 @contextlib.contextmanager
 def progress_bars(*columns: ProgressColumn) -> Iterator[Progress]:
     """Progress bars on stderr, if that is a terminal.

@@ -10,7 +10,14 @@ from typing import Any
 import click
 
 from ..names import check_integrator
-from .common import INTERRUPTED, MAX_SEED, progress_bars, scene_options, select_variant
+from .common import (
+    INTERRUPTED,
+    MAX_SEED,
+    kernels_compiled,
+    progress_bars,
+    scene_options,
+    select_variant,
+)
 
 
 @click.command(short_help="Render a scene to an image.")
@@ -64,6 +71,7 @@ def render(
         raise click.UsageError("--spp and --time exclude each other")
     images.check_target(output)
     select_variant(variant, plugins)
+    compiled = kernels_compiled()
     loaded = load_scene(scene, size, dict(definitions), keep_integrator=not specification)
     if specification:
         named = make_named(specification, loaded.settings)
@@ -74,6 +82,9 @@ def render(
     if integrator is None:
         raise InputError(f"{scene}: the scene has no integrator: name one with --integrator")
 
+    if kernels_compiled() > compiled:
+        # Those of the render take longer, and nothing can be printed meanwhile
+        click.echo("compiling kernels (later renders like this one find them in a cache)", err=True)
     film = loaded.scene.sensors()[0].film()
     interrupted = measuring = False
     start = time.perf_counter()
