@@ -1,17 +1,21 @@
 """Ten lines: integrators compared on a scene, as tables and as a report.
 
-Run from the root of the repository: ``.venv/bin/python examples/compare.py`` (a minute).
+``.venv/bin/python examples/compare.py`` (a minute) writes to ``out/example`` in the current folder.
 """
+
+from pathlib import Path
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 from mitsuba_ext import compare
 
 import mitsuba as mi  # isort: skip
 
+SCENE = Path(__file__).resolve().parents[1] / "scenes" / "door_ajar.xml"
+
 mi.set_variant("llvm_ad_rgb")
 integrators = {"path": "path", "neepp": "neepp", "coarse": {"type": "neepp", "grid": 4}}
 comparison = compare.Comparison(
-    "scenes/door_ajar.xml", integrators, compare.sweep([4, 16, 64]), folder="out/example"
+    SCENE, integrators, compare.sweep([4, 16, 64]), folder="out/example"
 )
 results = comparison.run(lambda step: print(step.label))
 compare.show(results)

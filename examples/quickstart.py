@@ -1,14 +1,18 @@
 """Ten lines: a scene, an integrator of ours, an image and what it cost.
 
-Run from the root of the repository: ``.venv/bin/python examples/quickstart.py``.
+``.venv/bin/python examples/quickstart.py`` writes ``door_ajar.exr`` to the current folder.
 """
+
+from pathlib import Path
 
 import mitsuba_ext  # registers the plugins; before mitsuba, so that it can choose the LLVM library
 
 import mitsuba as mi  # isort: skip
 
+SCENE = Path(__file__).resolve().parents[1] / "scenes" / "door_ajar.xml"
+
 mi.set_variant("llvm_ad_rgb")
-scene = mi.load_file("scenes/door_ajar.xml", integrator="neepp", spp=64)
+scene = mi.load_file(str(SCENE), integrator="neepp", spp=64)
 image = mi.render(scene, seed=1)
 mi.Bitmap(image).write("door_ajar.exr")
 

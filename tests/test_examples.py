@@ -3,13 +3,40 @@
 from __future__ import annotations
 
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from mitsuba_ext import compare
+
+import mitsuba as mi  # isort: skip
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def test_quickstart_runs_in_any_folder(tmp_path, monkeypatch, capsys):
+    """All but the render."""
+    monkeypatch.setattr(mi, "render", lambda scene, seed: np.ones((2, 4, 3), np.float32))
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(EXAMPLES / "quickstart.py"), run_name="__main__")
+    assert (tmp_path / "door_ajar.exr").is_file()
+    assert "door_ajar.exr" in capsys.readouterr().out
+
+
+def test_comparison_runs_in_any_folder(tmp_path, monkeypatch):
+    """All but the measurements."""
+    seen = []
+    monkeypatch.setattr(compare.Comparison, "run", lambda comparison, _: seen.append(comparison))
+    monkeypatch.setattr(compare, "show", lambda results: None)
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(EXAMPLES / "compare.py"), run_name="__main__")
+    (comparison,) = seen
+    assert all(Path(setup.source).is_file() for setup in comparison.scenes)
+    assert comparison.folder.resolve() == tmp_path / "out" / "example"
 
 
 @pytest.mark.slow
