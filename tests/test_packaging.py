@@ -35,6 +35,16 @@ def test_range_of_mitsuba_is_the_same_in_both_places() -> None:
     assert f'"mitsuba>={first},<{end}"' in PYPROJECT
 
 
+def test_page_on_versions_names_every_file_that_uses_meshes_as_in_mitsuba_3_9() -> None:
+    old = r"vertex_(?:positions|normals|texcoords)|faces_buffer|has_vertex_normals|mi\.Mesh\("
+    files = [file for source in SOURCES for file in source.rglob("*.py")]
+    using = {str(file.relative_to(ROOT)) for file in files if re.search(old, file.read_text())}
+    page = (ROOT / "docs" / "mitsuba_versions.md").read_text()
+    named = set(re.findall(r"`((?:mitsuba_ext|shapes|tests)/[\w/]+\.py)`", page))
+    assert using <= named, f"add {using - named} to docs/mitsuba_versions.md"
+    assert all((ROOT / name).is_file() for name in named)
+
+
 def test_imports_at_module_level_are_declared() -> None:
     declared = set(re.findall(r'^    "([A-Za-z0-9_]+)[<>=]', PYPROJECT, re.MULTILINE))
     allowed = declared | set(_standard_library()) | {"drjit", "mitsuba_ext", "PIL"}
