@@ -20,6 +20,11 @@ __all__ = ["__version__"]
 # The folders of plugins are part of an installed package. In a source tree they are beside it.
 _folder = Path(__file__).parent
 if not (_folder / "integrators").is_dir():
+    if not (_folder.parent / "integrators").is_dir():
+        raise ImportError(
+            f"mitsuba_ext finds none of its plugins: {_folder} must be a folder that `pip install` "
+            "made, or that of the sources (not inside of a zip archive)."
+        )
     __path__.append(str(_folder.parent))
 
 mitsuba_import.prepare()

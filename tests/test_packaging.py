@@ -130,6 +130,12 @@ cli.main(["list"])
     assert _run(source_tree, "-m", "mitsuba_ext", "--version").stdout.startswith("mitsuba-ext")
 
 
+def test_package_inside_of_an_archive_is_refused(source_tree: Path, tmp_path: Path) -> None:
+    archive = shutil.make_archive(str(tmp_path / "archive"), "zip", source_tree, "mitsuba_ext")
+    result = _run(tmp_path, "-c", "import mitsuba_ext", PYTHONPATH=archive)
+    assert result.returncode == 1 and "none of its plugins" in result.stderr.splitlines()[-1]
+
+
 def _run(folder: Path, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, *map(str, arguments)],
