@@ -36,6 +36,7 @@ def _register() -> None:
     mitsuba = sys.modules["mitsuba"]  # which is not the module that was executed
     runtime.check_version(mitsuba.__version__)
     runtime.guard(mitsuba)
+    runtime.ensure_two_threads()
     registry.install()
 
 

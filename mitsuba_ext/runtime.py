@@ -121,6 +121,14 @@ def check(variant: str) -> None:
             raise InstallationError(f"{variant}: {problem}")
 
 
+def ensure_two_threads() -> None:
+    """Gives Dr.Jit a second thread on a machine with one core. With one, Mitsuba 3.9.1 waits for
+    ever as soon as it reads or writes an EXR file: who waits for the threads is one of them."""
+    drjit = sys.modules["drjit"]
+    if drjit.thread_count() < 2:
+        drjit.set_thread_count(2)
+
+
 def guard(mitsuba: ModuleType) -> None:
     """Where LLVM does not work, makes ``mi.set_variant`` say so as :func:`check` does.
 

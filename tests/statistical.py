@@ -13,8 +13,10 @@ the module of the standard library.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,10 +51,24 @@ def batches(
 ) -> np.ndarray:
     """Images of independent seeds, as an array [seed, height, width, channel]."""
     images = []
-    for seed in seeds:
-        images.append(np.array(mi.render(scene, integrator=integrator, seed=seed, spp=spp)))
-    dr.sync_thread()
+    with _one_thread_per_worker():
+        for seed in seeds:
+            images.append(np.array(mi.render(scene, integrator=integrator, seed=seed, spp=spp)))
+        dr.sync_thread()
     return np.asarray(images, dtype=np.float64)
+
+
+@contextlib.contextmanager
+def _one_thread_per_worker() -> Iterator[None]:
+    """Where a process for each core runs tests, its other threads would only wait for work, and
+    keep the cores busy with that."""
+    count = dr.thread_count()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        dr.set_thread_count(1)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(count)
 
 
 def assert_images_are_sound(images: np.ndarray, tolerance: float = 0.0) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -71,6 +72,20 @@ for variant in {LLVM_VARIANTS!r} * 2:
     nested = mi.load_dict({{"type": "reweighted_lens", "nested": {{"type": "pss_guided"}}}})
     assert nested.pilots(scene, 256), "it learns, whatever variants there were before"
     kept[variant] = scene  # earlier variants' objects live on
+""")
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux only")
+def test_one_core_is_enough_to_read_and_write_images(tmp_path):
+    """Mitsuba alone waits for ever there."""
+    _run(f"""
+import os
+os.sched_setaffinity(0, {{min(os.sched_getaffinity(0))}})
+import mitsuba_ext, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+import drjit as dr
+mi.Bitmap(dr.ones(mi.TensorXf, (4, 4, 3))).write({str(tmp_path / "image.exr")!r})
+assert mi.Bitmap({str(tmp_path / "image.exr")!r}).width() == 4
 """)
 
 
