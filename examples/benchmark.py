@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.progress import Progress
 
 from mitsuba_ext import compare
 
@@ -88,13 +87,7 @@ def main(
         reference_spp=reference_spp,
         command="examples/benchmark.py",
     )
-    with Progress() as progress:
-        bar = progress.add_task("")
-        results = comparison.run(
-            lambda step: progress.update(
-                bar, description=step.label, completed=step.done, total=step.done + (step.left or 0)
-            )
-        )
+    results = comparison.run()
     compare.show(results)
     print(out / "report.html")
     if not names and not integrators:

@@ -17,6 +17,6 @@ integrators = {"path": "path", "neepp": "neepp", "coarse": {"type": "neepp", "gr
 comparison = compare.Comparison(
     SCENE, integrators, compare.sweep([4, 16, 64]), folder="out/example"
 )
-results = comparison.run(lambda step: print(step.label))
+results = comparison.run()
 compare.show(results)
 print(comparison.folder / "report.html")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 _PACKAGE = Path(__file__).parent
+
+#: Modules whose classes are written in C++.
+_COMPILED = ("builtins", "mitsuba", "drjit.detail")
 
 
 def hash_parsed_scene(
@@ -46,10 +49,21 @@ def hash_parsed_scene(
     return digest.hexdigest()
 
 
-def hash_code(integrator: type) -> str | None:
-    """SHA-256 over the Python files that define a class of integrators and, since any of ours may
-    be nested in it, over all files of ours that take part in a render. ``None`` for a class that
-    has no file (it was written in a notebook)."""
+def hash_value(value: object) -> str:
+    """SHA-256 over text, or over a dict as ``mi.load_dict`` takes it."""
+    digest = hashlib.sha256()
+    _feed(digest, value)
+    return digest.hexdigest()
+
+
+def hash_code(classes: Iterable[type]) -> str | None:
+    """SHA-256 over the Python files that define these classes of plugins; empty if all are written
+    in C++. With one that is in Python, all files of ours that take part in a render count, since
+    any of them may be imported there. ``None`` where a class has no file (it was written in a
+    notebook)."""
+    bases = {base for cls in classes for base in cls.__mro__ if base.__module__ not in _COMPILED}
+    if not bases:
+        return ""
     files = {
         path
         for path in _PACKAGE.rglob("*.py")
@@ -57,9 +71,7 @@ def hash_code(integrator: type) -> str | None:
     }
     for kind in registry.plugin_names():
         files.update(registry.plugin_files(kind))
-    for base in integrator.__mro__:
-        if base.__module__ in ("builtins", "mitsuba", "drjit.detail"):
-            continue  # written in C++
+    for base in bases:
         try:
             files.add(Path(inspect.getfile(base)))
         except (TypeError, OSError):

@@ -11,6 +11,7 @@ from typing import Any
 import mitsuba as mi
 
 from . import camera
+from .aovs import check_aovs
 from .decisions.defaults import SceneQuery
 from .decisions.moving_scene import refuse_movers, scene_query
 from .learning.learner import Learner, Observers
@@ -127,4 +128,5 @@ class WalkIntegrator(StagedIntegrator):
         return scene_query(scene)
 
     def _aov_integrator(self, aovs: str) -> mi.Integrator | None:
+        check_aovs(self.name, aovs)
         return mi.load_dict({"type": "aov", "aovs": aovs}) if aovs else None

@@ -29,11 +29,11 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f': did you mean "{close[0]}"?' if close else ""
 
 
-def unknown_integrator(name: str) -> InputError:
-    """What to raise where there is no integrator of this name."""
+def unknown_integrator(name: str, kind: str = "integrator") -> InputError:
+    """What to raise where there is no integrator of this name; ``kind`` is what it is called."""
     known = [*registry.plugin_names()["integrators"], *MITSUBA_INTEGRATORS]
     return InputError(
-        f'unknown integrator "{name}"{did_you_mean(name, known)} (\'mitsuba-ext list\' shows ours)'
+        f'unknown {kind} "{name}"{did_you_mean(name, known)} (\'mitsuba-ext list\' shows ours)'
     )
 
 

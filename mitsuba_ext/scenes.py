@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .aovs import check_nodes
 from .content_hash import hash_parsed_scene
 from .errors import InputError
 
@@ -24,16 +25,61 @@ if TYPE_CHECKING:
 #: end them, and what the camera sees of the lights.
 SETTINGS = ("max_depth", "rr_depth", "hide_emitters")
 
+_TRACEBACK = "Traceback (most recent call last):\n"
+
 #: How Mitsuba's integrators print a depth without limit.
 _UNLIMITED = 2**32 - 1
 
 
 def one_line(error: BaseException | str) -> str:
-    """A Mitsuba message without its source positions ("[parser.cpp:12] ", "[PLYMesh] ") and line
-    breaks."""
-    text = re.sub(r"\[\w+(?:\.(?:cpp|h):\d+)?\] ", "", str(error))
+    """A Mitsuba message without source positions ("[parser.cpp:12] ", "[PLYMesh] ") and line
+    breaks. Mitsuba quotes the whole traceback of an error in a plugin that is written in Python: of
+    that, only the message at the end is kept."""
+    text = str(error)
+    if _TRACEBACK in text:
+        before, *_, last = text.split(_TRACEBACK)
+        # The frames are indented; what follows is "ValueError: message"
+        kind, _colon, message = re.sub(r"\A(?: .*\n)*", "", last).partition(": ")
+        text = before + (message or kind)
+    text = re.sub(r"\[\w+(?:\.(?:cpp|h):\d+)?\] ", "", text)
     # "Found 1 unreferenced property in …:\n  - float "radiusx": 3"
     return re.sub(r"\s*\n\s*(?:- )?", " ", text).strip() or type(error).__name__
+
+
+def check_source(source: object) -> None:
+    """Checks that ``source`` can be a scene: a file, or a dict of the active variant.
+
+    Raises:
+        InputError: It cannot.
+    """
+    if isinstance(source, Mapping):
+        check_variant(source)
+    elif not isinstance(source, (str, Path)):
+        raise InputError(
+            f"a scene must be an XML file or a dict, found an object of type "
+            f"{type(source).__name__}"
+        )
+    else:
+        check_scene_file(Path(source))
+
+
+def check_variant(value: object) -> None:
+    """Checks that the objects of Mitsuba in ``value``, a dict of a scene or what it holds, are of
+    the active variant: Mitsuba ignores others, or takes them for something else.
+
+    Raises:
+        InputError: One is of another variant.
+    """
+    import mitsuba as mi
+
+    if isinstance(value, Mapping):
+        for item in value.values():
+            check_variant(item)
+    elif isinstance(value, mi.Object) and value.variant_name() not in ("", mi.variant()):
+        raise InputError(
+            f'the object "{value.class_name()}" was made in the variant "{value.variant_name()}", '
+            f'and the active one is "{mi.variant()}": make it again, or give a dict'
+        )
 
 
 @dataclass
@@ -96,15 +142,14 @@ def load_scene(
             integrator is unknown here can be rendered with another.
 
     Raises:
-        InputError: The file is missing or broken, something in it cannot be made, it has no
-            sensor, or ``size`` was given for a film with a crop window.
+        InputError: The file is missing or broken, something in it cannot be made or is of another
+            variant, it has no sensor, or ``size`` was given for a film with a crop window.
     """
     import mitsuba as mi
 
     is_dict = isinstance(source, Mapping)
+    check_source(source)
     path = None if is_dict else Path(source)
-    if path is not None:
-        check_scene_file(path)
     label = "the scene" if is_dict else str(path)
     strings = {key: _as_xml(value) for key, value in (parameters or {}).items()}
     if is_dict and strings:
@@ -116,6 +161,7 @@ def load_scene(
                 state = mi.parser.parse_dict(config, dict(source))
             else:
                 state = mi.parser.parse_file(config, str(path), **strings)
+            check_nodes(state)
             content_hash = hash_parsed_scene(state, strings, source if is_dict else None)
             integrator = _integrator_node(state)
             # Now: a node must not be touched after a transformation (it may be freed memory)

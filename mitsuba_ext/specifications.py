@@ -11,10 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union
 from xml.etree import ElementTree
 
-from .content_hash import hash_code
+from .aovs import check_aovs, check_nodes
+from .content_hash import hash_code, hash_value
 from .errors import InputError
-from .names import unknown_integrator
-from .scenes import one_line
+from .names import is_file_of_mitsuba, unknown_integrator
+from .plugin_text import parse_plugin
+from .registry import plugin_names
+from .scenes import check_variant, one_line
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -32,7 +35,7 @@ class NamedIntegrator:
     Attributes:
         label: What tells it from others in tables.
         name: Its plugin's name.
-        parameters: What it was made with, as far as that is known.
+        parameters: What it was made with, as far as that is known; a dict for what is nested in it.
         integrator: The integrator.
         identity: Text that changes whenever the integrator could render other images or take other
             time: its plugins, its parameters, and the code of those that are written in Python.
@@ -55,53 +58,77 @@ def make_named(
     """Makes an integrator in the active variant.
 
     Args:
-        specification: ``name`` or ``name:key=value,key=value``; the path of an XML file whose root
-            is an ``<integrator>``, or of a JSON file with what ``mi.load_dict`` takes; such a dict;
-            or an integrator that exists already (nothing is inherited then).
+        specification: ``name`` or ``name:key=value,key=value``
+            (:func:`mitsuba_ext.plugin_text.parse_plugin`); the path of an XML file whose root is an
+            ``<integrator>``, or of a JSON file with what ``mi.load_dict`` takes; such a dict; or an
+            integrator that exists already (nothing is inherited then).
         inherited: Parameters (a :attr:`LoadedScene.settings`) that apply to each integrator, nested
             ones included, that knows them and does not set them.
         label: Instead of one made from the specification.
 
     Raises:
-        InputError: There is no such file or plugin, it is no integrator, or it rejects a parameter.
+        InputError: There is no such file or plugin, it is no integrator, it rejects a parameter, or
+            it is of another variant.
     """
     import mitsuba as mi
 
+    check_variant(specification)
     if isinstance(specification, mi.Integrator):
         name = getattr(specification, "name", None) or specification.class_name()
-        parts = (name, {}, specification)
-    elif isinstance(specification, Mapping):
+        return NamedIntegrator(label or name, name, {}, specification, _never_again())
+    content: str | dict[str, Any] = ""
+    if isinstance(specification, Mapping):
         default = str(specification.get("type", "integrator"))
-        parts = _from_parser(default, dict(specification), inherited)
+        content = dict(specification)
+        made = _from_parser(default, content, inherited)
         label = label or _label_of_dict(specification)
+    elif not isinstance(specification, (str, Path)):
+        raise InputError(
+            f"an integrator must be named by text, a file or a dict, found an object of type "
+            f"{type(specification).__name__}"
+        )
     elif Path(specification).suffix.lower() in (".xml", ".json"):
-        parts = _from_parser(str(specification), _read_fragment(Path(specification)), inherited)
+        content = _read_fragment(Path(specification))
+        made = _from_parser(str(specification), content, inherited)
     else:
-        name, own = parse_integrator(str(specification))
-        integrator, parameters = make_integrator(name, own, inherited)
-        parts = (name, parameters, integrator)
-    name, parameters, integrator = parts
-    if label is None:
-        label = name if isinstance(specification, mi.Integrator) else str(specification)
-    identity = _identity(specification, name, parameters, integrator)
-    return NamedIntegrator(label, name, parameters, integrator, identity)
+        plugin = parse_plugin(str(specification))
+        made = _make(plugin, inherited or {})
+    return NamedIntegrator(
+        str(specification) if label is None else label,
+        made.name,
+        made.parameters,
+        made.integrator,
+        _never_again() if _is_alive(specification) else _identity(made, content),
+    )
 
 
-def _identity(
-    specification: Specification, name: str, parameters: dict[str, Any], integrator: mi.Integrator
-) -> str:
-    unique = uuid.uuid4().hex
-    if _is_alive(specification):
-        return unique
+@dataclass
+class _Made:
+    """An integrator, its parameters, and the classes of all plugins that it is made of (``None``
+    for one that is not known)."""
+
+    name: str
+    parameters: dict[str, Any]
+    integrator: mi.Integrator
+    classes: list[type | None]
+
+
+def _identity(made: _Made, content: str | dict[str, Any]) -> str:
+    """Of an integrator that was made from its parameters, or from the ``content`` of a file."""
     try:
-        state = str(integrator)
-    except Exception:  # a class in Python without to_string()
-        return unique
-    is_builtin = isinstance(specification, str) and type(integrator).__module__ == "mitsuba"
-    code = "" if is_builtin else hash_code(type(integrator))
+        # Parameters that were left out may have other defaults; addresses are never the same
+        state = re.sub("0x[0-9a-f]+", "", str(made.integrator))
+    except Exception:  # to_string() is optional for a class in Python
+        state = ""
+    code = None if None in made.classes else hash_code(made.classes)
     if code is None:
-        return unique
-    return json.dumps([name, parameters, state, code], sort_keys=True, default=repr)
+        return _never_again()
+    parts = [made.name, made.parameters, hash_value(content), state, code]
+    return json.dumps(parts, sort_keys=True, default=repr)
+
+
+def _never_again() -> str:
+    return uuid.uuid4().hex
 
 
 def _is_alive(specification: object) -> bool:
@@ -125,77 +152,51 @@ def is_fragment(path: Path) -> bool:
     return False
 
 
-def parse_integrator(text: str) -> tuple[str, dict[str, Value]]:
-    """Splits ``name:key=value,key=value`` into the name and its parameters.
-
-    >>> parse_integrator("neepp:max_depth=6,threshold=0.1,hide_emitters=true")
-    ('neepp', {'max_depth': 6, 'threshold': 0.1, 'hide_emitters': True})
-    """
-    name, colon, rest = text.partition(":")
-    if not re.fullmatch(r"\w+", name) or (colon and not rest):
-        raise InputError(f'integrator "{text}": expected NAME or NAME:key=value,key=value')
-    parameters: dict[str, Value] = {}
-    for item in rest.split(",") if rest else []:
-        key, equals, value = item.partition("=")
-        if not (re.fullmatch(r"\w+", key) and equals and value):
-            raise InputError(f'integrator "{text}": expected key=value, found "{item}"')
-        if key in parameters:
-            raise InputError(f'integrator "{text}": "{key}" is given twice')
-        parameters[key] = _parse_value(value)
-    return name, parameters
-
-
-def make_integrator(
-    name: str,
-    parameters: Mapping[str, Value] | None = None,
-    inherited: Mapping[str, Value] | None = None,
-) -> tuple[mi.Integrator, dict[str, Value]]:
-    """Makes an integrator in the active variant.
-
-    Args:
-        name: The plugin's name.
-        parameters: Its parameters; it is an error if the plugin does not know one of them.
-        inherited: Parameters that apply where ``parameters`` does not set them and the plugin
-            knows them (a :attr:`LoadedScene.settings`).
-
-    Returns:
-        The integrator, and the parameters that it was made with.
+def _make(
+    plugin: Mapping[str, Any], inherited: Mapping[str, Value], kind: str = "integrator"
+) -> _Made:
+    """Makes an integrator, and before it what is nested in it (``kind``: "nested plugin").
 
     Raises:
-        InputError: There is no such plugin, it is no integrator, or it rejects a parameter.
+        InputError: There is no such plugin, or it rejects or does not know a parameter.
     """
     import mitsuba as mi
 
-    own = dict(parameters or {})
-    merged = {**(inherited or {}), **own}
+    own = {key: value for key, value in plugin.items() if key != "type"}
+    nested = {
+        key: _make(value, inherited, "nested plugin")
+        for key, value in own.items()
+        if isinstance(value, Mapping)
+    }
+    objects = {key: made.integrator for key, made in nested.items()}
+    if any(isinstance(item, mi.Integrator) for item in objects.values()):
+        inherited = {}  # the paths are those of the nested integrator
+    name, given = plugin["type"], {**inherited, **own, **objects}
     properties = mi.Properties(name)
-    for key, value in merged.items():
+    for key, value in given.items():
         properties[key] = value
     try:
-        integrator = mi.PluginManager.instance().create_object(properties)
+        if name == "aov" and isinstance(own.get("aovs"), str):
+            check_aovs(name, own["aovs"])
+        made = mi.PluginManager.instance().create_object(properties)
     except Exception as error:  # a plugin's constructor may raise anything
         if "not found!" in str(error) and f'Plugin "{name}"' in str(error):
-            raise unknown_integrator(name) from error
-        raise InputError(f'integrator "{name}": {one_line(error)}') from error
-    if not isinstance(integrator, mi.Integrator):
+            raise unknown_integrator(name, kind) from error
+        raise InputError(f'{kind} "{name}": {one_line(error)}') from error
+    if kind == "integrator" and not isinstance(made, mi.Integrator):
         raise InputError(f'"{name}" is a plugin of Mitsuba, but not an integrator')
-    integrator = (integrator.expand() or [integrator])[0]  # "volpathmis" is made in two steps
+    made = (made.expand() or [made])[0]  # "volpathmis" is made in two steps
     unknown = set(properties.unqueried())
     for key in own:
         if key in unknown:
-            raise InputError(f'integrator "{name}" has no parameter "{key}"')
-    return integrator, {key: value for key, value in merged.items() if key not in unknown}
-
-
-def _parse_value(text: str) -> Value:
-    if text in ("true", "false"):
-        return text == "true"
-    for number in (int, float):
-        try:
-            return number(text)
-        except ValueError:
-            pass
-    return text
+            raise InputError(f'{kind} "{name}" has no parameter "{key}"')
+    parameters = {
+        key: {"type": nested[key].name, **nested[key].parameters} if key in nested else value
+        for key, value in given.items()
+        if key not in unknown
+    }
+    inner = [cls for item in nested.values() for cls in item.classes]
+    return _Made(name, parameters, made, [type(made), *inner])
 
 
 def _read_fragment(path: Path) -> str | dict[str, Any]:
@@ -222,7 +223,7 @@ def _read_fragment(path: Path) -> str | dict[str, Any]:
 
 def _from_parser(
     source: str, content: str | dict[str, Any], inherited: Mapping[str, Value] | None
-) -> tuple[str, dict[str, Any], mi.Integrator]:
+) -> _Made:
     import mitsuba as mi
 
     config = mi.parser.ParserConfig(mi.variant())
@@ -230,6 +231,8 @@ def _from_parser(
         is_text = isinstance(content, str)
         parse = mi.parser.parse_string if is_text else mi.parser.parse_dict
         state = parse(config, content)
+        check_nodes(state)
+        names = {node.props.plugin_name() for node in state.nodes}
         for node in state.nodes:
             for key, value in (inherited or {}).items():
                 if key not in node.props and _knows(node.props.plugin_name(), key, value):
@@ -245,7 +248,21 @@ def _from_parser(
         raise InputError(f'integrator "{source}": {one_line(error)}') from error
     if not isinstance(integrator, mi.Integrator):
         raise InputError(f'"{name}" ({source}) is a plugin of Mitsuba, but not an integrator')
-    return name, parameters, integrator
+    nested = [_class_of(other) for other in names - {name}]
+    return _Made(name, parameters, integrator, [type(integrator), *nested])
+
+
+def _class_of(name: str) -> type | None:
+    """The class of a plugin; ``None`` if that is unknown."""
+    import mitsuba as mi
+
+    try:
+        return type(mi.PluginManager.instance().create_object(mi.Properties(name)))
+    except Exception:  # one that cannot be made alone, as a wrapper
+        pass
+    if any(name in names for names in plugin_names().values()):
+        return _Made  # any class of this package stands for all of its files
+    return mi.Object if is_file_of_mitsuba(name) else None
 
 
 def _knows(name: str, key: str, value: Value) -> bool:

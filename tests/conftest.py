@@ -141,3 +141,9 @@ def kernels_are_cached(monkeypatch):
     """Whether a kernel is in the cache depends on what ran before: ``render`` does not speak of
     it."""
     monkeypatch.setattr(sys.modules["mitsuba_ext.cli.render"], "kernels_compiled", lambda: 0)
+
+
+@pytest.fixture
+def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Comparisons leave the HTML report out, which takes longer than a small comparison."""
+    monkeypatch.setattr("mitsuba_ext.compare.comparison.write_report", lambda _folder: None)

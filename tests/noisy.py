@@ -31,10 +31,11 @@ COUNT = itertools.count()
 
 
 class Clock:
-    """Stands in for the module ``time``."""
+    """Stands in for the module ``time``, on a machine that can become slower."""
 
     def __init__(self) -> None:
         self.now = 0.0
+        self.slowness = 1.0
 
     def perf_counter(self) -> float:
         return self.now
@@ -49,7 +50,7 @@ def noisy_integrator(clock, sigma=1.0, cost=0.01, fixed=0.0, fails_in=None, mean
                 calls.append((int(seed), spp))
             if fails_in is not None and seed == run_seed(0, fails_in) and spp > 3:
                 raise ZeroDivisionError("no\nlight")
-            clock.now += fixed + cost * spp
+            clock.now += clock.slowness * (fixed + cost * spp)
             width, height = scene.sensors()[0].film().crop_size()
             noise = np.random.default_rng([int(seed), spp, int(sigma * 1e6)])
             shape = (int(height), int(width), 3)
@@ -63,7 +64,12 @@ def noisy_integrator(clock, sigma=1.0, cost=0.01, fixed=0.0, fails_in=None, mean
     return name
 
 
-def compare_noisy(budget, integrators, tmp_path, **options):
-    options = {"reference_spp": 16, "seeds": 3, **options}
-    comparison = compare.Comparison(WHITE, integrators, budget, folder=tmp_path, **options)
+def compare_noisy(budget, integrators, tmp_path, reference_spp=16, seeds=3):
+    """Compares integrators on :data:`WHITE` against its image; the record of the scene."""
+    path = tmp_path / "reference.exr"
+    truth = np.concatenate([np.ones((24, 32, 3)), np.zeros((24, 32, 3))], axis=2)
+    channels = [f"{name}.{color}" for name in ("mean", "variance") for color in "RGB"]
+    compare.write_exr(path, truth, channels, {"spp": reference_spp})
+    setup = compare.SceneSetup(WHITE, reference=path)
+    comparison = compare.Comparison(setup, integrators, budget, seeds=seeds, folder=tmp_path)
     return comparison.run()["scenes"][0]

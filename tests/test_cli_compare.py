@@ -5,17 +5,16 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
-from conftest import SPHERE, in_subprocess
+from conftest import SPHERE
 
+from mitsuba_ext import cli
 from mitsuba_ext.compare import load_reference, read_exr, write_exr
-from mitsuba_ext.compare.experiment import run_seed
+from mitsuba_ext.compare.experiment import Experiment, run_seed
 
 
 def test_compare_writes_table_results_and_images(run, make_scene, tmp_path):
@@ -50,33 +49,43 @@ def test_compare_writes_table_results_and_images(run, make_scene, tmp_path):
     "budget, kind, levels",
     [
         (["--sweep", "8,2"], "sweep", [2, 8]),
-        (["--time", "0.2"], "time", [0.2]),
+        (["--time", "0.05"], "time", [0.05]),
         (["--until", "0.02"], "until", None),
     ],
 )
-def test_every_budget_works_on_several_scenes(run, make_scene, tmp_path, budget, kind, levels):
-    nearer = make_scene("nearer.xml", body=SPHERE.replace('z="5"', 'z="4"'))
+def test_every_budget_works(run, make_scene, tmp_path, budget, kind, levels, without_report):
     fragment = tmp_path / "mine.xml"
     fragment.write_text('<integrator type="direct"/>')
     out = tmp_path / "results"
-    arguments = ["compare", nearer, make_scene(), "path", fragment, *budget, "--seeds", "2"]
-    code, text, err = run(*arguments, "--reference-spp", "20000", "--out", out)
+    command = ["compare", make_scene(), "path", fragment, *budget, "--seeds", 2, "--out", out]
+    code, text, err = run(*command, "--reference-spp", 20000)
     assert err == ""
     # How many samples fit into a time, and whether the reference is good enough, is luck
     assert code == 0 or kind == "time"
     results = json.loads((out / "results.json").read_text())
     assert results["budget"]["kind"] == kind
+    for record in results["scenes"][0]["integrators"]:
+        assert record["error"] == ""
+        found = [level["level"] for level in record["levels"]]
+        assert found == levels if levels else found[0] == 8
+
+
+def test_several_scenes_are_compared_in_turn(run, make_scene, tmp_path):
+    nearer = make_scene("nearer.xml", body=SPHERE.replace('z="5"', 'z="4"'))
+    out = tmp_path / "results"
+    command = ["compare", nearer, make_scene(), "path", "--spp", 2, "--seeds", 1, "--out", out]
+    code, text, err = run(*command, "--reference-spp", 64)
+    assert (code, err) == (0, "")
+    results = json.loads((out / "results.json").read_text())
     assert [scene["name"] for scene in results["scenes"]] == ["nearer", tmp_path.name]
-    for scene in results["scenes"]:
-        for record in scene["integrators"]:
-            assert record["error"] == ""
-            found = [level["level"] for level in record["levels"]]
-            assert found == levels if levels else found[0] == 8
+    assert f"{nearer}, 8x6, 2 spp" in text and f"{make_scene()}, 8x6, 2 spp" in text
     assert (out / "report.html").stat().st_size > 10_000
 
 
-def test_progress_goes_to_a_file_line_by_line(run, make_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("mitsuba_ext.cli.common._Log.PERIOD", 0.0)
+def test_progress_goes_to_a_file_line_by_line(
+    run, make_scene, tmp_path, monkeypatch, without_report
+):
+    monkeypatch.setattr("mitsuba_ext.progress.PERIOD", 0.0)
     command = ("compare", make_scene(), "path", "prb", "--spp", 4, "--seeds", 2)
     _, _, err = run(*command, "--reference-spp", 64, "--out", tmp_path)
     name = tmp_path.name
@@ -90,7 +99,9 @@ def test_reference_that_is_too_noisy_ends_with_exit_code_1(run, make_scene, tmp_
     assert code == 1 and "the reference is too noisy" in text
 
 
-def test_rendered_reference_is_kept_until_the_scene_changes(run, make_scene, tmp_path):
+def test_rendered_reference_is_kept_until_the_scene_changes(
+    run, make_scene, tmp_path, without_report
+):
     out = tmp_path / "results"
     scene = make_scene()
 
@@ -105,7 +116,9 @@ def test_rendered_reference_is_kept_until_the_scene_changes(run, make_scene, tmp
     assert len(references()) == 2
 
 
-def test_rendered_reference_has_the_mean_and_its_variance(run, make_scene, tmp_path):
+def test_rendered_reference_has_the_mean_and_its_variance(
+    run, make_scene, tmp_path, without_report
+):
     scene = make_scene()
     command = ("compare", scene, "path", "--spp", 1, "--seeds", 1, "--out", tmp_path)
     assert run(*command, "--reference-spp", 512)[0] == 0
@@ -116,7 +129,9 @@ def test_rendered_reference_has_the_mean_and_its_variance(run, make_scene, tmp_p
     assert reference.variance.max() > 1e-6
 
 
-def test_images_with_variance_serve_as_reference_and_for_z(run, make_scene, tmp_path):
+def test_images_with_variance_serve_as_reference_and_for_z(
+    run, make_scene, tmp_path, without_report
+):
     wrapper = tmp_path / "variance.json"
     wrapper.write_text(json.dumps({"type": "variance", "image": {"type": "path"}}))
     scene, paths = make_scene(), [tmp_path / "a.exr", tmp_path / "b.exr"]
@@ -133,7 +148,9 @@ def test_images_with_variance_serve_as_reference_and_for_z(run, make_scene, tmp_
     assert reference["noise"] == pytest.approx(record["reference_noise"], rel=0.5)
 
 
-def test_plain_rgb_reference_is_accepted(run, make_scene, tmp_path):
+def test_plain_rgb_reference_is_accepted(
+    run, make_scene, tmp_path, without_report
+):
     path = tmp_path / "plain.exr"
     write_exr(path, np.ones((6, 8, 3)), "RGB", {})
     command = ("compare", make_scene(), "path", "--spp", 4, "--seeds", 1, "--out", tmp_path / "o")
@@ -162,21 +179,45 @@ def test_unfit_reference_is_refused(run, make_scene, tmp_path, pixels, channels,
     assert not out.exists()
 
 
-def test_truncated_reference_is_one_line(make_scene, tmp_path):
+def test_truncated_reference_is_one_line(make_scene, tmp_path, capfd):
     path = tmp_path / "reference.exr"
     write_exr(path, np.random.default_rng(0).random((6, 8, 3)), "RGB", {})
     path.write_bytes(path.read_bytes()[:-200])
-    scene = make_scene()
-    # In a process of its own: libraries write to the terminal past Python
-    result = in_subprocess(
-        "compare", scene, "path", "--spp", "1", "--reference", path, "--out", tmp_path / "o"
-    )
-    assert result.returncode == 2
-    assert result.stdout == "" and result.stderr.count("\n") == 1
-    assert f"{path}: unreadable" in result.stderr
+    command = ["compare", make_scene(), "path", "--spp", 1, "--reference", path]
+    assert cli.main([*map(str, command), "--out", str(tmp_path / "o")]) == 2
+    captured = capfd.readouterr()  # also what libraries write past Python
+    assert captured.out == "" and captured.err.count("\n") == 1
+    assert f"{path}: unreadable" in captured.err
 
 
-def test_failing_integrator_is_a_row_and_does_not_stop_the_others(run, make_scene, tmp_path):
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["scene.xml", "", "--spp", "1"], 'integrator "": expected NAME'),
+        (["scene.xml", " ", "--spp", "1"], 'integrator " ": expected NAME'),
+        (["", "path", "--spp", "1"], "no scene was given"),
+        (["scene.xml", "path", "--spp", "1", "--out", ""], "'--out': is empty"),
+        (["scene.xml", "path", "--spp", "1", "--reference", ""], "'--reference': is empty"),
+        (
+            ["scene.xml", "path", "--spp", "1", "--reference-integrator", ""],
+            'integrator "": expected NAME',
+        ),
+        (["scene.xml", "neepp:aovs=depth", "--spp", "1"], '"neepp": the parameter "aovs" must be'),
+        (["scene.xml", "variance:a=[path", "--spp", "1"], 'found "[" without "]"'),
+    ],
+)
+def test_bad_arguments_are_one_line(run, make_scene, tmp_path, monkeypatch, arguments, message):
+    make_scene()
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("compare", *arguments)
+    assert (code, out) == (2, "")
+    assert message in err and err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.xml"]
+
+
+def test_failing_integrator_is_a_row_and_does_not_stop_the_others(
+    run, make_scene, tmp_path, without_report
+):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -198,96 +239,107 @@ def test_failing_integrator_is_a_row_and_does_not_stop_the_others(run, make_scen
     assert fails["error"] and not path["error"]
 
 
+def stored_runs(folder) -> list[int]:
+    results = json.loads((folder / "out" / "results.json").read_text())
+    return [len(record["runs"]) for record in results["scenes"][0]["integrators"]]
 
 
-# ---- Processes that are interrupted, or die ----
+def test_interruption_reports_what_is_finished(run, make_scene, tmp_path, monkeypatch):
+    measure = Experiment._measure
+
+    def interrupted(self, contender, index, round, path):
+        if round == 1:
+            raise KeyboardInterrupt
+        return measure(self, contender, index, round, path)
+
+    monkeypatch.setattr(Experiment, "_measure", interrupted)
+    command = ("compare", make_scene(), "path", "--spp", 2, "--reference-spp", 64)
+    code, out, err = run(*command, "--out", tmp_path / "out")
+    assert code == 130 and out.count("report.html") == 1
+    assert err == "interrupted: the results are of the finished runs\n"
+    assert stored_runs(tmp_path) == [1] and (tmp_path / "out" / "report.html").is_file()
+
+
+# ---- Processes that are interrupted, or die (tests/test_supervisor.py has the rest) ----
 
 TROUBLE = """
 import os, time
 import mitsuba as mi
 from mitsuba_ext.compare.experiment import run_seed
 
-class Trouble(type(mi.load_dict({"type": "prb"}))):
+class Trouble(mi.SamplingIntegrator):  # without to_string(), which is optional
+    def __init__(self, props):
+        super().__init__(props)
+        self.path = mi.load_dict({"type": "path", "max_depth": 2})
+
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "abort":
-            os.abort()
-        if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "exit":
+        kind = os.environ["TROUBLE"] if seed == run_seed(0, 1) else ""
+        if kind == "exit":
             os._exit(3)
-        if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "wait":
-            print("waiting", flush=True)
-            time.sleep(60)
-        if seed == run_seed(0, 1) and os.environ["TROUBLE"] == "hang":
+        if kind == "hang":
             print("hanging", flush=True)
-            while True:  # as native code, it does not hear Ctrl-C
-                try:
-                    time.sleep(60)
-                except KeyboardInterrupt:
-                    pass
-        return super().render(scene, sensor, seed, spp, develop, evaluate)
+            time.sleep(600)
+        return self.path.render(scene, sensor, seed, spp, develop, evaluate)
 
 mi.register_integrator("trouble", lambda props: Trouble(props))
 """
 
 
-def troubled(scene, folder, kind: str, **options) -> subprocess.Popen:
-    """A comparison of ``path`` with an integrator that makes trouble in the second round."""
-    plugin = folder / "trouble.py"
+@pytest.fixture
+def troubled(make_scene, tmp_path):
+    """Starts a comparison of ``path`` with an integrator that makes trouble in the second round;
+    returns its process, and the arguments."""
+    plugin = tmp_path / "trouble.py"
     plugin.write_text(TROUBLE)
-    arguments = ["compare", scene, "path", "trouble", "--spp", "2", "--out", folder / "out"]
-    command = [sys.executable, "-m", "mitsuba_ext", *map(str, arguments), f"--plugin={plugin}"]
-    return subprocess.Popen(
-        command, env={**os.environ, "TROUBLE": kind}, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True, **options,
-    )
+    started = []
+
+    def start(kind: str) -> tuple[subprocess.Popen, list[str]]:
+        arguments = [
+            "compare", make_scene(), "path", "trouble", "--spp", 2, "--out", tmp_path / "out",
+            "--plugin", plugin,
+        ]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "mitsuba_ext", *map(str, arguments)],
+            env={**os.environ, "TROUBLE": kind}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        return process, arguments
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
 
 
-def stored_runs(folder) -> list[int]:
-    results = json.loads((folder / "out" / "results.json").read_text())
-    return [len(record["runs"]) for record in results["scenes"][0]["integrators"]]
-
-
-@pytest.mark.parametrize("kind, end", [("abort", "died of SIGABRT"), ("exit", "ended with exit")])
-def test_integrator_that_takes_the_process_down_is_a_failed_row(make_scene, tmp_path, kind, end):
-    process = troubled(make_scene(), tmp_path, kind)
+def test_integrator_that_takes_the_process_down_is_a_failed_row(
+    run, troubled, tmp_path, monkeypatch
+):
+    process, arguments = troubled("exit")
     out, err = process.communicate(timeout=120)
     assert process.returncode == 1
-    assert f"the process {end}" in out
-    assert "going on with the others" in err
+    assert out.count("the process ended with exit code 3 in this render") == 1
+    assert err.count("going on with the others") == 1
     assert stored_runs(tmp_path) == [3, 1]
-    # Forgiven the next time, and what is there is taken up
-    process = troubled(make_scene(), tmp_path, "none")
-    process.communicate(timeout=120)
-    assert process.returncode == 0
+    files = set(tmp_path.rglob("out/*/*.exr"))
+    # What is there is taken up the next time
+    monkeypatch.setenv("TROUBLE", "")
+    assert run(*arguments)[0] == 0
     assert stored_runs(tmp_path) == [3, 3]
+    assert len(set(tmp_path.rglob("out/*/*.exr")) - files) == 2
 
 
-def test_first_interrupt_reaches_the_worker_which_reports_what_is_finished(make_scene, tmp_path):
-    process = troubled(make_scene(), tmp_path, "wait")
-    assert process.stdout.readline() == "waiting\n"
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 130
-    assert "given up" not in err
-    assert stored_runs(tmp_path) == [2, 1]
-    assert json.loads((tmp_path / "out" / "results.json").read_text())["state"] == "interrupted"
-
-
-def test_second_interrupt_gives_up_the_running_render_and_reports_the_others(make_scene, tmp_path):
-    process = troubled(make_scene(), tmp_path, "hang")
+def test_end_of_the_supervisor_is_the_end_of_its_worker_and_lock(
+    run, troubled, tmp_path, monkeypatch
+):
+    process, arguments = troubled("hang")
     assert process.stdout.readline() == "hanging\n"
-    for _ in range(2):
-        process.send_signal(signal.SIGINT)
-        time.sleep(0.5)
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 130
-    assert "waiting for the running render" in err and "given up" in err
-    assert stored_runs(tmp_path) == [2, 1]
-    assert "report.html" in out
-
-
-def test_end_of_the_supervisor_is_the_end_of_its_worker(make_scene, tmp_path):
-    process = troubled(make_scene(), tmp_path, "hang")
-    assert process.stdout.readline() == "hanging\n"
-    process.terminate()
+    code, _, err = run(*arguments)
+    assert code == 2 and f"(process {process.pid})" in err and err.count("\n") == 1
+    process.kill()
     process.communicate(timeout=60)  # waits until the worker too has closed the pipe
-    assert process.returncode == -signal.SIGTERM
+    monkeypatch.setenv("TROUBLE", "")
+    code, out, err = run(*arguments)
+    assert (code, err) == (0, "")
+    assert out.count("results.json") == 1
+    assert stored_runs(tmp_path) == [3, 3]

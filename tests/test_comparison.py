@@ -11,7 +11,7 @@ from mitsuba_ext.compare.experiment import run_seed
 
 import mitsuba as mi  # isort: skip
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = pytest.mark.usefixtures("variant", "without_report")
 
 
 def is_near(estimate, truth) -> bool:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import json
 
 import numpy as np
 import pytest
 from noisy import WHITE, compare_noisy, noisy_integrator
 
-from mitsuba_ext import compare
-from mitsuba_ext.compare import InputError, experiment, runs
+from mitsuba_ext import compare, marks, progress
+from mitsuba_ext.compare import InputError, experiment
 from mitsuba_ext.compare.experiment import run_seed
 
 import mitsuba as mi  # isort: skip
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = pytest.mark.usefixtures("variant", "without_report")
 
 
 # ---- The reference ----
@@ -119,7 +120,7 @@ def test_failing_integrator_is_a_row_with_its_earlier_runs(clock, tmp_path):
     assert fails["error"] == "no light"
     assert "ZeroDivisionError" in fails["traceback"]
     assert not list(tmp_path.rglob("*.running"))
-    assert "ZeroDivisionError" in (tmp_path / "report.html").read_text()
+    assert "ZeroDivisionError" in compare.write_report(tmp_path).read_text()
     assert first["error"] == ""
 
 
@@ -167,7 +168,7 @@ def test_scene_that_fails_is_an_entry_and_does_not_stop_the_others(clock, tmp_pa
     first, second = comparison.run()["scenes"]
     assert "radiu" in first["error"] and not second["error"]
     assert first["name"] != second["name"]
-    assert (tmp_path / "report.html").is_file()
+    assert "radiu" in compare.write_report(tmp_path).read_text()
     with pytest.raises(InputError, match="radiu"):
         compare.Comparison(broken, ["path"], compare.equal_samples(4)).run()
 
@@ -213,15 +214,59 @@ def test_runs_of_a_live_object_are_not_taken_up(clock, tmp_path):
         assert (run_seed(0, 0), 8) in calls
 
 
-def test_times_of_different_sessions_are_not_paired(clock, tmp_path, monkeypatch):
+def test_times_are_compared_within_one_session(clock, tmp_path, monkeypatch):
+    calls = []
+    made = {
+        name: noisy_integrator(clock, sigma=sigma, calls=calls)
+        for name, sigma in (("first", 1.0), ("second", 0.5), ("third", 2.0))
+    }
+
+    def run_again(session: str, slowness: float, names: list[str]) -> dict:
+        calls.clear()
+        monkeypatch.setattr(marks, "SESSION", session)
+        clock.slowness = slowness
+        return compare_noisy(
+            compare.equal_samples(64), {name: made[name] for name in names}, tmp_path
+        )
+
+    alone = run_again("monday", 1.0, ["first"])
+    images = {path: path.read_bytes() for path in tmp_path.glob("scene/*.exr")}
+    # The machine takes twice as long: so does the first integrator, whose images stay
+    scene = run_again("tuesday", 2.0, ["first", "second"])
+    assert len([call for call in calls if call[1] == 64]) == 6
+    assert all(path.read_bytes() == content for path, content in images.items())
+    first, second = (record["levels"][0] for record in scene["integrators"])
+    assert first["figures"] == alone["integrators"][0]["levels"][0]["figures"]
+    ratios = second["ratios"]
+    assert list(ratios["seconds"].values()) == pytest.approx([1, 1, 1])
+    assert ratios["efficiency"]["value"] == pytest.approx(4, rel=0.1)
+    assert ratios["efficiency"]["low"] < ratios["efficiency"]["value"]
+    assert first["ratios"]["efficiency"]["value"] == pytest.approx(1)
+    (warning,) = scene["warnings"]
+    assert "different sessions" in warning and "(timed again for that: first)" in warning
+    # Nothing is missing: nothing is rendered
+    assert run_again("wednesday", 3.0, ["first", "second"]) == scene and not calls
+    # With another first integrator, the others are timed beside it
+    scene = run_again("thursday", 4.0, ["third", "first", "second"])
+    assert len([call for call in calls if call[1] == 64]) == 9
+    for record in scene["integrators"]:
+        assert record["levels"][0]["ratios"]["seconds"]["value"] == pytest.approx(1)
+
+
+def test_times_without_a_common_session_give_no_ratio(clock, tmp_path, monkeypatch):
     integrators = {name: noisy_integrator(clock) for name in ("first", "second")}
-    compare_noisy(compare.equal_samples(8), {"first": integrators["first"]}, tmp_path)
-    monkeypatch.setattr(runs, "SESSION", "tomorrow")
-    scene = compare_noisy(compare.equal_samples(8), integrators, tmp_path)
-    assert any("different sessions" in warning for warning in scene["warnings"])
+    for session, name in (("monday", "first"), ("tuesday", "second")):
+        monkeypatch.setattr(marks, "SESSION", session)
+        compare_noisy(compare.equal_samples(8), {name: integrators[name]}, tmp_path, seeds=2)
+    setup = compare.SceneSetup(WHITE, reference=tmp_path / "reference.exr")
+    comparison = compare.Comparison(
+        setup, integrators, compare.equal_samples(8), folder=tmp_path, only_stored=True
+    )
+    (scene,) = comparison.run()["scenes"]
     ratios = scene["integrators"][1]["levels"][0]["ratios"]
-    assert ratios["efficiency"]["low"] is None and ratios["seconds"]["low"] is None
-    assert ratios["relmse"]["low"] is not None
+    assert ratios["seconds"] is None and ratios["efficiency"] is None and ratios["relmse"]
+    assert "second and first have no times of one session" in scene["warnings"][1]
+    assert len(scene["integrators"][1]["runs"]) == 2
 
 
 def test_interruption_keeps_what_is_finished_and_says_so(clock, tmp_path, monkeypatch):
@@ -242,16 +287,43 @@ def test_interruption_keeps_what_is_finished_and_says_so(clock, tmp_path, monkey
     stored = json.loads((tmp_path / "results.json").read_text())
     assert stored["state"] == "interrupted"
     assert len(stored["scenes"][0]["integrators"][0]["runs"]) == 2
-    assert "nterrupted" in (tmp_path / "report.html").read_text()
+    assert "nterrupted" in compare.write_report(tmp_path).read_text()
     monkeypatch.undo()
-
-
-def test_temporary_folder_serves_where_none_is_given(clock):
+    # As the supervisor does after a second Ctrl-C: nothing is rendered
     comparison = compare.Comparison(
-        WHITE, {"noisy": noisy_integrator(clock)}, compare.equal_samples(4), reference_spp=16
+        WHITE, integrators, compare.equal_samples(8), folder=tmp_path, only_stored=True
     )
-    comparison.run()
-    assert (comparison.folder / "report.html").is_file()
+    monkeypatch.setattr(experiment.Experiment, "_timed", None)
+    assert comparison.run()["scenes"] == stored["scenes"]
+    assert comparison.results()["state"] == "interrupted"
+
+
+@pytest.fixture
+def small(clock):
+    """A comparison in a temporary folder."""
+    integrators = {"noisy": noisy_integrator(clock)}
+    return compare.Comparison(WHITE, integrators, compare.equal_samples(4), reference_spp=16)
+
+
+def test_progress_is_reported_unless_it_is_switched_off(small, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "PERIOD", 0.0)
+    small.run()
+    assert (small.folder / "results.json").is_file()  # nobody has said where
+    captured = capsys.readouterr()
+    assert "scene: reference 50%\n" in captured.err and captured.out == ""
+    steps = []
+    for silent in (False, lambda step: steps.append(step.label)):
+        small.run(progress=silent)
+        assert capsys.readouterr() == ("", "")
+    assert "scene: reference" in steps
+    monkeypatch.setattr(progress.sys, "stderr", terminal := Terminal())
+    small.run()
+    assert "scene: reference" in terminal.getvalue()
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
 
 
 @pytest.mark.parametrize(
@@ -260,13 +332,23 @@ def test_temporary_folder_serves_where_none_is_given(clock):
         ([], ["path"], {}, "no scene"),
         (WHITE, [], {}, "no integrator"),
         (WHITE, ["path", "path"], {}, "given twice"),
+        (WHITE, {"": "path"}, {}, "label of an integrator is empty"),
         (WHITE, ["path"], {"seeds": 0}, "seed"),
         ("none.xml", ["path"], {}, "no such scene"),
+        (3, ["path"], {}, "a scene must be an XML file or a dict"),
+        (WHITE, ["path"], {"folder": " "}, "name of the folder is empty"),
+        (WHITE, ["path"], {"reference_integrator": "none"}, 'unknown integrator "none"'),
     ],
 )
 def test_bad_input_is_refused_at_once(scenes, integrators, options, message):
     with pytest.raises(InputError, match=message):
         compare.Comparison(scenes, integrators, compare.equal_samples(4), **options)
+
+
+def test_budget_that_is_none_is_refused():
+    for budget in (64, None, [4, 16], "64"):
+        with pytest.raises(InputError, match=r"made by equal_samples\(64\), .* or until\(0.01\)"):
+            compare.Comparison(WHITE, ["path"], budget)
 
 
 @pytest.mark.parametrize(

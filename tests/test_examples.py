@@ -30,7 +30,7 @@ def test_quickstart_runs_in_any_folder(tmp_path, monkeypatch, capsys):
 def test_comparison_runs_in_any_folder(tmp_path, monkeypatch):
     """All but the measurements."""
     seen = []
-    monkeypatch.setattr(compare.Comparison, "run", lambda comparison, _: seen.append(comparison))
+    monkeypatch.setattr(compare.Comparison, "run", lambda comparison: seen.append(comparison))
     monkeypatch.setattr(compare, "show", lambda results: None)
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(EXAMPLES / "compare.py"), run_name="__main__")

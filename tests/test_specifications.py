@@ -8,34 +8,110 @@ import numpy as np
 import pytest
 from conftest import PATH
 
+from mitsuba_ext.aovs import AOV_TYPES
+from mitsuba_ext.cli.common import _import_module as import_plugin
 from mitsuba_ext.compare import InputError, load_scene
-from mitsuba_ext.specifications import make_integrator, make_named, parse_integrator
+from mitsuba_ext.plugin_text import parse_plugin
+from mitsuba_ext.scenes import one_line
+from mitsuba_ext.specifications import make_named
 
 import mitsuba as mi  # isort: skip
 
 
-def test_integrator_specification():
-    assert parse_integrator("path") == ("path", {})
-    name, parameters = parse_integrator("x:a=1,b=0.5,c=true,d=false,e=1e-3,f=mean")
-    assert name == "x"
-    assert parameters == {"a": 1, "b": 0.5, "c": True, "d": False, "e": 1e-3, "f": "mean"}
-    assert [type(value) for value in parameters.values()] == [int, float, bool, bool, float, str]
+def test_parameters_of_a_plugin_are_read_with_their_types():
+    assert parse_plugin("path") == {"type": "path"}
+    plugin = parse_plugin("x:a=1,b=0.5,c=true,d=false,e=1e-3,f=mean")
+    assert plugin == {
+        "type": "x", "a": 1, "b": 0.5, "c": True, "d": False, "e": 1e-3, "f": "mean"
+    }
+    kinds = [str, int, float, bool, bool, float, str]
+    assert [type(value) for value in plugin.values()] == kinds
+
+
+def test_comma_begins_a_parameter_only_where_a_key_follows():
+    plugin = parse_plugin("neepp:aovs=d:depth,a:albedo,spp=4,n=a,b,c=d=e,f")
+    values = {"aovs": "d:depth,a:albedo", "spp": 4, "n": "a,b", "c": "d=e,f"}
+    assert plugin == {"type": "neepp", **values}
+
+
+def test_brackets_hold_nested_plugins_to_any_depth():
+    text = "a:x=[b:y=[c:aovs=d:depth,n:uv,z=1],w=[e]],v=f[2],u=3"
+    assert parse_plugin(text) == {
+        "type": "a",
+        "x": {
+            "type": "b", "y": {"type": "c", "aovs": "d:depth,n:uv", "z": 1}, "w": {"type": "e"},
+        },
+        "v": "f[2]",
+        "u": 3,
+    }
 
 
 @pytest.mark.parametrize(
-    "text", ["", ":", "path:", "path:a", "path:=1", "path:a=", "a b", "x:a=1,a=2"]
+    "text, words",
+    [
+        ("", "expected NAME"), (":", "expected NAME"), ("path:", "expected NAME"),
+        ("a b", "expected NAME"), (" ", "expected NAME"), ("path:a", "expected key=value"),
+        ("path:=1", "expected key=value"), ("path:a=", "expected key=value"),
+        ("path:a=1,", "expected key=value"), ("x:a=1,,b=2", 'found "a=1,"'),
+        ("x:a=1,a=2", '"a" is given twice'), ("x:type=y", '"type" is given twice'),
+        ("x:n=[y", "without"), ("x:n=y]", "without"), ("x:n=]y[", "without"),
+        ("x:n=[]", "expected NAME"), ("x:n=[y:a]", 'found "a"'),
+        ("x:n=[y],z", 'behind "]"'), ("x:n=[y][z]", 'behind "]"'),
+    ],
 )
-def test_malformed_specification_is_refused(text):
-    with pytest.raises(InputError, match="integrator"):
-        parse_integrator(text)
+def test_malformed_specification_is_refused(text, words):
+    with pytest.raises(InputError) as error:
+        parse_plugin(text)
+    assert f'integrator "{text}": ' in str(error.value) and words in str(error.value)
+
+
+def test_nested_integrators_take_over_the_settings_and_are_checked(variant):
+    named = make_named("variance:nested=[neepp:rr_depth=9,aovs=d:depth,a:albedo],batches=4", DEPTH)
+    assert named.name == "variance"
+    assert named.parameters == {
+        "batches": 4,
+        "nested": {"type": "neepp", "max_depth": 3, "rr_depth": 9, "aovs": "d:depth,a:albedo"},
+    }
+    assert "max_depth = 3" in str(named.integrator) and "rr_depth = 9" in str(named.integrator)
+    settings = {**DEPTH, "hide_emitters": True}
+    lens = make_named("reweighted_lens:in=[composed_path]", settings)
+    assert lens.parameters["in"] == {"type": "composed_path", **settings}
+    for text in ("aov:aovs=d:depth,n:uv,image=[path]", "variance:a=[moment:b=[volpathmis]]"):
+        assert "max_depth = 3" in str(make_named(text, DEPTH).integrator)
+    for text, message in (
+        ("variance:nested=[none]", 'unknown nested plugin "none"'),
+        ("variance:nested=[path:x=1]", 'nested plugin "path" has no parameter "x"'),
+        ("variance:nested=[path:max_depth=a,b]", 'nested plugin "path": The property "max_depth"'),
+        ("path:nested=[path]", 'integrator "path" has no parameter "nested"'),
+        ("variance:nested=[independent]", "exactly one integrator must be nested in it"),
+        ("independent", "not an integrator"),
+    ):
+        with pytest.raises(InputError) as error:
+            make_named(text, DEPTH)
+        assert message in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("plugin", ["aov", "composed_path"])
+def test_output_variables_are_checked_before_mitsuba_sees_them(variant, tmp_path, plugin):
+    for aovs in ("depth", "d:", ":depth", "d:depht", "a:b:depth", "d:depth,x", "a : depth"):
+        with pytest.raises(InputError) as error:
+            make_named({"type": plugin, "aovs": aovs})
+        assert f'"{plugin}": the parameter "aovs" must be a list of name:type' in str(error.value)
+        assert "sh_normal, dp_du" in str(error.value)
+    with pytest.raises(InputError, match='and not "depth"'):
+        make_named(f"{plugin}:aovs=depth")
+    with pytest.raises(InputError, match='and not "depth"'):
+        load_scene({**SPHERE_SCENE, "integrator": {"type": plugin, "aovs": "depth"}})
+    every = ",".join(f"a{index}:{kind}" for index, kind in enumerate(AOV_TYPES))
+    assert len(make_named(f"{plugin}:aovs={every}").integrator.aov_names()) == 27
 
 
 def test_depth_is_inherited_where_the_integrator_knows_it(make_scene):
     mi.set_variant("llvm_ad_rgb")
     loaded = load_scene(make_scene())
     assert loaded.settings == {"max_depth": 3, "rr_depth": 5}
-    assert make_integrator("prb", {"max_depth": 7}, loaded.settings)[1]["max_depth"] == 7
-    assert make_integrator("direct", {}, loaded.settings)[1] == {}
+    assert make_named("prb:max_depth=7", loaded.settings).parameters["max_depth"] == 7
+    assert make_named("direct", loaded.settings).parameters == {}
     unlimited = load_scene(make_scene("b.xml", integrator='<integrator type="path"/>'))
     assert unlimited.settings["max_depth"] == -1
     nested = f'<integrator type="aov"><string name="aovs" value="d:depth"/>{PATH}</integrator>'
@@ -94,6 +170,45 @@ def test_code_without_a_file_and_live_objects_are_never_the_same_again(variant):
     nested = {"type": "aov", "aovs": "d:depth", "image": live}
     for specification in ("in_notebook", live, nested):
         assert identity(specification) != identity(specification)
+
+
+USERS = """
+import mitsuba as mi
+
+class Silent(mi.SamplingIntegrator):  # to_string() is optional
+    def __init__(self, props):
+        super().__init__(props)
+        self.grid = props.get("grid", 1)
+
+class Talking(Silent):
+    def to_string(self):
+        return f"Talking[{object()}]"
+
+mi.register_integrator("silent", lambda props: Silent(props))
+mi.register_integrator("talking", lambda props: Talking(props))
+"""
+
+
+def test_name_parameters_and_code_identify_integrators_without_to_string(variant, tmp_path):
+    file = tmp_path / "users_plugin.py"
+    file.write_text(USERS)
+    import_plugin(str(file))
+    (tmp_path / "wrapped.json").write_text(
+        json.dumps({"type": "variance", "nested": {"type": "silent", "grid": 3}})
+    )
+    forms = [
+        "silent", "silent:grid=2", "talking", "variance:nested=[silent]",
+        "variance:nested=[silent:grid=2]",
+        "aov:aovs=d:depth,image=[silent]", {"type": "variance", "nested": {"type": "silent"}},
+        str(tmp_path / "wrapped.json"),
+    ]
+    first = [make_named(form, DEPTH).identity for form in forms]
+    assert len(set(first)) == len(forms)
+    assert [make_named(form, DEPTH).identity for form in forms] == first
+    file.write_text(USERS + "\n# changed\n")
+    changed = [make_named(form, DEPTH).identity for form in forms]
+    assert not set(changed) & set(first)
+    assert make_named("aov:aovs=d:depth,image=[path]").identity.count('""') == 1  # no Python in it
 
 
 def test_identity_tells_parameters_and_plugins_apart(variant):
@@ -193,3 +308,38 @@ def test_hash_of_a_file_follows_its_meshes(variant, tmp_path):
         flat.write_ply(str(mesh))
         hashes.add(load_scene(scene).content_hash)
     assert len(hashes) == 2
+
+
+def test_of_a_traceback_that_mitsuba_quotes_only_the_message_is_left(variant, scenes):
+    with pytest.raises(InputError) as error:
+        load_scene(scenes / "prism.xml")
+    message = str(error.value)
+    assert message.startswith(f"At {scenes / 'prism.xml'} (line ") and "\n" not in message
+    assert '"dispersive_dielectric" cannot disperse light in the variant "llvm_ad_rgb"' in message
+    assert "Traceback" not in message and "File" not in message and "RuntimeError" not in message
+    traceback = 'Traceback (most recent call last):\n  File "a.py", line 1, in f\n    g()\n    ^\n'
+    for text, line in (
+        (f"[x.cpp:1] failed: {traceback}ValueError: no\n  light: here", "failed: no light: here"),
+        (f"{traceback}KeyError: 1\n\nDuring it:\n\n{traceback}a.B: two", "two"),
+        (f"failed: {traceback}AssertionError", "failed: AssertionError"),
+        ("one\n  - two", "one two"),
+    ):
+        assert one_line(RuntimeError(text)) == line
+
+
+def test_what_is_of_another_variant_or_no_scene_is_refused(variant):
+    mi.set_variant("scalar_rgb")
+    scene = mi.load_dict({**SPHERE_SCENE, "integrator": {"type": "path"}})
+    sphere, path = mi.load_dict({"type": "sphere"}), mi.load_dict({"type": "path"})
+    mi.set_variant(variant)
+    for source in ({**SPHERE_SCENE, "shape": sphere}, {"type": "scene", "in": {"x": sphere}}):
+        with pytest.raises(InputError, match='"Sphere" was made in the variant "scalar_rgb"'):
+            load_scene(source)
+    for source in (scene, 3):
+        with pytest.raises(InputError, match="a scene must be an XML file or a dict, found an obj"):
+            load_scene(source)
+    for specification in (path, {"type": "variance", "nested": path}):
+        with pytest.raises(InputError, match='was made in the variant "scalar_rgb"'):
+            make_named(specification)
+    with pytest.raises(InputError, match="an integrator must be named by text"):
+        make_named(3)

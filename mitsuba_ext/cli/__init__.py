@@ -2,7 +2,7 @@
 
 Mitsuba's own command cannot load plugins written in Python. Exit codes: 0, 1 (a comparison in which
 an integrator failed or a reference was too noisy, a problem that the doctor found), 2 (bad input:
-one line on stderr), 130 (Ctrl-C).
+one line on stderr), 130, 143 and 129 (Ctrl-C, SIGTERM, SIGHUP).
 """
 
 from __future__ import annotations

@@ -1,24 +1,20 @@
-"""What the commands share: kinds of options, the variant, progress bars, the terminal."""
+"""What the commands share: kinds of options, the variant, the terminal."""
 
 from __future__ import annotations
 
-import contextlib
-import datetime
 import importlib.util
 import re
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..progress import progress_bars  # noqa: F401  (for the commands)
+
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress, ProgressColumn
-
-    from ..compare.experiment import Step
 
 #: Exit code after Ctrl-C.
 INTERRUPTED = 130
@@ -46,6 +42,18 @@ class Numbers(click.ParamType):
         if not re.fullmatch(r"[1-9]\d*(,[1-9]\d*)*", value):
             self.fail(f'expected something like 4,16,64, found "{value}"', param, ctx)
         return tuple(map(int, value.split(",")))
+
+
+class FilledPath(click.Path):
+    """A path; an empty one is not taken for the current folder."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Path:
+        if not str(value).strip():
+            self.fail("is empty", param, ctx)
+        return super().convert(value, param, ctx)
 
 
 class Definition(click.ParamType):
@@ -120,71 +128,6 @@ def kernels_compiled() -> int:
 
     _launches, _loaded, compiled = dr.detail.launch_stats()
     return compiled
-
-
-@contextlib.contextmanager
-def progress_bars(*columns: ProgressColumn) -> Iterator[Progress]:
-    """Progress bars on stderr, if that is a terminal.
-
-    Args:
-        columns: What follows the label, the bar and the time; default: rich's estimate of the rest.
-    """
-    from rich import progress as bars
-    from rich.console import Console
-
-    terminal = sys.stderr.isatty()
-    console = Console(stderr=True, quiet=not terminal)
-    columns = (
-        bars.TextColumn("{task.description}", markup=False),
-        bars.BarColumn(),
-        bars.TimeElapsedColumn(),
-        *(columns or [bars.TimeRemainingColumn()]),
-    )
-    with bars.Progress(
-        *columns, console=console, disable=not terminal, transient=True
-    ) as progress:
-        yield progress
-
-
-@contextlib.contextmanager
-def progress_line() -> Iterator[Callable[[Step], None]]:
-    """What ``Comparison.run`` reports to: a progress bar with an estimate of the time left; where
-    there is no terminal, a line every minute."""
-    from rich.progress import TextColumn
-
-    if not sys.stderr.isatty():
-        yield _Log()
-        return
-    with progress_bars(TextColumn("{task.fields[left]}", markup=False)) as bars:
-        bar = bars.add_task("loading", total=None, left="")
-
-        def show(step: Step) -> None:
-            total = None if step.left is None else max(step.done + step.left, 1e-9)
-            bars.update(
-                bar, description=step.label, total=total, completed=step.done, left=_left(step)
-            )
-
-        yield show
-
-
-class _Log:
-    """Progress for a file: lines that are at least :attr:`PERIOD` seconds apart."""
-
-    PERIOD = 60.0
-
-    def __init__(self) -> None:
-        self._last = time.monotonic()
-
-    def __call__(self, step: Step) -> None:
-        if time.monotonic() - self._last >= self.PERIOD:
-            self._last = time.monotonic()
-            click.echo(", ".join(filter(None, [step.label, _left(step)])), err=True)
-
-
-def _left(step: Step) -> str:
-    if step.left is None:
-        return ""
-    return f"about {datetime.timedelta(seconds=round(step.left))} left"
 
 
 def console_for_tables() -> Console:

@@ -14,8 +14,8 @@ from ..names import check_integrator
 from . import supervisor
 from .common import (
     INTERRUPTED,
+    FilledPath,
     Numbers,
-    progress_line,
     scene_options,
     select_variant,
 )
@@ -43,7 +43,7 @@ from .common import (
     help="Runs of each integrator at each level, each with a seed of its own.",
 )
 @click.option(
-    "--reference", type=click.Path(path_type=Path), metavar="FILE",
+    "--reference", type=FilledPath(), metavar="FILE",
     help="EXR with mean.R/G/B or R/G/B, and variance.R/G/B (of the mean) if it is known.",
 )
 @click.option(
@@ -56,10 +56,9 @@ from .common import (
     help="What renders the reference.",
 )
 @click.option(
-    "--out", type=click.Path(path_type=Path), default=Path("out/compare"), show_default=True,
-    metavar="DIR",
+    "--out", type=FilledPath(), default="out/compare", show_default=True, metavar="DIR",
     help="Folder for report.html, results.json, the images, and rendered references. What is there "
-    "already is not rendered again.",
+    "already is kept, and only timed again beside new runs.",
 )
 @click.option("--worker", type=click.Choice(supervisor.JOBS), hidden=True)
 @scene_options
@@ -88,39 +87,42 @@ def compare(
     A SCENE is an XML file. An INTEGRATOR is a name, NAME:key=value,…, or an XML or JSON file that
     holds one. All get max_depth and rr_depth of the scene's integrator unless they set their own.
     Ratios are relative to the first integrator.
+
+    A comma begins a parameter only where key= follows: "neepp:aovs=d:depth,a:albedo,grid=8" has two
+    parameters. Square brackets hold what is nested in an integrator, in the same form:
+    "variance:nested=[neepp:grid=8],batches=32".
     """
     from ..scenes import check_scene_file
 
+    given = {"--spp": spp, "--time": seconds, "--sweep": sweep, "--until": until}
+    if sum(value is not None for value in given.values()) != 1:
+        raise click.UsageError(f"give one of {', '.join(given)}")
+    if reference and reference_spp:
+        raise click.UsageError("--reference and --reference-spp exclude each other")
     scenes, integrators = _sort_out(names)
     if not plugins:
         for specification in (*integrators, reference_integrator):
             check_integrator(specification)
     for scene in scenes:
         check_scene_file(scene)
-    from ..compare import Comparison, SceneSetup, budgets, show
-
-    given = {
-        "--spp": spp and budgets.equal_samples(spp),
-        "--time": seconds and budgets.equal_time(seconds),
-        "--sweep": sweep and budgets.sweep(sweep),
-        "--until": until and budgets.until(until),
-    }
-    chosen = [budget for budget in given.values() if budget]
-    if len(chosen) != 1:
-        raise click.UsageError(f"give one of {', '.join(given)}")
-    if reference and reference_spp:
-        raise click.UsageError("--reference and --reference-spp exclude each other")
-    if worker is not None:
-        supervisor.follow_parent()
-    elif context.obj == supervisor.SUPERVISED:
-        return supervisor.supervise(sys.argv[1:], out)
     if reference and len(scenes) > 1:
         raise click.UsageError("one --reference cannot serve several scenes")
+    if worker is not None:
+        supervisor.become_worker()
+    elif context.obj == supervisor.SUPERVISED:
+        return supervisor.supervise(sys.argv[1:], out)
+    from ..compare import Comparison, SceneSetup, budgets, show
+
+    make = {
+        "--spp": budgets.equal_samples, "--time": budgets.equal_time,
+        "--sweep": budgets.sweep, "--until": budgets.until,
+    }
+    (budget,) = (make[name](value) for name, value in given.items() if value is not None)
     select_variant(variant, plugins)
     comparison = Comparison(
         [SceneSetup(scene, size, dict(definitions), reference) for scene in scenes],
         integrators,
-        chosen[0],
+        budget,
         seeds=seeds,
         folder=out,
         reference_spp=reference_spp,
@@ -130,8 +132,7 @@ def compare(
     )
     interrupted = worker == supervisor.STORED
     try:
-        with progress_line() as progress:
-            comparison.run(progress)
+        comparison.run()
     except KeyboardInterrupt:
         interrupted = True
     results = comparison.results()

@@ -1,11 +1,13 @@
 """A comparison runs in a process of its own, which an integrator may take down with it.
 
 Out of memory, a fault in native code, an abort of LLVM: none of these can be caught in Python. The
-supervisor notes at which run the process died, and starts another; that one finds the finished runs
-in the folder, gives the guilty integrator a failed row, and goes on with the others.
+supervisor notes at which integrator the process died, and starts another; that one finds the
+finished runs in the folder, gives the guilty integrator a failed row, and goes on with the others.
 
 Mitsuba's own integrators cannot be interrupted: after Ctrl-C, the process ends when the running
 render does. A second Ctrl-C kills it, and another process writes the report of what is finished.
+SIGTERM and SIGHUP, which batch systems send before they kill, end it alike, but the running render
+has no more than :data:`GRACE` seconds.
 """
 
 from __future__ import annotations
@@ -18,9 +20,11 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 
+from .. import marks
 from ..processes import python_command
 from .common import INTERRUPTED
 
@@ -30,28 +34,48 @@ SUPERVISED = "supervised"
 #: Jobs of a worker: measure, or report what is there.
 MEASURE, STORED = JOBS = ("measure", "stored")
 
+#: Seconds that a running render has after SIGTERM or SIGHUP. Batch systems kill after 10 to 30, and
+#: the report takes a few.
+GRACE = 3.0
+
+#: Exit codes of a worker that came to its end: finished, with trouble, bad input, interrupted.
+_IN_ORDER = (0, 1, 2, INTERRUPTED)
+
 _PR_SET_PDEATHSIG = 1
 
 
-def supervise(arguments: Sequence[str], folder: Path) -> int:
-    """Runs ``mitsuba-ext`` with ``arguments`` in worker processes; returns the exit code."""
-    from ..compare import runs
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM or SIGHUP, whose number is the argument."""
 
-    runs.forgive(folder)
-    while True:
-        code = _work(arguments, MEASURE)
-        if code is None:
-            click.echo("interrupted: the running render is given up", err=True)
-            runs.forgive(folder)
-            return _work(arguments, STORED) or INTERRUPTED
-        reason = f"died of {_signal_name(-code)}" if code < 0 else f"ended with exit code {code}"
-        if runs.blame(folder, f"the process {reason} in this render"):
-            click.echo(f"mitsuba-ext: the process {reason}; going on with the others", err=True)
-        elif code < 0:
-            click.echo(f"mitsuba-ext: the process {reason}", err=True)
-            return 1
-        else:
-            return code
+
+def supervise(arguments: Sequence[str], folder: Path) -> int:
+    """Runs ``mitsuba-ext`` with ``arguments`` in worker processes; returns the exit code.
+
+    Raises:
+        InputError: Another comparison is running in ``folder``.
+    """
+    with _endings_raise(), marks.in_use(folder):
+        blamed: set[Path] = set()
+        while True:
+            end = _work(arguments, folder, MEASURE)
+            if end.signal and end.code in _IN_ORDER:
+                return 128 + end.signal if end.code == INTERRUPTED else end.code
+            if end.signal:
+                _say("interrupted: the running render is given up")
+                marks.forgive(folder)
+                _work(arguments, folder, STORED)
+                return 128 + end.signal
+            reason = _reason(end.code)
+            guilty = marks.blame(folder, end.process, f"the process {reason} in this render")
+            if not guilty:
+                if end.code not in _IN_ORDER:
+                    _say(f"mitsuba-ext: the process {reason}")
+                return end.code if end.code >= 0 else 1
+            if guilty <= blamed:
+                _say(f"mitsuba-ext: the process {reason} in the same render again: given up")
+                return 1
+            blamed |= guilty
+            _say(f"mitsuba-ext: the process {reason}; going on with the others")
 
 
 def without_job(arguments: Sequence[str]) -> list[str]:
@@ -59,48 +83,76 @@ def without_job(arguments: Sequence[str]) -> list[str]:
     return [text for text in arguments if not text.startswith("--worker=")]
 
 
-def follow_parent() -> None:
-    """Makes this worker end when its supervisor is killed (on Linux)."""
+def become_worker() -> None:
+    """Makes this process end when its supervisor is killed (on Linux), and interrupts it once,
+    whatever signal says so: the report that it then writes is not interrupted again."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    signals = [signal.SIGINT, *_endings()]
+
+    def interrupt(_number: int, _frame: object) -> None:
+        for number in signals:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    for number in signals:
+        signal.signal(number, interrupt)
 
 
-def _work(arguments: Sequence[str], job: str) -> int | None:
-    """Runs a worker; ``None`` if a second Ctrl-C killed it."""
-    from ..compare import runs
+class _End(NamedTuple):
+    """How a worker ended.
 
-    command = python_command("mitsuba_ext", *arguments, f"--worker={job}")
+    Attributes:
+        process: Its number.
+        code: Its exit code; negative if a signal ended it.
+        signal: The signal that asked it to end; 0 if none did.
+    """
+
+    process: int
+    code: int
+    signal: int
+
+
+def _command(arguments: Sequence[str], job: str) -> list[str]:
+    return python_command("mitsuba_ext", *arguments, f"--worker={job}")
+
+
+def _work(arguments: Sequence[str], folder: Path, job: str) -> _End:
+    """Runs a worker to its end; the first interruption asks it to end, the second one kills it."""
     # In a session of its own, it gets signals from here alone: each of them once
     worker = subprocess.Popen(
-        command, start_new_session=True, env={**os.environ, runs.SESSION_VARIABLE: runs.SESSION}
+        _command(arguments, job),
+        start_new_session=True,
+        env={**os.environ, marks.SESSION_VARIABLE: marks.SESSION},
     )
-    interrupts = 0
-    with _passing_on(worker):
-        while True:
-            try:
-                return worker.wait()
-            except KeyboardInterrupt:
-                interrupts += 1
-                if interrupts == 1:
-                    worker.send_signal(signal.SIGINT)
-                    click.echo("\nwaiting for the running render (Ctrl-C: give it up)", err=True)
-                else:
-                    worker.kill()
-                    worker.wait()
-                    return None
+    asked, patience = 0, None
+    while True:
+        try:
+            return _End(worker.pid, worker.wait(patience), asked)
+        except subprocess.TimeoutExpired:
+            patience = None
+            if marks.running(folder, worker.pid):  # else it is writing the report
+                worker.kill()
+        except KeyboardInterrupt as ending:
+            if asked:
+                worker.kill()
+                continue
+            worker.send_signal(signal.SIGINT)
+            if isinstance(ending, _Terminated):
+                asked, patience = ending.args[0], GRACE
+            else:
+                asked = signal.SIGINT
+                _say("\nwaiting for the running render (Ctrl-C: give it up)")
 
 
 @contextlib.contextmanager
-def _passing_on(worker: subprocess.Popen) -> Iterator[None]:
-    """What ends the supervisor ends the worker."""
+def _endings_raise() -> Iterator[None]:
+    """What asks this process to end raises :class:`_Terminated`."""
 
     def end(number: int, _frame: object) -> None:
-        worker.kill()
-        signal.signal(number, signal.SIG_DFL)
-        os.kill(os.getpid(), number)
+        raise _Terminated(number)
 
-    numbers = [signal.SIGTERM] + ([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])
-    previous = {number: signal.signal(number, end) for number in numbers}
+    previous = {number: signal.signal(number, end) for number in _endings()}
     try:
         yield
     finally:
@@ -108,8 +160,22 @@ def _passing_on(worker: subprocess.Popen) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _signal_name(number: int) -> str:
+def _endings() -> list[int]:
+    """The signals by which batch systems and terminals ask a process to end, but for those that are
+    ignored (as with ``nohup``)."""
+    numbers = [signal.SIGTERM] + ([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])
+    return [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
+
+
+def _say(text: str) -> None:
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        click.echo(text, err=True)
+
+
+def _reason(code: int) -> str:
+    if code >= 0:
+        return f"ended with exit code {code}"
     try:
-        return signal.Signals(number).name
+        return f"died of {signal.Signals(-code).name}"
     except ValueError:
-        return f"signal {number}"
+        return f"died of signal {-code}"

@@ -17,11 +17,12 @@
 
 from __future__ import annotations
 
+from ..progress import Step
 from ..scenes import InputError, LoadedScene, load_scene
 from ..specifications import NamedIntegrator, make_named
 from .budgets import Budget, equal_samples, equal_time, sweep, until
 from .comparison import Comparison, SceneSetup
-from .experiment import Contender, Experiment, Step
+from .experiment import Contender, Experiment
 from .flip import mean_flip
 from .images import read_exr, write_exr
 from .intervals import Estimate

@@ -7,7 +7,7 @@ import datetime
 import json
 import math
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Union
@@ -15,13 +15,16 @@ from typing import Any, Union
 import drjit as dr
 import mitsuba as mi
 
-from ..scenes import InputError, LoadedScene, load_scene, scene_name
+from ..marks import in_use
+from ..progress import Step, reporting
+from ..scenes import InputError, LoadedScene, check_source, load_scene, scene_name
 from ..specifications import Specification, make_named
-from . import images, references, report, results, timing
+from . import images, references, results, timing
 from .budgets import Budget
-from .experiment import Experiment, Step, make_all
+from .experiment import Experiment, make_all
 from .machine import machine, versions
 from .references import Reference
+from .report import write_report
 
 SceneSource = Union[str, Path, Mapping[str, Any]]
 
@@ -65,7 +68,8 @@ class Comparison:
         only_stored: Render nothing: figures and report of what is in the folder.
 
     Raises:
-        InputError: No scene was given, an integrator cannot be made, or the folder cannot.
+        InputError: No scene was given, an integrator cannot be made, the budget is none, or the
+            folder has no name.
     """
 
     def __init__(
@@ -89,7 +93,14 @@ class Comparison:
                 f'comparisons do not work in the variant "{mi.variant()}": select one that starts '
                 f'with "llvm" or "cuda"'
             )
+        if not isinstance(budget, Budget):
+            raise InputError(
+                f"the budget must be made by equal_samples(64), equal_time(10), sweep([4, 16, 64]) "
+                f"or until(0.01) of mitsuba_ext.compare, found {budget!r}"
+            )
         make_all(integrators)  # an unknown name must not wait for the end of a reference
+        if not all(setup.reference for setup in self.scenes):
+            make_named(reference_integrator)
         self.integrators = integrators
         self.budget = budget
         self.seeds = seeds
@@ -100,25 +111,38 @@ class Comparison:
         if folder is None:
             self._temporary = tempfile.TemporaryDirectory(prefix="mitsuba_ext_")
             folder = self._temporary.name
+        if not str(folder).strip():
+            raise InputError("the name of the folder is empty")
         self.folder = Path(folder)
         self._records: list[dict[str, object]] = []
         self._running: tuple[str, Experiment] | None = None
         self.is_finished = False
 
-    def run(self, progress: Callable[[Step], None] = lambda _step: None) -> dict[str, object]:
+    def run(self, progress: bool | Callable[[Step], None] = True) -> dict[str, object]:
         """Measures everything, writes ``results.json`` and ``report.html``, returns the results.
 
         After Ctrl-C both are written with what is finished before the exception goes on.
 
         Args:
-            progress: Called before each piece of work.
+            progress: What to say meanwhile: ``True`` for a bar on a terminal, and for a line every
+                half minute on stderr elsewhere; ``False`` for nothing; or what to call before each
+                piece of work.
 
         Raises:
             InputError: The only scene cannot be used, or its reference cannot. (Of several, one
-                that cannot is an entry of the results.)
+                that cannot is an entry of the results.) Or another comparison is running in the
+                folder, or the folder cannot be made.
         """
+        self._records, self.is_finished = [], False
+        with in_use(self.folder), reporting(progress) as report_step:
+            self._run(report_step)
+        return self.results()
+
+    def _run(self, progress: Callable[[Step], None]) -> None:
         try:
             for setup in self.scenes:
+                if self._records:
+                    self.write()
                 name = self._unique_name(setup.source)
                 try:
                     self._run_scene(setup, name, progress)
@@ -126,16 +150,12 @@ class Comparison:
                     if len(self.scenes) == 1:
                         raise
                     self._records.append(_failed_record(name, setup.source, str(error)))
-                if self._records:
-                    _make_folder(self.folder)
-                    self.write()
             self.is_finished = not self.only_stored
         finally:
             if self._running:
                 self._keep_record()
             if self._records:
                 self.write()
-        return self.results()
 
     def results(self) -> dict[str, object]:
         """What ``results.json`` holds; see :mod:`.results`."""
@@ -157,7 +177,7 @@ class Comparison:
         text = json.dumps(self.results(), indent=2)
         with images.replacing(self.folder / "results.json") as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
-        report.write_report(self.folder)
+        write_report(self.folder)
 
     def _run_scene(self, setup: SceneSetup, name: str, progress: Callable[[Step], None]) -> None:
         scene = load_scene(setup.source, setup.size, setup.parameters, keep_integrator=False)
@@ -175,7 +195,6 @@ class Comparison:
             raise InputError(f"{scene.source}: {error}") from error
         if setup.reference:
             reference = references.load_reference(setup.reference, scene.size)
-        _make_folder(self.folder)
         if not setup.reference:
             reference = self._render_reference(scene, report_step)
         if reference is None:
@@ -233,14 +252,13 @@ class Comparison:
 
 
 def _setups(scenes: Any) -> list[SceneSetup]:
-    if isinstance(scenes, (str, Path, Mapping, SceneSetup)):
+    if isinstance(scenes, (str, Mapping)) or not isinstance(scenes, Iterable):
         scenes = [scenes]
     setups = [s if isinstance(s, SceneSetup) else SceneSetup(s) for s in scenes]
     if not setups:
         raise InputError("no scene was given")
     for setup in setups:
-        if not isinstance(setup.source, Mapping) and not Path(setup.source).is_file():
-            raise InputError(f"{setup.source}: no such scene")
+        check_source(setup.source)
     return setups
 
 
@@ -257,11 +275,3 @@ def _failed_record(name: str, source: SceneSource, error: str) -> dict[str, obje
         "reference": None,
         "integrators": [],
     }
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot make this folder ({error.strerror})") from error
-    images.check_folder(folder)

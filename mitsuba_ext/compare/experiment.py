@@ -6,6 +6,8 @@
   (a size of pass that the small one did not have) is thrown away and repeated.
 - The integrators take turns (A B C A B C …), round by round: a machine that becomes slower becomes
   so for all of them. Each round and each level has a seed of its own, which the integrators share.
+- Times are compared within one session only: a run that was kept from an earlier one is timed again
+  (its image stays) when the run that it is compared with is of this session.
 - The clock runs around the whole of ``render()``, what it learns included, and stops when the
   image is there.
 """
@@ -17,15 +19,16 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
+from ..marks import has_crashed, mark_of, marked
+from ..progress import Step
 from ..scenes import InputError, LoadedScene, one_line
 from ..specifications import NamedIntegrator, Specification, make_named
 from . import images, metrics, timing
 from .budgets import Budget
 from .machine import machine, versions
 from .references import Reference
-from .runs import Run, RunFolder, has_crashed, marked
+from .runs import Run, RunFolder
 from .zero_radiance import zero_radiance_share
 
 #: How far the time of a run may be from what was asked for before it is repeated, and how often.
@@ -34,20 +37,6 @@ _TIME_ATTEMPTS = 3
 
 #: ``until`` goes no further than this where the reference does not say how many samples it has.
 _MAX_UNTIL_SPP = 1 << 16
-
-
-class Step(NamedTuple):
-    """Where a comparison is; what ``progress`` is called with.
-
-    Attributes:
-        label: What is being done.
-        done: Seconds of work that are behind (measured ones, not the clock's).
-        left: Seconds that are estimated to be left; ``None`` while nothing is known.
-    """
-
-    label: str
-    done: float
-    left: float | None
 
 
 @dataclass
@@ -155,9 +144,9 @@ class Experiment:
         for contender in self.contenders:
             # All speeds are known before the first long run: the time that is left can be told
             paths = (self._path(contender, i, r) for i in indices for r in range(self.rounds))
-            missing = next((path for path in paths if self._folder.load(path) is None), None)
-            if missing and not has_crashed(missing) and not self.only_stored:
-                self._attempt(contender, lambda c=contender, p=missing: self._prepare(c, p))
+            is_complete = all(self._folder.load(path) for path in paths)
+            if not (is_complete or has_crashed(self._mark(contender)) or self.only_stored):
+                self._attempt(contender, lambda c=contender: self._prepare(c))
         for round in range(self.rounds):
             for index in indices:
                 for contender in self.contenders:
@@ -204,15 +193,37 @@ class Experiment:
         if run is None:
             if self.only_stored:
                 return
-            self._prepare(contender, path)
+            self._prepare(contender)
             self._progress(Step(contender.label, self._done, self._seconds_left()))
-            with marked(path):
+            with marked(self._mark(contender)):
                 run = self._measure(contender, index, round, path)
         reference = self.reference
         run.errors = metrics.errors(run.image(), reference.mean, reference.variance)
         contender.runs.append(run)
         contender._pace = run.seconds / run.spp
         self._done += run.seconds
+        if not self.only_stored:
+            self._share_session(contender, run)
+
+    def _share_session(self, contender: Contender, run: Run) -> None:
+        """Sees to it that a run and that of the first integrator have times of one session."""
+        first = self.contenders[0]
+        partner = next((r for r in first.at(run.level) if r.round == run.round), run)
+        if partner.times.keys() & run.times.keys():
+            return
+        for other, stored in ((first, partner), (contender, run)):
+            if not (stored.is_timed_now or other.error):
+                self._attempt(other, lambda c=other, r=stored: self._time_again(c, r))
+
+    def _time_again(self, contender: Contender, run: Run) -> None:
+        """Repeats a run of an earlier session for its time in this one."""
+        self._prepare(contender)
+        label = f"{contender.label}: timing again"
+        self._progress(Step(label, self._done, self._seconds_left()))
+        with marked(self._mark(contender)):
+            timed = self._render_compiled(contender, run.spp, run.seed)
+        self._folder.add_time(run, timed.seconds)
+        self._done += timed.seconds
 
     def _measure(self, contender: Contender, index: int, round: int, path: Path) -> Run:
         level, seed = self.budget.level(index), run_seed(index, round)
@@ -247,9 +258,7 @@ class Experiment:
         spp = self._samples(contender, level)
         attempts: list[timing.Timed] = []
         while len(attempts) < _TIME_ATTEMPTS:
-            timed = self._timed(contender, spp, seed)
-            if timed.compiled:
-                timed = self._timed(contender, spp, seed)
+            timed = self._render_compiled(contender, spp, seed)
             if not self.budget.is_time:
                 return timed
             attempts.append(timed)
@@ -259,12 +268,15 @@ class Experiment:
             spp = better
         return min(attempts, key=lambda timed: abs(timed.seconds - level))
 
-    def _prepare(self, contender: Contender, path: Path) -> None:
-        """Compiles what the runs will need, of which ``path`` is the first, and finds out how fast
-        they will be."""
+    def _render_compiled(self, contender: Contender, spp: int, seed: int) -> timing.Timed:
+        timed = self._timed(contender, spp, seed)
+        return self._timed(contender, spp, seed) if timed.compiled else timed
+
+    def _prepare(self, contender: Contender) -> None:
+        """Compiles what the runs will need, and finds out how fast they will be."""
         if contender._is_prepared:
             return
-        with marked(path):
+        with marked(self._mark(contender)):
             self._warm_up(contender)
         contender._is_prepared = True
 
@@ -318,6 +330,9 @@ class Experiment:
 
     # ---- The folder ----
 
+    def _mark(self, contender: Contender) -> Path:
+        return mark_of(self._folder.folder, contender.label)
+
     def _path(self, contender: Contender, index: int, round: int) -> Path:
         level = f"{self.budget.level(index):g}{'s' if self.budget.is_time else 'spp'}"
         named = contender.named
@@ -339,7 +354,7 @@ def make_all(
     """Makes the integrators of a comparison.
 
     Raises:
-        InputError: There are none, one cannot be made, or two have the same label.
+        InputError: There are none, one cannot be made, a label is empty, or two are the same.
     """
     if isinstance(integrators, Mapping) and "type" not in integrators:
         pairs = list(integrators.items())
@@ -349,6 +364,8 @@ def make_all(
         pairs = [(None, specification) for specification in integrators]
     if not pairs:
         raise InputError("no integrator was given")
+    if any(label is not None and not str(label).strip() for label, _specification in pairs):
+        raise InputError("the label of an integrator is empty")
     made = [make_named(specification, inherited, label) for label, specification in pairs]
     labels = [named.label for named in made]
     for label in labels:

@@ -9,13 +9,13 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..folders import check_folder
 from ..scenes import InputError, one_line
 
 if TYPE_CHECKING:
@@ -33,17 +33,6 @@ def check_target(path: Path) -> None:
         found = f'the extension "{path.suffix}"' if path.suffix else "a name without extension"
         raise InputError(f"{path}: {found} cannot be written ({' '.join(EXTENSIONS)} can)")
     check_folder(path.parent)
-
-
-def check_folder(folder: Path) -> None:
-    """Raises :class:`InputError` if no file can be made in ``folder``."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
-    try:
-        with tempfile.NamedTemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"{folder}: cannot write here ({error.strerror})") from error
 
 
 @contextlib.contextmanager

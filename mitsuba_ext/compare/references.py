@@ -23,11 +23,11 @@ from pathlib import Path
 import numpy as np
 
 from ..batches import Batches, batch_seeds, each_batch
+from ..marks import mark_of, marked
 from ..scenes import InputError, LoadedScene, one_line, scene_name
 from ..specifications import NamedIntegrator, Specification, make_named
 from . import images, metrics
 from .machine import versions
-from .runs import marked
 
 #: Batches of a rendered reference. Their spread gives the variance.
 BATCH_COUNT = 16
@@ -166,7 +166,7 @@ def _render(
     batches = unfinished = _unfinished(partial)
     seeds = batch_seeds(FIRST_SEED, batch_count)[unfinished.count if unfinished else 0 :]
     start = time.perf_counter()
-    with marked(path):
+    with marked(mark_of(folder, f"{named.label}_{scene.content_hash}")):
         for batches in each_batch(named.integrator, scene.scene, 0, batch_spp, seeds, unfinished):
             if fault := metrics.describe_non_finite(images.to_rgb(batches.mean, batches.channels)):
                 raise InputError(f"has {fault}")

@@ -61,12 +61,30 @@ def _warnings(experiment: Experiment) -> Iterator[str]:
     actual = scene.settings.get("max_depth")
     if isinstance(claimed, int) and actual is not None and claimed != actual:
         yield f"the reference has max_depth {claimed}, the scene {actual}"
-    sessions = {run.session for contender in experiment.contenders for run in contender.runs}
-    if len(sessions) > 1:
-        yield (
-            "runs of different sessions, between which the machine may have changed: intervals of "
-            "ratios of times come from rounds of one session only"
-        )
+    yield from _sessions(experiment)
+
+
+def _sessions(experiment: Experiment) -> Iterator[str]:
+    """About runs between which the machine may have changed."""
+    first, *others = experiment.contenders
+    all_runs = [run for contender in experiment.contenders for run in contender.runs]
+    if len({run.session for run in all_runs}) < 2:
+        return
+    repeated = [c.label for c in experiment.contenders if any(run.timed_again for run in c.runs)]
+    yield (
+        "runs of different sessions, between which the machine may have become faster or slower: "
+        "ratios of times and efficiencies compare times of one session"
+        + (f" (timed again for that: {', '.join(repeated)})" if repeated else "")
+        + "; seconds are those of each run's own session"
+    )
+    for contender in others:
+        partners = {(run.level, run.round): run for run in first.runs}
+        pairs = [(run, partners.get((run.level, run.round))) for run in contender.runs]
+        if any(other and not run.times.keys() & other.times.keys() for run, other in pairs):
+            yield (
+                f"{contender.label} and {first.label} have no times of one session in some rounds, "
+                f"which are left out of the ratios: the same command adds them"
+            )
 
 
 def _notes(experiment: Experiment, contender: Contender) -> Iterator[str]:

@@ -27,7 +27,8 @@ bounds are null for a single one), or null where there is none. Other unknown nu
             runs             a list: level (samples, or seconds), round, seed, spp, seconds,
                              relmse, relmse_trimmed, mse, rmse, sigma_mu, flip,
                              rays {camera, scatter, shadow}, connections, zero_radiance,
-                             memory (bytes), launches, session, image
+                             memory (bytes), launches, session, image, timed_again (seconds of
+                             the same render in later sessions, by session)
             levels           a list:
                 level, run_count
                 refused      why the errors are not given: the reference is too noisy for them
@@ -37,7 +38,8 @@ bounds are null for a single one), or null where there is none. Other unknown nu
                              zero_radiance, memory, launches,
                              efficiency (1 / (mean relMSE · median seconds))
                 ratios       F of seconds, relmse, relmse_trimmed, efficiency, to the first
-                             integrator at the same level
+                             integrator at the same level; those of times from rounds in which both
+                             have a time of one session
             slopes           F of log relMSE against log spp ("spp") and log seconds ("seconds")
             target           F of the spp and seconds that the relMSE of "until" costs; else null.
                              (It stops at the first level whose mean is small enough, which luck
@@ -51,7 +53,7 @@ Seconds are wall clock without compilation, learning included.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -181,26 +183,57 @@ def _level_record(
     of_first = _figures(first, not is_measured) if first else {}
     own_rounds = {run.round: run for run in runs}
     pairs = [(own_rounds[run.round], run) for run in first if run.round in own_rounds]
-    # Times of different sessions do not belong together
-    timed_pairs = [(own, other) for own, other in pairs if own.session == other.session]
 
-    def ratio(name: str, value: Callable[[Run], float], pairs=pairs) -> Estimate | None:
-        return intervals.ratio(
-            figures.get(name), of_first.get(name), [(value(a), value(b)) for a, b in pairs]
-        )
+    def ratio(name: str) -> Estimate | None:
+        values = [(getattr(own.errors, name), getattr(other.errors, name)) for own, other in pairs]
+        return intervals.ratio(figures[name], of_first.get(name), values)
 
+    seconds, efficiency = _timed_ratios(pairs, ratio("relmse"))
     return {
         "level": level,
         "run_count": len(runs),
         "refused": refused,
         "figures": figures,
         "ratios": {
-            "seconds": ratio("seconds", lambda run: run.seconds, timed_pairs),
-            "relmse": ratio("relmse", lambda run: run.errors.relmse),
-            "relmse_trimmed": ratio("relmse_trimmed", lambda run: run.errors.relmse_trimmed),
-            "efficiency": ratio("efficiency", _efficiency, timed_pairs),
+            "seconds": seconds,
+            "relmse": ratio("relmse"),
+            "relmse_trimmed": ratio("relmse_trimmed"),
+            "efficiency": efficiency,
         },
     }
+
+
+def _timed_ratios(
+    pairs: Sequence[tuple[Run, Run]], errors: Estimate | None
+) -> tuple[Estimate | None, Estimate | None]:
+    """The ratios of the seconds and of the efficiencies.
+
+    Args:
+        pairs: Runs of an integrator, and of the first one in the same rounds.
+        errors: The ratio of their errors.
+    """
+    timed = [
+        (own, other, _common_times(own, other)) for own, other in pairs
+        if own.times.keys() & other.times.keys()
+    ]
+    seconds = [times for _own, _other, times in timed]
+    medians = [intervals.median(values) for values in zip(*seconds)] or [None, None]
+    ratio = intervals.ratio(*medians, seconds)
+    if ratio is None or errors is None or not errors.value > 0:
+        return ratio, None
+    efficiencies = [
+        (other.errors.relmse * times[1], own.errors.relmse * times[0])
+        for own, other, times in timed
+    ]
+    efficiency = Estimate(1 / (errors.value * ratio.value))
+    return ratio, intervals.ratio(efficiency, Estimate(1.0), efficiencies)
+
+
+def _common_times(own: Run, other: Run) -> tuple[float, float]:
+    """The seconds of two runs in one session: that in which the first of them was measured, if the
+    other was timed then."""
+    session = next(session for session in own.times if session in other.times)
+    return own.times[session], other.times[session]
 
 
 def _figures(runs: Sequence[Run], is_refused: bool) -> dict[str, Estimate | None]:

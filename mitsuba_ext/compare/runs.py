@@ -2,35 +2,27 @@
 
 Every run is one EXR: its image, and in its header what it cost. The name holds a hash of all that
 the run depends on, so that a comparison that is started again takes up the runs that are there, and
-never one of another scene, integrator, version or machine.
+never one of another scene, integrator, version or machine. A run that was timed again, in another
+session, has a JSON file with these times beside it.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
-import re
-import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from .. import marks
 from ..scenes import InputError
 from . import images
 from .metrics import Errors
 
-#: What stands beside a run's file while it is being made, and after the process died of it.
-_RUNNING = ".running"
-_CRASHED = ".crashed"
-
-
-#: Tells the processes of one session from others. A supervisor hands its own on to its workers.
-SESSION_VARIABLE = "MITSUBA_EXT_SESSION"
-SESSION = os.environ.get(SESSION_VARIABLE) or uuid.uuid4().hex
+#: The file beside a run's that holds its times in other sessions.
+_TIMES = ".times.json"
 
 
 @dataclass
@@ -50,6 +42,7 @@ class Run:
         memory: Peak of the memory that Dr.Jit held, in bytes.
         launches: Kernels launched.
         session: In which it was measured: runs of different ones did not take turns.
+        timed_again: Seconds that the same render took in later sessions, by session.
         path: The EXR that holds the image.
         errors: Against the reference of the experiment.
     """
@@ -64,7 +57,8 @@ class Run:
     zero_radiance: float | None
     memory: int | None
     launches: int
-    session: str = field(default_factory=lambda: SESSION)
+    session: str = field(default_factory=lambda: marks.SESSION)
+    timed_again: dict[str, float] = field(default_factory=dict)
     path: Path = field(default_factory=Path)
     errors: Errors | None = None
 
@@ -81,6 +75,16 @@ class Run:
     def shadow_share(self) -> float | None:
         """Shadow rays traced, of those that ``path`` would trace."""
         return self.rays["shadow"] / self.connections if self.connections else None
+
+    @property
+    def times(self) -> dict[str, float]:
+        """Seconds by session: its own first, then those in which it was timed again."""
+        return {self.session: self.seconds, **self.timed_again}
+
+    @property
+    def is_timed_now(self) -> bool:
+        """Is there a time of this session?"""
+        return marks.SESSION in self.times
 
     def record(self) -> dict[str, object]:
         """The run without image, path and errors, for JSON."""
@@ -112,8 +116,8 @@ class RunFolder:
         identity = {**self._identity, "integrator": integrator, "level": level, "round": round,
                     "seed": seed}
         key = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode())
-        readable = re.sub(r"[^\w.=-]+", "_", label)[:60].strip("_")
-        return self.folder / f"{readable}_{level}_seed{seed}_{key.hexdigest()[:12]}.exr"
+        name = f"{marks.readable(label)}_{level}_seed{seed}_{key.hexdigest()[:12]}.exr"
+        return self.folder / name
 
     def load(self, path: Path) -> Run | None:
         """A run that was finished earlier; ``None`` if there is none, or its file is damaged."""
@@ -121,9 +125,11 @@ class RunFolder:
             return None
         try:
             _, metadata = images.read_exr(path)
-            return Run(**json.loads(str(metadata["run"])), path=path)
+            run = Run(**json.loads(str(metadata["run"])), path=path)
         except (InputError, KeyError, TypeError, ValueError):
             return None
+        run.timed_again = _read_times(path.with_suffix(_TIMES))
+        return run
 
     def save(
         self, run: Run, image: np.ndarray, path: Path, metadata: Mapping[str, object]
@@ -134,43 +140,17 @@ class RunFolder:
         images.write_exr(path, image, "RGB", header)
         return replace(run, path=path)
 
+    def add_time(self, run: Run, seconds: float) -> None:
+        """Keeps the seconds that a run took when it was repeated in this session."""
+        run.timed_again[marks.SESSION] = seconds
+        with images.replacing(run.path.with_suffix(_TIMES)) as temporary:
+            temporary.write_text(json.dumps(run.timed_again), encoding="utf-8")
 
-def has_crashed(path: Path) -> bool:
-    """Did an earlier process die while it was making ``path``?"""
-    return path.with_suffix(_CRASHED).exists()
 
-
-@contextlib.contextmanager
-def marked(path: Path) -> Iterator[None]:
-    """Leaves a mark beside ``path`` while that file (a run, a reference) is being made. A mark that
-    stays tells a supervisor what the process died of (:func:`blame`).
-
-    Raises:
-        RuntimeError: A process died of it before.
-    """
-    if has_crashed(path):
-        raise RuntimeError(path.with_suffix(_CRASHED).read_text(encoding="utf-8"))
-    mark = path.with_suffix(_RUNNING)
-    mark.parent.mkdir(parents=True, exist_ok=True)
-    mark.touch()
+def _read_times(path: Path) -> dict[str, float]:
+    """Times of other sessions; none where the file is missing or damaged."""
     try:
-        yield
-    finally:
-        mark.unlink(missing_ok=True)
-
-
-def blame(folder: Path, message: str) -> bool:
-    """After the end of the process that was comparing in ``folder``: notes ``message`` as the end
-    of what it was at. Returns whether there was something."""
-    marks = list(folder.glob(f"*/*{_RUNNING}"))
-    for mark in marks:
-        mark.with_suffix(_CRASHED).write_text(message, encoding="utf-8")
-        mark.unlink()
-    return bool(marks)
-
-
-def forgive(folder: Path) -> None:
-    """Forgets what :func:`blame` noted: the runs are tried again."""
-    for suffix in (_RUNNING, _CRASHED):
-        for mark in folder.glob(f"*/*{suffix}"):
-            mark.unlink()
+        times = json.loads(path.read_text(encoding="utf-8"))
+        return {str(session): float(seconds) for session, seconds in times.items()}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from rich import box
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+#: Column headings and figures.
 _ERRORS = (
     ("relMSE", "relmse"), ("trimmed", "relmse_trimmed"), ("σ/μ", "sigma_mu"), ("FLIP", "flip"),
 )
@@ -21,16 +24,16 @@ _LEGEND = (
     "that 'path' would trace."
 )
 
-
-#: On narrower terminals, only the most important figures are shown.
-_FULL_WIDTH = 140
-
 #: Width of what goes to a file or a pipe, where there is no terminal to ask.
 _PIPE_WIDTH = 160
 
+#: Labels get no less than this; what does not fit beside them goes to a further table.
+_LABEL_WIDTH = 16
+
 
 def show(results: Mapping[str, Any]) -> None:
-    """Prints a table for each scene, with what a reader has to know to trust it.
+    """Prints a table for each scene, with what a reader has to know to trust it. Where the terminal
+    is too narrow for all columns, several tables follow each other.
 
     Args:
         results: The content of ``results.json``.
@@ -42,52 +45,103 @@ def show(results: Mapping[str, Any]) -> None:
         console.print(part, highlight=False, soft_wrap=isinstance(part, Text))
 
 
-def tables(results: Mapping[str, Any], width: int = _FULL_WIDTH) -> Iterator[Table | Text]:
+def tables(results: Mapping[str, Any], width: int = _PIPE_WIDTH) -> Iterator[Table | Text]:
     """What :func:`show` prints, for ``width`` characters."""
     for scene in results["scenes"]:
         if scene["error"]:
             yield Text(f"{scene['name']}: {scene['error']}\n", style="red")
             continue
-        yield _scene_table(scene, results["budget"], width < _FULL_WIDTH)
+        title = _title(scene, results["budget"])
+        labels = [contender["label"] for contender in scene["integrators"]]
+        groups = _in_groups(_columns(scene, results["budget"]), labels, width)
+        for index, columns in enumerate(groups):
+            yield Text("" if index else title)
+            yield _table(labels, columns, width)
+        for contender in scene["integrators"]:
+            if contender["error"]:
+                yield Text(f"{contender['label']}: {contender['error']}", style="red")
         yield Text("\n".join(_notes(scene)) + "\n")
     yield Text(_LEGEND)
 
 
-def _scene_table(scene: Mapping[str, Any], budget: Mapping[str, Any], is_narrow: bool) -> Table:
+class _Column(NamedTuple):
+    heading: str
+    cells: list[str]
+
+    @property
+    def width(self) -> int:
+        """With the two spaces before it."""
+        return 2 + max(cell_len(text) for text in (self.heading, *self.cells))
+
+
+def _columns(scene: Mapping[str, Any], budget: Mapping[str, Any]) -> list[_Column]:
+    """The figures at the largest level of each integrator."""
+    makers: dict[str, Callable[[Mapping[str, Any], Mapping[str, Any]], str]] = {
+        **{
+            heading: lambda _contender, level, name=name: _number(level["figures"][name])
+            for heading, name in _ERRORS
+        },
+        "spp": lambda _contender, level: f"{level['figures']['spp']['value']:.6g}",
+        "seconds": lambda _contender, level: _number(level["figures"]["seconds"]),
+        "shadow": lambda _contender, level: _percent(level["figures"]["shadow_share"]),
+        "eff.": lambda _contender, level: _ratio(level["ratios"]["efficiency"]),
+    }
+    if budget["kind"] in ("sweep", "until"):
+        makers["slope"] = lambda contender, _level: _difference(contender["slopes"]["spp"])
+    if budget["kind"] == "until":
+        makers["s to target"] = lambda contender, _level: _number(
+            (contender["target"] or {}).get("seconds")
+        )
+    return [
+        _Column(heading, [
+            make(contender, contender["levels"][-1]) if contender["levels"] else "–"
+            for contender in scene["integrators"]
+        ])
+        for heading, make in makers.items()
+    ]
+
+
+def _in_groups(
+    columns: Sequence[_Column], labels: Sequence[str], width: int
+) -> Iterator[list[_Column]]:
+    """All columns if they fit beside the labels; else errors and costs apart, or even less."""
+    room = width - min(_LABEL_WIDTH, max(map(cell_len, labels), default=0))
+    if sum(column.width for column in columns) <= room:
+        yield list(columns)
+        return
+    for part in (columns[: len(_ERRORS)], columns[len(_ERRORS) :]):
+        group: list[_Column] = []
+        for column in part:
+            if group and sum(other.width for other in (*group, column)) > room:
+                yield group
+                group = []
+            group.append(column)
+        yield group
+
+
+def _table(labels: Sequence[str], columns: Sequence[_Column], width: int) -> Table:
     table = Table(
-        title=_title(scene, budget), title_justify="left", title_style="", box=box.SIMPLE_HEAD,
-        show_edge=False, padding=(0, 1, 0, 0),
+        box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), pad_edge=False
     )
-    table.add_column("integrator", overflow="fold", min_width=12)
-    has_levels = budget["kind"] in ("sweep", "until")
-    errors = _ERRORS[:1] if is_narrow else _ERRORS
-    headings = [*(heading for heading, _ in errors), "spp", "seconds", "shadow", "eff."]
-    headings += ["slope"] if has_levels else []
-    headings += ["s to target"] if budget["kind"] == "until" else []
-    for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for contender in scene["integrators"]:
-        label = Text(contender["label"])
-        if contender["error"]:
-            label.append(f"\n{contender['error']}", style="red")
-        if not contender["levels"]:
-            table.add_row(label, *["–"] * len(headings))
-            continue
-        level = contender["levels"][-1]
-        figures = level["figures"]
-        row = [
-            *(_number(figures[name], not is_narrow) for _, name in errors),
-            f"{figures['spp']['value']:.6g}",
-            _number(figures["seconds"], not is_narrow),
-            _percent(figures["shadow_share"]),
-            _ratio(level["ratios"]["efficiency"]),
-        ]
-        if has_levels:
-            row.append(_difference(contender["slopes"]["spp"]))
-        if budget["kind"] == "until":
-            row.append(_number((contender["target"] or {}).get("seconds"), not is_narrow))
-        table.add_row(label, *row)
+    room = max(_LABEL_WIDTH, width - sum(column.width for column in columns))
+    table.add_column("integrator", overflow="fold")
+    for column in columns:
+        table.add_column(column.heading, justify="right", no_wrap=True)
+    for index, label in enumerate(labels):
+        text = Text("\n".join(_broken(label, room)))
+        table.add_row(text, *(column.cells[index] for column in columns))
     return table
+
+
+def _broken(label: str, width: int) -> Iterator[str]:
+    """The lines of a label, broken behind commas and brackets where possible."""
+    line = ""
+    for piece in re.split(r"(?<=[,\[])", label):
+        if line and cell_len(line + piece) > width:
+            yield line
+            line = "  "
+        line += piece
+    yield line
 
 
 def _title(scene: Mapping[str, Any], budget: Mapping[str, Any]) -> str:
@@ -115,11 +169,11 @@ def _notes(scene: Mapping[str, Any]) -> Iterator[str]:
                 yield f"{contender['label']} at {level['level']:g}: {level['refused']}."
 
 
-def _number(estimate: Mapping[str, float] | None, with_interval: bool) -> str:
+def _number(estimate: Mapping[str, float] | None) -> str:
     if estimate is None:
         return "–"
     value, high = estimate["value"], estimate["high"]
-    if not with_interval or high is None or not value > 0:
+    if high is None or not value > 0:
         return f"{value:#.3g}"
     factor = high / value
     return f"{value:#.3g} " + (f"±{factor - 1:.0%}" if factor < 11 else "± >1000%")

@@ -7,7 +7,7 @@ import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,6 +71,7 @@ def render_page(results: Record, folder: Path) -> str:
     )
 
 
+@cache  # compiles the templates once
 def _environment() -> jinja2.Environment:
     import jinja2
 
