@@ -8,12 +8,9 @@ depend on the number of samples, and all passes of a stage run the same kernel.
 
 from __future__ import annotations
 
-import contextlib
 import operator
-import signal
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -22,6 +19,7 @@ import mitsuba as mi
 
 from . import camera
 from .decisions.camera_samples import CameraSamples
+from .interrupts import deferred_interrupt
 from .walk import Walk
 
 if TYPE_CHECKING:
@@ -117,7 +115,7 @@ def render(
     sensor = camera.find_sensor(scene, sensor)
     job = _Job(integrator, scene, sensor, seed, spp)
     try:
-        with _deferred_interrupt() as interrupt:
+        with deferred_interrupt() as interrupt:
             job.run(interrupt)
     finally:
         # Also after an exception, the film holds the passes that were finished
@@ -145,10 +143,7 @@ class _Job:
             self.sampler.set_sample_count(spp)
         self.spp = self.sampler.sample_count()
         self.width, self.height = camera.film_extent(self.film)
-        if self.width * self.height >= _MAX_WAVEFRONT:
-            raise ValueError(
-                f"a film of {self.width}x{self.height} pixels exceeds the 2^32 samples of one pass"
-            )
+        check_extent(self.film)
         self.statistics = integrator.statistics = RenderStatistics()
         self.tally = dr.zeros(mi.UInt64, 4)
         aovs = integrator.aov_names()
@@ -286,7 +281,7 @@ class _Job:
     def _run_pass(self, stage: Stage, spp: int) -> bool:
         """Renders ``spp`` samples per pixel into the block; did it have to compile a kernel?"""
         begin = time.perf_counter()
-        misses = _kernel_cache_misses()
+        misses = kernel_cache_misses()
         sampler = self._pass_sampler(spp)
         rays = camera.sample_rays(
             self.sensor, sampler, spp, self.spp, stage.camera, self.statistics.spp
@@ -310,7 +305,7 @@ class _Job:
         self.statistics.passes += 1
         self.statistics.spp += spp
         self.statistics.rays["camera"] += self._lanes(spp)
-        return _kernel_cache_misses() > misses
+        return kernel_cache_misses() > misses
 
     def _pass_sampler(self, spp: int) -> mi.Sampler:
         if self.structured:
@@ -353,6 +348,18 @@ class _Job:
         )
 
 
+def check_extent(film: mi.Film) -> None:
+    """
+    Raises:
+        ValueError: The film has more pixels than a wavefront can hold.
+    """
+    width, height = camera.film_extent(film)
+    if width * height >= _MAX_WAVEFRONT:
+        raise ValueError(
+            f"a film of {width}x{height} pixels exceeds the 2^32 samples of one pass"
+        )
+
+
 def _even_length(samples: int, limit: int) -> int:
     """The length of passes of about equal length, none above ``limit``."""
     pass_count = -(-samples // limit)
@@ -368,28 +375,7 @@ def _own_sampler(sensor: mi.Sensor) -> mi.Sampler:
         return sensor.sampler()
 
 
-def _kernel_cache_misses() -> int:
+def kernel_cache_misses() -> int:
+    """How many kernels have been compiled, or loaded from the disk, in this process."""
     _launches, soft_misses, hard_misses = dr.detail.launch_stats()
     return soft_misses + hard_misses
-
-
-@contextlib.contextmanager
-def _deferred_interrupt() -> Iterator[threading.Event]:
-    """While active, the first Ctrl-C only sets the event, so that the running pass can finish; a
-    second one interrupts at once."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    previous = signal.getsignal(signal.SIGINT)
-
-    def handler(_signum, _frame) -> None:
-        event.set()
-        signal.signal(signal.SIGINT, previous or signal.SIG_DFL)
-        mi.Log(mi.LogLevel.Warn, "Interrupted: the running pass is being finished.")
-
-    signal.signal(signal.SIGINT, handler)
-    try:
-        yield event
-    finally:
-        signal.signal(signal.SIGINT, previous or signal.SIG_DFL)
