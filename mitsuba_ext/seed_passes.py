@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -37,74 +36,11 @@ _PASS_SPP, _STRUCTURED_PASS_SPP = 4, 64
 _TIMED_PASS_DIVISOR = 4
 
 
-@dataclass
-class SeedPasses:
-    """What :func:`render` did.
-
-    Attributes:
-        passes: Passes whose samples are in the film.
-        spp: Samples per pixel of these passes.
-        interrupted: Did Ctrl-C end the render early?
-    """
-
-    passes: int = 0
-    spp: int = 0
-    interrupted: bool = False
-
-
 def can_render(integrator: mi.Integrator) -> bool:
     """Is it one of Mitsuba's own, with only such in it? Others may learn, which passes would make
     them repeat. In scalar variants, Mitsuba's can be stopped as they are."""
     modules = {type(each).__module__.split(".")[0] for each in with_nested(integrator)}
     return dr.is_jit_v(mi.Float) and modules == {"mitsuba"}
-
-
-def render(
-    integrator: mi.Integrator,
-    scene: mi.Scene,
-    sensor: mi.Sensor,
-    seed: int,
-    spp: int,
-    seconds: float | None = None,
-    progress: Callable[[float], None] = lambda done: None,
-) -> SeedPasses:
-    """Renders with an integrator for which :func:`can_render` is true, and leaves the image in the
-    film. A render of one pass is that of ``integrator.render``. Ctrl-C ends it after a pass.
-
-    Args:
-        integrator, scene, sensor, seed: What to render.
-        spp: Samples per pixel, which structured samplers may round up.
-        seconds: Instead of ``spp``, as many passes as fit. Their number follows from the time of
-            the first one that compiles nothing, and not from the clock: an image that ends when the
-            clock says so prefers samples that are fast.
-        progress: Called after each pass with the fraction done.
-
-    Raises:
-        NotImplementedError: Something moves, which such integrators do not see.
-        ValueError: The film has more pixels than a wavefront can hold.
-    """
-    check_motion_is_seen(integrator, scene)
-    check_extent(sensor.film())
-    work = _Work(integrator, scene, sensor, seed)
-    length = pass_length(sensor, seconds is not None)
-    pass_count = -(-spp // length) if seconds is None else math.inf
-    asked = sensor.sampler().sample_count()
-    try:
-        with deferred_interrupt() as interrupt:
-            while work.report.passes < pass_count:
-                if interrupt.is_set():
-                    work.report.interrupted = True
-                    break
-                rest = spp - work.report.spp if seconds is None else length
-                elapsed, compiled = work.run_pass(sample_count(sensor, min(length, rest)))
-                done = work.report.passes
-                if pass_count == math.inf and not compiled:
-                    pass_count = max(done, round(seconds / elapsed))
-                progress(done / pass_count)
-    finally:
-        sensor.sampler().set_sample_count(asked)  # Mitsuba's integrators change it
-        work.fill_film()
-    return work.report
 
 
 def pass_length(sensor: mi.Sensor, is_timed: bool = False) -> int:
@@ -125,22 +61,72 @@ def is_independent(sensor: mi.Sensor) -> bool:
     return sensor.sampler().class_name() == "IndependentSampler"
 
 
-class _Work:
-    """The passes of one render, and the sum of what they leave in the film."""
+class SeedPasses:
+    """A render with an integrator for which :func:`can_render` is true.
+
+    Parameters:
+        integrator, scene, sensor, seed: What to render.
+
+    Attributes:
+        passes: Passes whose samples are in the film.
+        spp: Samples per pixel of these passes.
+        interrupted: Did Ctrl-C end the render early?
+
+    Raises:
+        NotImplementedError: Something moves, which such integrators do not see.
+        ValueError: The film has more pixels than a wavefront can hold.
+    """
 
     def __init__(
         self, integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int
     ) -> None:
+        check_motion_is_seen(integrator, scene)
+        check_extent(sensor.film())
         self._integrator, self._scene, self._sensor, self._seed = integrator, scene, sensor, seed
         self._film = sensor.film()
         self._sum: np.ndarray | float = 0.0
         self._has_weights = True
-        self.report = SeedPasses()
+        self.passes = self.spp = 0
+        self.interrupted = False
 
-    def run_pass(self, spp: int) -> tuple[float, bool]:
+    def run(
+        self,
+        spp: int,
+        seconds: float | None = None,
+        progress: Callable[[float], None] = lambda done: None,
+    ) -> None:
+        """Renders, and leaves the image in the film: also after Ctrl-C, which ends it after a pass,
+        and after an exception. A render of one pass is that of ``integrator.render``.
+
+        Args:
+            spp: Samples per pixel, which structured samplers may round up.
+            seconds: Instead of ``spp``, as many passes as fit. Their number follows from the time
+                of the first one that compiles nothing, and not from the clock: an image that ends
+                when the clock says so prefers samples that are fast.
+            progress: Called after each pass with the fraction done.
+        """
+        length = pass_length(self._sensor, seconds is not None)
+        pass_count = -(-spp // length) if seconds is None else math.inf
+        asked = self._sensor.sampler().sample_count()
+        try:
+            with deferred_interrupt() as interrupt:
+                while self.passes < pass_count and not self.interrupted:
+                    rest = length if seconds is not None else spp - self.spp
+                    elapsed, compiled = self._run_pass(min(length, rest))
+                    if pass_count == math.inf and not compiled:
+                        pass_count = max(self.passes, round(seconds / elapsed))
+                    self.interrupted = interrupt.is_set() and self.passes < pass_count
+                    progress(self.passes / pass_count)
+        finally:
+            self._sensor.sampler().set_sample_count(asked)  # Mitsuba's integrators change it
+            if self.passes > 0:
+                self._fill_film()
+
+    def _run_pass(self, spp: int) -> tuple[float, bool]:
         """Adds a pass; how many seconds did it take, and did it compile a kernel?"""
+        spp = sample_count(self._sensor, spp)
         begin, misses = time.perf_counter(), kernel_cache_misses()
-        seed = self._seed if self.report.passes == 0 else self._scattered_seed()
+        seed = self._seed if self.passes == 0 else self._scattered_seed()
         # Developed: "prb" refuses to do without
         self._integrator.render(self._scene, self._sensor, seed, spp)
         contents = np.array(self._film.develop(raw=True), dtype=np.float64)
@@ -148,26 +134,22 @@ class _Work:
         # Light tracing leaves an image, and no weights
         self._has_weights = bool(contents[..., self._weight_channel()].any())
         self._sum += contents if self._has_weights else contents * spp
-        self.report.passes += 1
-        self.report.spp += spp
+        self.passes += 1
+        self.spp += spp
         return elapsed, compiled
 
-    def fill_film(self) -> None:
+    def _fill_film(self) -> None:
         """Hands the sum to the film, which holds the last pass."""
-        if self.report.passes == 0:
-            return
-        contents = self._sum if self._has_weights else self._sum / self.report.spp
+        contents = self._sum if self._has_weights else self._sum / self.spp
         self._film.prepare(self._integrator.aov_names())
         tensor = mi.TensorXf(contents.astype(np.float32))
         self._film.put_block(mi.ImageBlock(tensor, offset=self._film.crop_offset()))
 
     def _scattered_seed(self) -> int:
         # Far from each other, as those of batches (batch_seeds)
-        index = mi.UInt32(self.report.passes)
-        return mi.sample_tea_32(mi.UInt32(self._seed), index)[1][0]
+        return mi.sample_tea_32(mi.UInt32(self._seed), mi.UInt32(self.passes))[1][0]
 
     def _weight_channel(self) -> int:
-        film = self._film
-        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-            return film.base_channels_count()
-        return 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
+        if mi.has_flag(self._film.flags(), mi.FilmFlags.Special):
+            return self._film.base_channels_count()
+        return 4 if mi.has_flag(self._film.flags(), mi.FilmFlags.Alpha) else 3
