@@ -14,7 +14,7 @@ from mitsuba_ext import registry
 from mitsuba_ext.batches import Batches, batch_seeds, each_batch, sample_count
 from mitsuba_ext.camera import develop as develop_film
 from mitsuba_ext.camera import find_sensor
-from mitsuba_ext.parameters import read_parameter
+from mitsuba_ext.parameters import MOST_SPP, read_parameter
 from mitsuba_ext.rendering import RenderStatistics
 
 _PREFIX = "variance."
@@ -191,6 +191,8 @@ class Variance(mi.AdjointIntegrator):
     def _plan(self, sensor: mi.Sensor, spp: int) -> tuple[int, int]:
         """The number of batches, and the samples per pixel of each."""
         spp = spp or sample_count(sensor, 0)
+        if spp > MOST_SPP:
+            raise ValueError(f'"{self.name}": spp is {spp}; it must be at most {MOST_SPP}')
         if spp < 2:
             raise ValueError(
                 f'"{self.name}": a variance needs at least 2 samples per pixel, found spp = {spp}; '

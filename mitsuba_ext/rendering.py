@@ -20,6 +20,7 @@ import mitsuba as mi
 from . import camera
 from .decisions.camera_samples import CameraSamples
 from .interrupts import deferred_interrupt
+from .parameters import MOST_SPP
 from .walk import Walk
 
 if TYPE_CHECKING:
@@ -41,6 +42,9 @@ _MIN_STRUCTURED_PASSES = 16
 _TIMEOUT_PASS_DIVISOR = 4
 
 _MAX_WAVEFRONT = 1 << 32
+
+#: Passes of a render, at most: they last weeks.
+_MOST_PASSES = 1 << 20
 
 
 @dataclass
@@ -139,6 +143,11 @@ class _Job:
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
         self.seed = seed & 0xFFFFFFFF
         self.sampler = _own_sampler(sensor)
+        if not 0 <= spp <= MOST_SPP:
+            raise ValueError(
+                f'"{integrator.name}": spp is {spp}; it must be 1 to {MOST_SPP}, or 0 for as many '
+                f"as the sampler says"
+            )
         if spp:
             self.sampler.set_sample_count(spp)
         self.spp = self.sampler.sample_count()
@@ -163,12 +172,18 @@ class _Job:
         """Decides the samples of each stage and of each of its passes."""
         pixel_count = self.width * self.height
         self.structured = self.sampler.class_name() != "IndependentSampler"
-        limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // pixel_count
+        cost = self.integrator.sample_cost
+        limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // (pixel_count * cost)
         if not self.structured:
-            limit = max(limit, min(_PASS_SPP, (_MAX_WAVEFRONT - 1) // pixel_count))
+            limit = max(limit, min(_PASS_SPP // cost, (_MAX_WAVEFRONT - 1) // pixel_count))
         if self.integrator.timeout > 0:
             limit //= _TIMEOUT_PASS_DIVISOR
         limit = max(1, min(limit, self.integrator.samples_per_pass))
+        if self.spp > limit * _MOST_PASSES:
+            raise ValueError(
+                f'"{self.integrator.name}": {self.spp} samples for each of {pixel_count} pixels '
+                f"are too many: give at most {limit * _MOST_PASSES}"
+            )
         pilots = self.integrator.pilots(self.scene, self.spp)
         stages = [*pilots, self.spp - sum(pilots)]
         self.set_size = (
