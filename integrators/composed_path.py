@@ -112,7 +112,7 @@ class ComposedPath(WalkIntegrator):
         return self.light_sampling.learners(scene, samples) if self.light_sampling else []
 
     def parameters(self) -> dict[str, Any]:
-        learned = vars(self.light_sampling) if self.light_sampling else {}
+        learned = self.light_sampling.parameters() if self.light_sampling else {}
         named_differently = ("light_sampling", "rejection")
         return {
             "shadow_test": self.shadow_test,

@@ -15,6 +15,7 @@ from typing import Any, Union
 import drjit as dr
 import mitsuba as mi
 
+from .. import files
 from ..scenes import InputError, LoadedScene, load_scene, scene_name
 from ..specifications import Specification, make_named
 from . import images, references, report, results, timing
@@ -155,7 +156,7 @@ class Comparison:
     def write(self) -> None:
         """Writes ``results.json`` and ``report.html``."""
         text = json.dumps(self.results(), indent=2)
-        with images.replacing(self.folder / "results.json") as temporary:
+        with files.replacing(self.folder / "results.json") as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
         report.write_report(self.folder)
 
@@ -264,4 +265,4 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot make this folder ({error.strerror})") from error
-    images.check_folder(folder)
+    files.check_folder(folder)

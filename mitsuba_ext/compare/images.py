@@ -6,16 +6,15 @@ terminal when a file is damaged, and returns an empty image.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .. import files
 from ..scenes import InputError, one_line
 
 if TYPE_CHECKING:
@@ -26,39 +25,12 @@ EXTENSIONS = (".exr", ".png", ".jpg", ".jpeg", ".hdr", ".pfm")
 
 
 def check_target(path: Path) -> None:
-    """Raises :class:`InputError` where ``path`` could not be written, before hours of rendering."""
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder")
+    """Raises :class:`InputError` where no image could be written to ``path``, before hours of
+    rendering."""
+    files.check_target(path)
     if path.suffix.lower() not in EXTENSIONS:
         found = f'the extension "{path.suffix}"' if path.suffix else "a name without extension"
         raise InputError(f"{path}: {found} cannot be written ({' '.join(EXTENSIONS)} can)")
-    check_folder(path.parent)
-
-
-def check_folder(folder: Path) -> None:
-    """Raises :class:`InputError` if no file can be made in ``folder``."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
-    try:
-        with tempfile.NamedTemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"{folder}: cannot write here ({error.strerror})") from error
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yields a name to write to; the finished file then takes the place of ``path`` in one step.
-
-    After an exception, what ``path`` held before is still there.
-    """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
 
 
 def write_exr(
@@ -193,7 +165,7 @@ def film_channels(film: mi.Film) -> list[str]:
 
 
 def _save(bitmap: mi.Bitmap, path: Path) -> None:
-    with replacing(path) as temporary:
+    with files.replacing(path) as temporary:
         try:
             bitmap.write(str(temporary))
         except RuntimeError as error:

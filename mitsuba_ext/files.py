@@ -1,0 +1,44 @@
+"""Files that are written: whether they can be, and never half of them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from .scenes import InputError
+
+
+def check_folder(folder: Path) -> None:
+    """Raises :class:`InputError` if no file can be made in ``folder``."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: {'is not a folder' if folder.exists() else 'no such folder'}")
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder}: cannot write here ({error.strerror})") from error
+
+
+def check_target(path: Path) -> None:
+    """Raises :class:`InputError` if no file ``path`` can be made: before hours of rendering."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder")
+    check_folder(path.parent)
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a name to write to; the finished file then takes the place of ``path`` in one step.
+
+    After an exception, what ``path`` held before is still there.
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
