@@ -97,17 +97,17 @@ class LightSampling:
         """What parameters need to have an effect: is it so, and how to say it."""
         learns = self.light_sampling in LEARNING
         is_affine = self.rejection and self.law == "affine"
+        has_table = learns or self.rejection or self.light_sampling == "spatial"
         learning = f"lights that are chosen by what was learned ({' or '.join(LEARNING)})"
-        table = (learns or self.rejection or self.light_sampling == "spatial", f"{learning}, or "
-                 "spatially, or shadow rays that are rejected")
-        affine = (is_affine, "shadow rays that are rejected by the affine law")
-        refining = self.rejection and not learns
+        rejecting = "shadow rays that are rejected"
+        table = (has_table, f"{learning} or spatially, or {rejecting}")
+        affine = (is_affine, f"{rejecting} by the affine law")
         return {
             "grid": table,
             "max_memory": table,
-            "pilot_spp": (learns or self.rejection, f"{learning}, or shadow rays that are rejected"),
-            "refine": (refining, "shadow rays that are rejected, and light sampling not learned"),
-            "law": (self.rejection, "shadow rays that are rejected"),
+            "pilot_spp": (learns or self.rejection, f"{learning}, or {rejecting}"),
+            "refine": (self.rejection and not learns, f"{rejecting}, and lights not learned"),
+            "law": (self.rejection, rejecting),
             "slope": affine,
             "floor": affine,
             "load_map": (learns, learning),
