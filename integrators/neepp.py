@@ -91,10 +91,9 @@ class NEEPlusPlus(WalkIntegrator):
        - Hide directly visible emitters. (Default: false)
      * - timeout
        - |float|
-       - Seconds after which to stop, 0 or less for no limit. The number of passes is fixed from the
-         speed of the first pass after learning, so that stopping does not prefer fast samples. The
-         pilot and that pass are always finished (and one more, if it had to compile its kernel);
-         beyond that the time is kept as well as the speed is steady. (Default: -1)
+       - Seconds after which to stop, learning and compilation included; 0 or less for no limit. It
+         is kept as by :monosp:`composed_path`. Pilots then get at most a quarter of the samples
+         that fit. A short pass of each pilot, and one of the rest, are always taken. (Default: -1)
      * - aovs
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
