@@ -19,6 +19,8 @@ from mitsuba_ext.rendering import RenderStatistics
 
 _PREFIX = "variance."
 
+_MOST_BATCHES = 1 << 16
+
 
 # Not a SamplingIntegrator: "aov" and "moment" draw single samples from those that they nest, and
 # refuse any other when the scene is loaded.
@@ -39,7 +41,7 @@ class Variance(mi.AdjointIntegrator):
 
      * - batches
        - |int|
-       - Number of batches, at least 2. (Default: 16)
+       - Number of batches, 2 to 65536. (Default: 16)
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one. It may be any that renders an image.
@@ -109,7 +111,9 @@ class Variance(mi.AdjointIntegrator):
         # Nothing for the base class to read: what it would accept has no effect here
         super().__init__(mi.Properties(props.plugin_name()))
         self.name = props.plugin_name()
-        self.batch_count = read_parameter(self.name, props, "batches", 16, minimum=2)
+        self.batch_count = read_parameter(
+            self.name, props, "batches", 16, minimum=2, maximum=_MOST_BATCHES
+        )
         self.nested = self._nested(props)
         self.progress: Callable[[float], None] | None = None
         self.statistics = RenderStatistics()

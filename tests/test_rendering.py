@@ -101,7 +101,8 @@ def test_passes_of_expensive_samples_are_shorter(scene):
     """Else nothing could stop them for minutes."""
     def length(**parameters):
         integrator = mi.load_dict({"type": "reweighted_direct", **parameters})
-        return rendering._Job(integrator, scene, scene.sensors()[0], 0, 1 << 20)._pass_length(1 << 20)
+        job = rendering._Job(integrator, scene, scene.sensors()[0], 0, 1 << 20)
+        return job._pass_length(1 << 20)
 
     assert length(light_samples=1024) <= length(light_samples=1) / 60
 
