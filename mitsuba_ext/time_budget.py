@@ -102,7 +102,7 @@ class _LastStageBudget(StageBudget):
     def passed(self, spp: int, done: int, seconds: float) -> None:
         if not self.is_open:
             return
-        left = int(max(0.0, self._whole._end - time.perf_counter()) * spp / seconds)
+        left = round(max(0.0, self._whole._end - time.perf_counter()) * spp / seconds)
         self.samples = min(self._wanted, done + left)
         self._measured += 1
         self.is_open = self._measured < 2 and left > 0
