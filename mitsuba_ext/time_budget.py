@@ -29,14 +29,20 @@ class TimeBudget:
         start: When they began, by ``time.perf_counter``.
         pixel_count: Of the film.
         pilot_spp: Samples per pixel that all pilots would take without a limit.
+
+    Attributes:
+        is_limited: Is there a limit?
+        end: When it is reached, by the same clock.
+        short: Samples per pixel of a short pass.
+        pilot_factor: By how much pilots are cut short; ``None`` until the speed is known.
     """
 
     def __init__(self, timeout: float, start: float, pixel_count: int, pilot_spp: int) -> None:
         self.is_limited = timeout > 0
-        self._end = start + timeout
-        self._short = max(1, _SHORT_PASS // pixel_count)
-        self._pilot_spp = pilot_spp
-        self._pilot_factor: float | None = None
+        self.end = start + timeout
+        self.short = max(1, _SHORT_PASS // pixel_count)
+        self.pilot_spp = pilot_spp
+        self.pilot_factor: float | None = None
 
     def stage(self, samples: int, taken: int, is_last: bool) -> StageBudget:
         """That of a stage which would take ``samples`` samples per pixel without a limit, after
@@ -71,20 +77,20 @@ class _PilotBudget(StageBudget):
     """All pilots together are cut short when the speed of the first pass is known."""
 
     def __init__(self, whole: TimeBudget, samples: int, taken: int) -> None:
-        super().__init__(samples, whole._short)
+        super().__init__(samples, whole.short)
         self._whole, self._wanted, self._taken = whole, samples, taken
         self._fit()
 
     def passed(self, spp: int, done: int, seconds: float) -> None:
         whole = self._whole
-        if whole._pilot_factor is None:
-            left = max(0.0, whole._end - time.perf_counter()) * spp / seconds
+        if whole.pilot_factor is None:
+            left = max(0.0, whole.end - time.perf_counter()) * spp / seconds
             most = _PILOT_SHARE * (self._taken + done + left)
-            whole._pilot_factor = min(1.0, most / whole._pilot_spp)
+            whole.pilot_factor = min(1.0, most / whole.pilot_spp)
             self._fit()
 
     def _fit(self) -> None:
-        factor = self._whole._pilot_factor
+        factor = self._whole.pilot_factor
         self.is_open = factor is None
         if factor is not None:
             self.samples = self.longest = max(1, int(factor * self._wanted))
@@ -96,13 +102,13 @@ class _LastStageBudget(StageBudget):
     is_open = True
 
     def __init__(self, whole: TimeBudget, samples: int) -> None:
-        super().__init__(samples, whole._short)
+        super().__init__(samples, whole.short)
         self._whole, self._wanted, self._measured = whole, samples, 0
 
     def passed(self, spp: int, done: int, seconds: float) -> None:
         if not self.is_open:
             return
-        left = round(max(0.0, self._whole._end - time.perf_counter()) * spp / seconds)
+        left = round(max(0.0, self._whole.end - time.perf_counter()) * spp / seconds)
         self.samples = min(self._wanted, done + left)
         self._measured += 1
         self.is_open = self._measured < 2 and left > 0

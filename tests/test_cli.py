@@ -186,6 +186,8 @@ def test_a_signal_ends_the_render_after_a_pass_and_keeps_an_older_image(
         assert (metadata["spp"], metadata["interrupted"]) == (12, "true")
     assert f"{output} is an older image" in err
     assert sorted(tmp_path.iterdir()) == [output, partial, tmp_path / "scene.xml"]
+    assert run(*arguments[:-1], 12)[0] == 0, "the last pass had all samples"
+    assert read_exr(output)[1]["interrupted"] == "false"
 
 
 def test_a_second_signal_ends_the_process_whatever_runs(run, make_scene, tmp_path, monkeypatch):

@@ -99,6 +99,7 @@ def render(
                 return stop.exit_code
             job.is_interrupted = True
 
+        stop.wait()
         target = output
         if job.is_interrupted and output.exists():
             target = output.with_name(f"{output.stem}.partial{output.suffix}")

@@ -96,6 +96,11 @@ class RenderJob:
                     spp, seconds = self._measured(seconds, bars), None
                     begin = time.perf_counter()
                 self._render(spp, seconds, bars)
+        except KeyboardInterrupt:
+            report = timing.own_statistics(self.integrator)
+            # In the last pass, it came too late
+            if report is None or self._wanted is None or report.spp < self._wanted:
+                raise
         except (ValueError, TypeError, RuntimeError) as error:
             message = f'{self._loaded.source}: "{self.name}": {one_line(error)}'
             raise InputError(message) from error

@@ -43,6 +43,13 @@ class Stop:
         """That of a process which the signal ended."""
         return INTERRUPTED if self.number is None else 128 + self.number
 
+    def wait(self) -> None:
+        """From now on, a signal that comes together with the first one does nothing: the image is
+        being written."""
+        if threading.current_thread() is threading.main_thread():
+            for number in _SIGNALS:
+                signal.signal(number, lambda *_: None)
+
     def handle(self, number: int, frame: object) -> None:
         """Does what Ctrl-C would do now: end at once, or after the running pass."""
         self.number = self.number or number
@@ -62,17 +69,16 @@ def stopping() -> Iterator[Stop]:
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
-    previous = {
-        number: signal.signal(number, stop.handle)
-        for number in _SIGNALS
-        if number != signal.SIGINT and signal.getsignal(number) is not signal.SIG_IGN
-    }
+    previous = {number: signal.getsignal(number) for number in _SIGNALS}
+    for number, handler in previous.items():
+        if number != signal.SIGINT and handler is not signal.SIG_IGN:
+            signal.signal(number, stop.handle)
     try:
         with _watching():
             yield stop
     finally:
         for number, handler in previous.items():
-            signal.signal(number, handler)
+            signal.signal(number, handler or signal.SIG_DFL)
 
 
 @contextlib.contextmanager
