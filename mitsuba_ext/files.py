@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from .scenes import InputError
+from .errors import InputError
 
 
 def check_folder(folder: Path) -> None:

@@ -13,8 +13,9 @@ from rich.progress import Progress
 
 from ..batches import sample_count
 from ..compare import timing
+from ..errors import InputError
 from ..scene_remarks import scene_remarks
-from ..scenes import InputError, LoadedScene, load_scene, one_line
+from ..scenes import LoadedScene, load_scene, one_line
 from ..seed_passes import SeedPasses, can_render, is_independent
 from ..specifications import make_named
 from .common import progress_bars

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import mitsuba as mi
 
 from ..bounds import scene_bounds
+from ..errors import InputError
 from ..files import check_target
 from ..learning.learner import Learner
 from ..learning.voxel_grid import VoxelGrid
 from ..lights.light_cells import LightCells
 from ..lights.weights import VoxelRows, power_weights, spatial_weights
-from ..scenes import InputError
 from .light_learner import LightLearner
 from .light_selection import TABLE_BYTES, LightSelection, OneRow
 from .linear_selection import LinearSelection
