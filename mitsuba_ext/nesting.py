@@ -14,8 +14,9 @@ def with_nested(integrator: mi.Integrator) -> list[mi.Integrator]:
 
 
 def _children(integrator: mi.Integrator) -> list[mi.Integrator]:
-    if hasattr(integrator, "nested"):  # ours
-        return [integrator.nested]
+    if type(integrator).__module__.split(".")[0] != "mitsuba":
+        nested = getattr(integrator, "nested", None)  # as ours call it
+        return [nested] if isinstance(nested, mi.Integrator) else []
 
     # The base class is known once a variant is selected
     class Collector(mi.TraversalCallback):
