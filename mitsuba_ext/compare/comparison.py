@@ -15,7 +15,6 @@ from typing import Any, Union
 import drjit as dr
 import mitsuba as mi
 
-from .. import files
 from ..scenes import InputError, LoadedScene, load_scene, scene_name
 from ..specifications import Specification, make_named
 from . import images, references, report, results, timing
@@ -156,7 +155,7 @@ class Comparison:
     def write(self) -> None:
         """Writes ``results.json`` and ``report.html``."""
         text = json.dumps(self.results(), indent=2)
-        with files.replacing(self.folder / "results.json") as temporary:
+        with images.replacing(self.folder / "results.json") as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
         report.write_report(self.folder)
 
@@ -265,4 +264,4 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot make this folder ({error.strerror})") from error
-    files.check_folder(folder)
+    images.check_folder(folder)

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .. import files
+from ..files import check_folder as check_folder
+from ..files import replacing
 from ..scenes import InputError, one_line
 
 if TYPE_CHECKING:
@@ -165,7 +167,7 @@ def film_channels(film: mi.Film) -> list[str]:
 
 
 def _save(bitmap: mi.Bitmap, path: Path) -> None:
-    with files.replacing(path) as temporary:
+    with replacing(path) as temporary:
         try:
             bitmap.write(str(temporary))
         except RuntimeError as error:

@@ -22,7 +22,6 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import files
 from ..batches import Batches, batch_seeds, each_batch
 from ..scenes import InputError, LoadedScene, one_line, scene_name
 from ..specifications import NamedIntegrator, Specification, make_named
@@ -171,7 +170,7 @@ def _render(
         for batches in each_batch(named.integrator, scene.scene, 0, batch_spp, seeds, unfinished):
             if fault := metrics.describe_non_finite(images.to_rgb(batches.mean, batches.channels)):
                 raise InputError(f"has {fault}")
-            with files.replacing(partial) as temporary:
+            with images.replacing(partial) as temporary:
                 batches.save(temporary)
             if progress is not None:
                 progress(batches.count / batch_count)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...files import replacing
+from ..images import replacing
 from .records import read_results
 
 __all__ = ["write_report"]
