@@ -42,7 +42,8 @@ class DispersiveDielectric(mi.BSDF):
          :monosp:`air`, :monosp:`carbon dioxide`. (Default: air, 1.000277)
      * - specular_reflectance, specular_transmittance
        - |spectrum| or |texture|
-       - Factors of reflection and refraction, to be left at 1 for physical results. (Default: 1)
+       - Factors of reflection and refraction, 0 to 1, to be left at 1 for physical results.
+         (Default: 1)
 
     **Use it when** colours that glass makes are to be seen: prisms, gems, lenses, edges of thick
     glass. **Not when** nobody will: where a path is refracted, one of its four wavelengths is left,

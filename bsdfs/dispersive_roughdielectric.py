@@ -6,7 +6,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.dispersive_interface import DispersiveInterface, fresnel_spectrum
+from mitsuba_ext.dispersive_interface import (
+    DispersiveInterface,
+    check_uniform,
+    fresnel_spectrum,
+)
 from mitsuba_ext.parameters import read_parameter
 
 NAME = "dispersive_roughdielectric"
@@ -34,7 +38,7 @@ class DispersiveRoughDielectric(mi.BSDF):
        - Of microfacets: :monosp:`beckmann` or :monosp:`ggx`. (Default: beckmann)
      * - alpha
        - |float| or |texture|
-       - Roughness: the root mean square slope of microfacets. (Default: 0.1)
+       - Roughness, not negative: the root mean square slope of microfacets. (Default: 0.1)
      * - alpha_u, alpha_v
        - |float| or |texture|
        - Instead of alpha: roughness along the tangent and the bitangent.
@@ -43,7 +47,8 @@ class DispersiveRoughDielectric(mi.BSDF):
        - Choose among microfacets that are seen, which is less noisy. (Default: true)
      * - specular_reflectance, specular_transmittance
        - |spectrum| or |texture|
-       - Factors of reflection and refraction, to be left at 1 for physical results. (Default: 1)
+       - Factors of reflection and refraction, 0 to 1, to be left at 1 for physical results.
+         (Default: 1)
 
     **Use it when** colours that frosted glass makes are to be seen. **Not when** it is so rough
     that they run into each other: the noise remains, and :monosp:`roughdielectric` has less.
@@ -199,13 +204,16 @@ class DispersiveRoughDielectric(mi.BSDF):
     def _read_alphas(self, props: mi.Properties) -> list[mi.Texture]:
         given = [key for key in ("alpha", "alpha_u", "alpha_v") if key in props]
         if given == ["alpha_u", "alpha_v"]:
-            return [props.get_unbounded_texture(key) for key in given]
+            return [self._read_alpha(props, key) for key in given]
         if given in ([], ["alpha"]):
-            return [props.get_unbounded_texture("alpha", 0.1)]
+            return [self._read_alpha(props, "alpha")]
         raise ValueError(
             f'"{NAME}": {" and ".join(given)} are given; it must be either alpha, or alpha_u and '
             f"alpha_v"
         )
+
+    def _read_alpha(self, props: mi.Properties, key: str) -> mi.Texture:
+        return check_uniform(NAME, key, props.get_unbounded_texture(key, 0.1))
 
     def _facets(self, si, cos_θ, active):
         """The distribution of microfacets, and that of which they are drawn."""

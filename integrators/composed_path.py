@@ -54,10 +54,11 @@ class ComposedPath(WalkIntegrator):
        - Hide directly visible emitters. (Default: false)
      * - timeout
        - |float|
-       - Seconds after which to stop, 0 or less for no limit. The number of passes is fixed from the
-         speed of the first one, so that stopping does not prefer fast samples. That pass is always
-         finished (and one more, if it had to compile its kernel); beyond that the time is
-         kept as well as the speed is steady. (Default: -1)
+       - Seconds after which to stop, compilation included; 0 or less for no limit. The number of
+         samples follows from the speed of the first passes (short ones, until one compiles nothing,
+         and then one of a quarter of the time left), and not from the clock, so that stopping does
+         not prefer fast samples. The time is kept as well as the speed is steady; a short pass is
+         always taken. (Default: -1)
      * - aovs
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
@@ -112,7 +113,7 @@ class ComposedPath(WalkIntegrator):
         return self.light_sampling.learners(scene, samples) if self.light_sampling else []
 
     def parameters(self) -> dict[str, Any]:
-        learned = vars(self.light_sampling) if self.light_sampling else {}
+        learned = self.light_sampling.parameters() if self.light_sampling else {}
         named_differently = ("light_sampling", "rejection")
         return {
             "shadow_test": self.shadow_test,

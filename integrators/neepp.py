@@ -57,22 +57,24 @@ class NEEPlusPlus(WalkIntegrator):
          (Default: 16)
      * - law
        - |string|
-       - How the probability of tracing a shadow ray follows from the learned visibility V:
+       - With :monosp:`rejection` only, as the next two: how the probability of tracing a shadow
+         ray follows from the learned visibility V:
          :monosp:`affine` for min(1, slope · V + floor), :monosp:`paper` for max(V, 1e-4), as
          printed: it traces fewer rays and is much noisier. (Default: affine)
      * - slope
        - |float|
-       - Slope of the affine law. (Default: 10)
+       - Slope of the affine law; unknown to the other. (Default: 10)
      * - floor
        - |float|
-       - Least probability of the affine law, 1e-6 to 1. (Default: 0.1)
+       - Least probability of the affine law, 1e-6 to 1; unknown to the other. (Default: 0.1)
      * - refine
        - |int|
-       - Only where light sampling is not learned: random visibility tests added to each entry of
-         the map in which the pilot saw a success, for the voxels with a light. (Default: 16)
+       - With :monosp:`rejection`, and only where light sampling is not learned: random visibility
+         tests added to each entry of the map in which the pilot saw a success, for the voxels with
+         a light. (Default: 16)
      * - save_map
        - |string|
-       - File to which the learned map is written. (Default: none)
+       - File to which the learned map is written; its folder must be there. (Default: none)
      * - load_map
        - |string|
        - File of a map to begin with, from this view of the scene or another one; the pilot adds to
@@ -89,10 +91,9 @@ class NEEPlusPlus(WalkIntegrator):
        - Hide directly visible emitters. (Default: false)
      * - timeout
        - |float|
-       - Seconds after which to stop, 0 or less for no limit. The number of passes is fixed from the
-         speed of the first pass after learning, so that stopping does not prefer fast samples. The
-         pilot and that pass are always finished (and one more, if it had to compile its kernel);
-         beyond that the time is kept as well as the speed is steady. (Default: -1)
+       - Seconds after which to stop, learning and compilation included; 0 or less for no limit. It
+         is kept as by :monosp:`composed_path`. Pilots then get at most a quarter of the samples
+         that fit. A short pass of each pilot, and one of the rest, are always taken. (Default: -1)
      * - aovs
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
@@ -153,4 +154,4 @@ class NEEPlusPlus(WalkIntegrator):
         return self.next_event.learners(scene, samples)
 
     def parameters(self) -> dict[str, Any]:
-        return vars(self.next_event)
+        return self.next_event.parameters()

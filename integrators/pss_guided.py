@@ -73,8 +73,8 @@ class PSSGuided(WalkIntegrator):
        - Hide directly visible emitters. (Default: false)
      * - timeout
        - |float|
-       - Seconds after which to stop, 0 or less for no limit. It is kept as by
-         :monosp:`composed_path`; the pilots are always finished. (Default: -1)
+       - Seconds after which to stop, 0 or less for no limit. It is kept as by :monosp:`neepp`.
+         (Default: -1)
      * - aovs
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as

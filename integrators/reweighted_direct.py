@@ -8,8 +8,13 @@ import mitsuba as mi
 
 from mitsuba_ext import registry
 from mitsuba_ext.decisions.many_connections import ManyConnections
-from mitsuba_ext.decisions.weighted_sets import SetKind
+from mitsuba_ext.decisions.weighted_sets import MOST_SLOW_POINTS, SetKind
 from mitsuba_ext.integrator import WalkIntegrator
+
+_MOST_LIGHT_SAMPLES = 4096
+
+#: Connections that take as long as a path, about.
+_CONNECTIONS_PER_PATH = 16
 
 
 @registry.plugin
@@ -40,7 +45,9 @@ class ReweightedDirect(WalkIntegrator):
          border, as in the thesis: slightly biased). (Default: none)
      * - light_samples
        - |int|
-       - Points of a set: connections of the first vertex. (Default: 256)
+       - Points of a set: connections of the first vertex, at most 4096 (1024 with
+         :monosp:`poisson_disk`): beyond that, the time serves more camera samples better.
+         (Default: 256)
      * - camera_samples
        - |int|
        - Samples per pixel, where :monosp:`render` is not told how many; 0 for as many as the
@@ -96,7 +103,12 @@ class ReweightedDirect(WalkIntegrator):
         super().__init__(props)
         self.set_kind = SetKind(self.name, props, pattern="hammersley", weights="none")
         self.camera_samples = self.parameter(props, "camera_samples", 0, minimum=0)
-        self.light_samples = self.parameter(props, "light_samples", 256, minimum=1)
+        most = MOST_SLOW_POINTS if self.set_kind.is_slow else _MOST_LIGHT_SAMPLES
+        self.light_samples = self.parameter(props, "light_samples", 256, minimum=1, maximum=most)
+
+    @property
+    def sample_cost(self) -> int:
+        return max(1, self.light_samples // _CONNECTIONS_PER_PATH)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         spp = spp or self.camera_samples

@@ -14,10 +14,12 @@ from mitsuba_ext import registry
 from mitsuba_ext.batches import Batches, batch_seeds, each_batch, sample_count
 from mitsuba_ext.camera import develop as develop_film
 from mitsuba_ext.camera import find_sensor
-from mitsuba_ext.parameters import read_parameter
+from mitsuba_ext.parameters import MOST_SPP, read_parameter
 from mitsuba_ext.rendering import RenderStatistics
 
 _PREFIX = "variance."
+
+_MOST_BATCHES = 1 << 16
 
 
 # Not a SamplingIntegrator: "aov" and "moment" draw single samples from those that they nest, and
@@ -39,7 +41,7 @@ class Variance(mi.AdjointIntegrator):
 
      * - batches
        - |int|
-       - Number of batches, at least 2. (Default: 16)
+       - Number of batches, 2 to 65536. (Default: 16)
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one. It may be any that renders an image.
@@ -109,7 +111,9 @@ class Variance(mi.AdjointIntegrator):
         # Nothing for the base class to read: what it would accept has no effect here
         super().__init__(mi.Properties(props.plugin_name()))
         self.name = props.plugin_name()
-        self.batch_count = read_parameter(self.name, props, "batches", 16, minimum=2)
+        self.batch_count = read_parameter(
+            self.name, props, "batches", 16, minimum=2, maximum=_MOST_BATCHES
+        )
         self.nested = self._nested(props)
         self.progress: Callable[[float], None] | None = None
         self.statistics = RenderStatistics()
@@ -191,6 +195,8 @@ class Variance(mi.AdjointIntegrator):
     def _plan(self, sensor: mi.Sensor, spp: int) -> tuple[int, int]:
         """The number of batches, and the samples per pixel of each."""
         spp = spp or sample_count(sensor, 0)
+        if spp > MOST_SPP:
+            raise ValueError(f'"{self.name}": spp is {spp}; it must be at most {MOST_SPP}')
         if spp < 2:
             raise ValueError(
                 f'"{self.name}": a variance needs at least 2 samples per pixel, found spp = {spp}; '

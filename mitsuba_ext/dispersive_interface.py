@@ -45,7 +45,7 @@ class DispersiveInterface:
         self._description, self._inside = self._read_inside(props)
         self._outside = self._read_outside(props)
         self._textures = {
-            name: props.get_texture(name, 1.0)
+            name: check_uniform(plugin, name, props.get_texture(name, 1.0), maximum=1.0)
             for name in ("specular_reflectance", "specular_transmittance")
             if name in props
         }
@@ -180,6 +180,24 @@ class DispersiveInterface:
     def _texture(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
         texture = self._textures.get(name)
         return mi.Spectrum(1) if texture is None else texture.eval(si, active)
+
+
+def check_uniform(
+    plugin: str, key: str, texture: mi.Texture, maximum: float = math.inf
+) -> mi.Texture:
+    """The texture of the parameter ``key``.
+
+    Raises:
+        ValueError: It is a number, and that is negative, above ``maximum``, or not finite.
+    """
+    if texture.class_name() == "UniformSpectrum":
+        value = float(dr.slice(mi.traverse(texture)["value"]))
+        if not (0 <= value <= maximum and value < math.inf):
+            accepted = "not negative" if maximum == math.inf else f"0 to {maximum:g}"
+            raise ValueError(
+                f'"{plugin}": the parameter "{key}" is {value:g}; it must be {accepted}'
+            )
+    return texture
 
 
 def _is_rendered() -> bool:

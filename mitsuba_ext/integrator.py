@@ -42,7 +42,8 @@ class WalkIntegrator(StagedIntegrator):
         max_depth = self.parameter(props, "max_depth", -1, minimum=-1, maximum=NO_LIMIT - 1)
         self.max_depth = max_depth if max_depth >= 0 else NO_LIMIT
         self.rr_depth = self.parameter(props, "rr_depth", 5, minimum=1, maximum=NO_LIMIT)
-        self._aovs = self._aov_integrator(self.parameter(props, "aovs", ""))
+        self.aovs = self.parameter(props, "aovs", "")
+        self._aovs = self._aov_integrator(self.aovs)
 
     # ---- What a subclass says ----
 
@@ -111,13 +112,13 @@ class WalkIntegrator(StagedIntegrator):
         return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
 
     def common_parameters(self) -> dict[str, Any]:
-        parameters = {
+        return {
             "max_depth": -1 if self.max_depth == NO_LIMIT else self.max_depth,
             "rr_depth": self.rr_depth,
             "hide_emitters": self.hide_emitters,
             **super().common_parameters(),
+            "aovs": self.aovs or "none",
         }
-        return {**parameters, "aovs": ", ".join(self.aov_names())} if self._aovs else parameters
 
     # ---- Helpers ----
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TextIO
 
 from .errors import InputError
-from .folders import make_folder
+from .files import make_folder
 
 try:
     import fcntl

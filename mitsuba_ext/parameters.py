@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import mitsuba as mi
 
+#: Samples per pixel of a render, at most: structured samplers do not count further.
+MOST_SPP = 2**30
+
 
 def read_parameter(
     plugin: str,

@@ -8,12 +8,9 @@ depend on the number of samples, and all passes of a stage run the same kernel.
 
 from __future__ import annotations
 
-import contextlib
 import operator
-import signal
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -22,6 +19,9 @@ import mitsuba as mi
 
 from . import camera
 from .decisions.camera_samples import CameraSamples
+from .interrupts import deferred_interrupt
+from .parameters import MOST_SPP
+from .time_budget import TimeBudget
 from .walk import Walk
 
 if TYPE_CHECKING:
@@ -39,10 +39,14 @@ _PASS_SPP = 16
 #: Passes of a structured sampler that learns, at least: a pilot is one of them or more.
 _MIN_STRUCTURED_PASSES = 16
 
-#: With a time budget, passes are shorter by this factor: they are what it is kept with.
+#: With a timeout, passes of a structured sampler are shorter by this factor: they cannot differ in
+#: length, and are what the timeout is kept with.
 _TIMEOUT_PASS_DIVISOR = 4
 
 _MAX_WAVEFRONT = 1 << 32
+
+#: Passes of a render, at most: they last weeks.
+_MOST_PASSES = 1 << 20
 
 
 @dataclass
@@ -117,7 +121,7 @@ def render(
     sensor = camera.find_sensor(scene, sensor)
     job = _Job(integrator, scene, sensor, seed, spp)
     try:
-        with _deferred_interrupt() as interrupt:
+        with deferred_interrupt() as interrupt:
             job.run(interrupt)
     finally:
         # Also after an exception, the film holds the passes that were finished
@@ -141,14 +145,16 @@ class _Job:
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
         self.seed = seed & 0xFFFFFFFF
         self.sampler = _own_sampler(sensor)
+        if not 0 <= spp <= MOST_SPP:
+            raise ValueError(
+                f'"{integrator.name}": spp is {spp}; it must be 1 to {MOST_SPP}, or 0 for as many '
+                f"as the sampler says"
+            )
         if spp:
             self.sampler.set_sample_count(spp)
         self.spp = self.sampler.sample_count()
         self.width, self.height = camera.film_extent(self.film)
-        if self.width * self.height >= _MAX_WAVEFRONT:
-            raise ValueError(
-                f"a film of {self.width}x{self.height} pixels exceeds the 2^32 samples of one pass"
-            )
+        check_extent(self.film)
         self.statistics = integrator.statistics = RenderStatistics()
         self.tally = dr.zeros(mi.UInt64, 4)
         aovs = integrator.aov_names()
@@ -161,113 +167,107 @@ class _Job:
         self._plan()
         self.block = self.film.create_block()
         # One kernel for all passes: coalescing is decided once
-        longest = max(max(passes) for passes in self.plan)
+        longest = max(self._pass_length(samples) for samples in self.stages)
         self.block.set_coalesce(self.block.coalesce() and longest >= 4)
 
     def _plan(self) -> None:
-        """Decides the samples of each stage and of each of its passes."""
+        """Decides the samples of each stage and the length of passes."""
         pixel_count = self.width * self.height
         self.structured = self.sampler.class_name() != "IndependentSampler"
-        limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // pixel_count
+        cost = self.integrator.sample_cost
+        limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // (pixel_count * cost)
         if not self.structured:
-            limit = max(limit, min(_PASS_SPP, (_MAX_WAVEFRONT - 1) // pixel_count))
-        if self.integrator.timeout > 0:
+            limit = max(limit, min(_PASS_SPP // cost, (_MAX_WAVEFRONT - 1) // pixel_count))
+        is_timed = self.integrator.timeout > 0
+        if self.structured and is_timed:
             limit //= _TIMEOUT_PASS_DIVISOR
-        limit = max(1, min(limit, self.integrator.samples_per_pass))
+        self.limit = max(1, min(limit, self.integrator.samples_per_pass))
+        if self.spp > self.limit * _MOST_PASSES:
+            raise ValueError(
+                f'"{self.integrator.name}": {self.spp} samples for each of {pixel_count} pixels '
+                f"are too many: give at most {self.limit * _MOST_PASSES}"
+            )
         pilots = self.integrator.pilots(self.scene, self.spp)
-        stages = [*pilots, self.spp - sum(pilots)]
-        self.set_size = (
-            self.integrator.samples_per_set(self.spp) if self.integrator.timeout > 0 else 1
-        )
-        # Independent samples can be cut anywhere, and each pass gets a seed of its own. Samples
-        # that are stratified over the whole render must come in passes of equal length, to which
-        # the pilots are rounded; sets of samples must not begin in the middle of a pass.
-        if not self.structured:
-            taken = [sum(stages[:index]) for index in range(len(stages))]
-            self.plan = [self._passes(*part, limit) for part in zip(taken, stages)]
-        else:
-            if len(stages) > 1:
-                limit = min(limit, max(*stages[:-1], self.spp // _MIN_STRUCTURED_PASSES))
-            length = max(d for d in range(1, limit + 1) if self._can_be_cut(d))
-            stages = [length * max(1, s // length) for s in stages[:-1]]
-            stages.append(self.spp - sum(stages))
-            self.plan = [[length] * (samples // length) for samples in stages]
-            self.sampler.set_samples_per_wavefront(length)
-            self.sampler.seed(dr.opaque(mi.UInt32, self.seed), self._lanes(length))
+        # With a timeout, sets of samples are kept whole
+        self.set_size = self.integrator.samples_per_set(self.spp) if is_timed else 1
+        if self.structured:
+            pilots = self._plan_structured(pilots)
+        self.stages = [*pilots, self.spp - sum(pilots)]
+        self.budget = TimeBudget(self.integrator.timeout, self.start, pixel_count, sum(pilots))
         self.pass_index = 0
 
-    def _passes(self, taken: int, samples: int, limit: int) -> list[int]:
-        """The lengths of passes of a stage, none above ``limit``, after ``taken`` samples."""
-        if self.set_size == 1:
-            length, first = _even_length(samples, limit), 0
-        else:
-            length = max(d for d in range(1, limit + 1) if self._can_be_cut(d))
-            first = min(samples, -taken % length)
-        passes, rest = divmod(samples - first, length)
-        return [n for n in (first, *[length] * passes, rest) if n]
+    def _plan_structured(self, pilots: list[int]) -> list[int]:
+        """Independent samples can be cut anywhere, and each pass gets a seed of its own. Samples
+        that are stratified over the whole render must come in passes of equal length, to which
+        the pilots are rounded."""
+        if pilots:
+            self.limit = min(self.limit, max(*pilots, self.spp // _MIN_STRUCTURED_PASSES))
+        self.limit = length = max(d for d in range(1, self.limit + 1) if self._can_be_cut(d))
+        self.sampler.set_samples_per_wavefront(length)
+        self.sampler.seed(dr.opaque(mi.UInt32, self.seed), self._lanes(length))
+        return [length * max(1, samples // length) for samples in pilots]
 
     def _can_be_cut(self, length: int) -> bool:
         """Into passes of this length?"""
-        if self.structured and self.spp % length != 0:
+        if self.spp % length != 0:
             return False
         return self.set_size % length == 0 or length % self.set_size == 0
+
+    def _pass_length(self, samples: int) -> int:
+        """Of passes of about equal length that take ``samples`` samples."""
+        if self.structured:
+            return self.limit
+        pass_count = -(-samples // self.limit)
+        return max(1, -(-samples // max(1, pass_count)))
 
     def _lanes(self, spp: int) -> int:
         return self.width * self.height * spp
 
     def run(self, interrupt: threading.Event) -> None:
-        stage_samples = [sum(passes) for passes in self.plan]
-        pass_count = sum(len(passes) for passes in self.plan)
         mi.Log(
             mi.LogLevel.Info,
             f"Starting render job ({self.width}x{self.height}, {self.spp} samples, "
-            f"{len(self.plan)} stage(s), {pass_count} pass(es))",
+            f"{len(self.stages)} stage(s))",
         )
-        plan = iter(enumerate(self.plan))
-        for stage in self.integrator.stages(
-            self.scene, self.sensor, stage_samples, self.seed
-        ):
+        plan = iter(enumerate(self.stages))
+        for stage in self.integrator.stages(self.scene, self.sensor, self.stages, self.seed):
             if stage.is_scout:
                 self._run_scout(stage)
                 continue
-            index, passes = next(plan)
-            is_last = index == len(self.plan) - 1
+            index, samples = next(plan)
+            is_last = index == len(self.stages) - 1
             self.statistics.learned = stage.learned
             if is_last:
                 self.statistics.learning_seconds = time.perf_counter() - self.start
-            self._run_stage(stage, passes, is_last, interrupt)
+            self._run_stage(stage, samples, is_last, interrupt)
             if self._stopped(interrupt):
                 self.statistics.interrupted = True
                 return
 
-    def _run_stage(self, stage: Stage, passes: list[int], is_last: bool, interrupt) -> None:
-        """Runs the passes of a stage: all of them, or as many as the timeout allows.
-
-        Their number is fixed as soon as the speed is known, from the first pass that compiled
-        nothing, and not by looking at the clock later: an image that ends when the clock says so
-        prefers samples that are fast.
-        """
-        timeout = self.integrator.timeout
-        is_open = is_last and timeout > 0  # is the number of passes still open?
-        allowed = len(passes)
+    def _run_stage(self, stage: Stage, samples: int, is_last: bool, interrupt) -> None:
+        """Runs the passes of a stage: all of them, or as many as the timeout allows."""
         before = self.statistics.spp
-        for index, spp in enumerate(passes):
-            if index >= allowed or self._stopped(interrupt):
+        budget = self.budget.stage(samples, before, is_last)
+        length, done = self._pass_length(samples), 0
+        while done < (wanted := self._whole(before, budget.samples, samples)):
+            if self._stopped(interrupt):
                 return
+            spp = length if self.structured else min(length, budget.longest, wanted - done)
             begin = time.perf_counter()
             compiled = self._run_pass(stage, spp)
-            end = time.perf_counter()
-            if is_open and not compiled:
-                remaining = timeout - (end - self.start)
-                allowed = min(allowed, index + 1 + max(0, int(remaining / (end - begin))))
-                while (before + sum(passes[:allowed])) % self.set_size and allowed < len(passes):
-                    allowed += 1
-                is_open = False
+            done += spp
+            if not compiled:
+                budget.passed(spp, done, time.perf_counter() - begin)
             if self.integrator.progress is not None:
-                left = 0 if is_open else sum(passes[index + 1 : allowed])
-                done = self.statistics.spp
-                total = self.spp if is_open or not is_last else done + left
-                self.integrator.progress(done / total)
+                is_known = is_last and not budget.is_open
+                wanted = max(done, self._whole(before, budget.samples, samples))
+                total = before + wanted if is_known else self.spp
+                self.integrator.progress((before + done) / total)
+
+    def _whole(self, before: int, samples: int, most: int) -> int:
+        """The samples of a stage, so many that the render ends with a whole set; ``most`` would do
+        so."""
+        return min(most, samples + -(before + samples) % self.set_size)
 
     def _stopped(self, interrupt: threading.Event) -> bool:
         return interrupt.is_set() or self.integrator.is_cancelled
@@ -286,7 +286,7 @@ class _Job:
     def _run_pass(self, stage: Stage, spp: int) -> bool:
         """Renders ``spp`` samples per pixel into the block; did it have to compile a kernel?"""
         begin = time.perf_counter()
-        misses = _kernel_cache_misses()
+        misses = kernel_cache_misses()
         sampler = self._pass_sampler(spp)
         rays = camera.sample_rays(
             self.sensor, sampler, spp, self.spp, stage.camera, self.statistics.spp
@@ -310,7 +310,7 @@ class _Job:
         self.statistics.passes += 1
         self.statistics.spp += spp
         self.statistics.rays["camera"] += self._lanes(spp)
-        return _kernel_cache_misses() > misses
+        return kernel_cache_misses() > misses
 
     def _pass_sampler(self, spp: int) -> mi.Sampler:
         if self.structured:
@@ -353,10 +353,16 @@ class _Job:
         )
 
 
-def _even_length(samples: int, limit: int) -> int:
-    """The length of passes of about equal length, none above ``limit``."""
-    pass_count = -(-samples // limit)
-    return max(1, -(-samples // max(1, pass_count)))
+def check_extent(film: mi.Film) -> None:
+    """
+    Raises:
+        ValueError: The film has more pixels than a wavefront can hold.
+    """
+    width, height = camera.film_extent(film)
+    if width * height >= _MAX_WAVEFRONT:
+        raise ValueError(
+            f"a film of {width}x{height} pixels exceeds the 2^32 samples of one pass"
+        )
 
 
 def _own_sampler(sensor: mi.Sensor) -> mi.Sampler:
@@ -368,28 +374,7 @@ def _own_sampler(sensor: mi.Sensor) -> mi.Sampler:
         return sensor.sampler()
 
 
-def _kernel_cache_misses() -> int:
+def kernel_cache_misses() -> int:
+    """How many kernels have been compiled, or loaded from the disk, in this process."""
     _launches, soft_misses, hard_misses = dr.detail.launch_stats()
     return soft_misses + hard_misses
-
-
-@contextlib.contextmanager
-def _deferred_interrupt() -> Iterator[threading.Event]:
-    """While active, the first Ctrl-C only sets the event, so that the running pass can finish; a
-    second one interrupts at once."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    previous = signal.getsignal(signal.SIGINT)
-
-    def handler(_signum, _frame) -> None:
-        event.set()
-        signal.signal(signal.SIGINT, previous or signal.SIG_DFL)
-        mi.Log(mi.LogLevel.Warn, "Interrupted: the running pass is being finished.")
-
-    signal.signal(signal.SIGINT, handler)
-    try:
-        yield event
-    finally:
-        signal.signal(signal.SIGINT, previous or signal.SIG_DFL)

@@ -67,6 +67,10 @@ class ReweightedCamera(StagedIntegrator):
     def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
         return self.nested.pilots(scene, spp) if self._is_staged else []
 
+    @property
+    def sample_cost(self) -> int:
+        return self.nested.sample_cost if self._is_staged else 1
+
     def samples_per_set(self, spp: int) -> int:
         most = _MOST_POINTS_TIMED if self.timeout > 0 else _MOST_POINTS
         return -(-spp // -(-spp // most))

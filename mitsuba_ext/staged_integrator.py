@@ -50,6 +50,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
         """The samples per pixel of each pilot stage, out of ``spp``; none where nothing learns."""
         return []
 
+    @property
+    def sample_cost(self) -> int:
+        """The time of a sample in units of that of a path, about: passes are the shorter."""
+        return 1
+
     def samples_per_set(self, spp: int) -> int:
         """So many samples of a pixel belong together, out of ``spp``: a timeout keeps them whole.
         """

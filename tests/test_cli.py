@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 import pytest
 from conftest import PATH, in_subprocess
 
-from mitsuba_ext import pages
-from mitsuba_ext.compare import load_scene, read_exr, write_exr
+from mitsuba_ext import pages, rendering, seed_passes
+from mitsuba_ext.cli import stopping
+from mitsuba_ext.compare import images, load_scene, read_exr, write_exr
 from mitsuba_ext.names import MITSUBA_INTEGRATORS
 
 # ---- render ----
@@ -134,7 +139,7 @@ def test_interrupted_render_writes_what_the_film_holds(
     arguments = ("render", make_scene(), "-o", output, "--integrator", interrupted_integrator)
     code, _, err = run(*arguments)
     assert code == 130
-    assert err == f"interrupted: {output} has the samples so far\n"
+    assert err == f"interrupted during the render: {output}\n"
     assert read_exr(output)[0]["R"].shape == (6, 8)
 
 
@@ -149,6 +154,113 @@ def test_render_interrupted_before_its_first_pass_leaves_an_older_file_alone(
     assert code == 130
     assert err.count("\n") == 1 and "nothing written" in err
     assert output.read_bytes() == b"older"
+
+
+@pytest.mark.parametrize(
+    "integrator, module, job",
+    [("path", seed_passes, "SeedPasses"), ("composed_path", rendering, "_Job")],
+)
+@pytest.mark.parametrize("name, code", [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_a_signal_ends_the_render_after_a_pass_and_keeps_an_older_image(
+    run, make_scene, tmp_path, monkeypatch, integrator, module, job, name, code
+):
+    """In passes of 4 samples, of which the third is interrupted."""
+    monkeypatch.setattr(module, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 4 * 8 * 6})
+    monkeypatch.setattr(module, "_PASS_SPP", 1)
+    run_pass, passes = getattr(module, job)._run_pass, []
+
+    def interrupted(self, *arguments):
+        passes.append(self)
+        if len(passes) % 3 == 0:
+            os.kill(os.getpid(), getattr(signal, name))
+        return run_pass(self, *arguments)
+
+    monkeypatch.setattr(getattr(module, job), "_run_pass", interrupted)
+    output, partial = tmp_path / "image.exr", tmp_path / "image.partial.exr"
+    arguments = ("render", make_scene(), "-o", output, "--integrator", integrator, "--spp", 40)
+    for target in (output, partial):
+        found, _, err = run(*arguments)
+        assert found == code
+        assert f"interrupted after 12 of 40 spp: {target}" in err
+        metadata = read_exr(target)[1]
+        assert (metadata["spp"], metadata["interrupted"]) == (12, "true")
+    assert f"{output} is an older image" in err
+    assert sorted(tmp_path.iterdir()) == [output, partial, tmp_path / "scene.xml"]
+    assert run(*arguments[:-1], 12)[0] == 0, "the last pass had all samples"
+    assert read_exr(output)[1]["interrupted"] == "false"
+
+
+def test_a_second_signal_ends_the_process_whatever_runs(run, make_scene, tmp_path, monkeypatch):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    prb = type(mi.load_dict({"type": "prb"}))
+    exits: list[int] = []
+
+    class Stubborn(prb):
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            while not exits:
+                with contextlib.suppress(KeyboardInterrupt):
+                    os.kill(os.getpid(), signal.SIGINT)
+                    time.sleep(0.01)
+            raise KeyboardInterrupt
+
+    mi.register_integrator("stubborn", lambda props: Stubborn(props))
+    monkeypatch.setattr(stopping, "_TOGETHER", 0.02)
+    monkeypatch.setattr(os, "_exit", exits.append)
+    arguments = ("render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", "stubborn")
+    assert run(*arguments)[0] == 130 and exits[0] == 130
+    assert not (tmp_path / "a.exr").exists()
+
+
+def test_output_that_cannot_hold_the_film_is_refused_before_rendering(
+    run, make_scene, tmp_path, monkeypatch
+):
+    scene = make_scene(film='<spectrum name="band" value="400:1, 700:1"/>')
+    scene.write_text(scene.read_text().replace("hdrfilm", "specfilm"))
+    arguments = ("render", scene, "--variant", "llvm_ad_spectral", "-o")
+    code, _, err = run(*arguments, tmp_path / "a.png")
+    assert code == 2 and 'the film "SpecFilm" has no RGB image: write it to an .exr' in err
+    assert run(*arguments, tmp_path / "a.exr")[0] == 0
+    assert set(read_exr(tmp_path / "a.exr")[0]) == {"band"}
+
+    def full_disk(*_):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(images, "write_film", full_disk)
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "b.exr")
+    assert code == 2 and "b.exr: cannot be written (No space left on device)" in err
+    assert not list(tmp_path.glob("b*"))
+
+
+def test_pixels_that_are_not_finite_are_counted(run, make_scene, tmp_path):
+    bright = '<emitter type="constant"><rgb name="radiance" value="3e38"/></emitter>'
+    scene = make_scene()
+    scene.write_text(scene.read_text().replace('<emitter type="constant"/>', bright))
+    code, out, err = run("render", scene, "-o", tmp_path / "a.exr")
+    assert code == 1 and "a.exr: 4 spp" in out
+    assert f"48 of 48 pixels of {tmp_path / 'a.exr'} are NaN or infinite" in err
+
+
+def test_what_the_image_does_not_show_is_said(run, make_scene, tmp_path):
+    """Media, which path does not see; no light; other sensors than the first."""
+    second = '<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="5"/>'
+    fog = '<medium type="homogeneous" name="interior"/><bsdf type="null"/>'
+    scene = make_scene(body=f'<shape type="cube">{fog}</shape>{second}</film></sensor>')
+    scene.write_text(scene.read_text().replace('<emitter type="constant"/>', ""))
+    output = tmp_path / "a.exr"
+    code, _, err = run("render", scene, "-o", output)
+    assert code == 0 and read_exr(output)[0]["R"].shape == (6, 8)
+    assert 'participating media, and "path" treats them as absent: use "volpath"' in err
+    assert "the scene has no light: the image is black" in err
+    assert "the scene has 2 sensors: the first is rendered" in err
+    assert err.count("warning") == 3
+    arguments = ("--sensor", 1, "--integrator", "volpath", "--spp", 1)
+    code, _, err = run("render", scene, "-o", output, *arguments)
+    assert code == 0 and read_exr(output)[0]["R"].shape[1] == 5
+    assert err.count("warning") == 1 and "no light" in err
+    code, _, err = run("render", scene, "-o", output, "-s", 2)
+    assert code == 2 and "there is no sensor 2: the scene has 2" in err
 
 
 def test_failing_write_leaves_an_older_file_alone(tmp_path, monkeypatch):
@@ -180,6 +292,13 @@ BAD_INPUT = [
     (["render", "{scene}", "-o", "{tmp}/none/a.exr"], "none: no such folder"),
     (["render", "{scene}", "-o", "{scene}/a.exr"], "is not a folder"),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--spp", "0"], "'--spp': 0"),
+    (["render", "{scene}", "-o", "{tmp}/a.exr", "--spp", "100000000000"], "'--spp': 1000"),
+    (["render", "{scene}", "-o", "{tmp}/a.exr", "--integrator", ""], 'integrator "": expected'),
+    (
+        ["render", "{scene}", "-o", "{tmp}/a.exr", "--spp", "64", "--integrator",
+         "neepp:save_map={tmp}/none/map.npz"],
+        '"neepp": "save_map": {tmp}/none: no such folder',
+    ),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--time", "0"], "'--time': 0"),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--time", "1", "--spp", "1"], "exclude"),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--seed", "4294967296"], "'--seed'"),
@@ -232,7 +351,7 @@ def test_bad_input_is_one_line_and_exit_code_2(run, make_scene, tmp_path, argume
     code, out, err = run(*arguments)
     assert code == 2
     assert out == ""
-    assert message in err
+    assert message.format(tmp=tmp_path) in err
     assert err.count("\n") == 1 and err.startswith("mitsuba-ext: ")
     assert sorted(tmp_path.iterdir()) == before
 

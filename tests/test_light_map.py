@@ -242,7 +242,7 @@ def test_the_same_seed_learns_bitwise_the_same(tmp_path: Path):
 
 def test_a_map_serves_another_view_and_is_refused_by_another_scene(tmp_path: Path):
     """Learned once, used without a pilot: fewer shadow rays than without, and the same mean."""
-    file = tmp_path / "deep" / "map.npz"
+    file = tmp_path / "map.npz"
     scene = load("door_ajar", width=64, height=36)
     learn = mi.load_dict({"type": "neepp", "max_depth": 4, "save_map": str(file)})
     mi.render(scene, integrator=learn, spp=64)

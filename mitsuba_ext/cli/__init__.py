@@ -1,8 +1,9 @@
 """The command ``mitsuba-ext``, one file per subcommand.
 
-Mitsuba's own command cannot load plugins written in Python. Exit codes: 0, 1 (a comparison in which
-an integrator failed or a reference was too noisy, a problem that the doctor found), 2 (bad input:
-one line on stderr), 130, 143 and 129 (Ctrl-C, SIGTERM, SIGHUP).
+Mitsuba's own command cannot load plugins written in Python. Exit codes: 0, 1 (an image with NaN or
+infinite pixels, a comparison in which an integrator failed or a reference was too noisy, a problem
+that the doctor found), 2 (bad input: one line on stderr), 130, 143 and 129 (Ctrl-C, SIGTERM and
+SIGHUP).
 """
 
 from __future__ import annotations

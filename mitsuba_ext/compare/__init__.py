@@ -7,7 +7,7 @@
     mi.set_variant("llvm_ad_rgb")
     comparison = compare.Comparison(
         ["scenes/door_ajar.xml", "scenes/rooms.xml"],
-        ["path", "neepp:grid=32", {"type": "neepp", "law": "paper"}],
+        ["path", "neepp:grid=32", {"type": "neepp", "rejection": True}],
         compare.equal_time(10),
         folder="out/doors",
     )

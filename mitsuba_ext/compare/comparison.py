@@ -190,7 +190,7 @@ class Comparison:
             progress(step._replace(label=f"{name}{count}: {step.label}"))
 
         try:
-            images.check_film(scene.scene.sensors()[0].film())
+            images.check_comparable(scene.scene.sensors()[0].film())
         except InputError as error:
             raise InputError(f"{scene.source}: {error}") from error
         if setup.reference:

@@ -6,16 +6,17 @@ terminal when a file is damaged, and returns an empty image.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-from collections.abc import Iterator, Mapping, Sequence
+import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..folders import check_folder
+from .. import files
+from ..files import check_folder as check_folder
+from ..files import replacing
 from ..scenes import InputError, one_line
 
 if TYPE_CHECKING:
@@ -26,28 +27,12 @@ EXTENSIONS = (".exr", ".png", ".jpg", ".jpeg", ".hdr", ".pfm")
 
 
 def check_target(path: Path) -> None:
-    """Raises :class:`InputError` where ``path`` could not be written, before hours of rendering."""
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder")
+    """Raises :class:`InputError` where no image could be written to ``path``, before hours of
+    rendering."""
+    files.check_target(path)
     if path.suffix.lower() not in EXTENSIONS:
         found = f'the extension "{path.suffix}"' if path.suffix else "a name without extension"
         raise InputError(f"{path}: {found} cannot be written ({' '.join(EXTENSIONS)} can)")
-    check_folder(path.parent)
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yields a name to write to; the finished file then takes the place of ``path`` in one step.
-
-    After an exception, what ``path`` held before is still there.
-    """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
 
 
 def write_exr(
@@ -106,6 +91,32 @@ def check_file(path: Path) -> None:
         raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
 
 
+def check_film(path: Path, film: mi.Film, aovs: Sequence[str]) -> None:
+    """Raises :class:`InputError` where what ``film`` will hold could not be written to ``path``:
+    finds out by writing a black image beside it."""
+    import mitsuba as mi
+
+    is_special = mi.has_flag(film.flags(), mi.FilmFlags.Special)
+    if is_special and path.suffix.lower() != ".exr":
+        raise InputError(
+            f'{path}: the film "{film.class_name()}" has no RGB image: write it to an .exr'
+        )
+    try:
+        film.prepare(list(aovs))
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            write_film(Path(folder) / path.name, film, {})
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"{path}: cannot be written ({one_line(error)})") from error
+
+
+def count_non_finite(film: mi.Film) -> tuple[int, int]:
+    """How many pixels of the image that a film holds (AOVs apart) are NaN or infinite, and how many
+    there are."""
+    image = np.array(film.develop())[..., : film.base_channels_count()]
+    bad = ~np.isfinite(image).all(axis=2)
+    return int(np.count_nonzero(bad)), bad.size
+
+
 def write_film(path: Path, film: mi.Film, metadata: Mapping[str, object]) -> None:
     """Writes what a film holds: an EXR as it is, HDR and PFM as RGB, the others as 8-bit sRGB."""
     import mitsuba as mi
@@ -137,7 +148,7 @@ def to_rgb(image: object, channels: Sequence[str]) -> np.ndarray:
     return pixels[:, :, :3]
 
 
-def check_film(film: mi.Film) -> None:
+def check_comparable(film: mi.Film) -> None:
     """Raises :class:`InputError` for a film whose image has no RGB (or grey) channels."""
     import mitsuba as mi
 

@@ -42,7 +42,9 @@ class Timed(NamedTuple):
     image: mi.TensorXf
 
 
-def timed_render(integrator: mi.Integrator, scene: mi.Scene, seed: int, spp: int) -> Timed:
+def timed_render(
+    integrator: mi.Integrator, scene: mi.Scene, seed: int, spp: int, sensor: int = 0
+) -> Timed:
     """Renders (``spp`` 0: as many samples as the scene's sampler says) and waits for the image.
 
     Raises:
@@ -58,7 +60,9 @@ def timed_render(integrator: mi.Integrator, scene: mi.Scene, seed: int, spp: int
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         start = time.perf_counter()
-        image = integrator.render(scene, sensor=0, seed=seed, spp=spp, develop=True, evaluate=True)
+        image = integrator.render(
+            scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=True
+        )
         dr.eval(image)
         dr.sync_thread()
         seconds = time.perf_counter() - start
@@ -72,7 +76,7 @@ def timed_render(integrator: mi.Integrator, scene: mi.Scene, seed: int, spp: int
         compiled=bool(compiled),
         compile_seconds=milliseconds / 1000,
         launches=len(kernels),
-        spp=report.spp if report else sample_count(scene.sensors()[0], spp),
+        spp=report.spp if report else sample_count(scene.sensors()[sensor], spp),
         memory=memory,
         image=image,
     )
@@ -86,7 +90,9 @@ def own_statistics(integrator: mi.Integrator) -> RenderStatistics | None:
     return report if isinstance(report, RenderStatistics) else None
 
 
-def samples_for(budget: float, integrator: mi.Integrator, scene: mi.Scene, seed: int) -> int:
+def samples_for(
+    budget: float, integrator: mi.Integrator, scene: mi.Scene, seed: int, sensor: int = 0
+) -> int:
     """How many samples per pixel take ``budget`` seconds.
 
     Mitsuba's own integrators ignore a ``timeout`` outside of the scalar variants, and those that
@@ -96,9 +102,9 @@ def samples_for(budget: float, integrator: mi.Integrator, scene: mi.Scene, seed:
     """
 
     def seconds_of(spp: int) -> float:
-        seconds, compiled, *_ = timed_render(integrator, scene, seed, spp)
+        seconds, compiled, *_ = timed_render(integrator, scene, seed, spp, sensor)
         if compiled or seconds < _SHORT:
-            seconds = min(seconds, timed_render(integrator, scene, seed, spp).seconds)
+            seconds = min(seconds, timed_render(integrator, scene, seed, spp, sensor).seconds)
         return seconds
 
     # From 8 on: with fewer, an integrator may have none to learn from

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import mitsuba as mi
 
 from ..bounds import scene_bounds
+from ..errors import InputError
+from ..files import check_target
 from ..learning.learner import Learner
 from ..learning.voxel_grid import VoxelGrid
 from ..lights.light_cells import LightCells
@@ -34,6 +36,7 @@ class LightSampling:
     """How lights are chosen and shadow rays are rejected.
 
     The attributes are the parameters of the plugins that use it; see ``neepp`` for their meaning.
+    The last one is the plugin's name, for errors.
     """
 
     light_sampling: str
@@ -47,6 +50,7 @@ class LightSampling:
     floor: float
     load_map: str
     save_map: str
+    plugin: str
 
     @classmethod
     def from_properties(
@@ -55,16 +59,10 @@ class LightSampling:
         """Reads the parameters of a scene, but for the first two, which plugins name differently.
 
         Raises:
-            TypeError, ValueError: A parameter has a wrong type or value.
+            TypeError, ValueError: A parameter has a wrong type or value, or would have no effect.
         """
         get = integrator.parameter
-        for key in ("load_map", "save_map"):
-            if get(props, key, "") and light_sampling not in LEARNING:
-                raise ValueError(
-                    f'"{integrator.name}": the parameter "{key}" needs lights that are chosen by '
-                    f'what was learned ({" or ".join(LEARNING)}), not "{light_sampling}"'
-                )
-        return cls(
+        sampling = cls(
             light_sampling=light_sampling,
             rejection=rejection,
             # Chosen later where the scene does not say
@@ -77,7 +75,44 @@ class LightSampling:
             floor=get(props, "floor", 0.1, minimum=1e-6, maximum=1.0),
             load_map=get(props, "load_map", ""),
             save_map=get(props, "save_map", ""),
+            plugin=integrator.name,
         )
+        for key, (is_met, condition) in sampling._conditions().items():
+            if key in props and not is_met:
+                raise ValueError(
+                    f'"{integrator.name}": the parameter "{key}" needs {condition}; leave it out'
+                )
+        return sampling
+
+    def parameters(self) -> dict[str, Any]:
+        """Names and values of all parameters that have an effect."""
+        conditions = self._conditions()
+        return {
+            key: value
+            for key, value in vars(self).items()
+            if key != "plugin" and conditions.get(key, (True, ""))[0]
+        }
+
+    def _conditions(self) -> dict[str, tuple[bool, str]]:
+        """What parameters need to have an effect: is it so, and how to say it."""
+        learns = self.light_sampling in LEARNING
+        is_affine = self.rejection and self.law == "affine"
+        has_table = learns or self.rejection or self.light_sampling == "spatial"
+        learning = f"lights that are chosen by what was learned ({' or '.join(LEARNING)})"
+        rejecting = "shadow rays that are rejected"
+        table = (has_table, f"{learning} or spatially, or {rejecting}")
+        affine = (is_affine, f"{rejecting} by the affine law")
+        return {
+            "grid": table,
+            "max_memory": table,
+            "pilot_spp": (learns or self.rejection, f"{learning}, or {rejecting}"),
+            "refine": (self.rejection and not learns, f"{rejecting}, and lights not learned"),
+            "law": (self.rejection, rejecting),
+            "slope": affine,
+            "floor": affine,
+            "load_map": (learns, learning),
+            "save_map": (learns, learning),
+        }
 
     def decisions(self, scene: mi.Scene) -> dict[str, Any]:
         """What needs no learning. A single light needs no choice."""
@@ -122,7 +157,16 @@ class LightSampling:
         return [samples // 4, samples - samples // 4]
 
     def learners(self, scene: mi.Scene, samples: int) -> list[Learner]:
-        """Who learns from ``samples`` pilot samples (of all pixels together)."""
+        """Who learns from ``samples`` pilot samples (of all pixels together).
+
+        Raises:
+            ValueError: The map that is going to be learned cannot be written.
+        """
+        if self.save_map:
+            try:
+                check_target(Path(self.save_map))
+            except InputError as error:
+                raise ValueError(f'"{self.plugin}": "save_map": {error}') from None
         if not self._can_learn(scene) or (samples == 0 and not self.load_map):
             return []
         law = {"law": self.law, "slope": self.slope, "floor": self.floor}

@@ -21,8 +21,8 @@ WEIGHTS = ("none", "voronoi", "torus", "unbiased")
 #: Points of all sets together, and sets at most. With few sets, pixels share the luck of one.
 _POINTS, _MOST_SETS = 1 << 13, 32
 
-#: A pattern whose points are slow to find.
-_SLOW, _FEW_SETS = "poisson_disk", 2
+#: A pattern whose points are slow to find; more of them than this take ten seconds.
+_SLOW, _FEW_SETS, MOST_SLOW_POINTS = "poisson_disk", 2, 1024
 
 
 class SetKind:
@@ -42,6 +42,11 @@ class SetKind:
     ) -> None:
         self.pattern = read_parameter(plugin, props, "pattern", pattern, choices=PATTERNS)
         self.weights = read_parameter(plugin, props, "weights", weights, choices=accepted)
+
+    @property
+    def is_slow(self) -> bool:
+        """Are its points slow to find? There should be no more than ``MOST_SLOW_POINTS``."""
+        return self.pattern == _SLOW
 
     def sets(self, count: int, dimension: int, seed: Any, periods: int = 1) -> WeightedSets:
         """Sets of ``count`` points; another seed gives others."""

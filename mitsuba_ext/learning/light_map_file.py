@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..files import replacing
 from ..lights.light_cells import LightCells
 from .light_map import LightMap
 from .surface_rows import SurfaceRows, voxel_edges
@@ -24,8 +25,7 @@ _ARRAYS = {"scene", "bbox", "resolution", "p", "n", "tests", "successes", "squar
 def save(path: Path, scene: mi.Scene, light_map: LightMap) -> None:
     """Writes a map, with a fingerprint of the scene that it belongs to."""
     rows = light_map.rows
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("wb") as file:
+    with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,
             format=_FORMAT,

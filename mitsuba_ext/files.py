@@ -1,8 +1,11 @@
-"""Folders that somebody wants to write to."""
+"""Files and folders that are written: whether they can be, and never half of them."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 from .errors import InputError
@@ -30,3 +33,25 @@ def make_folder(folder: Path) -> None:
     except OSError as error:
         raise InputError(f"{folder}: cannot make this folder ({error.strerror})") from error
     check_folder(folder)
+
+
+def check_target(path: Path) -> None:
+    """Raises :class:`InputError` if no file ``path`` can be made: before hours of rendering."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder")
+    check_folder(path.parent)
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a name to write to; the finished file then takes the place of ``path`` in one step.
+
+    After an exception, what ``path`` held before is still there.
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()

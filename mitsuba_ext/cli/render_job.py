@@ -1,0 +1,168 @@
+"""One render of a scene file, with whichever integrator: Mitsuba's in passes, ours as they are."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from rich.progress import Progress
+
+from ..batches import sample_count
+from ..compare import timing
+from ..errors import InputError
+from ..scene_remarks import scene_remarks
+from ..scenes import LoadedScene, load_scene, one_line
+from ..seed_passes import SeedPasses, can_render, is_independent
+from ..specifications import make_named
+from .common import progress_bars
+
+
+class RenderJob:
+    """A scene, an integrator, and how far it got.
+
+    Attributes:
+        integrator, name, parameters: Of the integrator.
+        film: Where the image is.
+        is_interrupted: Did a signal end the render early?
+        seconds: Wall clock of the render.
+    """
+
+    def __init__(
+        self, loaded: LoadedScene, integrator: mi.Integrator, name: str,
+        parameters: Mapping[str, Any], sensor_index: int, seed: int,
+    ) -> None:  # fmt: skip
+        self.integrator, self.name, self.parameters = integrator, name, parameters
+        self.is_interrupted, self.seconds = False, 0.0
+        self._loaded, self._sensor_index, self._seed = loaded, sensor_index, seed
+        self._sensor = loaded.scene.sensors()[sensor_index]
+        self.film = self._sensor.film()
+        self._wanted: int | None = None  # samples per pixel, where it is known
+        self._is_measuring = False
+        self._passes: SeedPasses | None = None
+
+    @classmethod
+    def load(
+        cls, path: Path, size: tuple[int, int] | None, definitions: Mapping[str, str],
+        specification: str | None, sensor_index: int | None, seed: int,
+    ) -> RenderJob:  # fmt: skip
+        """
+        Args:
+            specification: The integrator; ``None`` for the scene's.
+            sensor_index: ``None`` for the first.
+
+        Raises:
+            InputError: The scene, the integrator or the sensor cannot be used.
+        """
+        loaded = load_scene(path, size, definitions, keep_integrator=specification is None)
+        if specification is not None:
+            named = make_named(specification, loaded.settings)
+            parts = (named.integrator, named.name, named.parameters)
+        else:
+            parts = (loaded.scene.integrator(), loaded.integrator_name, dict(loaded.settings))
+        if parts[0] is None:
+            raise InputError(f"{path}: the scene has no integrator: name one with --integrator")
+        count = len(loaded.scene.sensors())
+        if sensor_index is not None and sensor_index >= count:
+            raise InputError(f"{path}: there is no sensor {sensor_index}: the scene has {count}")
+        return cls(loaded, *parts, sensor_index or 0, seed)
+
+    def remarks(self, is_sensor_chosen: bool) -> list[str]:
+        """What the image will not show."""
+        remarks = scene_remarks(self._loaded.scene, self._sensor, self.integrator, self.name)
+        count = len(self._loaded.scene.sensors())
+        if count > 1 and not is_sensor_chosen:
+            remarks.append(f"the scene has {count} sensors: the first is rendered (see --sensor)")
+        return remarks
+
+    def run(self, spp: int | None, seconds: float | None) -> None:
+        """Renders ``spp`` samples per pixel (else as many as the sampler says), or as many as fit
+        into ``seconds``. Ctrl-C ends it: :attr:`is_interrupted` tells, or an exception.
+
+        Raises:
+            InputError: The integrator cannot render this scene.
+            KeyboardInterrupt: Ctrl-C; :meth:`has_image` tells whether the film holds something.
+        """
+        begin = time.perf_counter()
+        try:
+            with progress_bars() as bars:
+                if can_render(self.integrator):
+                    self._passes = SeedPasses(
+                        self.integrator, self._loaded.scene, self._sensor, self._seed
+                    )
+                if seconds is not None and not (self._passes and is_independent(self._sensor)):
+                    spp, seconds = self._measured(seconds, bars), None
+                    begin = time.perf_counter()
+                self._render(spp, seconds, bars)
+        except KeyboardInterrupt:
+            report = timing.own_statistics(self.integrator)
+            # In the last pass, it came too late
+            if report is None or self._wanted is None or report.spp < self._wanted:
+                raise
+        except (ValueError, TypeError, RuntimeError) as error:
+            message = f'{self._loaded.source}: "{self.name}": {one_line(error)}'
+            raise InputError(message) from error
+        finally:
+            self.seconds = time.perf_counter() - begin
+
+    def _measured(self, seconds: float, bars: Progress) -> int:
+        self._is_measuring = True
+        bar = bars.add_task("measuring the speed", total=None)
+        spp = timing.samples_for(
+            seconds, self.integrator, self._loaded.scene, self._seed, self._sensor_index
+        )
+        bars.remove_task(bar)
+        self._is_measuring = False
+        return spp
+
+    def _render(self, spp: int | None, seconds: float | None, bars: Progress) -> None:
+        bar = bars.add_task(self.name, total=None)
+
+        def progress(done: float) -> None:
+            bars.update(bar, total=1.0, completed=done)
+
+        self._wanted = spp
+        if self._passes is not None:
+            if seconds is None:
+                self._wanted = sample_count(self._sensor, spp or 0)
+            self._passes.run(self._wanted or 0, seconds, progress)
+            self.is_interrupted = self._passes.interrupted
+            return
+        if hasattr(self.integrator, "progress"):
+            self.integrator.progress = progress
+        timing.timed_render(
+            self.integrator, self._loaded.scene, self._seed, spp or 0, self._sensor_index
+        )
+
+    # ---- How far it got ----
+
+    @property
+    def spp(self) -> int | None:
+        """Samples per pixel in the image. What others' integrators took before an interruption only
+        they know."""
+        report = self._passes or timing.own_statistics(self.integrator)
+        if report is not None:
+            return report.spp
+        return None if self.is_interrupted else sample_count(self._sensor, self._wanted or 0)
+
+    def how_far(self) -> str:
+        """For a message about an interruption."""
+        if self.spp is None:
+            return "during the render"
+        wanted = f" of {self._wanted}" if self._wanted else ""
+        return f"after {self.spp}{wanted} spp"
+
+    def has_image(self) -> bool:
+        """Does the film hold samples?"""
+        if self._is_measuring:
+            return False
+        report = self._passes or timing.own_statistics(self.integrator)
+        if report is not None:
+            return report.passes > 0
+        try:
+            return bool(np.any(self.film.develop(raw=True)))
+        except RuntimeError:  # not prepared yet
+            return False

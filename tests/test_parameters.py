@@ -1,0 +1,65 @@
+"""Parameters that would have no effect, or are out of range, are refused when a scene is loaded."""
+
+from __future__ import annotations
+
+import math
+
+import mitsuba as mi
+import pytest
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+_REJECTED = "shadow rays that are rejected"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "key", "needs"),
+    [
+        ({"law": "paper"}, "law", _REJECTED),
+        ({"slope": 3.0}, "slope", _REJECTED),
+        ({"floor": 0.5}, "floor", _REJECTED),
+        ({"rejection": True, "law": "paper", "slope": 3.0}, "slope", "by the affine law"),
+        ({"rejection": True, "law": "paper", "floor": 0.5}, "floor", "by the affine law"),
+        ({"rejection": True, "refine": 3}, "refine", "lights not learned"),
+        ({"light_sampling": "uniform", "grid": 3}, "grid", _REJECTED),
+        ({"light_sampling": "linear", "max_memory": 3.0}, "max_memory", _REJECTED),
+        ({"light_sampling": "spatial", "pilot_spp": 3}, "pilot_spp", _REJECTED),
+        ({"light_sampling": "power", "save_map": "map.npz"}, "save_map", "visibility or contrib"),
+    ],
+)
+def test_parameter_without_effect_is_refused(parameters, key, needs):
+    with pytest.raises(RuntimeError, match=f'"neepp": the parameter "{key}" needs .*{needs}'):
+        mi.load_dict({"type": "neepp", **parameters})
+
+
+def test_only_parameters_with_an_effect_are_shown():
+    assert "law" not in str(mi.load_dict({"type": "neepp"}))
+    paper = str(mi.load_dict({"type": "neepp", "rejection": True, "law": "paper"}))
+    assert "law = paper" in paper and "slope" not in paper and "refine" not in paper
+    spatial = {"type": "composed_path", "next_event": "spatial", "grid": 7, "aovs": "d:depth"}
+    text = str(mi.load_dict(spatial))
+    assert "grid = 7" in text and "pilot_spp" not in text and "aovs = d:depth" in text
+
+
+@pytest.mark.parametrize(
+    ("plugin", "parameters", "message"),
+    [
+        ("dispersive_roughdielectric", {"alpha": -1.0}, '"alpha" is -1; it must be not negative'),
+        ("dispersive_roughdielectric", {"alpha_u": 0.1, "alpha_v": math.inf}, '"alpha_v" is inf'),
+        ("dispersive_dielectric", {"specular_reflectance": -0.1}, "must be 0 to 1"),
+        ("dispersive_dielectric", {"specular_transmittance": 1.5}, "must be 0 to 1"),
+        ("reweighted_direct", {"light_samples": 10**9}, "at most 4096"),
+        ("reweighted_direct", {"light_samples": 1025, "pattern": "poisson_disk"}, "at most 1024"),
+        ("variance", {"batches": 10**9, "nested": {"type": "path"}}, "at most 65536"),
+    ],
+)
+def test_value_out_of_range_is_refused(plugin, parameters, message):
+    constant = {"int_ior": 1.5} if plugin.startswith("dispersive") else {}
+    with pytest.raises((RuntimeError, ValueError), match=f'"{plugin}".*{message}'):
+        mi.load_dict({"type": plugin, **constant, **parameters})
+
+
+def test_largest_and_smallest_values_are_accepted():
+    mi.load_dict({"type": "dispersive_roughdielectric", "int_ior": 1.5, "alpha": 0.0,
+                  "specular_reflectance": 0.0, "specular_transmittance": 1.0})  # fmt: skip
+    mi.load_dict({"type": "reweighted_direct", "light_samples": 4096})
