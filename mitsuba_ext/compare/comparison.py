@@ -15,6 +15,7 @@ from typing import Any, Union
 import drjit as dr
 import mitsuba as mi
 
+from ..files import replacing
 from ..marks import in_use
 from ..progress import Step, reporting
 from ..scenes import InputError, LoadedScene, check_source, load_scene, scene_name
@@ -175,7 +176,7 @@ class Comparison:
     def write(self) -> None:
         """Writes ``results.json`` and ``report.html``."""
         text = json.dumps(self.results(), indent=2)
-        with images.replacing(self.folder / "results.json") as temporary:
+        with replacing(self.folder / "results.json") as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
         write_report(self.folder)
 

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .. import files
-from ..files import check_folder as check_folder
 from ..files import replacing
 from ..scenes import InputError, one_line
 

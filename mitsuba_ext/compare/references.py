@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from ..batches import Batches, batch_seeds, each_batch
+from ..files import replacing
 from ..marks import mark_of, marked
 from ..scenes import InputError, LoadedScene, one_line, scene_name
 from ..specifications import NamedIntegrator, Specification, make_named
@@ -170,7 +171,7 @@ def _render(
         for batches in each_batch(named.integrator, scene.scene, 0, batch_spp, seeds, unfinished):
             if fault := metrics.describe_non_finite(images.to_rgb(batches.mean, batches.channels)):
                 raise InputError(f"has {fault}")
-            with images.replacing(partial) as temporary:
+            with replacing(partial) as temporary:
                 batches.save(temporary)
             if progress is not None:
                 progress(batches.count / batch_count)

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import marks
+from ..files import replacing
 from ..scenes import InputError
 from . import images
 from .metrics import Errors
@@ -143,7 +144,7 @@ class RunFolder:
     def add_time(self, run: Run, seconds: float) -> None:
         """Keeps the seconds that a run took when it was repeated in this session."""
         run.timed_again[marks.SESSION] = seconds
-        with images.replacing(run.path.with_suffix(_TIMES)) as temporary:
+        with replacing(run.path.with_suffix(_TIMES)) as temporary:
             temporary.write_text(json.dumps(run.timed_again), encoding="utf-8")
 
 
