@@ -44,8 +44,6 @@ def supervise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             supervisor, "_command", lambda _arguments, job:
             [sys.executable, "-S", "-c", code, str(tmp_path), job],
         )
-        # Mitsuba's renders leave the handler so that Ctrl-C does not end waiting for a process
-        signal.signal(signal.SIGINT, signal.default_int_handler)
         result = supervisor.supervise([], tmp_path)
         return result, (tmp_path / "log").read_text().split()
 

@@ -14,10 +14,12 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -41,11 +43,10 @@ GRACE = 3.0
 #: Exit codes of a worker that came to its end: finished, with trouble, bad input, interrupted.
 _IN_ORDER = (0, 1, 2, INTERRUPTED)
 
+#: Seconds after which is looked for signals that have come.
+_POLL = 0.1
+
 _PR_SET_PDEATHSIG = 1
-
-
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP, whose number is the argument."""
 
 
 def supervise(arguments: Sequence[str], folder: Path) -> int:
@@ -54,16 +55,16 @@ def supervise(arguments: Sequence[str], folder: Path) -> int:
     Raises:
         InputError: Another comparison is running in ``folder``.
     """
-    with _endings_raise(), marks.in_use(folder):
+    with _collected_signals() as received, marks.in_use(folder):
         blamed: set[Path] = set()
         while True:
-            end = _work(arguments, folder, MEASURE)
+            end = _work(arguments, folder, MEASURE, received)
             if end.signal and end.code in _IN_ORDER:
                 return 128 + end.signal if end.code == INTERRUPTED else end.code
             if end.signal:
                 _say("interrupted: the running render is given up")
                 marks.forgive(folder)
-                _work(arguments, folder, STORED)
+                _work(arguments, folder, STORED, received)
                 return 128 + end.signal
             reason = _reason(end.code)
             guilty = marks.blame(folder, end.process, f"the process {reason} in this render")
@@ -117,44 +118,49 @@ def _command(arguments: Sequence[str], job: str) -> list[str]:
     return python_command("mitsuba_ext", *arguments, f"--worker={job}")
 
 
-def _work(arguments: Sequence[str], folder: Path, job: str) -> _End:
-    """Runs a worker to its end; the first interruption asks it to end, the second one kills it."""
+def _work(arguments: Sequence[str], folder: Path, job: str, received: list[int]) -> _End:
+    """Runs a worker to its end; the first signal asks it to end, another one kills it."""
     # In a session of its own, it gets signals from here alone: each of them once
     worker = subprocess.Popen(
         _command(arguments, job),
         start_new_session=True,
         env={**os.environ, marks.SESSION_VARIABLE: marks.SESSION},
     )
-    asked, patience = 0, None
+    asked, deadline = 0, math.inf
     while True:
         try:
-            return _End(worker.pid, worker.wait(patience), asked)
+            return _End(worker.pid, worker.wait(_POLL), asked)
         except subprocess.TimeoutExpired:
-            patience = None
-            if marks.running(folder, worker.pid):  # else it is writing the report
-                worker.kill()
-        except KeyboardInterrupt as ending:
+            pass
+        while received:
+            number = received.pop(0)
             if asked:
                 worker.kill()
                 continue
+            asked = number
             worker.send_signal(signal.SIGINT)
-            if isinstance(ending, _Terminated):
-                asked, patience = ending.args[0], GRACE
-            else:
-                asked = signal.SIGINT
+            if number == signal.SIGINT:
                 _say("\nwaiting for the running render (Ctrl-C: give it up)")
+            else:
+                deadline = time.monotonic() + GRACE
+        if time.monotonic() > deadline:
+            deadline = math.inf
+            if marks.running(folder, worker.pid):  # else it is writing the report
+                worker.kill()
 
 
 @contextlib.contextmanager
-def _endings_raise() -> Iterator[None]:
-    """What asks this process to end raises :class:`_Terminated`."""
-
-    def end(number: int, _frame: object) -> None:
-        raise _Terminated(number)
-
-    previous = {number: signal.signal(number, end) for number in _endings()}
+def _collected_signals() -> Iterator[list[int]]:
+    """The numbers of the signals that ask this process to end, as they come. (Exceptions in their
+    place could come at any time, also while the last one is being dealt with.)"""
+    received: list[int] = []
+    numbers = [signal.SIGINT, *_endings()]
+    previous = {
+        number: signal.signal(number, lambda number, _frame: received.append(number))
+        for number in numbers
+    }
     try:
-        yield
+        yield received
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
