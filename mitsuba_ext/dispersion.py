@@ -42,6 +42,22 @@ def disperses(shapes: Iterable[mi.Shape]) -> bool:
     )
 
 
+def warn_of_sampler(scene: mi.Scene, sampler: mi.Sampler) -> None:
+    """Warns if light may disperse in ``scene``, and ``sampler`` does not choose lobes and
+    wavelengths independently of each other: small lobe numbers of Mitsuba 3.9.1's ``ldsampler`` go
+    with some quarters of the wavelength numbers more often than with others."""
+    if (
+        mi.is_spectral
+        and sampler.class_name() == "LowDiscrepancySampler"
+        and disperses(scene.shapes())
+    ):
+        mi.Log(
+            mi.LogLevel.Warn,
+            'The numbers of the sampler "ldsampler" depend on each other: what dispersive glass '
+            'shows is coloured by up to 2 %. Use "independent" or "multijitter".',
+        )
+
+
 class Heroes:
     """Lets only the hero be refracted by what disperses. Where nothing does, no code is left.
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from . import camera
+from . import camera, dispersion
 from .decisions.camera_samples import CameraSamples
 from .interrupts import deferred_interrupt
 from .parameters import MOST_SPP
@@ -239,6 +239,8 @@ class _Job:
             self.statistics.learned = stage.learned
             if is_last:
                 self.statistics.learning_seconds = time.perf_counter() - self.start
+                if stage.camera.wavelength is None:
+                    dispersion.warn_of_sampler(self.scene, self.sampler)
             self._run_stage(stage, samples, is_last, interrupt)
             if self._stopped(interrupt):
                 self.statistics.interrupted = True

@@ -158,7 +158,7 @@ def load_scene(
     with _search_path(path):
         try:
             if is_dict:
-                state = mi.parser.parse_dict(config, dict(source))
+                state = mi.parser.parse_dict(config, _with_own_bitmaps(source))
             else:
                 state = mi.parser.parse_file(config, str(path), **strings)
             check_nodes(state)
@@ -195,6 +195,20 @@ def load_scene(
         integrator_name=integrator_name,
         size=(int(film.crop_size()[0]), int(film.crop_size()[1])),
     )
+
+
+def _with_own_bitmaps(source: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of a scene's dict and of its bitmaps: in spectral variants, Mitsuba's ``bitmap``
+    converts the pixels that it is given in place, so that the dict would be another scene when it
+    is loaded again."""
+    import mitsuba as mi
+
+    def copy(value: Any) -> Any:
+        if isinstance(value, mi.Bitmap):
+            return mi.Bitmap(value)
+        return _with_own_bitmaps(value) if isinstance(value, Mapping) else value
+
+    return {key: copy(value) for key, value in source.items()}
 
 
 def _as_xml(value: object) -> str:

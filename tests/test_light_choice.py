@@ -79,6 +79,19 @@ def test_no_light_has_less_than_its_defensive_share():
     assert p.min() >= 0.99 * 0.05 / light_map.cells.count and p.sum() == pytest.approx(1)
 
 
+def test_a_beam_that_the_expectation_misses_keeps_a_share_as_large_as_in_path():
+    """Not that of one of hundreds of bins of the sky."""
+    look = mi.ScalarTransform4f().look_at([0.1, 0.1, 1], [0.1, 0.1, 0], [0, 1, 0])
+    beam = {"type": "spot", "cutoff_angle": 0.1, "to_world": look}
+    scene = floor(beam=beam, sky={"type": "constant"})
+    learner = learner_of(scene, grid=2)
+    beam_cell = [e.class_name() for e in scene.emitters()].index("SpotLight")
+    cells = learner._map.cells
+    p = row_of(learner._map, learner._probabilities(learner._map.unoccluded))
+    assert cells.count > 500
+    assert 0.024 < p[cells.emitter_index == beam_cell].item() < 0.1
+
+
 def test_lights_without_sampling_weight_stay_dark_where_no_other_light_arrives():
     look = mi.ScalarTransform4f().look_at([-0.8, 0, 1], [-0.8, 0, 0], [0, 1, 0])
     scene = floor(
@@ -152,10 +165,14 @@ def test_pairs_that_are_all_alike_are_not_measured_again(monkeypatch):
 # ---- Giving up ----
 
 
-@pytest.mark.parametrize("grid, ends", [(0, True), (4, False)])
-def test_learning_that_does_not_pay_ends_with_the_choice_of_path_unless_needed(grid, ends):
+@pytest.mark.parametrize(
+    "wishes, ends",
+    [({}, True), ({"grid": 4}, False),
+     ({"rejection": {"law": "affine", "slope": 10.0, "floor": 0.1}}, False)],
+)  # fmt: skip
+def test_learning_that_does_not_pay_ends_with_the_choice_of_path_unless_needed(wishes, ends):
     scene = floor(a=lamp(-0.1, 0, 50), b=lamp(0.1, 0, 50))  # nothing to choose between
-    learner = learner_of(scene, grid=grid)
+    learner = learner_of(scene, **wishes)
     for cell in (0, 1):
         observe(learner._map, cell, 1000, 0, row_of(learner._map, learner._map.unoccluded)[cell])
     decisions = learner.learn(scene, is_last=False)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hard_cases import area, diffuse, film, lookat, rectangle, rgb, sensor
 from scipy import stats
-from statistical import REFERENCE, REFERENCE_SEEDS, SEEDS, assert_same_mean, batches, load
+from statistical import REFERENCE_SEEDS, SEEDS, assert_same_mean, batches
+from techniques import REFERENCE
 
 from mitsuba_ext.decisions.linear_selection import LinearSelection
-from mitsuba_ext.rendering import Stage
 from mitsuba_ext.walk import Walk
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -19,11 +19,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 LANES = 1 << 16
 
 
-def _integrator(scene: mi.Scene, max_depth: int) -> mi.Integrator:
-    integrator = mi.load_dict({"type": "composed_path", "max_depth": max_depth})
-    walk = Walk(max_depth, integrator.rr_depth, False, next_event=LinearSelection(scene))
-    integrator.stages = lambda *_arguments: iter([Stage(walk)])
-    return integrator
+def _integrator(max_depth: int) -> mi.Integrator:
+    return mi.load_dict({"type": "composed_path", "max_depth": max_depth, "next_event": "linear"})
 
 
 def _translate(*offset: float) -> mi.ScalarTransform4f:
@@ -88,18 +85,11 @@ def _mixed() -> dict:
 # ---- Unbiased ----
 
 
-def test_mean_in_rooms_is_that_of_path():
-    scene = load("rooms", width=32, height=18)
-    a = batches(scene, _integrator(scene, 4), 64, SEEDS)
-    b = batches(scene, REFERENCE.make(4), 128, REFERENCE_SEEDS)
-    assert_same_mean(a, b, precision=0.015)
-
-
 def test_mean_with_all_kinds_of_lights_and_glass_is_that_of_path():
     scene = mi.load_dict(_mixed())
-    a = batches(scene, _integrator(scene, 4), 256, SEEDS)
+    a = batches(scene, _integrator(4), 256, SEEDS[:8])
     b = batches(scene, REFERENCE.make(4), 256, REFERENCE_SEEDS)
-    assert_same_mean(a, b, precision=0.01)
+    assert_same_mean(a, b, precision=0.015)
 
 
 def test_mean_with_normal_maps_that_face_away_is_that_of_path():
@@ -119,8 +109,8 @@ def test_mean_with_normal_maps_that_face_away_is_that_of_path():
         "above": _point(0.3, 0, 0.7),
         "below": _point(-0.3, 0, -0.7),
     })
-    a = batches(scene, _integrator(scene, 2), 64, SEEDS)
-    b = batches(scene, REFERENCE.make(2), 64, REFERENCE_SEEDS)
+    a = batches(scene, _integrator(2), 512, SEEDS[:8])
+    b = batches(scene, REFERENCE.make(2), 512, REFERENCE_SEEDS[:8])
     assert b.mean() > 1e-3
     assert_same_mean(a, b)
 
@@ -131,6 +121,8 @@ def test_mean_with_normal_maps_that_face_away_is_that_of_path():
 def _vertex(scene: mi.Scene, origin: list[float], target: list[float]) -> mi.SurfaceInteraction3f:
     """The same surface point in all lanes."""
     o, t = mi.Point3f(*origin), mi.Point3f(*target)
+    # Data, not literals of kernels
+    dr.make_opaque(o, t)
     o += dr.zeros(mi.Point3f, LANES)
     return scene.ray_intersect(mi.Ray3f(o, dr.normalize(t - o)))
 
@@ -162,43 +154,38 @@ def _choices(
     return choices
 
 
-@pytest.mark.parametrize(
-    "origin, target",
-    [
-        ([0.1, -2, 2], [0.1, -0.6, 0]),  # the glass, from above
-        ([0.1, -0.2, -0.2], [0.2, -0.6, 0]),  # from below
-        ([0, -2, 1], [0, 1.5, 1]),  # the wall
-        ([0.5, -2, 0.6], [0.5, 0, 0.5]),  # the ball
-    ],
-)
-def test_emitters_are_chosen_as_often_as_the_density_says(origin, target):
+def test_emitters_are_chosen_as_often_as_the_density_says():
     scene = mi.load_dict(_mixed())
-    si = _vertex(scene, origin, target)
-    _selection, (ds, _weight, _state) = _select(scene, si)
-    choices = _choices(scene, si, ds)
-    unknown = choices.pop("slide")[0] if choices["slide"][1] == 0 else 0
-    counts, probabilities = (np.array(column) for column in zip(*choices.values()))
-    error = 4 * np.sqrt(unknown) / LANES + 1e-4
-    assert probabilities.sum() == pytest.approx(1 - unknown / LANES, abs=error), "Σ α"
-    expected = probabilities * LANES
-    frequent = expected > 5
-    chi2 = ((counts - expected)[frequent] ** 2 / expected[frequent]).sum()
-    assert stats.chi2.sf(chi2, frequent.sum()) > 1e-4, (counts, expected)
+    vertices = {
+        "glass, from above": ([0.1, -2, 2], [0.1, -0.6, 0]),
+        "from below": ([0.1, -0.2, -0.2], [0.2, -0.6, 0]),
+        "wall": ([0, -2, 1], [0, 1.5, 1]),
+        "ball": ([0.5, -2, 0.6], [0.5, 0, 0.5]),
+    }
+    for vertex in vertices.values():
+        si = _vertex(scene, *vertex)
+        selection, (ds, _weight, state) = _select(scene, si)
+        choices = _choices(scene, si, ds)
+        unknown = choices.pop("slide")[0] if choices["slide"][1] == 0 else 0
+        counts, probabilities = (np.array(column) for column in zip(*choices.values()))
+        error = 4 * np.sqrt(unknown) / LANES + 1e-4
+        assert probabilities.sum() == pytest.approx(1 - unknown / LANES, abs=error), "Σ α"
+        expected = probabilities * LANES
+        frequent = expected > 5
+        chi2 = ((counts - expected)[frequent] ** 2 / expected[frequent]).sum()
+        assert stats.chi2.sf(chi2, frequent.sum()) > 1e-4, (counts, expected)
 
-
-def test_density_of_a_light_that_a_ray_hits_is_that_of_the_sample():
-    scene = mi.load_dict(_mixed())
-    si = _vertex(scene, [0.1, -2, 2], [0.1, -0.6, 0])
-    selection, (ds, _weight, state) = _select(scene, si)
-    hit = scene.ray_intersect(si.spawn_ray(ds.d))
-    ds_hit = mi.DirectionSample3f(scene, hit, si)
-    same = ~ds.delta & (ds_hit.emitter == ds.emitter) & (dr.norm(ds_hit.p - ds.p) < 1e-4)
-    same |= ~ds.delta & (ds_hit.emitter == ds.emitter) & (ds.emitter == scene.environment())
-    pdf, _state = selection.pdf(state, scene, mi.Interaction3f(si), hit, ds_hit, same)
-    same = same.numpy()
-    assert same.mean() > 0.3
-    np.testing.assert_allclose(pdf.numpy()[same], ds.pdf.numpy()[same], rtol=2e-3)
-    assert not pdf.numpy()[~same].any(), "masked lanes"
+        # A ray that runs into what was chosen finds the same density
+        hit = scene.ray_intersect(si.spawn_ray(ds.d))
+        ds_hit = mi.DirectionSample3f(scene, hit, si)
+        at_the_point = dr.norm(ds_hit.p - ds.p) < 1e-4
+        at_the_point |= ds.emitter == scene.environment()
+        same = ~ds.delta & (ds_hit.emitter == ds.emitter) & at_the_point
+        pdf, _state = selection.pdf(state, scene, mi.Interaction3f(si), hit, ds_hit, same)
+        same = same.numpy()
+        assert same.mean() > 0.05
+        np.testing.assert_allclose(pdf.numpy()[same], ds.pdf.numpy()[same], rtol=2e-3)
+        assert not pdf.numpy()[~same].any(), "masked lanes"
 
 
 # ---- Zeros ----
@@ -273,7 +260,7 @@ def test_a_light_that_nothing_faces_is_never_chosen_in_a_render():
     variances = []
     for lights in (lamp, lamp | up):
         scene = _floor(diffuse(), **camera, **lights)
-        images = batches(scene, _integrator(scene, 2), 16, range(4))
+        images = batches(scene, _integrator(2), 16, range(4))
         variances.append(np.var(images, axis=0).mean())
     # Choosing it would waste almost all samples
     assert variances[1] < 2 * variances[0]
@@ -328,10 +315,10 @@ def test_one_emitter_needs_no_estimates_and_none_no_tables():
     sampler.seed(0, 4)
     assert selection.begin(sampler, mi.Ray3f()) == ()
     image = batches(_floor(diffuse(), sensor=sensor(), lamp=_panel(0, 0, 1, angle=180)),
-                    _integrator(scene, 3), 4, [1])  # fmt: skip
+                    _integrator(3), 4, [1])  # fmt: skip
     assert image.mean() > 0
     dark = _floor(diffuse(), sensor=sensor())
-    assert not batches(dark, _integrator(dark, 3), 4, [1]).any()
+    assert not batches(dark, _integrator(3), 4, [1]).any()
 
 
 # ---- In the walk ----

@@ -82,20 +82,54 @@ def test_cells_of_a_gradient_bring_what_rays_find(surface: dict):
     assert np.median(np.abs((density / ds.pdf).numpy() - 1)) < 1e-4
 
 
-@pytest.mark.parametrize("spots", [False, True])
-def test_the_mean_is_that_of_path(surface: dict, spots: bool):
+def test_divided_textures_do_not_mind_shapes_and_emitters_that_cannot_be_sampled(tmp_path):
+    """Neither in their scene nor in another one: Dr.Jit asks all that exist."""
+    T = mi.ScalarTransform4f
+    (tmp_path / "curve.txt").write_text("-1 0 0.3 0.1\n0 0 0.4 0.1\n0.3 0 0.3 0.1\n1 0 0.5 0.1\n")
+    curve = {"filename": str(tmp_path / "curve.txt")}
+    others = {
+        "group": {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.3}},
+        "instance": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+        "curve": {"type": "bsplinecurve", **curve},
+        "line": {"type": "linearcurve", **curve, "to_world": T().translate([0, 1, 0])},
+        "beam": {"type": "rectangle", "to_world": T().translate([0, 0, 3]).rotate([1, 0, 0], 180),
+                 "emitter": {"type": "directionalarea"}},
+    }  # fmt: skip
+    lamp = {"type": "sphere", "radius": 0.2, "center": [-2, 1, 1], "emitter": {"type": "area"}}
+    among_them, alone = (
+        _scene({"type": "rectangle"}, lamp=lamp, **more) for more in (others, {})
+    )
+    for scene in (among_them, alone):
+        cells = LightCells(scene, mi.Vector3f(1.0))
+        light = next(i for i, e in enumerate(scene.emitters()) if "Bitmap" in str(e))
+        chosen = np.flatnonzero(cells.emitter_index == light)
+        assert len(chosen) >= 20
+        cell = mi.UInt32(chosen.astype(np.uint32))
+        ref = dr.zeros(mi.Interaction3f, len(chosen))
+        ref.p = mi.Point3f(0, 0, 1)
+        ds, weight = cells.sample(cell, ref, mi.Point2f(0.5), mi.Bool(True))
+        assert bool(dr.all(weight.x > 0))
+        si = scene.ray_intersect(mi.Ray3f(ref.p, ds.d))
+        found, pdf = cells.pdf(ref, si, mi.DirectionSample3f(scene, si, ref), mi.Bool(True))
+        assert bool(dr.all(found == cell)) and bool(dr.all(dr.abs(pdf / ds.pdf - 1) < 1e-4))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("surface", ["mesh"], indirect=True)
+def test_the_mean_is_that_of_path(surface: dict):
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}}
     scene = _scene(
-        surface, spots,
-        floor={"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3)},
+        surface,
+        floor={"type": "rectangle", "to_world": T().scale(3)},
         ball={"type": "sphere", "radius": 0.5, "center": [0, 0, 0.6]},
         # A light without a texture is another branch
         lamp={"type": "sphere", "radius": 0.2, "center": [-2, 1, 1],
               "emitter": {"type": "area", "radiance": 3.0}},
-        sensor={"type": "perspective", "fov": 50, "film": {
-            "type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}},
-            "to_world": mi.ScalarTransform4f().look_at([0, -6, 3], [0, 0, 1], [0, 0, 1])},
+        sensor={"type": "perspective", "fov": 50, "film": film,
+                "to_world": T().look_at([0, -6, 3], [0, 0, 1], [0, 0, 1])},
     )  # fmt: skip
-    neepp = mi.load_dict({"type": "neepp", "max_depth": 3, "grid": 8})
-    images = batches(scene, neepp, 64, range(1, 9))
-    reference = batches(scene, mi.load_dict({"type": "path", "max_depth": 3}), 64, range(100, 116))
+    neepp = mi.load_dict({"type": "neepp", "max_depth": 2, "grid": 8})
+    images = batches(scene, neepp, 128, range(1, 7))
+    reference = batches(scene, mi.load_dict({"type": "path", "max_depth": 2}), 512, range(100, 108))
     assert_same_mean(images, reference, precision=0.01)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from ..learning import light_map_file
 from ..learning.learner import Learner
 from ..learning.light_map import BYTES_PER_ENTRY, LightMap
 from ..learning.scout import region
-from ..learning.surface_rows import RowCounts, SurfaceRows, voxel_edges
+from ..learning.surface_rows import BYTES_PER_VOXEL, RowCounts, SurfaceRows, voxel_edges
 from ..lights.light_cells import LightCells
 from ..lights.weights import uniform_weights
 from .defaults import EmitterSampling
@@ -21,7 +22,8 @@ from .light_selection import LightSelection
 from .visibility_roulette import WORTHWHILE
 
 #: Share of the choices that what was learned does not decide: half of them go by the unoccluded
-#: contributions, half to all cells alike.
+#: contributions, half are those of ``path``, whose variance bounds ours. Where a beam lights a
+#: small part of a voxel, the expectation may have missed it.
 _DEFENSIVE = 0.1
 
 #: Voxels along each axis where the scene's author leaves the choice to us, at most; and entries of
@@ -47,6 +49,7 @@ class LightLearner(Learner):
         max_memory: Bytes that the map may take.
         pilot_samples: Samples of all pilots together.
         load, save: Files of a map to begin with, and of the map that was learned.
+        plugin: What errors call the plugin.
     """
 
     def __init__(
@@ -58,10 +61,11 @@ class LightLearner(Learner):
         pilot_samples: int,
         load: Path | None = None,
         save: Path | None = None,
+        plugin: str = "neepp",
     ) -> None:
         self.target, self.rejection, self.grid = target, rejection, grid
         self.max_memory, self.pilot_samples = max_memory, pilot_samples
-        self.load, self.save = load, save
+        self.load, self.save, self.plugin = load, save, plugin
         # A loaded map brings its region and its rows
         self.wants_scout = load is None
         self._is_needed = grid > 0 or rejection is not None or load is not None or save is not None
@@ -71,7 +75,10 @@ class LightLearner(Learner):
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
         self._map, self._summary = None, "nothing: no path scatters"
         if self.load is not None:
-            self._map = light_map_file.load(self.load, scene, self.pilot_samples)
+            self._map = light_map_file.load(
+                self.load, scene, self.pilot_samples, self.max_memory,
+                parameter=f'"{self.plugin}": the parameter "load_map"',
+            )  # fmt: skip
         elif dr.width(p) > 0:
             self._map = self._new_map(scene, p, n)
             # Mitsuba samples these with a wrong density
@@ -80,18 +87,25 @@ class LightLearner(Learner):
                 self._map, self._summary = None, "nothing: there is one light to choose"
         if self._map is None:
             return {}
+        self._as_path = _normalized(
+            uniform_weights(scene, self._map.cells), self._map.cells.count
+        )
         return self._selection(self._probabilities(self._map.unoccluded))
 
     def _new_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
         bbox = region(p)
         grid = self.grid or _GRID
         cells = LightCells(scene, voxel_edges(bbox, grid))
-        limit = self.max_memory // BYTES_PER_ENTRY
-        if self.grid == 0:
-            limit = min(limit, int(self.pilot_samples * _ENTRIES_PER_SAMPLE))
+        limit = math.inf if self.grid else self.pilot_samples * _ENTRIES_PER_SAMPLE
         counts = RowCounts(bbox, p, n)
-        # A coarser grid has no more cells
-        while grid > 1 and counts(grid) * cells.count > limit:
+
+        def fits(grid: int) -> bool:
+            # A coarser grid has no more cells
+            entries = counts(grid) * cells.count
+            memory = entries * BYTES_PER_ENTRY + grid**3 * BYTES_PER_VOXEL
+            return entries <= limit and memory <= self.max_memory
+
+        while grid > 1 and not fits(grid):
             grid = max(1, int(0.8 * grid))
         rows = SurfaceRows(bbox, grid, p, n)
         if grid != (self.grid or _GRID):
@@ -122,7 +136,7 @@ class LightLearner(Learner):
         self._map.evaluate()
         probabilities = self._probabilities(self._map.weights(self.target))
         if not self._is_needed:
-            gain = self._gain(scene, probabilities)
+            gain = self._gain(probabilities)
             if gain < _LEAST_GAIN:
                 self._summary = (
                     f"{self._map}; not used, it would lower the variance by only "
@@ -143,20 +157,19 @@ class LightLearner(Learner):
         self._map = None  # the last stage needs the tables only
         return decisions
 
-    def _gain(self, scene: mi.Scene, probabilities: mi.Float) -> float:
+    def _gain(self, probabilities: mi.Float) -> float:
         """By how much, relatively, these probabilities lower the variance below that of Mitsuba's
         choice."""
-        rows, cells = self._map.rows, self._map.cells
-        uniform = _normalized(uniform_weights(scene, cells), cells.count)
         default, learned = self._map.relative_variances(
-            dr.tile(uniform, rows.count), probabilities
+            dr.tile(self._as_path, self._map.rows.count), probabilities
         )
         return (default - learned) / (default + _OTHER_VARIANCE)
 
     def _probabilities(self, weights: mi.Float) -> mi.Float:
         """Probabilities that no wrong expectation can keep from any cell."""
         count, unoccluded = self._map.cells.count, self._map.unoccluded
-        safe = 0.5 * (_normalized(unoccluded, count) + dr.rcp(mi.Float(count)))
+        as_path = dr.tile(self._as_path, self._map.rows.count)
+        safe = 0.5 * (_normalized(unoccluded, count) + as_path)
         mixed = (1 - _DEFENSIVE) * _normalized(weights, count) + _DEFENSIVE * safe
         # Cells with a sampling_weight of 0 have no weight in any row
         return _normalized(dr.select(unoccluded > 0, mixed, 0), count)

@@ -125,11 +125,11 @@ class LightSampling:
             return {"next_event": LightSelection(OneRow(), cells, power_weights(scene, cells))}
         if self.light_sampling == "spatial" and scene_bounds(scene).valid():
             cells = LightCells(scene, None)
-            rows = self._voxel_rows(scene, cells.count)
+            rows = self.voxel_rows(scene, cells.count)
             return {"next_event": LightSelection(rows, cells, spatial_weights(scene, rows, cells))}
         return {}
 
-    def _voxel_rows(self, scene: mi.Scene, cells: int) -> VoxelRows:
+    def voxel_rows(self, scene: mi.Scene, cells: int) -> VoxelRows:
         """Voxels for ``spatial``, not more than there is memory for."""
         grid = self.grid or _SPATIAL_GRID
         rows = VoxelRows(VoxelGrid(scene, grid))
@@ -180,6 +180,7 @@ class LightSampling:
                     samples,
                     Path(self.load_map) if self.load_map else None,
                     Path(self.save_map) if self.save_map else None,
+                    self.plugin,
                 )
             ]
         if samples == 0:

@@ -19,6 +19,9 @@ from .surface_rows import SurfaceRows
 #: Fixed point of the squared ratios. They are clipped: a single one must not decide.
 _UNIT, _LIMIT = 2.0**20, 16.0
 
+#: What one test can add to the sum of squares.
+MOST_SQUARED = int(_UNIT * _LIMIT)
+
 #: What the expectation is worth, in tests: for visibility, and for the mean square.
 _PRIOR_TESTS, _PRIOR_SQUARES = 1.0, 4.0
 

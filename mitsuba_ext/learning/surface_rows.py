@@ -11,6 +11,9 @@ from .scout import lit_normal
 #: The six directions of the axes.
 _SIDES = 6
 
+#: The table of rows takes so much for each voxel of the region.
+BYTES_PER_VOXEL = 4 * _SIDES
+
 
 class SurfaceRows:
     """Numbers the pairs of a voxel and a side that vertices were found in.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -51,12 +53,14 @@ class EmitterCells:
         self._emitter = mi.UInt32(number.astype(np.uint32))
         self._is_divided = any(d.shape for d in divisions)
         # The emitter itself would sample the texture, whatever part of the unit square it is given
-        self._has_textures = any(d.is_textured for d in divisions)
-        if self._has_textures:
-            self._is_textured = mi.Bool([d.is_textured for d in divisions])
-            number_of = {shape.ptr: i for i, shape in enumerate(scene.shapes())}
-            numbers = [number_of.get(getattr(shapes[i], "ptr", None), 0) for i in indices]
-            self._shapes = dr.gather(mi.ShapePtr, scene.shapes_dr(), mi.UInt32(numbers))
+        self._by_area = [
+            functools.partial(_sample_by_area, shapes[i], scene.emitters()[i])
+            for i, d in zip(indices, divisions) if d.is_textured
+        ]
+        if self._by_area:
+            is_textured = np.array([d.is_textured for d in divisions])
+            self._is_textured = mi.Bool(is_textured)
+            self._textured_number = mi.UInt32((np.cumsum(is_textured) - 1).clip(0))
         self._longest = int(sizes.max())
         self._has_groups = self._longest > 1
         # Rounding shall not lead into the neighbour of a piece
@@ -91,13 +95,15 @@ class EmitterCells:
         self._kinds = kinds
         self.has_smooth_meshes = any(d.is_smooth for d in divisions)
 
-        def by_id(values) -> mi.UInt32:
-            table = np.zeros(int(ids.max(initial=0)) + 1, dtype=np.uint32)
+        def by_id(values, dtype=np.uint32) -> mi.UInt32 | mi.Float:
+            table = np.zeros(int(ids.max(initial=0)) + 1, dtype=dtype)
             table[ids] = values
-            return mi.UInt32(table)
+            return mi.UInt32(table) if dtype is np.uint32 else mi.Float(table)
 
-        if self._has_textures:
+        if self._by_area:
             self._is_textured_id = by_id([d.is_textured for d in divisions])
+            areas = [_area(s) if d.is_textured else 1.0 for s, d in zip(shapes, divisions)]
+            self._density = by_id(np.float32(1 / np.array(areas)), np.float32)
         first = np.cumsum(cell_counts) - cell_counts
         self._first_cell = by_id(first)
         if kinds - {"", "mesh"}:
@@ -171,17 +177,17 @@ class EmitterCells:
     def _sample_emitter(self, cell, ref, sample, active):
         """What the cell's emitter makes of a point of the unit square."""
         emitter = self._pointer(cell, active)
-        if not self._has_textures:
+        if not self._by_area:
             return emitter.sample_direction(ref, sample, active)
         number = dr.gather(mi.UInt32, self._emitter, cell, active)
         textured = dr.gather(mi.Bool, self._is_textured, number, active)
         ds, weight = emitter.sample_direction(ref, sample, active & ~textured)
         textured &= active
-        shape = dr.gather(mi.ShapePtr, self._shapes, number, textured)
-        by_area = shape.sample_direction(ref, sample, textured)
+        # No calls by pointer: those ask all shapes and emitters that exist, also in other scenes,
+        # and some cannot answer (a curve has no area to sample, a directional area no value)
+        number = dr.gather(mi.UInt32, self._textured_number, number, textured)
+        by_area, value = dr.switch(number, self._by_area, ref, sample, textured)
         by_area.emitter = mi.EmitterPtr(emitter)
-        value = emitter.eval_direction(ref, by_area, textured)
-        value = dr.select(by_area.pdf > 0, value / by_area.pdf, 0)
         return dr.select(textured, by_area, ds), dr.select(textured, value, weight)
 
     def _piece(self, cell, x, active) -> tuple[mi.UInt32, mi.Float]:
@@ -212,11 +218,13 @@ class EmitterCells:
         cell, with which :meth:`sample` gives that direction."""
         id = dr.reinterpret_array(mi.UInt32, ds.emitter)
         textured = mi.Bool(False)
-        if self._has_textures:
+        if self._by_area:
             textured = active & (dr.gather(mi.UInt32, self._is_textured_id, id, active) > 0)
         pdf = (self._only or ds.emitter).pdf_direction(ref, ds, active & ~textured)
-        if self._has_textures:
-            pdf = dr.select(textured, si.shape.pdf_direction(ref, ds, textured), pdf)
+        if self._by_area:
+            cosine = dr.abs(dr.dot(ds.d, ds.n))
+            by_area = dr.gather(mi.Float, self._density, id, textured) * dr.square(ds.dist)
+            pdf = dr.select(textured, dr.select(cosine > 0, by_area / cosine, 0), pdf)
         cell = dr.gather(mi.UInt32, self._first_cell, id, active)
         if not self._is_divided:
             return cell, dr.select(active, pdf, 0)
@@ -266,6 +274,23 @@ class EmitterCells:
             x, y = 1 - t * t, dr.select(t > 0, v / t, 0)
             entry += _slot(x, cuts) + cuts * _slot(y, cuts)
         return dr.gather(mi.UInt32, self._cell_of_piece, entry, active)
+
+
+def _sample_by_area(
+    shape: mi.Shape,
+    emitter: mi.Emitter,
+    ref: mi.Interaction3f,
+    sample: mi.Point2f,
+    active: mi.Bool,
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+    """A point of the emitter's shape, and its radiance / pdf."""
+    ds = shape.sample_direction(ref, sample, active)
+    value = emitter.eval_direction(ref, ds, active)
+    return ds, dr.select(ds.pdf > 0, value / ds.pdf, 0)
+
+
+def _area(shape: mi.Shape) -> float:
+    return float(dr.slice(shape.surface_area()))
 
 
 def _floats(values: np.ndarray) -> np.ndarray:

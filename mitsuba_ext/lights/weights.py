@@ -12,12 +12,10 @@ from ..learning.surface_rows import SurfaceRows
 from ..learning.voxel_grid import VoxelGrid
 from .environment import brightness, some_wavelengths
 from .light_cells import LightCells
+from .power import emitter_powers
 
 #: Least weight of a cell, relative to the mean of its row (pbrt's).
 _FLOOR = 1e-3
-
-#: Samples of an emitter's power.
-_POWER_SAMPLES = 256
 
 #: Points of a row from which a cell is evaluated, at least and at most. In voxels, most are pbrt's
 #: number.
@@ -40,22 +38,15 @@ def uniform_weights(scene: mi.Scene, cells: LightCells) -> mi.Float:
 
 
 def power_weights(scene: mi.Scene, cells: LightCells) -> mi.Float:
-    """Each emitter by its power times its ``sampling_weight``; shape [cells]."""
-    count = len(scene.emitters())
-    lanes = count * _POWER_SAMPLES
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, lanes)
-    index = dr.arange(mi.UInt32, lanes) // _POWER_SAMPLES
-    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index)
-    _ray, weight = emitter.sample_ray(
-        0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), mi.Bool(True)
-    )
-    value = brightness(weight)
-    power = dr.block_sum(dr.select(dr.isfinite(value), value, 0), _POWER_SAMPLES).numpy()
-    weights = power * np.array([e.sampling_weight() for e in scene.emitters()])
+    """Each emitter by its power times its ``sampling_weight``, in units of the brightest; shape
+    [cells]. Only a ``sampling_weight`` of 0 makes a weight 0."""
+    sampling_weight = np.array([e.sampling_weight() for e in scene.emitters()])
+    weights = emitter_powers(scene) * sampling_weight
+    weights /= max(weights.max(), 1e-300)
     cell = weights[cells.emitter_index] * cells.share
-    # A weight that is lost in rounding would leave a point light dark
-    cell = np.where(weights[cells.emitter_index] > 0, np.maximum(cell, _FLOOR * cell.mean()), 0)
+    # What its samples missed, or rounding loses, would stay dark
+    cell = np.maximum(cell, _FLOOR * (cell.mean() or 1.0))
+    cell[sampling_weight[cells.emitter_index] <= 0] = 0
     return mi.Float(cell.astype(np.float32))
 
 

@@ -1,0 +1,142 @@
+"""The power of emitters."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..bounds import scene_bounds
+from .division import emitter_shapes
+from .spectra import brightness
+
+#: Samples of an emitter.
+_SAMPLES = 256
+
+#: Texels of a spot's texture that are looked at, at most: those of larger ones are thinned out. And
+#: points along its edges where it is no bitmap.
+_MOST_TEXELS, _POINTS = 1 << 22, 256
+
+
+def emitter_powers(scene: mi.Scene) -> np.ndarray:
+    """The power of each emitter, in units of brightness: what it sends out, or, from infinity, into
+    the bounding sphere of the scene. An estimate, which can be 0 where something is emitted.
+
+    Returns:
+        Shape [emitters].
+    """
+    emitters = scene.emitters()
+    is_infinite = np.array([mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters])
+    powers = np.zeros(len(emitters))
+    powers[~is_infinite] = _sent_out(scene, np.flatnonzero(~is_infinite))
+    powers[is_infinite] = _sent_in(scene, np.flatnonzero(is_infinite))
+    for index, emitter in enumerate(emitters):
+        size = _texture_size(emitter)
+        if size is not None:
+            powers[index] = _spot_power(emitter, *size)
+    return powers
+
+
+def _sent_out(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
+    if len(indices) == 0:
+        return np.zeros(0)
+    shapes = emitter_shapes(scene)
+    # No calls by pointer: those ask all emitters that exist, also in other scenes
+    senders = [functools.partial(_radiated, scene.emitters()[i], shapes[i]) for i in indices]
+    index, sampler = _lanes(len(indices))
+    numbers = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+    return _means(dr.switch(index, senders, *numbers), len(indices))
+
+
+def _radiated(
+    emitter: mi.Emitter, shape: mi.Shape | None, x: mi.Float, y: mi.Point2f, z: mi.Point2f
+) -> mi.Float:
+    """A sample of an emitter's power, for uniform numbers."""
+    try:
+        weight = emitter.sample_ray(0.0, x, y, z)[1]
+    except RuntimeError:  # its texture cannot choose wavelengths (a checkerboard, an attribute)
+        if shape is None:
+            return dr.zeros(mi.Float, dr.width(x))
+        ps = shape.sample_position(0.0, y)
+        wavelengths, weight = _wavelengths(x)
+        si = mi.SurfaceInteraction3f(ps, wavelengths)
+        si.wi = mi.Vector3f(0, 0, 1)
+        weight *= emitter.eval(si) * dr.select(ps.pdf > 0, dr.pi / ps.pdf, 0)
+    return brightness(weight)
+
+
+def _sent_in(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
+    """Rays from infinity start on a disk that Mitsuba makes as large as it takes the scene to be,
+    which is wrong where rectangles were merged (``bounds.py``): directions do without."""
+    if len(indices) == 0:
+        return np.zeros(0)
+    bbox = scene_bounds(scene)
+    sphere = bbox.bounding_sphere() if bbox.valid() else mi.ScalarBoundingSphere3f(0.0, 1.0)
+    index, sampler = _lanes(len(indices))
+    emitter = dr.gather(mi.UInt32, mi.UInt32(indices.astype(np.uint32)), index)
+    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), emitter)
+    ref = dr.zeros(mi.Interaction3f, dr.width(index))
+    ref.p = mi.Point3f(sphere.center)
+    ref.wavelengths, weight = _wavelengths(sampler.next_1d())
+    weight *= emitter.sample_direction(ref, sampler.next_2d(), mi.Bool(True))[1]
+    return math.pi * sphere.radius**2 * _means(brightness(weight), len(indices))
+
+
+def _lanes(count: int) -> tuple[mi.UInt32, mi.Sampler]:
+    """Lanes for the samples of so many emitters: whose they are, and their random numbers."""
+    lanes = count * _SAMPLES
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, lanes)
+    return dr.arange(mi.UInt32, lanes) // _SAMPLES, sampler
+
+
+def _wavelengths(sample: mi.Float) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """Wavelengths, as Mitsuba's emitters choose them, and 1 / their density."""
+    if not mi.is_spectral:
+        return dr.zeros(mi.Interaction3f).wavelengths, mi.Spectrum(1)
+    return mi.sample_rgb_spectrum(mi.sample_shifted(sample))
+
+
+def _means(value: mi.Float, count: int) -> np.ndarray:
+    # Some emitters send the same everywhere: one number for all lanes
+    value = mi.Float64(value + dr.zeros(mi.Float, count * _SAMPLES))
+    return dr.block_sum(dr.select(dr.isfinite(value), value, 0), _SAMPLES).numpy() / _SAMPLES
+
+
+def _texture_size(emitter: mi.Emitter) -> tuple[int, int] | None:
+    """Width and height of the texture of a spot, which its samples do not heed; ``None`` for all
+    other emitters, and spots without one."""
+    is_textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+    if emitter.class_name() != "SpotLight" or not is_textured:
+        return None
+    parameters = mi.traverse(emitter)
+    if "texture.data" not in parameters:
+        return _POINTS, _POINTS
+    height, width = parameters["texture.data"].shape[:2]
+    step = max(1, math.ceil(math.sqrt(height * width / _MOST_TEXELS)))
+    return math.ceil(width / step), math.ceil(height / step)
+
+
+def _spot_power(emitter: mi.Emitter, width: int, height: int) -> float:
+    """The sum over texels, which divide a square in the plane at the distance of one."""
+    angle = float(dr.slice(mi.traverse(emitter)["cutoff_angle"]))
+    edge = 2 * math.tan(math.radians(angle))
+    index = dr.arange(mi.UInt32, width * height)
+    row = index // width
+    p = mi.Point3f(
+        edge * ((mi.Float(index - row * width) + 0.5) / width - 0.5),
+        edge * ((mi.Float(row) + 0.5) / height - 0.5),
+        1,
+    )
+    ref = dr.zeros(mi.Interaction3f, width * height)
+    ref.p = mi.Transform4f(emitter.world_transform()) @ p
+    ref.wavelengths, weight = _wavelengths(mi.sample_tea_float32(index, 0))
+    ds, radiance = emitter.sample_direction(ref, mi.Point2f(0.5), mi.Bool(True))
+    # Intensity times the solid angle of a texel, dA cos θ / r², with cos θ = 1 / r
+    r_2 = dr.squared_norm(mi.Vector3f(p))
+    value = mi.Float64(brightness(weight * radiance) * dr.square(ds.dist) * r_2**-1.5)
+    value = dr.select(dr.isfinite(value), value, 0)
+    return float(dr.sum(value)[0]) * edge**2 / (width * height)
