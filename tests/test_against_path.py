@@ -29,7 +29,7 @@ WIDTH, HEIGHT = 32, 18
 PRECISION = {
     "cornell_box": (0.004, 0.002),
     "door_ajar": (0.03, 0.012),
-    "rooms": (0.02, 0.01),
+    "rooms": (0.03, 0.01),
     "mirrors_and_glass": (0.03, 0.012),
     "sunny_gloss": (0.02, 0.008),
     "window": (0.025, 0.012),
