@@ -122,7 +122,9 @@ def render(
             older = "" if target == output else f" ({output} is an older image, and still there)"
             click.echo(f"interrupted {job.how_far()}: {target}{older}", err=True)
             return stop.exit_code
-    click.echo(f"{output}: {job.spp} spp in {job.seconds:.1f} s")
+    cold = kernels_compiled() > compiled
+    remark = " (kernels were compiled: next time that is faster)" if cold else ""
+    click.echo(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}")
     return 1 if bad else 0
 
 
