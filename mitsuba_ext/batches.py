@@ -16,6 +16,7 @@ import numpy as np
 
 from .camera import find_sensor
 from .decisions.moving_scene import check_motion_is_seen
+from .garbage import garbage_left_alone
 
 
 class Batches:
@@ -154,7 +155,7 @@ def _render(
     sampler = sensor.sampler()
     before = sampler.sample_count()
     try:
-        with dr.suspend_grad():
+        with dr.suspend_grad(), garbage_left_alone():
             # Developed: "prb" refuses to do without
             return integrator.render(
                 scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=True

@@ -54,7 +54,7 @@ def warn_of_sampler(scene: mi.Scene, sampler: mi.Sampler) -> None:
         mi.Log(
             mi.LogLevel.Warn,
             'The numbers of the sampler "ldsampler" depend on each other: what dispersive glass '
-            'shows is coloured by up to 2 %. Use "independent" or "multijitter".',
+            'shows may be coloured by a few percent. Use "independent" or "multijitter".',
         )
 
 

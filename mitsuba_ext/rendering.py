@@ -238,6 +238,7 @@ class _Job:
             is_last = index == len(self.stages) - 1
             self.statistics.learned = stage.learned
             if is_last:
+                samples = self.spp - self.statistics.spp  # pilots may have been cut short
                 self.statistics.learning_seconds = time.perf_counter() - self.start
                 if stage.camera.wavelength is None:
                     dispersion.warn_of_sampler(self.scene, self.sampler)

@@ -14,6 +14,7 @@ import mitsuba as mi
 from .decisions.camera_samples import PixelSets
 from .decisions.moving_scene import check_motion_is_seen
 from .decisions.weighted_sets import WEIGHTS, SetKind
+from .garbage import garbage_left_alone
 from .rendering import Stage
 from .staged_integrator import StagedIntegrator
 from .walk import PathSample
@@ -154,6 +155,7 @@ class _NestedWalk:
     def __call__(
         self, scene, sampler, ray, active, pixel=None, hero_weight=1.0
     ) -> PathSample:
-        L, valid, aovs = self._nested.sample(scene, sampler, ray, self._medium, active)
+        with garbage_left_alone():
+            L, valid, aovs = self._nested.sample(scene, sampler, ray, self._medium, active)
         zero = dr.zeros(mi.UInt32)
         return PathSample(L, valid, zero, zero, zero, aovs)

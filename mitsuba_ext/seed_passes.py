@@ -19,6 +19,7 @@ import numpy as np
 from .batches import sample_count
 from .camera import film_extent
 from .decisions.moving_scene import check_motion_is_seen
+from .garbage import garbage_left_alone
 from .interrupts import deferred_interrupt
 from .nesting import with_nested
 from .rendering import check_extent, kernel_cache_misses
@@ -34,6 +35,9 @@ _PASS_SPP, _STRUCTURED_PASS_SPP = 4, 64
 
 #: With a time to fill, passes are shorter by this factor: they are what it is filled with.
 _TIMED_PASS_DIVISOR = 4
+
+#: The first of the numbers by which passes get their seeds. Batches count from 0.
+_STREAM = 1 << 31
 
 
 def can_render(integrator: mi.Integrator) -> bool:
@@ -128,7 +132,8 @@ class SeedPasses:
         begin, misses = time.perf_counter(), kernel_cache_misses()
         seed = self._seed if self.passes == 0 else self._scattered_seed()
         # Developed: "prb" refuses to do without
-        self._integrator.render(self._scene, self._sensor, seed, spp)
+        with garbage_left_alone():
+            self._integrator.render(self._scene, self._sensor, seed, spp)
         contents = np.array(self._film.develop(raw=True), dtype=np.float64)
         elapsed, compiled = time.perf_counter() - begin, kernel_cache_misses() > misses
         # Light tracing leaves an image, and no weights
@@ -146,8 +151,9 @@ class SeedPasses:
         self._film.put_block(mi.ImageBlock(tensor, offset=self._film.crop_offset()))
 
     def _scattered_seed(self) -> int:
-        # Far from each other, as those of batches (batch_seeds)
-        return mi.sample_tea_32(mi.UInt32(self._seed), mi.UInt32(self.passes))[1][0]
+        # Far from each other, and none of those that batches have (batch_seeds)
+        stream = mi.UInt32(self.passes + _STREAM)
+        return mi.sample_tea_32(mi.UInt32(self._seed), stream)[1][0]
 
     def _weight_channel(self) -> int:
         if mi.has_flag(self._film.flags(), mi.FilmFlags.Special):

@@ -12,9 +12,6 @@ therefore a *state* that its methods take and return; its attributes are read-on
 
 from __future__ import annotations
 
-import contextlib
-import gc
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,6 +20,7 @@ import mitsuba as mi
 
 from .decisions import AlwaysTest, DirectionSamples, EmitterSampling, SceneQuery, ShadowTest
 from .dispersion import Heroes
+from .garbage import garbage_left_alone
 from .mis import power_heuristic
 
 
@@ -84,7 +82,7 @@ class Walk:
         """Traces one path for each lane of ``ray``. ``pixel`` is where on the film it begins, row
         by row; a walk without decisions that learn can do without. ``hero_weight`` multiplies what
         reaches the camera by paths of which only one wavelength is left (see ``dispersion.py``)."""
-        with _garbage_left_alone():
+        with garbage_left_alone():
             return self._trace(scene, sampler, ray, active, pixel, hero_weight)
 
     @dr.syntax
@@ -255,20 +253,6 @@ class Walk:
             pi = self.query.closest(scene, ray, coherent=True, active=on_emitter)
             on_emitter &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
         return ray, pi
-
-
-@contextlib.contextmanager
-def _garbage_left_alone() -> Iterator[None]:
-    """Stops Python's garbage collector. To trace a call of a BSDF's method, Dr.Jit goes through all
-    living BSDFs, and while it runs the methods of those that are written in Python, the collector
-    may free others, of scenes that nobody uses any more: the process would end."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
 
 
 def _emitters_can_be_hit(scene: mi.Scene) -> bool:

@@ -1,11 +1,15 @@
 """The statistics with which tests judge images.
 
-The noise of a mean is estimated from the scatter of what is independent, never from a variance that
-the algorithm under test reports about itself: of images of other seeds, or of the *differences* of
-two images in their pixels. The latter needs one render instead of ten. It holds where no sample
-lands in two pixels (a ``box`` filter), also for integrators that learn: what was learned says
-nothing about which way the samples err that come after it. A Student t statistic is given as the z
-score of equal probability, so that one threshold serves for any number of seeds or pixels.
+The noise of a mean is estimated from the scatter of independent images, never from a variance that
+the algorithm under test reports about itself. Two seeds are enough where the errors of pixels do
+not depend on each other: what the two images differ by, in all pixels together, tells the noise as
+well as many seeds do. That needs a ``box`` filter, so that no sample lands in two pixels. It holds
+for integrators that learn: what was learned says nothing about which way the samples err that come
+after it. It does not hold where one sample brings light to many pixels (light paths, photons), or
+where pixels share numbers: these need many seeds (:func:`assert_same_mean`).
+
+A Student t statistic is given as the z score of equal probability, so that one threshold serves for
+any number of seeds or pixels.
 
 The module is not called ``statistics``: pytest puts this folder on the path, where it would hide
 the module of the standard library.
@@ -56,6 +60,14 @@ def batches(
             images.append(np.array(mi.render(scene, integrator=integrator, seed=seed, spp=spp)))
         dr.sync_thread()
     return np.asarray(images, dtype=np.float64)
+
+
+def two_halves(
+    scene: mi.Scene, integrator: mi.Integrator, spp: int, seeds: Iterable[int]
+) -> np.ndarray:
+    """Two images of half of the samples each: their difference tells the noise of their mean."""
+    first, second, *_ = seeds
+    return batches(scene, integrator, spp // 2, [first, second])
 
 
 @contextlib.contextmanager
@@ -188,44 +200,64 @@ def compare(a: np.ndarray, b: np.ndarray, tile: int = 8) -> Comparison:
 
 
 def compare_pixels(a: np.ndarray, b: np.ndarray, tile: int = 8, unit: int = 1) -> Comparison:
-    """Compares images, [seed, height, width, channel] each, by the differences in their pixels.
+    """Compares images, [seed, height, width, channel] each, of two seeds at least.
 
     Parameters:
         tile: Edge of the tiles.
-        unit: Edge of the squares whose differences do not depend on each other: more than 1 for
-            wide filters.
+        unit: Edge of the squares whose errors are taken for independent: more than 1 for filters
+            wider than a pixel.
     """
-    difference = a.mean(axis=0) - b.mean(axis=0)
-    scale = (np.abs(a).mean(axis=0) + np.abs(b).mean(axis=0)) / 2
-    height, width = difference.shape[:2]
+    height, width = a.shape[1:3]
+    # Neighbouring squares share what lands on their border: measured, for a gaussian filter
+    caution = 1.0 if unit == 1 else 1.2
 
-    def z(rows: slice, columns: slice, channels: slice | int = slice(None)) -> float:
-        part = tiles(difference[None, rows, columns, channels], unit).ravel()
-        allowance = 2 * _ROUNDING * scale[rows, columns, channels].mean()
-        return z_exact(part, 0.0, allowance)[0]
+    def z(part: tuple[slice, slice], channels: slice = slice(None)) -> tuple[float, float]:
+        means = [tiles(x[:, part[0], part[1], channels], unit) for x in (a, b)]
+        return z_of_means(*means, caution)
 
-    top, left = max(1, height // 2), max(1, width // 2)
-    everything = slice(None)
-    parts = [(everything, everything)]
-    parts += [
-        (rows, columns)
-        for rows in (slice(top), slice(top, None))
-        for columns in (slice(left), slice(left, None))
-        if difference[rows, columns].size
+    quarters = _cut(height, width, max(1, height // 2), max(1, width // 2))
+    parts = [(slice(None), slice(None)), *quarters]
+    channels = range(a.shape[3])
+    by_part = [z(part, slice(c, c + 1))[0] for part in parts for c in channels]
+    by_tile = [z(part)[0] for part in _cut(height, width, tile, tile)]
+    scale = max(abs(b.mean()), 1e-30)
+    return Comparison(np.array(by_part), np.array(by_tile), z(parts[0])[1] / scale)
+
+
+def z_of_means(
+    a: np.ndarray, b: np.ndarray | float, caution: float = 1.0, allowance: float = 0.0
+) -> tuple[float, float]:
+    """Do the means of ``a`` and ``b`` (or a number) agree? Both have the shape [seed, value]: the
+    values of a seed may have different means, and their errors are independent.
+
+    Returns:
+        The z score (of the part of the difference that exceeds ``allowance``), and the standard
+        error of the difference, which is multiplied by ``caution``.
+    """
+    variances, terms, means, rounding = 0.0, 0.0, [], 0.0
+    for x in (a, np.asarray(b)):
+        means.append(x.mean())
+        rounding += _ROUNDING * np.abs(x).mean()
+        if x.ndim == 2:
+            each = x.var(axis=0, ddof=1) / len(x) / x.shape[1] ** 2
+            variances += each.sum()
+            terms += (each**2).sum() / (len(x) - 1)
+    difference = means[0] - means[1]
+    # Welch–Satterthwaite: where few values make all of the noise, they are all that is known
+    freedom = variances**2 / terms if terms > 0 else 1.0
+    error = caution * math.sqrt(variances)
+    deviation = max(0.0, abs(difference) - rounding - allowance)
+    z = _as_normal(np.array(deviation), np.array(error), np.array(max(freedom, 1.0)))
+    return math.copysign(float(z), difference), error
+
+
+def _cut(height: int, width: int, rows: int, columns: int) -> list[tuple[slice, slice]]:
+    """Tiles of at most so many rows and columns."""
+    return [
+        (slice(y, y + rows), slice(x, x + columns))
+        for y in range(0, height, rows)
+        for x in range(0, width, columns)
     ]
-    channels = range(difference.shape[2])
-    by_tile = [
-        z(slice(y, y + tile), slice(x, x + tile))
-        for y in range(0, height, tile)
-        for x in range(0, width, tile)
-    ]
-    units = tiles(difference[None], unit).ravel()
-    error = units.std(ddof=1) / math.sqrt(units.size)
-    return Comparison(
-        np.array([z(*part, slice(c, c + 1)) for part in parts for c in channels]),
-        np.array(by_tile),
-        error / max(abs(b.mean()), 1e-30),
-    )
 
 
 def assert_same_mean(
@@ -248,7 +280,8 @@ def assert_same_pixels_on_average(
     unit: int = 1,
     tolerance: float = 0.0,
 ) -> Comparison:
-    """As :func:`assert_same_mean`, by the differences in the pixels: one image of each will do."""
+    """As :func:`assert_same_mean`, for two images of each, by the scatter in all pixels: see
+    :func:`compare_pixels`."""
     return _assert_agreement(a, b, compare_pixels(a, b, tile, unit), precision, tolerance)
 
 
@@ -273,34 +306,29 @@ def assert_exact(
     allowance: float = 0.0,
     precision: float = 0.02,
 ) -> float:
-    """The mean over ``pixels`` is ``exact``. Where each of them has that value (``uniform``), their
-    scatter tells the noise, and tiles of them are looked at too; else that of several seeds in each
-    pixel. Returns the relative standard error of the mean.
+    """The mean over ``pixels`` is ``exact``, and where each of them has that value (``uniform``),
+    that of each tile of them too. Returns the relative standard error of the mean.
+
+    Parameters:
+        images: Of two seeds at least, with a box filter: [seed, height, width, channel].
     """
     assert_images_are_sound(images)
-    part = images[:, pixels[0], pixels[1]]
+    part = images[:, pixels[0], pixels[1]].mean(axis=3)
     if exact == 0:
         assert not part.any()
         return 0.0
-    samples = part.mean(axis=3)
-    if uniform:
-        samples = samples.mean(axis=0)
-    else:
-        # What differs between pixels is not noise
-        samples = samples.mean() + (samples - samples.mean(axis=0)) * math.sqrt(
-            len(samples) / (len(samples) - 1)
-        )
-    z, error = z_exact(samples.ravel(), exact, allowance)
-    assert abs(z) < THRESHOLD, f"mean {part.mean():.6g} instead of {exact:.6g}: z = {z:.2f}"
+
+    def z(rows: slice, columns: slice) -> tuple[float, float]:
+        values = part[:, rows, columns].reshape(len(part), -1)
+        return z_of_means(values, exact, allowance=allowance)
+
+    score, error = z(slice(None), slice(None))
+    error /= exact
+    assert abs(score) < THRESHOLD, f"mean {part.mean():.6g} instead of {exact:.6g}: z = {score:.2f}"
     assert error <= precision, f"too noisy to say anything: relative standard error {error:.2%}"
     if uniform:
-        size = 8
-        scores = [
-            z_exact(part[:, y : y + size, x : x + size].mean(axis=(0, 3)).ravel(), exact, allowance)
-            for y in range(0, part.shape[1], size)
-            for x in range(0, part.shape[2], size)
-        ]
-        worst = max(abs(z) for z, _ in scores)
-        assert worst < sidak(len(scores)), f"tiles: z up to {worst:.2f} of {sidak(len(scores)):.2f}"
-    print(f"mean {part.mean():.6g}, exact {exact:.6g}: z = {z:.2f}, known to {error:.3%}")
+        scores = [abs(z(*tile)[0]) for tile in _cut(*part.shape[1:], 8, 8)]
+        limit = sidak(len(scores))
+        assert max(scores) < limit, f"tiles: z up to {max(scores):.2f} of {limit:.2f}"
+    print(f"mean {part.mean():.6g}, exact {exact:.6g}: z = {score:.2f}, known to {error:.3%}")
     return error

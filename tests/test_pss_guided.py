@@ -17,6 +17,7 @@ from statistical import (
     assert_same_pixels_on_average,
     batches,
     load,
+    two_halves,
 )
 from techniques import REFERENCE
 
@@ -56,7 +57,7 @@ def hidden_lamp(camera: dict | None = None, **changes: Any) -> mi.Scene:
 @pytest.fixture(scope="module")
 def reference() -> np.ndarray:
     mi.set_variant("llvm_ad_rgb")
-    return batches(hidden_lamp(), REFERENCE.make(5), 8192, REFERENCE_SEEDS[:1])
+    return two_halves(hidden_lamp(), REFERENCE.make(5), 8192, REFERENCE_SEEDS)
 
 
 # ---- The mean ----
@@ -85,8 +86,8 @@ def reference() -> np.ndarray:
 def test_mean_is_that_of_path_whatever_is_guided(
     parameters: dict[str, Any], reference: np.ndarray
 ) -> None:
-    integrator = insisting(pilot_spp=256, **parameters)
-    images = batches(hidden_lamp(), integrator, 2048, SEEDS[:1])
+    integrator = insisting(pilot_spp=128, **parameters)
+    images = two_halves(hidden_lamp(), integrator, 2048, SEEDS)
     assert integrator.guide.bounces == min(parameters.get("bounces", 2), 4)
     precision = 0.01 if parameters.get("nee_first_bounce", True) else 0.03
     assert_same_pixels_on_average(images, reference, precision)
@@ -116,9 +117,9 @@ def test_guiding_lowers_the_variance_behind_a_door(parameters: dict, most: float
 def test_early_roulette_keeps_the_mean_of_long_paths() -> None:
     scene = load("cornell_box", width=16, height=16, rfilter="box")
     integrator = insisting(-1, rr_depth=2)
-    images = batches(scene, integrator, 1024, SEEDS[:1])
+    images = two_halves(scene, integrator, 1024, SEEDS)
     assert integrator.guide is not None
-    reference = batches(scene, REFERENCE.make(-1, rr_depth=20), 2048, REFERENCE_SEEDS[:1])
+    reference = two_halves(scene, REFERENCE.make(-1, rr_depth=20), 2048, REFERENCE_SEEDS)
     assert_same_pixels_on_average(images, reference, precision=0.02)
 
 
@@ -128,7 +129,7 @@ def test_memory_bounds_what_is_recorded(
 ) -> None:
     """A hundred samples of 37,000: trees are poor, and the mean is right."""
     integrator = insisting(max_memory=0.015, **parameters)
-    images = batches(hidden_lamp(), integrator, 1024, SEEDS[:1])
+    images = two_halves(hidden_lamp(), integrator, 1024, SEEDS)
     assert_same_pixels_on_average(images, reference, precision=0.015)
     assert 20 < integrator.learner.sample_count < 120
 
@@ -158,8 +159,8 @@ def test_later_connections_alone_have_the_mean_of_path() -> None:
     for more in ({}, {"point": point}):
         scene = mi.load_dict(stage(**more))
         later = guided(4, nee_first_bounce=False, pilot_spp=0)
-        images = batches(scene, later, 2048, SEEDS[:1])
-        reference = batches(scene, REFERENCE.make(4), 2048, REFERENCE_SEEDS[:1])
+        images = two_halves(scene, later, 2048, SEEDS)
+        reference = two_halves(scene, REFERENCE.make(4), 2048, REFERENCE_SEEDS)
         assert_same_pixels_on_average(images, reference, precision=0.02)
 
 
@@ -186,22 +187,25 @@ _NOTHING_TO_GAIN = [
 
 
 @pytest.mark.parametrize("parameters", [{}, TILES], ids=["surfaces", "tiles"])
-@pytest.mark.parametrize(("scene", "max_depth"), _NOTHING_TO_GAIN)
+@pytest.mark.parametrize(("scene_name", "max_depth"), _NOTHING_TO_GAIN)
 def test_nothing_is_guided_where_nothing_is_gained(
-    scene: str, max_depth: int, parameters: dict[str, Any]
+    scene_name: str, max_depth: int, parameters: dict[str, Any]
 ) -> None:
-    if scene.startswith("furnace"):
-        scene = load(scene, width=16, height=16)
+    if scene_name.startswith("furnace"):
+        scene = load(scene_name, width=16, height=16)
     else:
-        scene = mi.load_dict(_mirrors() if scene == "mirrors" else HARD_CASES[scene].make())
+        make = _mirrors if scene_name == "mirrors" else HARD_CASES[scene_name].make
+        scene = mi.load_dict(make())
     integrator = guided(max_depth, **parameters)
-    image = batches(scene, integrator, 64, SEEDS[:1])
+    image = batches(scene, integrator, 256, SEEDS[:2])
     assert integrator.guide is None
     learned = integrator.statistics.learned
     assert learned.startswith("no guide: ") if integrator.learner else learned == ""
-    reference = batches(scene, REFERENCE.make(max_depth), 512, REFERENCE_SEEDS[:1])
+    reference = batches(scene, REFERENCE.make(max_depth), 512, REFERENCE_SEEDS[:2])
     if reference.any():
-        assert_same_pixels_on_average(image, reference, precision=0.2)
+        # Rays that mirrors lead to a small lamp are few
+        precision = 0.15 if scene_name == "mirrors" else 0.05
+        assert_same_pixels_on_average(image, reference, precision)
     else:
         assert not image.any()
 

@@ -8,7 +8,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import HARD_CASES, film, sensor, stage
-from statistical import REFERENCE_SEEDS, SEEDS, assert_same_pixels_on_average, batches, load
+from statistical import (
+    REFERENCE_SEEDS,
+    SEEDS,
+    assert_same_pixels_on_average,
+    batches,
+    load,
+    two_halves,
+)
 from techniques import REFERENCE
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -25,7 +32,7 @@ def _box() -> mi.Scene:
 @pytest.fixture(scope="module")
 def reference() -> np.ndarray:
     mi.set_variant("llvm_ad_rgb")
-    return batches(_box(), REFERENCE.make(3), 4096, REFERENCE_SEEDS[:1])
+    return two_halves(_box(), REFERENCE.make(3), 4096, REFERENCE_SEEDS)
 
 
 @pytest.mark.parametrize("pattern, weights, count", [
@@ -34,14 +41,14 @@ def reference() -> np.ndarray:
 ])  # fmt: skip
 def test_mean_is_that_of_path(reference, pattern, weights, count):
     integrator = direct(3, pattern=pattern, weights=weights, light_samples=count)
-    assert_same_pixels_on_average(batches(_box(), integrator, 512, SEEDS[:1]), reference, 0.01)
+    assert_same_pixels_on_average(two_halves(_box(), integrator, 512, SEEDS), reference, 0.01)
 
 
 def test_glossy_things_and_mirrors_reflect_lights_once() -> None:
     """The BSDF sample and the many light samples share what both can find."""
     scene = load("mirrors_and_glass", width=32, height=18, rfilter="box")
-    reference = batches(scene, REFERENCE.make(3), 6144, REFERENCE_SEEDS[:1])
-    images = batches(scene, direct(3, light_samples=8), 1536, SEEDS[:1])
+    reference = two_halves(scene, REFERENCE.make(3), 6144, REFERENCE_SEEDS)
+    images = two_halves(scene, direct(3, light_samples=8), 1536, SEEDS)
     assert_same_pixels_on_average(images, reference, 0.02)
 
 

@@ -47,7 +47,7 @@ WIDE = film(96, 96, rfilter={"type": "gaussian"}, sample_border=True)
 
 @functools.cache
 def _reference() -> np.ndarray:
-    return batches(bokeh(film=WIDE), mi.load_dict(PATH), 256, [1001])
+    return batches(bokeh(film=WIDE), mi.load_dict(PATH), 128, [1001, 1002])
 
 
 @pytest.mark.parametrize("pattern, weights", [
@@ -71,8 +71,8 @@ def test_mean_with_other_integrators(nested):
     wall = {"type": "rectangle", "bsdf": diffuse(0.5),
             "to_world": lookat([0, 1, 0], [0, 0, 0], [0, 0, 1]).scale(3)}  # fmt: skip
     scene = mi.load_dict(stage(camera=camera, back=wall))
-    reference = batches(scene, mi.load_dict(nested), 768, [1001])
-    assert_same_pixels_on_average(batches(scene, lens(nested), 768, [1]), reference, 0.05)
+    reference = batches(scene, mi.load_dict(nested), 384, [1001, 1002])
+    assert_same_pixels_on_average(batches(scene, lens(nested), 384, [1, 2]), reference, 0.05)
 
 
 # ---- Sets ----

@@ -42,7 +42,7 @@ def streaks(**parameters: Any) -> mi.Scene:
 
 @functools.cache
 def _reference() -> np.ndarray:
-    return batches(streaks(film=film(64, 64)), mi.load_dict(PATH), 256, [1001])
+    return batches(streaks(film=film(64, 64)), mi.load_dict(PATH), 128, [1001, 1002])
 
 
 @pytest.mark.parametrize("pattern, weights", [
@@ -84,8 +84,8 @@ def test_mean_with_other_integrators(nested):
     ball = {"type": "moving", "translate": [0.8, 0, 0.4], "ball": {"type": "sphere", "radius": 0.5}}
     scene = mi.load_dict(stage(camera=camera(film=film(12, 12)), ball=ball))
     nested = {"type": nested, "max_depth": 4}
-    reference = batches(scene, mi.load_dict(nested), 512, [1001])
-    assert_same_pixels_on_average(batches(scene, timed(nested), 512, [1]), reference, 0.05)
+    reference = batches(scene, mi.load_dict(nested), 256, [1001, 1002])
+    assert_same_pixels_on_average(batches(scene, timed(nested), 256, [1, 2]), reference, 0.05)
 
 
 def test_lens_and_time_work_together() -> None:

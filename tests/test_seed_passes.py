@@ -9,6 +9,7 @@ import pytest
 from batched import film_channels, small_scene
 
 from mitsuba_ext import seed_passes
+from mitsuba_ext.batches import batch_seeds
 from mitsuba_ext.seed_passes import SeedPasses
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -20,6 +21,12 @@ AOV = {"type": "aov", "aovs": "d:depth", "inner": {"type": "path"}}
 def small_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Four samples per pixel and pass."""
     monkeypatch.setattr(seed_passes, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 1})
+
+
+def test_seeds_of_passes_are_none_of_batches() -> None:
+    for seed in (0, 7):
+        passes = mi.sample_tea_32(mi.UInt32(seed), seed_passes._STREAM + dr.arange(mi.UInt32, 64))
+        assert not set(passes[1].numpy().tolist()) & set(batch_seeds(seed, 4096))
 
 
 @pytest.mark.parametrize(

@@ -133,5 +133,5 @@ def test_hard_case_has_the_mean_of_path(case):
     own = {"type": "composed_path", "max_depth": hard.max_depth, **hard.parameters}
     integrator = mi.load_dict(nest(("time", "lens"), own, pattern="stratified", weights="torus"))
     images = batches(scene, integrator, hard.spp, range(1, 1 + hard.seeds))
-    path = batches(scene, mi.load_dict({**own, "type": "path"}), 1024, [101])
+    path = batches(scene, mi.load_dict({**own, "type": "path"}), 512, [101, 102])
     assert_same_pixels_on_average(images, path, hard.precision, unit=hard.unit)

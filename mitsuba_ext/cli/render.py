@@ -122,8 +122,8 @@ def render(
             older = "" if target == output else f" ({output} is an older image, and still there)"
             click.echo(f"interrupted {job.how_far()}: {target}{older}", err=True)
             return stop.exit_code
-    cold = kernels_compiled() > compiled
-    remark = " (kernels were compiled: next time that is faster)" if cold else ""
+    is_slow = kernels_compiled() > compiled and not is_new  # else it has been said
+    remark = " (kernels were compiled: next time that is faster)" if is_slow else ""
     click.echo(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}")
     return 1 if bad else 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -55,6 +56,8 @@ def timed_render(
 
     check_motion_is_seen(integrator, scene)
 
+    # What is garbage now must not be found while Dr.Jit traces calls (see garbage.py)
+    gc.collect()
     dr.detail.malloc_clear_statistics()
     # The history costs nothing that could be measured
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

@@ -78,8 +78,6 @@ class GuideLearner(Learner):
         self._share, self._summary = _FIRST_SHARE, ""
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
-        self.guide, self.guidance, self._records = None, None, None
-        self.sample_count = 0
         self._summary = "no guide: no path scatters"
         if self.wants_scout and dr.width(p) == 0:
             return {}

@@ -22,8 +22,8 @@ from .light_selection import LightSelection
 from .visibility_roulette import WORTHWHILE
 
 #: Share of the choices that what was learned does not decide: half of them go by the unoccluded
-#: contributions, half are those of ``path``, whose variance bounds ours. Where a beam lights a
-#: small part of a voxel, the expectation may have missed it.
+#: contributions, half are those of ``path``, so that no choice is less likely than 1/20 of what it
+#: is there. Where a beam lights a small part of a voxel, the expectation may have missed it.
 _DEFENSIVE = 0.1
 
 #: Voxels along each axis where the scene's author leaves the choice to us, at most; and entries of

@@ -140,7 +140,8 @@ def _is_even(emitter: mi.Emitter, shape: mi.Shape, division: Division) -> bool:
     share, square = (np.bincount(cell, w) for w in (area, area * np.square(value).mean(axis=1)))
     # Cells are chosen by the root of their mean square, texels by their radiance
     by_texture = (area * value.mean(axis=1)).sum()
-    return np.sqrt(share * square).sum() ** 2 <= _UNEVENNESS * by_texture**2
+    # A light that is black, or has no area, is left whole
+    return by_texture > 0 and np.sqrt(share * square).sum() ** 2 <= _UNEVENNESS * by_texture**2
 
 
 def _edges(shape: mi.Shape, kind: str) -> np.ndarray:

@@ -101,7 +101,7 @@ def _wavelengths(sample: mi.Float) -> tuple[mi.Spectrum, mi.Spectrum]:
 
 
 def _means(value: mi.Float, count: int) -> np.ndarray:
-    # Some emitters send the same everywhere: one number for all lanes
+    # Where an emitter sends the same everywhere, Mitsuba returns an array of one value
     value = mi.Float64(value + dr.zeros(mi.Float, count * _SAMPLES))
     return dr.block_sum(dr.select(dr.isfinite(value), value, 0), _SAMPLES).numpy() / _SAMPLES
 
