@@ -57,8 +57,8 @@ class Technique:
     Attributes:
         plugin: The name of the integrator.
         parameters: Besides ``max_depth``.
-        is_default: Is it a plugin with its default parameters? Then it is also asked for seeds,
-            errors, gradients, AOVs.
+        is_plugin: Does it stand for its plugin? Then it is also asked for seeds, errors, gradients,
+            AOVs.
         draws_like_path: At the same seed, does it draw the numbers that ``path`` draws? Images are
             compared then, which is sharper than means.
         checks, thorough: What is run on it.
@@ -66,7 +66,7 @@ class Technique:
 
     plugin: str
     parameters: dict[str, Any] = field(default_factory=dict)
-    is_default: bool = False
+    is_plugin: bool = False
     draws_like_path: bool = False
     checks: Checks = Checks()
     thorough: Checks = Checks()
@@ -107,24 +107,27 @@ def _neepp(scene: str, cases: Iterable[str] = (), **parameters: Any) -> Techniqu
 
 TECHNIQUES: dict[str, Technique] = {
     "composed_path": Technique(
-        "composed_path", is_default=True, draws_like_path=True,
+        "composed_path", is_plugin=True, draws_like_path=True,
         checks=Checks(SCENES, EVERYTHING.variants, FURNACES, [2, -1], HARD_CASES),
         thorough=EVERYTHING,
     ),
     "neepp": Technique(
-        "neepp", is_default=True,
+        "neepp", is_plugin=True,
         checks=Checks(
             ["rooms", "window"], ["llvm_ad_spectral"], FURNACES[2:], [3, -1], _LEARNERS
         ),
         thorough=EVERYTHING,
     ),
-    # On films of a few pixels guiding gains little
+    # On films of a few pixels guiding gains little, and would be given up
     "pss_guided": Technique(
-        "pss_guided", {"always_guide": True}, is_default=True,
+        "pss_guided", {"always_guide": True}, is_plugin=True,
         checks=Checks(
             ["cornell_box", "door_ajar"], ["llvm_ad_spectral"], FURNACES[3:], [2, -1], _LEARNERS
         ),
         thorough=EVERYTHING,
+    ),
+    "guided_as_it_pays": Technique(
+        "pss_guided", checks=Checks(["cornell_box"]), thorough=Checks(["door_ajar", "rooms"])
     ),
     "tiles": Technique(
         "pss_guided", {"always_guide": True, "regions": "tiles", "tile": 5},
@@ -198,7 +201,7 @@ TECHNIQUES: dict[str, Technique] = {
 #: What they are compared with.
 REFERENCE = Technique("path", draws_like_path=True)
 
-DEFAULTS = [name for name, technique in TECHNIQUES.items() if technique.is_default]
+DEFAULTS = [name for name, technique in TECHNIQUES.items() if technique.is_plugin]
 FOLLOWERS = [name for name, technique in TECHNIQUES.items() if technique.draws_like_path]
 
 
