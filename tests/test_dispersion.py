@@ -279,6 +279,20 @@ def test_refraction_leaves_one_wavelength_and_reflection_four(variant: str) -> N
     assert (np.diff(reflected[:, lives], axis=0) < 0).all()  # n falls, and so does F
 
 
+def test_connections_through_glass_are_the_heros(variant: str) -> None:
+    """As samples of the BSDF are: MIS weights would not add up otherwise."""
+    scene = furnace(ROUGH)
+    heroes = Heroes(scene)
+    si = dr.zeros(mi.SurfaceInteraction3f, 2)
+    si.wi = mi.Vector3f(0, 0, 1)
+    wo = mi.Vector3f(0, 0, [-1, 1])
+    bsdf = mi.BSDFPtr(scene.shapes()[0].bsdf())
+    value = mi.Spectrum(1, 2, 3, 4)
+    for is_alone, passed in ((False, [4, 0, 0, 0]), (True, [1, 0, 0, 0])):
+        result = heroes.connect(mi.Bool(is_alone), value, bsdf, si, wo).numpy()
+        np.testing.assert_array_equal(result.T, [passed, [1, 2, 3, 4]])
+
+
 def test_nothing_is_left_in_the_kernel_where_nothing_disperses(variant: str) -> None:
     scene = furnace({"type": "dispersive_dielectric", "int_ior": 1.5})
     heroes = Heroes(scene)
