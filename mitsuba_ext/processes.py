@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 
@@ -15,8 +16,9 @@ def python_command(module: str, *arguments: str) -> list[str]:
         module: Its full name; it is executed as ``__main__``.
         arguments: What it finds in ``sys.argv``.
     """
+    paths = [os.fspath(path) for path in sys.path]  # a user may have added a Path
     code = (
-        f"import sys; sys.path[:] = {sys.path!r}; import runpy; "
+        f"import sys; sys.path[:] = {paths!r}; import runpy; "
         f"runpy.run_module({module!r}, run_name='__main__', alter_sys=True)"
     )
     return [sys.executable, "-c", code, *arguments]

@@ -65,7 +65,8 @@ class RenderStatistics:
         zero_radiance: Share of the camera samples that brought back nothing.
         learned: Summary of what the integrator learned; empty where it learns nothing.
         memory: Peak of the memory that Dr.Jit held during the render, in bytes.
-        interrupted: Did Ctrl-C or :meth:`cancel` end the render early?
+        interrupted: Did Ctrl-C, :meth:`cancel` or an error end the render before all samples were
+            taken? Ctrl-C in the last pass does not.
     """
 
     passes: int = 0
@@ -115,7 +116,9 @@ def render(
     ``integrator.statistics``.
 
     Raises:
-        ValueError: There is no such sensor, or the film has more pixels than a wavefront can hold.
+        ValueError: There is no such sensor, ``spp`` is out of range, the film has more pixels than
+            a wavefront can hold, or these are too many samples for so many pixels.
+        NotImplementedError: The integrator has AOVs, and the film is a special one.
         KeyboardInterrupt: Ctrl-C; the film then holds the image of the finished passes.
     """
     sensor = camera.find_sensor(scene, sensor)
@@ -229,6 +232,7 @@ class _Job:
             f"Starting render job ({self.width}x{self.height}, {self.spp} samples, "
             f"{len(self.stages)} stage(s))",
         )
+        self.statistics.interrupted = True  # until the last stage has all its samples
         plan = iter(enumerate(self.stages))
         for stage in self.integrator.stages(self.scene, self.sensor, self.stages, self.seed):
             if stage.is_scout:
@@ -244,7 +248,6 @@ class _Job:
                     dispersion.warn_of_sampler(self.scene, self.sampler)
             self._run_stage(stage, samples, is_last, interrupt)
             if self._stopped(interrupt):
-                self.statistics.interrupted = True
                 return
 
     def _run_stage(self, stage: Stage, samples: int, is_last: bool, interrupt) -> None:
@@ -266,6 +269,7 @@ class _Job:
                 wanted = max(done, self._whole(before, budget.samples, samples))
                 total = before + wanted if is_known else self.spp
                 self.integrator.progress((before + done) / total)
+        self.statistics.interrupted = not is_last
 
     def _whole(self, before: int, samples: int, most: int) -> int:
         """The samples of a stage, so many that the render ends with a whole set; ``most`` would do
@@ -357,9 +361,10 @@ class _Job:
 
 
 def check_extent(film: mi.Film) -> None:
-    """
+    """Refuses a film that one pass cannot fill.
+
     Raises:
-        ValueError: The film has more pixels than a wavefront can hold.
+        ValueError: It has more pixels than a wavefront can hold.
     """
     width, height = camera.film_extent(film)
     if width * height >= _MAX_WAVEFRONT:

@@ -8,8 +8,14 @@ import mitsuba as mi
 
 from .nesting import with_nested
 
-#: They look at surfaces only.
-_NO_LIGHT_NEEDED = ("AOVIntegrator", "DepthIntegrator")
+#: Integrators that need no light and have nothing to do with media: two look at surfaces only, one
+#: renders primitives that emit.
+_NO_LIGHT_NEEDED = {
+    "AOVIntegrator", "DepthIntegrator", "BasicVolumetricPrimitiveRadianceFieldIntegrator",
+}  # fmt: skip
+
+#: "volpath", "volpathmis" and "prbvolpath".
+_SEES_MEDIA = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator"}
 
 
 def scene_remarks(
@@ -21,11 +27,11 @@ def scene_remarks(
         each
         for each in with_nested(integrator)
         if type(each).__module__.split(".")[0] in ("mitsuba", "mitsuba_ext")
-        and each.class_name() not in _NO_LIGHT_NEEDED
+        and not _is_one_of(each, _NO_LIGHT_NEEDED)
         and len(with_nested(each)) == 1
     ]
     remarks = []
-    blind = [each for each in tracers if not _sees_media(each)]
+    blind = [each for each in tracers if not _is_one_of(each, _SEES_MEDIA)]
     if blind and (sensor.get_medium() is not None or _has_media(scene.shapes())):
         remarks.append(
             f'the scene has participating media, and "{name}" treats them as absent: use "volpath"'
@@ -35,8 +41,9 @@ def scene_remarks(
     return remarks
 
 
-def _sees_media(integrator: mi.Integrator) -> bool:
-    return "Vol" in integrator.class_name() or "vol" in type(integrator).__module__
+def _is_one_of(integrator: mi.Integrator, classes: set[str]) -> bool:
+    # Classes in Python are called by their name there, those in C++ by Mitsuba's
+    return not classes.isdisjoint([integrator.class_name(), type(integrator).__name__])
 
 
 def _has_media(shapes: Iterable[mi.Shape]) -> bool:

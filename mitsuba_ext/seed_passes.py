@@ -33,6 +33,10 @@ _PASS_SAMPLES = {dr.JitBackend.LLVM: 1 << 20, dr.JitBackend.CUDA: 1 << 24}
 #: with fewer, more would be lost than a shorter wait for Ctrl-C is worth.
 _PASS_SPP, _STRUCTURED_PASS_SPP = 4, 64
 
+#: Where passes of so many samples would be longer than this many lanes (minutes on two CPU cores),
+#: they are shorter: batch systems kill 10 to 30 seconds after they ask.
+_LONG_PASS, _LARGE_FILM_PASS_SPP = 1 << 25, 16
+
 #: With a time to fill, passes are shorter by this factor: they are what it is filled with.
 _TIMED_PASS_DIVISOR = 4
 
@@ -48,14 +52,16 @@ def can_render(integrator: mi.Integrator) -> bool:
 
 
 def pass_length(sensor: mi.Sensor, is_timed: bool = False) -> int:
-    """The samples per pixel of a pass."""
-    limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // math.prod(film_extent(sensor.film()))
-    if is_timed:
-        limit //= _TIMED_PASS_DIVISOR
-    if is_independent(sensor):
-        limit = max(limit, 1 if is_timed else _PASS_SPP)
+    """The samples per pixel of a pass; ``is_timed`` matters to independent samples only."""
+    pixel_count = math.prod(film_extent(sensor.film()))
+    limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // pixel_count
+    if not is_independent(sensor):
+        is_long = _STRUCTURED_PASS_SPP * pixel_count > _LONG_PASS
+        limit = max(limit, _LARGE_FILM_PASS_SPP if is_long else _STRUCTURED_PASS_SPP)
+    elif is_timed:
+        limit = max(limit // _TIMED_PASS_DIVISOR, 1)
     else:
-        limit = max(limit, _STRUCTURED_PASS_SPP)
+        limit = max(limit, _PASS_SPP)
     # Mitsuba finds the pixels of other numbers than powers of two by another kernel
     return sample_count(sensor, 1 << (limit.bit_length() - 1))
 
@@ -74,7 +80,7 @@ class SeedPasses:
     Attributes:
         passes: Passes whose samples are in the film.
         spp: Samples per pixel of these passes.
-        interrupted: Did Ctrl-C end the render early?
+        interrupted: Did Ctrl-C or an error end the render before all samples were taken?
 
     Raises:
         NotImplementedError: Something moves, which such integrators do not see.
@@ -104,22 +110,23 @@ class SeedPasses:
 
         Args:
             spp: Samples per pixel, which structured samplers may round up.
-            seconds: Instead of ``spp``, as many passes as fit. Their number follows from the time
-                of the first one that compiles nothing, and not from the clock: an image that ends
-                when the clock says so prefers samples that are fast.
+            seconds: Instead of ``spp``, with independent samples: as many passes as fit. Their
+                number follows from the time of the first one that compiles nothing, and not from
+                the clock: an image that ends when the clock says so prefers samples that are fast.
             progress: Called after each pass with the fraction done.
         """
         length = pass_length(self._sensor, seconds is not None)
         pass_count = -(-spp // length) if seconds is None else math.inf
+        self.interrupted = True  # until all passes are there
         asked = self._sensor.sampler().sample_count()
         try:
             with deferred_interrupt() as interrupt:
-                while self.passes < pass_count and not self.interrupted:
+                while self.interrupted and not interrupt.is_set():
                     rest = length if seconds is not None else spp - self.spp
                     elapsed, compiled = self._run_pass(min(length, rest))
                     if pass_count == math.inf and not compiled:
                         pass_count = max(self.passes, round(seconds / elapsed))
-                    self.interrupted = interrupt.is_set() and self.passes < pass_count
+                    self.interrupted = self.passes < pass_count
                     progress(self.passes / pass_count)
         finally:
             self._sensor.sampler().set_sample_count(asked)  # Mitsuba's integrators change it

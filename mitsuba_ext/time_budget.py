@@ -1,8 +1,9 @@
 """How many samples fit into the time that a render has.
 
-Numbers of samples follow from the times of earlier passes, never from a look at the clock when a
-pass is over: an image that ends when the clock says so prefers samples that are fast. Each stage
-begins with a short pass, which is repeated until one has compiled nothing: it tells the speed.
+The number of samples of a stage is fixed by the times of its first passes, before the others are
+rendered. The clock never ends a stage: an image that ends when the clock says so prefers samples
+that are fast. Each stage begins with a short pass, which is repeated until one has compiled
+nothing: it tells the speed.
 """
 
 from __future__ import annotations

@@ -196,8 +196,8 @@ def test_truncated_reference_is_one_line(make_scene, tmp_path, capfd):
         (["scene.xml", "", "--spp", "1"], 'integrator "": expected NAME'),
         (["scene.xml", " ", "--spp", "1"], 'integrator " ": expected NAME'),
         (["", "path", "--spp", "1"], "no scene was given"),
-        (["scene.xml", "path", "--spp", "1", "--out", ""], "'--out': is empty"),
-        (["scene.xml", "path", "--spp", "1", "--reference", ""], "'--reference': is empty"),
+        (["scene.xml", "path", "--spp", "1", "--out", ""], "'--out': expected a path"),
+        (["scene.xml", "path", "--spp", "1", "--reference", ""], "'--reference': expected a path"),
         (
             ["scene.xml", "path", "--spp", "1", "--reference-integrator", ""],
             'integrator "": expected NAME',

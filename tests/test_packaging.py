@@ -103,8 +103,9 @@ print(__name__, sys.argv[1:], importlib.util.find_spec("mitsuba_ext.integrators.
 """)
     command = tmp_path / "command"
     command.write_text("""
-import subprocess
+import pathlib, subprocess, sys
 from mitsuba_ext.processes import python_command
+sys.path.append(pathlib.Path("added by a user"))
 subprocess.run(python_command("worker", "1 + 1", "'"))
 """)
     result = _run(source_tree, command, PYTHONPATH=str(packages))

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext import rendering, time_budget
+from mitsuba_ext import interrupts, rendering, time_budget
 from mitsuba_ext.rendering import Stage
 from mitsuba_ext.walk import PathSample
 
@@ -229,6 +229,25 @@ def test_ctrl_c_leaves_the_finished_passes_in_the_film(scene):
     image = np.array(scene.sensors()[0].film().bitmap())
     np.testing.assert_allclose(image, whole, rtol=1e-5)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.usefixtures("small_passes")
+def test_ctrl_c_in_the_last_pass_comes_too_late(scene):
+    integrator = _path()
+    integrator.progress = lambda fraction: fraction < 1 or os.kill(os.getpid(), signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        integrator.render(scene, spp=8)
+    assert integrator.statistics.spp == 8 and not integrator.statistics.interrupted
+
+
+def test_second_ctrl_c_interrupts_a_pass_unless_it_comes_at_once(monkeypatch):
+    with interrupts.deferred_interrupt() as interrupt:
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+        assert interrupt.is_set()
+        monkeypatch.setattr(interrupts, "TOGETHER", 0.0)
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
 
 
 @pytest.mark.usefixtures("small_passes")

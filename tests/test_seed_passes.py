@@ -92,6 +92,18 @@ def test_passes_of_structured_samplers_are_whole_sets(sampler):
     assert length >= 64 and 300 <= passes.spp < 300 + length
 
 
+def test_passes_of_structured_samplers_are_short_for_large_films():
+    """Else 30 seconds, which batch systems leave, would not see the end of one."""
+    lengths = {}
+    for width, height in ((640, 360), (1920, 1080)):
+        film = {"type": "hdrfilm", "width": width, "height": height}
+        sensor = mi.load_dict(
+            {"type": "perspective", "film": film, "sampler": {"type": "multijitter"}}
+        )
+        lengths[width] = seed_passes.pass_length(sensor)
+    assert lengths == {640: 64, 1920: 16}
+
+
 def test_time_fixes_the_number_of_passes_by_the_first_that_compiles_nothing(monkeypatch):
     """Passes of 2, 2 and then 1 seconds; the first one compiles."""
     scene = small_scene(3, 2)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsuba_ext import marks
+from mitsuba_ext import interrupts, marks
 from mitsuba_ext.cli import supervisor
 from mitsuba_ext.compare import InputError
 
@@ -101,7 +101,28 @@ def test_report_is_waited_for_after_sigterm(supervise, monkeypatch):
     assert supervise(lines) == (143, ["measure", "written"])
 
 
-def test_second_interrupt_gives_up_the_running_render(supervise, capfd):
+def test_signals_that_come_together_do_not_kill_the_worker_that_reports(supervise):
+    lines = """
+os.kill(parent, signal.SIGHUP)
+wait(signal.SIGINT, lambda *_: (time.sleep(0.3), log('written'), os._exit(130)))
+"""
+    assert supervise(lines) == (129, ["measure", "written"])
+
+
+def test_worker_hears_its_supervisor_where_ctrl_c_is_ignored(supervise):
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        lines = "sys.exit(signal.getsignal(signal.SIGINT) is signal.SIG_IGN)"
+        assert supervise("os.kill(parent, signal.SIGINT); time.sleep(0.3); " + lines) == (
+            0, ["measure"]
+        )
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def test_second_interrupt_gives_up_the_running_render(supervise, capfd, monkeypatch):
+    monkeypatch.setattr(interrupts, "TOGETHER", 0.0)
     lines = """
 if job == 'stored': sys.exit(130)
 begin()

@@ -15,7 +15,7 @@ import click
 
 from .. import __version__
 from ..errors import InputError, InstallationError
-from .common import INTERRUPTED
+from .common import INTERRUPTED, say
 from .compare import compare
 from .diff import diff
 from .plugins import list_plugins
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         obj = SUPERVISED if arguments is None else None
         code = cli.main(arguments, prog_name="mitsuba-ext", standalone_mode=False, obj=obj)
     except click.Abort:
-        click.echo("interrupted", err=True)
+        say("interrupted")
         return INTERRUPTED
     except click.ClickException as error:
         if not list(sys.argv[1:] if arguments is None else arguments):
@@ -68,4 +68,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _complain(message: str) -> None:
-    click.echo(f"mitsuba-ext: {' '.join(message.split())}", err=True)
+    say(f"mitsuba-ext: {' '.join(message.split())}")

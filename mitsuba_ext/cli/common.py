@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import re
 import sys
@@ -10,8 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-
-from ..progress import progress_bars  # noqa: F401  (for the commands)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -52,7 +51,7 @@ class FilledPath(click.Path):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Path:
         if not str(value).strip():
-            self.fail("is empty", param, ctx)
+            self.fail('expected a path, found ""', param, ctx)
         return super().convert(value, param, ctx)
 
 
@@ -128,6 +127,13 @@ def kernels_compiled() -> int:
 
     _launches, _loaded, compiled = dr.detail.launch_stats()
     return compiled
+
+
+def say(text: str, err: bool = True) -> None:
+    """Prints a line, on stderr or stdout. A terminal that is gone is no reason to lose an image or
+    to end with another exit code."""
+    with contextlib.suppress(OSError):
+        click.echo(text, err=err)
 
 
 def console_for_tables() -> Console:

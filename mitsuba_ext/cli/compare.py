@@ -16,6 +16,7 @@ from .common import (
     INTERRUPTED,
     FilledPath,
     Numbers,
+    say,
     scene_options,
     select_variant,
 )
@@ -137,13 +138,13 @@ def compare(
         interrupted = True
     results = comparison.results()
     if not results["scenes"]:
-        click.echo("interrupted before the first run: nothing written", err=True)
+        say("interrupted before the first run: nothing written")
         return INTERRUPTED
     show(results)
     for name in ("results.json", "report.html"):
         click.echo(out / name)
     if interrupted:
-        click.echo("interrupted: the results are of the finished runs", err=True)
+        say("interrupted: the results are of the finished runs")
         return INTERRUPTED
     return 1 if any(map(_has_trouble, results["scenes"])) else 0
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from .common import console_for_tables
+from .common import FilledPath, console_for_tables
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,7 +30,7 @@ _FIGURES = {
 @click.command(short_help="Measure how far one image is from another.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for scripts.")
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), metavar="FILE",
+    "-o", "--output", type=FilledPath(), metavar="FILE",
     help="Write the signed difference A − B to this EXR.",
 )
 @click.argument("a", type=click.Path(path_type=Path), metavar="A")

@@ -9,13 +9,20 @@ import click
 
 from ..names import check_integrator
 from ..parameters import MOST_SPP
-from .common import MAX_SEED, kernels_compiled, scene_options, select_variant
+from .common import (
+    MAX_SEED,
+    FilledPath,
+    kernels_compiled,
+    say,
+    scene_options,
+    select_variant,
+)
 from .stopping import stopping
 
 
 @click.command(short_help="Render a scene to an image.")
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), required=True, metavar="FILE",
+    "-o", "--output", type=FilledPath(), required=True, metavar="FILE",
     help="Image to write: .exr (float, with metadata), .png, .jpg, .hdr or .pfm.",
 )
 @click.option(
@@ -42,7 +49,7 @@ from .stopping import stopping
     help="Sensor to render, counted from 0. [default: the first]",
 )
 @scene_options
-@click.argument("scene", type=click.Path(path_type=Path))
+@click.argument("scene", type=FilledPath())
 def render(
     scene: Path,
     output: Path,
@@ -59,7 +66,12 @@ def render(
     """Render SCENE (an XML file) to an image.
 
     Ctrl-C, SIGTERM and SIGHUP end it after the running pass and keep the image so far: in FILE, or
-    in NAME.partial.EXT where FILE exists already. A second one ends it at once.
+    in NAME.partial.EXT where FILE exists already. A second one, half a second later or more, ends
+    it at once, unless the image is being written.
+
+    Mitsuba's own integrators are rendered in passes of whole sets of samples: a structured sampler
+    stratifies each pass (64 samples per pixel or more, 16 for large images) and not the whole
+    render.
     """
     if specification and not plugins:
         check_integrator(specification)
@@ -86,18 +98,17 @@ def render(
                 warn(remark)
             if is_new:
                 # Those of the render will take longer, and nothing can be printed meanwhile
-                click.echo(
-                    "compiling kernels (later renders like this one find them in a cache)", err=True
-                )
+                say("compiling kernels (later renders like this one find them in a cache)")
             job.run(spp, seconds)
         except (KeyboardInterrupt, OSError) as error:
             # A terminal that has been closed cannot show progress any more
             if isinstance(error, OSError) and not stop.is_asked:
                 raise
             if job is None or not job.has_image():
-                click.echo("interrupted before there was an image: nothing written", err=True)
+                say("interrupted before there was an image: nothing written")
                 return stop.exit_code
-            job.is_interrupted = True
+            # In the last pass, it came too late
+            job.is_interrupted = not job.is_complete()
 
         stop.wait()
         target = output
@@ -120,13 +131,13 @@ def render(
             warn(f"{bad} of {pixel_count} pixels of {target} are NaN or infinite")
         if job.is_interrupted:
             older = "" if target == output else f" ({output} is an older image, and still there)"
-            click.echo(f"interrupted {job.how_far()}: {target}{older}", err=True)
+            say(f"interrupted {job.how_far()}: {target}{older}")
             return stop.exit_code
     is_slow = kernels_compiled() > compiled and not is_new  # else it has been said
     remark = " (kernels were compiled: next time that is faster)" if is_slow else ""
-    click.echo(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}")
+    say(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}", err=False)
     return 1 if bad else 0
 
 
 def warn(text: str) -> None:
-    click.echo(f"mitsuba-ext: warning: {text}", err=True)
+    say(f"mitsuba-ext: warning: {text}")

@@ -14,11 +14,11 @@ from rich.progress import Progress
 from ..batches import sample_count
 from ..compare import timing
 from ..errors import InputError
+from ..progress import progress_bars
 from ..scene_remarks import scene_remarks
 from ..scenes import LoadedScene, load_scene, one_line
 from ..seed_passes import SeedPasses, can_render, is_independent
 from ..specifications import make_named
-from .common import progress_bars
 
 
 class RenderJob:
@@ -27,7 +27,7 @@ class RenderJob:
     Attributes:
         integrator, name, parameters: Of the integrator.
         film: Where the image is.
-        is_interrupted: Did a signal end the render early?
+        is_interrupted: Did a signal end the render before all samples were taken?
         seconds: Wall clock of the render.
     """
 
@@ -84,7 +84,8 @@ class RenderJob:
 
         Raises:
             InputError: The integrator cannot render this scene.
-            KeyboardInterrupt: Ctrl-C; :meth:`has_image` tells whether the film holds something.
+            KeyboardInterrupt: Ctrl-C; :meth:`has_image` tells whether the film holds something,
+                :meth:`is_complete` whether it holds all samples.
         """
         begin = time.perf_counter()
         try:
@@ -97,11 +98,6 @@ class RenderJob:
                     spp, seconds = self._measured(seconds, bars), None
                     begin = time.perf_counter()
                 self._render(spp, seconds, bars)
-        except KeyboardInterrupt:
-            report = timing.own_statistics(self.integrator)
-            # In the last pass, it came too late
-            if report is None or self._wanted is None or report.spp < self._wanted:
-                raise
         except (ValueError, TypeError, RuntimeError) as error:
             message = f'{self._loaded.source}: "{self.name}": {one_line(error)}'
             raise InputError(message) from error
@@ -154,6 +150,12 @@ class RenderJob:
             return "during the render"
         wanted = f" of {self._wanted}" if self._wanted else ""
         return f"after {self.spp}{wanted} spp"
+
+    def is_complete(self) -> bool:
+        """Does the film hold all samples, as after a signal in the last pass? What others'
+        integrators leave after one is taken for incomplete."""
+        report = self._passes or timing.own_statistics(self.integrator)
+        return report is not None and report.passes > 0 and not report.interrupted
 
     def has_image(self) -> bool:
         """Does the film hold samples?"""

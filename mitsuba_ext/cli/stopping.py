@@ -10,32 +10,24 @@ import threading
 import time
 from collections.abc import Iterator
 
-import click
-
-from .common import INTERRUPTED
-
-#: Signals that come together count as one: a terminal that is closed may send several.
-_TOGETHER = 0.5
-
-#: They are treated alike: the first one ends the render and keeps its image. Batch systems send
-#: SIGTERM some seconds before they kill; a terminal that is closed sends SIGHUP.
-_SIGNALS = [
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-]
+from .. import interrupts
+from .common import INTERRUPTED, say
 
 
-class Stop:
-    """What has asked for the end so far.
+class Stop(interrupts.InterruptHandler):
+    """The handler of the signals, and what has asked for the end so far. Only the first signal
+    does something here; what comes later is the business of :func:`_watching`, which knows when a
+    signal came. (Handlers in Python learn of it after the native code that is running.)"""
 
-    Attributes:
-        number: The first signal, as far as it was another one than Ctrl-C.
-    """
+    is_writing = False
 
-    number: int | None = None
+    def __call__(self, number: int, frame: object) -> None:
+        if self.number is None and not self.is_writing:
+            super().__call__(number, frame)
 
     @property
     def is_asked(self) -> bool:
-        """Was there such a signal?"""
+        """Was there a signal?"""
         return self.number is not None
 
     @property
@@ -44,45 +36,26 @@ class Stop:
         return INTERRUPTED if self.number is None else 128 + self.number
 
     def wait(self) -> None:
-        """From now on, a signal that comes together with the first one does nothing: the image is
-        being written."""
-        if threading.current_thread() is threading.main_thread():
-            for number in _SIGNALS:
-                signal.signal(number, lambda *_: None)
-
-    def handle(self, number: int, frame: object) -> None:
-        """Does what Ctrl-C would do now: end at once, or after the running pass."""
-        self.number = self.number or number
-        handler = signal.getsignal(signal.SIGINT)
-        if callable(handler):
-            handler(signal.SIGINT, frame)
-        else:  # what a shell runs in the background ignores Ctrl-C
-            raise KeyboardInterrupt
+        """From now on, signals do nothing: the image is being written."""
+        self.is_writing = True
 
 
 @contextlib.contextmanager
 def stopping() -> Iterator[Stop]:
-    """While active, each of the signals raises ``KeyboardInterrupt``, as Ctrl-C does (where passes
-    are rendered, after the running one); a second signal ends the process at once, whatever code is
-    running. Signals that are ignored, as SIGHUP is under ``nohup``, stay so."""
+    """While active, the first signal raises ``KeyboardInterrupt`` (where passes are rendered, after
+    the running one); a second signal ends the process at once, whatever code is running, but not
+    after :meth:`Stop.wait`. Signals that come together count as one; those that are ignored, as
+    SIGHUP is under ``nohup``, stay so."""
     stop = Stop()
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
-    previous = {number: signal.getsignal(number) for number in _SIGNALS}
-    for number, handler in previous.items():
-        if number != signal.SIGINT and handler is not signal.SIG_IGN:
-            signal.signal(number, stop.handle)
-    try:
-        with _watching():
-            yield stop
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler or signal.SIG_DFL)
+    with interrupts.handling(interrupts.SIGNALS, stop), _watching(stop):
+        yield stop
 
 
 @contextlib.contextmanager
-def _watching() -> Iterator[None]:
+def _watching(stop: Stop) -> Iterator[None]:
     """A thread that learns of signals while native code runs, when no handler in Python does."""
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
@@ -90,12 +63,12 @@ def _watching() -> Iterator[None]:
     def watch() -> None:
         first = None
         while number := receiver.recv(1):  # nothing once the sender is closed
-            if number[0] not in _SIGNALS:
+            if number[0] not in interrupts.SIGNALS:
                 continue
             now = time.monotonic()
             first = first or now
-            if now - first > _TOGETHER:
-                click.echo("interrupted again: the render is given up", err=True)
+            if now - first > interrupts.TOGETHER and not stop.is_writing:
+                say("interrupted again: the render is given up")
                 os._exit(128 + number[0])
 
     thread = threading.Thread(target=watch, daemon=True)

@@ -7,7 +7,7 @@ finished runs in the folder, gives the guilty integrator a failed row, and goes 
 Mitsuba's own integrators cannot be interrupted: after Ctrl-C, the process ends when the running
 render does. A second Ctrl-C kills it, and another process writes the report of what is finished.
 SIGTERM and SIGHUP, which batch systems send before they kill, end it alike, but the running render
-has no more than :data:`GRACE` seconds.
+has no more than :data:`GRACE` seconds. Signals that come together count as one.
 """
 
 from __future__ import annotations
@@ -24,11 +24,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import click
-
-from .. import marks
+from .. import interrupts, marks
 from ..processes import python_command
-from .common import INTERRUPTED
+from .common import INTERRUPTED, say
 
 #: What the context's ``obj`` is in a process that was started from a shell.
 SUPERVISED = "supervised"
@@ -62,7 +60,7 @@ def supervise(arguments: Sequence[str], folder: Path) -> int:
             if end.signal and end.code in _IN_ORDER:
                 return 128 + end.signal if end.code == INTERRUPTED else end.code
             if end.signal:
-                _say("interrupted: the running render is given up")
+                say("interrupted: the running render is given up")
                 marks.forgive(folder)
                 _work(arguments, folder, STORED, received)
                 return 128 + end.signal
@@ -70,13 +68,13 @@ def supervise(arguments: Sequence[str], folder: Path) -> int:
             guilty = marks.blame(folder, end.process, f"the process {reason} in this render")
             if not guilty:
                 if end.code not in _IN_ORDER:
-                    _say(f"mitsuba-ext: the process {reason}")
+                    say(f"mitsuba-ext: the process {reason}")
                 return end.code if end.code >= 0 else 1
             if guilty <= blamed:
-                _say(f"mitsuba-ext: the process {reason} in the same render again: given up")
+                say(f"mitsuba-ext: the process {reason} in the same render again: given up")
                 return 1
             blamed |= guilty
-            _say(f"mitsuba-ext: the process {reason}; going on with the others")
+            say(f"mitsuba-ext: the process {reason}; going on with the others")
 
 
 def without_job(arguments: Sequence[str]) -> list[str]:
@@ -89,7 +87,7 @@ def become_worker() -> None:
     whatever signal says so: the report that it then writes is not interrupted again."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    signals = [signal.SIGINT, *_endings()]
+    signals = [n for n in interrupts.SIGNALS if signal.getsignal(n) is not signal.SIG_IGN]
 
     def interrupt(_number: int, _frame: object) -> None:
         for number in signals:
@@ -140,7 +138,7 @@ def _work(arguments: Sequence[str], folder: Path, job: str, received: list[int])
             asked = number
             worker.send_signal(signal.SIGINT)
             if number == signal.SIGINT:
-                _say("\nwaiting for the running render (Ctrl-C: give it up)")
+                say("\nwaiting for the running render (Ctrl-C: give it up)")
             else:
                 deadline = time.monotonic() + GRACE
         if time.monotonic() > deadline:
@@ -151,31 +149,30 @@ def _work(arguments: Sequence[str], folder: Path, job: str, received: list[int])
 
 @contextlib.contextmanager
 def _collected_signals() -> Iterator[list[int]]:
-    """The numbers of the signals that ask this process to end, as they come. (Exceptions in their
-    place could come at any time, also while the last one is being dealt with.)"""
+    """The numbers of the signals that ask this process to end, as they come; of those that come
+    together, the first. (Exceptions in their place could come at any time, also while the last one
+    is being dealt with.)"""
     received: list[int] = []
-    numbers = [signal.SIGINT, *_endings()]
-    previous = {
-        number: signal.signal(number, lambda number, _frame: received.append(number))
-        for number in numbers
-    }
+    first = -math.inf
+
+    def collect(number: int, _frame: object) -> None:
+        nonlocal first
+        now = time.monotonic()
+        if now - first > interrupts.TOGETHER:
+            first = now
+            received.append(number)
+
+    is_deaf = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if is_deaf:
+        # Workers would inherit that, and must hear the SIGINT that is sent from here
+        signal.signal(signal.SIGINT, lambda *_: None)
+    numbers = [n for n in interrupts.SIGNALS if not (is_deaf and n == signal.SIGINT)]
     try:
-        yield received
+        with interrupts.handling(numbers, collect):
+            yield received
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
-def _endings() -> list[int]:
-    """The signals by which batch systems and terminals ask a process to end, but for those that are
-    ignored (as with ``nohup``)."""
-    numbers = [signal.SIGTERM] + ([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])
-    return [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
-
-
-def _say(text: str) -> None:
-    with contextlib.suppress(OSError):  # the terminal may be gone
-        click.echo(text, err=True)
+        if is_deaf:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _reason(code: int) -> str:
