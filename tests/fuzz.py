@@ -2,17 +2,21 @@
 
     python tests/fuzz.py --seconds 600 --seed 0
 
-tries scene 0, 1, 2 and so on, and prints for each failure the line that repeats it. ``--scene``
-and ``--technique`` try one of each; ``--variant`` selects another variant.
+tries scene 0, 1, 2 and so on, the kinds in turn, and prints for each failure the line that repeats
+it with the same random numbers. ``--kind``, ``--scene`` and ``--technique`` try one of each;
+``--variant`` selects another variant. At the end it says how often ``path`` could not tell what is
+right, and how often there was too much noise to say anything.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
+import math
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,111 +26,198 @@ import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before dr
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
-from random_scenes import random_scene  # isort: skip
+from random_kinds import KINDS  # isort: skip
+from random_scenes import SPP  # isort: skip
 from statistical import regions, sidak, z_welch  # isort: skip
-from techniques import REFERENCE, TECHNIQUES, Technique  # isort: skip
+from techniques import REFERENCE, TECHNIQUES  # isort: skip
 
 #: Renders of ``path`` and of each of ours, and how many times as many decide about a suspicion.
 _SEEDS, _REFERENCE_SEEDS, _MORE = 8, 16, 5
 
+#: Of each image of ``path`` that is put together of several scenes, and how many such images.
+_STRATUM_SPP, _STRATIFIED_SEEDS = SPP // 4, 8
+
 #: Scores that are suspicious, and how many comparisons share the probability of a false alarm.
 _SUSPICIOUS, _COMPARISONS = 3.5, 100
+
+#: The relative standard error of means beyond which a comparison says nothing.
+PRECISION = 0.05
 
 #: What is tried: all techniques but those that gamble most, whose noise says nothing in a minute.
 TRIED = [name for name in TECHNIQUES if "paper" not in name and "floor" not in name]
 
+#: What is found out about a technique in a scene: right; ``path`` cannot tell; wrong.
+OK, UNTOLD, FAILED = "ok", "could not tell", "failed"
+
 
 @dataclass
-class Failure:
-    """What went wrong, and how to see it again."""
+class Verdict:
+    """On a technique in a scene.
 
+    Attributes:
+        status: One of ``OK``, ``UNTOLD`` and ``FAILED``.
+        what: Why ``path`` cannot tell, or what is wrong.
+        error: Where it is ``OK``: the relative standard error of the difference of the means of the
+            two images.
+    """
+
+    kind: str
     scene: int
     technique: str
-    what: str
+    status: str = OK
+    what: str = ""
+    error: float = 0.0
+
+    @property
+    def is_noisy(self) -> bool:
+        return self.status == OK and not self.error <= PRECISION
 
     def __str__(self) -> str:
-        command = f"python tests/fuzz.py --variant {mi.variant()} --scene {self.scene}"
-        return f"{command} --technique {self.technique}  # {self.what}"
+        noise = f"means known to {self.error:.2%}" if self.status == OK else self.what
+        return (
+            f"python tests/fuzz.py --variant {mi.variant()} --kind {self.kind} --scene "
+            f"{self.scene} --technique {self.technique}  # {self.status}: {noise}"
+        )
 
 
-class _Trial:
+class CannotTellError(Exception):
+    """``path`` does not know what is right, and why."""
+
+
+class Trial:
     """One scene."""
 
-    def __init__(self, number: int, folder: Path) -> None:
-        self.number = number
+    def __init__(self, kind: str, number: int, folder: Path) -> None:
+        self.kind, self.number = kind, number
+        self._kind, self._folder = KINDS[kind], folder
         rng = np.random.default_rng([number, 11])
-        self._scene = mi.load_dict(random_scene(number, folder), optimize=False)
         self._depth = {"max_depth": int(rng.choice([2, 3, 5])), "rr_depth": int(rng.choice([2, 5]))}
-        # Scattered: of structured samplers, neighbouring seeds share their numbers
-        self._seeds = rng.choice(1 << 31, 4096, replace=False)
-        self._taken = 0
-        self._reference: dict[int, np.ndarray] = {}
+        self._depth |= self._kind.depth
+        self._reference: dict[int, np.ndarray | CannotTellError] = {}
 
-    def failure(self, name: str) -> str | None:
-        """What is wrong with a technique; ``None`` if nothing is, or if ``path`` cannot tell."""
-        reference = self._path(_REFERENCE_SEEDS)
-        if reference is None:
-            return None
+    def verdict(self, name: str) -> Verdict:
+        """What is found out about the technique of this name."""
         try:
-            images = self._render(TECHNIQUES[name], _SEEDS)
+            status, what, error = self._judge(name)
+        except CannotTellError as reason:
+            status, what, error = UNTOLD, str(reason), 0.0
+        return Verdict(self.kind, self.number, name, status, what, error)
+
+    def _judge(self, name: str) -> tuple[str, str, float]:
+        """Status, what is wrong, and the relative standard error."""
+        reference = self._path(1)
+        try:
+            images = self._ours(name, 1)
             # Single wavelengths are outside of the gamut
             is_negative = images.min() < 0 and not mi.is_spectral
             if is_negative or not np.isfinite(images).all():
-                return f"pixels from {images.min()} to {images.max()}"
+                return FAILED, f"pixels from {images.min()} to {images.max()}", 0.0
             if images.shape[1:] != reference.shape[1:]:
-                return f"images of shape {images.shape[1:]} instead of {reference.shape[1:]}"
-            z = _score(images, reference)
-            if z < _SUSPICIOUS:
-                return None
-            reference = self._path(_MORE * _REFERENCE_SEEDS)
-            images = self._render(TECHNIQUES[name], _MORE * _SEEDS)
+                shapes = f"{images.shape[1:]} instead of {reference.shape[1:]}"
+                return FAILED, f"images of shape {shapes}", 0.0
+            z = self._score(images, reference)
+            if z >= _SUSPICIOUS:
+                reference, images = self._path(_MORE), self._ours(name, _MORE)
+                again = self._score(images, reference)
+                if not again < sidak(_COMPARISONS * regions(images).shape[1]):
+                    means = f"{images.mean():.5g} instead of {reference.mean():.5g}"
+                    return FAILED, f"z = {z:.1f} and {again:.1f}, image means {means}", 0.0
+        except CannotTellError:
+            raise
         except Exception as error:  # whatever it is, ``path`` has none
-            return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
-        again = _score(images, reference)
-        if again < sidak(_COMPARISONS * regions(images).shape[1]):
-            return None
-        return (
-            f"z = {z:.1f} and {again:.1f}, image means {images.mean():.5g} instead of "
-            f"{reference.mean():.5g}"
-        )
+            return FAILED, _line(error), 0.0
+        if not (_colours(images).any() or _colours(reference).any()):
+            raise CannotTellError("the image is black")
+        return OK, "", _relative_error(images, reference)
 
-    def _path(self, seeds: int) -> np.ndarray | None:
-        """Images of ``path``; ``None`` where it fails itself."""
-        if seeds not in self._reference:
+    def _score(self, images: np.ndarray, reference: np.ndarray) -> float:
+        """The largest |z| of means of the image and of its quarters."""
+        ours, theirs = regions(images), regions(reference)
+        mean = theirs.mean(axis=0)
+        allowance = self._kind.allowance * np.abs(mean)
+        return float(
+            np.abs(z_welch(ours + np.clip(mean - ours.mean(axis=0), -allowance, allowance), theirs))
+            .max()
+        )  # fmt: skip
+
+    # ---- Images: [seed, height, width, channel] ----
+
+    def _path(self, times: int) -> np.ndarray:
+        """So many times the usual number of images of ``path``."""
+        if times not in self._reference:
             try:
-                self._reference[seeds] = self._render(REFERENCE, seeds)
-            except RuntimeError:
-                return None
-        images = self._reference[seeds]
-        return images if np.isfinite(images).all() else None
+                self._reference[times] = self._images_of_path(times)
+            except RuntimeError as error:
+                self._reference[times] = CannotTellError(f"path: {_line(error)}")
+        images = self._reference[times]
+        if isinstance(images, CannotTellError):
+            raise images
+        if not np.isfinite(images).all():
+            raise CannotTellError("pixels of path are not finite")
+        return images
 
-    def _render(self, technique: Technique, seeds: int) -> np.ndarray:
-        integrator = technique.make(**self._depth)
-        images = []
-        for _ in range(seeds):
-            seed = int(self._seeds[self._taken])
-            self._taken += 1
-            images.append(np.array(mi.render(self._scene, integrator=integrator, seed=seed)))
-        images = np.array(images, dtype=np.float64)
+    def _images_of_path(self, times: int) -> np.ndarray:
+        count, strata = times * _REFERENCE_SEEDS, self._kind.strata
+        integrator = REFERENCE.make(**self._depth)
+        rng = self._rng("path", times)
+        if strata == 1:
+            return self._render(0.0, integrator, _scattered(rng, count))
+        count = times * _STRATIFIED_SEEDS
+        seeds, jitter = _scattered(rng, count * strata), rng.random(count * strata)
+        images = [
+            self._render((k % strata + jitter[k]) / strata, integrator, [seed], _STRATUM_SPP)
+            for k, seed in enumerate(seeds)
+        ]
+        return np.stack(images).reshape(count, strata, *images[0].shape[1:]).mean(axis=1)
+
+    def _ours(self, name: str, times: int) -> np.ndarray:
+        seeds = _scattered(self._rng(name, times), times * _SEEDS)
+        return self._render(None, TECHNIQUES[name].make(**self._depth), seeds)
+
+    def _rng(self, name: str, times: int) -> np.random.Generator:
+        """The same for one technique as for several."""
+        return np.random.default_rng([self.number, times, zlib.crc32(name.encode())])
+
+    def _render(
+        self, at: float | None, integrator: mi.Integrator, seeds: list[int], spp: int = 0
+    ) -> np.ndarray:
+        # Scenes that are alive take part in the kernels of all others: let go of each
+        scene = mi.load_dict(self._kind.make(self.number, self._folder, at), optimize=False)
+        images = np.array(
+            [np.array(mi.render(scene, integrator=integrator, seed=s, spp=spp)) for s in seeds],
+            dtype=np.float64,
+        )
         return images if images.ndim == 4 else images[..., None]
 
 
-def _score(images: np.ndarray, reference: np.ndarray) -> float:
-    """The largest |z| of means of the image and of its quarters."""
-    return float(np.abs(z_welch(regions(images), regions(reference))).max())
+def _scattered(rng: np.random.Generator, count: int) -> list[int]:
+    """Of structured samplers, neighbouring seeds share their numbers."""
+    return rng.choice(1 << 31, count, replace=False).tolist()
 
 
-def failures(number: int, names: list[str]) -> Iterator[Failure]:
-    """What goes wrong with the scene of this number."""
+def _colours(images: np.ndarray) -> np.ndarray:
+    """Without opacity, which may be all that is known well."""
+    return images[..., :3]
+
+
+def _relative_error(images: np.ndarray, reference: np.ndarray) -> float:
+    ours, theirs = (_colours(x).mean(axis=(1, 2, 3)) for x in (images, reference))
+    error = math.sqrt(sum(x.var(ddof=1) / len(x) for x in (ours, theirs)))
+    return error / max(abs(theirs.mean()), 1e-30)
+
+
+def _line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+
+
+def verdicts(kind: str, number: int, names: list[str]) -> Iterator[Verdict]:
+    """What is found out in the scene of this kind and number."""
     with tempfile.TemporaryDirectory() as folder:
-        trial = _Trial(number, Path(folder))
+        trial = Trial(kind, number, Path(folder))
         for name in names:
-            what = trial.failure(name)
-            if what is not None:
-                yield Failure(number, name, what)
-    # Scenes that are alive take part in the kernels of all others
-    del trial
-    gc.collect()
+            yield trial.verdict(name)
+            # Scenes with plugins in Python may be garbage that waits for the collector
+            gc.collect()
 
 
 def some_techniques(number: int, count: int) -> list[str]:
@@ -141,19 +232,25 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60, help="how long (default: 60)")
     parser.add_argument("--seed", type=int, default=0, help="the first scene (default: 0)")
     parser.add_argument("--scene", type=int, help="only this scene")
+    parser.add_argument("--kind", choices=KINDS, help="only this kind of scenes")
     parser.add_argument("--technique", choices=TECHNIQUES, help="only this technique")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     arguments = parser.parse_args()
     mi.set_variant(arguments.variant)
     mi.set_log_level(mi.LogLevel.Error)
-    start, found, number = time.perf_counter(), 0, arguments.seed
-    if arguments.scene is not None:
-        number = arguments.scene
+    start = time.perf_counter()
+    first = number = arguments.seed if arguments.scene is None else arguments.scene
+    found: list[Verdict] = []
     while True:
+        # All kinds of one scene where it is named; else each scene has another one
+        kinds = list(KINDS) if arguments.scene is not None else [list(KINDS)[number % len(KINDS)]]
         names = [arguments.technique] if arguments.technique else some_techniques(number, 4)
-        for failure in failures(number, names):
-            print(failure, flush=True)
-            found += 1
+        for kind in [arguments.kind] if arguments.kind else kinds:
+            for verdict in verdicts(kind, number, names):
+                found.append(verdict)
+                # Of one scene, all is told
+                if verdict.status != OK or verdict.is_noisy or arguments.scene is not None:
+                    print(verdict, flush=True)
         number += 1
         if arguments.scene is not None or time.perf_counter() - start > arguments.seconds:
             break
@@ -161,8 +258,13 @@ def main() -> int:
             dr.sync_thread()
             dr.flush_kernel_cache()
             dr.flush_malloc_cache()
-    print(f"{number - (arguments.scene or arguments.seed)} scene(s), {found} failure(s)")
-    return 1 if found else 0
+    failed, untold = (sum(v.status == status for v in found) for status in (FAILED, UNTOLD))
+    print(
+        f"{number - first} scene(s), {len(found)} comparison(s): {failed} failure(s), {untold} "
+        f"where path could not tell, {sum(v.is_noisy for v in found)} with a relative standard "
+        f"error above {PRECISION:.0%}"
+    )
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

@@ -19,20 +19,20 @@ Scene = dict[str, Any]
 SPP, PRIME_SPP = 64, 49
 
 
-def random_scene(seed: int, folder: Path) -> Scene:
-    """A scene for ``mi.load_dict(…, optimize=False)``: where Mitsuba merges rectangles, sky and sun
-    leak in ``path``.
+class Maker:
+    """Makes scenes, and parts of them, for ``mi.load_dict(…, optimize=False)``: where Mitsuba
+    merges rectangles, sky and sun leak in ``path``.
 
     Parameters:
         seed: Another number is another scene.
         folder: Where files of curves are written.
+        stream: Another number is other random numbers for the same seed.
     """
-    return _Maker(seed, folder).scene()
 
-
-class _Maker:
-    def __init__(self, seed: int, folder: Path) -> None:
-        self.rng, self.folder = np.random.default_rng([seed, 7]), folder
+    def __init__(self, seed: int, folder: Path, stream: int = 7) -> None:
+        self.rng, self.folder = np.random.default_rng([seed, stream]), folder
+        #: How far things are from the middle, and how large they are.
+        self.spread, self.size = 1.2, (0.2, 0.7)
 
     def scene(self) -> Scene:
         scene: Scene = {"type": "scene", "sensor": self.sensor(), "floor": self.floor()}
@@ -55,16 +55,22 @@ class _Maker:
     def choice(self, *values: Any) -> Any:
         return values[self.rng.integers(len(values))]
 
-    def pick(self, makers: list[Callable[[_Maker], Scene]]) -> Scene:
+    def pick(self, makers: list[Callable[[Maker], Scene]]) -> Scene:
         return makers[self.rng.integers(len(makers))](self)
 
-    def point(self, spread: float = 1.2) -> list[float]:
+    def large(self) -> Maker:
+        """From now on, things are large and in the middle: what matters is seen."""
+        self.spread, self.size = 0.5, (0.5, 0.9)
+        return self
+
+    def point(self) -> list[float]:
+        spread = self.spread
         x, y, z = self.rng.uniform([-spread, -spread, 0.1], [spread, spread, 1.8])
         return [float(x), float(y), float(z)]
 
-    def place(self, uniform: bool = False, size: tuple[float, float] = (0.2, 0.7)) -> Any:
+    def place(self, uniform: bool = False, size: tuple[float, float] | None = None) -> Any:
         axis = self.rng.normal(size=3)
-        scale = self.rng.uniform(*size, 3)
+        scale = self.rng.uniform(*(size or self.size), 3)
         T = mi.ScalarTransform4f().translate(self.point())
         # A longer axis would scale the scene
         T = T.rotate((axis / np.linalg.norm(axis)).tolist(), self.number(0, 360))
@@ -91,6 +97,14 @@ class _Maker:
             pixels.flat[:3] = high
         return {"type": "bitmap", "bitmap": mi.Bitmap(pixels.astype(np.float32)),
                 "filter_type": self.choice("bilinear", "nearest")}  # fmt: skip
+
+    def weights(self) -> Scene:
+        """A texture of numbers: in spectral variants, ``path`` refuses colours in their place."""
+        texture = self.texture()
+        if texture["type"] == "bitmap":
+            return {**texture, "raw": True}
+        colours = {key: float(np.mean(texture[key]["value"])) for key in ("color0", "color1")}
+        return {**texture, **colours}
 
     def reflectance(self) -> Scene:
         return self.texture() if self.chance(0.4) else self.colour()
@@ -127,14 +141,14 @@ class _Maker:
                      "roughness": self.number(0.4, 1)},
             lambda: {"type": "principledthin", "base_color": self.colour(), "spec_trans": 0.3,
                      "diff_trans": self.number(0, 2), "roughness": self.number(0.4, 1)},
-            lambda: {"type": "mask", "opacity": self.choice(self.number(0.2, 0.8), self.texture()),
+            lambda: {"type": "mask", "opacity": self.choice(self.number(0.2, 0.8), self.weights()),
                      "bsdf": self.opaque()},
             # Not with mirrors: Mitsuba adds probabilities and densities there
-            lambda: {"type": "blendbsdf", "weight": self.choice(0.4, self.texture()),
+            lambda: {"type": "blendbsdf", "weight": self.choice(0.4, self.weights()),
                      "first": {"type": "roughplastic", "alpha": alpha},
                      "second": {"type": "diffuse", "reflectance": self.reflectance()}},
-            lambda: {"type": "bumpmap", "texture": self.bitmap(0, 1), "scale": 0.1,
-                     "bsdf": self.opaque()},
+            lambda: {"type": "bumpmap", "texture": {**self.bitmap(0, 1), "raw": True},
+                     "scale": 0.1, "bsdf": self.opaque()},
             lambda: {"type": "normalmap", "bsdf": self.opaque(),
                      "normalmap": {**self.bitmap(0.4, 0.9), "raw": True}},
             lambda: {"type": "null"},

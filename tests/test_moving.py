@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import area, bitmap, diffuse, lookat, rectangle, sensor
-from scipy.spatial.transform import Rotation, Slerp
+from motions import Pose, keyed, uniform
+from scipy.spatial.transform import Rotation
 from statistical import (
     SEEDS,
     assert_same_image,
@@ -25,7 +26,6 @@ from mitsuba_ext.decisions.moving_scene import scene_query
 from mitsuba_ext.motion import Motion, PoseTable
 
 Scene = dict[str, Any]
-Pose = Callable[[float], np.ndarray]
 
 
 @pytest.fixture(autouse=True)
@@ -34,39 +34,7 @@ def quiet(variant: str) -> None:
     mi.set_log_level(mi.LogLevel.Error)
 
 
-# ---- Motions: as parameters, and as poses that are computed here ----
-
-
-def uniform(translate, axis, angle, center, begin=0.0, end=1.0) -> tuple[Scene, Pose]:
-    def pose(time: float) -> np.ndarray:
-        x = np.clip((time - begin) / (end - begin), 0, 1)
-        unit = np.array(axis) / np.linalg.norm(axis)
-        matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_rotvec(unit * np.radians(x * angle)).as_matrix()
-        matrix[:3, 3] = x * np.array(translate) + center - matrix[:3, :3] @ center
-        return matrix
-
-    parameters = {"translate": translate, "axis": axis, "angle": angle, "center": center,
-                  "begin": begin, "end": end}  # fmt: skip
-    return parameters, pose
-
-
-def keyed(times, rotations: Rotation, positions) -> tuple[Scene, Pose]:
-    slerp, positions = Slerp(times, rotations), np.array(positions)
-
-    def pose(time: float) -> np.ndarray:
-        time = np.clip(time, times[0], times[-1])
-        matrix = np.eye(4)
-        matrix[:3, :3] = slerp(time).as_matrix()
-        matrix[:3, 3] = [np.interp(time, times, column) for column in positions.T]
-        return matrix
-
-    parameters: Scene = {}
-    for i, time in enumerate(times):
-        parameters[f"time_{i}"] = float(time)
-        parameters[f"pose_{i}"] = mi.ScalarTransform4f(pose(time))
-    return parameters, pose
-
+# ---- Motions ----
 
 SPIN = uniform([0.5, -0.3, 0.2], [0, 0.4, 1], 420.0, [0.1, 0, 0.5])
 SLIDE = uniform([0, -0.8, 0], [0, 0, 1], 0.0, [0, 0, 0], begin=0.1, end=0.6)

@@ -1,0 +1,149 @@
+"""Kinds of random scenes: what is tried, and what ``path`` renders that must have the same mean.
+
+All that a scene holds is made anew for each load: in spectral variants, Mitsuba converts the pixels
+of an ``mi.Bitmap`` in place (``docs/mitsuba_faults.md``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from lights import ball
+from motions import Pose, keyed, uniform
+from random_scenes import Maker, Scene
+from scipy.spatial.transform import Rotation
+
+from mitsuba_ext.glass import GLASSES
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of scenes.
+
+    Attributes:
+        make: The scene of a number, in a folder for its files: the one to try where the time is
+            ``None``, else the one that ``path`` sees at this time (0 to 1) of the shutter interval.
+        strata: Into how many parts the shutter interval is divided; ``path`` sees each of them at
+            a random time, so that its mean is that of the interval.
+        depth: Parameters of integrators that this kind prescribes.
+        allowance: By how much, relatively, the means may differ.
+    """
+
+    make: Callable[[int, Path, float | None], Scene]
+    strata: int = 1
+    depth: dict[str, int] = field(default_factory=dict)
+    allowance: float = 0.0
+
+
+def _plain(seed: int, folder: Path, time: float | None) -> Scene:
+    return Maker(seed, folder).scene()
+
+
+# ---- Moving shapes ----
+
+
+def _moving(seed: int, folder: Path, time: float | None) -> Scene:
+    """One or two things move: in ``moving``, or each where it is at this time."""
+    scene, maker = Maker(seed, folder).large().scene(), Maker(seed, folder, stream=13)
+    opens, lasts = maker.number(0, 0.3), maker.number(0.2, 1)
+    scene["sensor"] |= {"shutter_open": opens, "shutter_close": opens + lasts}
+    names = [name for name in scene if name.startswith("thing_") and "group" not in name]
+    for name in maker.rng.permutation(names)[: maker.rng.integers(1, 3)]:
+        parameters, pose = _motion(maker)
+        group = f"{name}_group"
+        parts = {key: scene.pop(key) for key in (group, name) if key in scene}
+        if group in parts:
+            parts[group]["id"] = group
+        if time is None:
+            scene[name] = {"type": "moving", **parameters, **parts}
+        else:
+            to_world = parts[name].get("to_world", mi.ScalarTransform4f())
+            moved = mi.ScalarTransform4f(pose(opens + time * lasts)) @ to_world
+            scene |= parts | {name: {**parts[name], "to_world": moved}}
+    return scene
+
+
+def _motion(maker: Maker) -> tuple[Scene, Pose]:
+    rng = maker.rng
+    if maker.chance(0.5):
+        translate, axis = rng.normal(size=(2, 3))
+        begin = maker.number(-0.2, 0.3)
+        return uniform((0.4 * translate).tolist(), axis.tolist(), maker.number(-500, 500),
+                       maker.point(), begin, begin + maker.number(0.3, 1.2))  # fmt: skip
+    count = rng.integers(2, 5)
+    times = np.cumsum(rng.uniform(0.1, 0.5, count))
+    turns, positions = rng.normal(size=(2, count, 3))
+    return keyed(times, Rotation.from_rotvec(turns), 0.3 * positions)
+
+
+# ---- Dispersive glass ----
+
+
+def _constant_index(seed: int, folder: Path, time: float | None) -> Scene:
+    """Glass in a scene: our plugins with an index that does not depend on the wavelength are
+    Mitsuba's."""
+    scene, maker = Maker(seed, folder).scene(), Maker(seed, folder, stream=17).large()
+    for index in range(maker.rng.integers(1, 3)):
+        glass: Scene = {"type": "dielectric", "int_ior": maker.number(1.2, 1.9)}
+        if maker.chance(0.5):
+            glass |= {"type": "roughdielectric", "distribution": maker.choice("ggx", "beckmann"),
+                      "alpha_u": maker.number(0.1, 0.5),
+                      "alpha_v": maker.number(0.1, 0.5)}  # fmt: skip
+        if maker.chance(0.3):
+            glass["ext_ior"] = 1.1
+        if maker.chance(0.3):
+            glass["specular_transmittance"] = maker.reflectance()
+        if time is None:
+            glass["type"] = f"dispersive_{glass['type']}"
+        if maker.chance(0.3):
+            glass = {"type": "mask", "opacity": maker.number(0.4, 0.8), "bsdf": glass}
+        scene[f"glass_{index}"] = {**maker.shape(), "bsdf": glass}
+    return scene
+
+
+def _furnace(seed: int, folder: Path, time: float | None) -> Scene:
+    """Glass that disperses, where the sky is all there is: nothing is absorbed, so that glass
+    cannot be seen. ``path`` sees the sky alone."""
+    maker = Maker(seed, folder, stream=19).large()
+    sky = {"type": "constant", "radiance": maker.colour()}
+    scene = {"type": "scene", "sensor": maker.sensor(), "sky": sky}
+    # Behind glass, opacity is 1
+    scene["sensor"]["film"]["pixel_format"] = "rgb"
+    for index in range(maker.rng.integers(1, 4) if time is None else 0):
+        glass = {"type": "dispersive_dielectric", **_index(maker)}
+        if maker.chance(0.3):
+            # So smooth that hardly anything is scattered twice, and lost
+            glass |= {"type": "dispersive_roughdielectric", "distribution": "ggx", "alpha": 0.002}
+        scene[f"glass_{index}"] = {**_closed(maker), "bsdf": glass}
+    return scene
+
+
+def _index(maker: Maker) -> Scene:
+    number = maker.number(1.3, 2)
+    if not mi.is_spectral:
+        return {"int_ior": number}
+    cauchy = f"{number}, {maker.number(0.002, 0.02)}"
+    return maker.choice({"int_ior": maker.choice(*GLASSES)}, {"cauchy": cauchy})
+
+
+def _closed(maker: Maker) -> Any:
+    """A shape with an inside. Interpolated normals would not conserve energy."""
+    return maker.choice(
+        lambda: {"type": "sphere", "to_world": maker.place(uniform=True)},
+        lambda: {"type": "cube", "to_world": maker.place()},
+        lambda: {**ball(9, 5), "to_world": maker.place()},
+    )()
+
+
+KINDS = {
+    "plain": Kind(_plain),
+    "moving": Kind(_moving, strata=16),
+    "constant_index": Kind(_constant_index),
+    # What ends early is lost; roulette's rare long paths would be its only noise in RGB
+    "furnace": Kind(_furnace, depth={"max_depth": -1, "rr_depth": 64}, allowance=2e-3),
+}
