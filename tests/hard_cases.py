@@ -350,7 +350,7 @@ HARD_CASES: dict[str, HardCase] = {
     ),  # fmt: skip
     "three_samples": HardCase(_film(64, 64), spp=3, precision=0.03),
     "one_sample": HardCase(_film(64, 64), spp=1, precision=0.05),
-    "thousand_samples": HardCase(_film(11, 9), spp=1000),
+    "thousand_samples": HardCase(_film(11, 9), spp=1000, precision=0.03),
     "max_depth_0": HardCase(stage, max_depth=0, is_black=True),
     "max_depth_2": HardCase(stage, max_depth=2),
     "max_depth_unlimited": HardCase(stage, max_depth=-1),
