@@ -30,6 +30,8 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
+from mitsuba_ext.garbage import garbage_left_alone
+
 SCENES = Path(__file__).parents[1] / "scenes"
 
 #: Single tests accept |z| below this (p = 6e-5); several at once, its Šidák correction.
@@ -55,7 +57,7 @@ def batches(
 ) -> np.ndarray:
     """Images of independent seeds, as an array [seed, height, width, channel]."""
     images = []
-    with _one_thread_per_worker():
+    with _one_thread_per_worker(), garbage_left_alone():
         for seed in seeds:
             images.append(np.array(mi.render(scene, integrator=integrator, seed=seed, spp=spp)))
         dr.sync_thread()

@@ -18,6 +18,7 @@ from statistical import batches, compare_pixels, sidak, z_of_means, z_welch
 from techniques import TECHNIQUES
 
 from mitsuba_ext.dispersion import DISPERSES, Heroes, disperses, warn_of_sampler
+from mitsuba_ext.garbage import garbage_left_alone
 from mitsuba_ext.glass import GLASSES
 from mitsuba_ext.walk import Walk
 
@@ -83,7 +84,8 @@ def means(trace, seed: int, batch_count: int = 12, count: int = 1 << 14) -> np.n
     """What ``trace(sampler)`` returns, averaged over the paths of each batch: [batch, …]."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, batch_count * count)
-    values = [mi.Float(value) for value in trace(sampler)]
+    with garbage_left_alone():  # also where Mitsuba's path traces calls of our BSDFs
+        values = [mi.Float(value) for value in trace(sampler)]
     dr.eval(values)
     return np.stack([v.numpy().reshape(batch_count, -1).mean(axis=1) for v in values], axis=1)
 
