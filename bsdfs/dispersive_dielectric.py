@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.dispersive_interface import DispersiveInterface, fresnel_spectrum
+from mitsuba_ext.materials.dispersive_interface import DispersiveInterface, fresnel_spectrum
 
 
 @registry.plugin

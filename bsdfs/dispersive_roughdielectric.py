@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.dispersive_interface import (
+from mitsuba_ext.materials.dispersive_interface import (
     DispersiveInterface,
     check_uniform,
     fresnel_spectrum,

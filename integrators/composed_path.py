@@ -7,9 +7,9 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.decisions.light_sampling import METHODS, LightSampling
-from mitsuba_ext.integrator import WalkIntegrator
-from mitsuba_ext.learning.learner import Learner
+from mitsuba_ext.composition.light_parameters import METHODS, LightSampling
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.decisions.learner import Learner
 
 
 @registry.plugin

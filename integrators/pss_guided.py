@@ -7,11 +7,11 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.decisions.defaults import EmitterSampling
-from mitsuba_ext.decisions.guided_directions import LaterConnections
-from mitsuba_ext.decisions.guiding import Guiding
-from mitsuba_ext.integrator import WalkIntegrator
-from mitsuba_ext.learning.learner import Learner
+from mitsuba_ext.composition.guide_parameters import Guiding
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.decisions.directions.guided_directions import LaterConnections
+from mitsuba_ext.decisions.learner import Learner
+from mitsuba_ext.transport.path_decisions import EmitterSampling
 
 
 @registry.plugin
@@ -122,14 +122,14 @@ class PSSGuided(WalkIntegrator):
 
     @property
     def guide(self):
-        """What the last render has learned (:class:`~mitsuba_ext.decisions.guided_directions.\
-GuidedDirections`); ``None`` where nothing was guided."""
+        """What the last render has learned (``GuidedDirections``); ``None`` where nothing was
+        guided."""
         return self.guiding.guide
 
     @property
     def learner(self):
-        """Who learned in the last render (:class:`~mitsuba_ext.decisions.guide_learner.\
-GuideLearner`), with what it measured; ``None`` where there was no pilot."""
+        """Who learned in the last render (``GuideLearner``), with what it measured; ``None``
+        where there was no pilot."""
         return self.guiding.learner
 
     def decisions(self, scene: mi.Scene, seed: int) -> dict[str, Any]:

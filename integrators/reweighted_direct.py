@@ -7,9 +7,9 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.decisions.many_connections import ManyConnections
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.decisions.connections.many_connections import ManyConnections
 from mitsuba_ext.decisions.weighted_sets import MOST_SLOW_POINTS, SetKind
-from mitsuba_ext.integrator import WalkIntegrator
 
 _MOST_LIGHT_SAMPLES = 4096
 

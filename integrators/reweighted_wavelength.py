@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.reweighted_camera import ReweightedCamera
+from mitsuba_ext.composition.reweighted_camera import ReweightedCamera
 
 
 @registry.plugin

@@ -11,11 +11,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_ext import registry
-from mitsuba_ext.batches import Batches, batch_seeds, each_batch, sample_count
-from mitsuba_ext.camera import develop as develop_film
-from mitsuba_ext.camera import find_sensor
 from mitsuba_ext.parameters import MOST_SPP, read_parameter
-from mitsuba_ext.rendering import RenderStatistics
+from mitsuba_ext.rendering.batches import Batches, batch_seeds, each_batch, sample_count
+from mitsuba_ext.rendering.camera import develop as develop_film
+from mitsuba_ext.rendering.camera import find_sensor
+from mitsuba_ext.rendering.render import RenderStatistics
 
 _PREFIX = "variance."
 

@@ -32,8 +32,10 @@ _KINDS: dict[str, str] = {
 
 #: Variant-bound base classes, executed before the plugins that derive from them.
 _BASES = (
-    "mitsuba_ext.staged_integrator", "mitsuba_ext.integrator", "mitsuba_ext.reweighted_camera",
-)  # fmt: skip
+    "mitsuba_ext.rendering.staged_integrator",
+    "mitsuba_ext.composition.walk_integrator",
+    "mitsuba_ext.composition.reweighted_camera",
+)
 
 _registered: set[str] = set()
 

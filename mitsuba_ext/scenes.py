@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .aovs import check_nodes
 from .content_hash import hash_parsed_scene
 from .errors import InputError
+from .rendering.aovs import check_nodes
 
 if TYPE_CHECKING:
     import mitsuba as mi

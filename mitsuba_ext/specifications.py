@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union
 from xml.etree import ElementTree
 
-from .aovs import check_aovs, check_nodes
 from .content_hash import hash_code, hash_value
 from .errors import InputError
 from .names import is_file_of_mitsuba, unknown_integrator
 from .plugin_text import parse_plugin
 from .registry import plugin_names
+from .rendering.aovs import check_aovs, check_nodes
 from .scenes import check_variant, one_line
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 from hard_cases import film, sensor, stage
 
-from mitsuba_ext.batches import Batches, each_batch
+from mitsuba_ext.rendering.batches import Batches, each_batch
 
 
 def with_variance(nested: str | dict = "path", batches: int = 4, **parameters) -> mi.Integrator:

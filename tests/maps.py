@@ -6,12 +6,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.decisions.light_learner import LightLearner
-from mitsuba_ext.decisions.light_selection import Choice
-from mitsuba_ext.learning.light_map import LightMap
-from mitsuba_ext.learning.scout import region
-from mitsuba_ext.learning.surface_rows import SurfaceRows, voxel_edges
+from mitsuba_ext.decisions.next_event.light_map import LightMap
+from mitsuba_ext.decisions.next_event.light_map_learner import LightLearner
+from mitsuba_ext.decisions.next_event.light_table import Choice
 from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.regions.surface_rows import SurfaceRows, voxel_edges
+from mitsuba_ext.regions.surface_sides import region
 
 
 def lamp(*position: float, radiance: float = 1.0, size: float = 0.1, **more) -> dict:

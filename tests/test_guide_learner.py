@@ -11,11 +11,11 @@ import pytest
 from hard_cases import area, diffuse, film, lookat, rectangle, sensor
 
 from mitsuba_ext.decisions import DirectionSamples
-from mitsuba_ext.decisions.guide_learner import GuideLearner, most_efficient
-from mitsuba_ext.decisions.guided_directions import GuidedDirections
-from mitsuba_ext.learning.path_records import BYTES_PER_RECORD, PathRecords
-from mitsuba_ext.learning.surface_regions import SurfaceRegions
-from mitsuba_ext.learning.tile_regions import TileRegions
+from mitsuba_ext.decisions.directions.guide_learner import GuideLearner, most_efficient
+from mitsuba_ext.decisions.directions.guided_directions import GuidedDirections
+from mitsuba_ext.decisions.directions.path_records import BYTES_PER_RECORD, PathRecords
+from mitsuba_ext.decisions.directions.surface_regions import SurfaceRegions
+from mitsuba_ext.decisions.directions.tile_regions import TileRegions
 
 pytestmark = pytest.mark.usefixtures("variant")
 

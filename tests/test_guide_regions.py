@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hard_cases import diffuse, sensor, stage
 
-from mitsuba_ext.learning.path_records import PathRecords
-from mitsuba_ext.learning.sample_trees import LEAF, SampleTrees
-from mitsuba_ext.learning.surface_regions import SurfaceRegions
-from mitsuba_ext.learning.tile_regions import TileRegions
-from mitsuba_ext.learning.tree_builder import cell_code
-from mitsuba_ext.walk import Walk
+from mitsuba_ext.decisions.directions.path_records import PathRecords
+from mitsuba_ext.decisions.directions.sample_trees import LEAF, SampleTrees
+from mitsuba_ext.decisions.directions.surface_regions import SurfaceRegions
+from mitsuba_ext.decisions.directions.tile_regions import TileRegions
+from mitsuba_ext.decisions.directions.tree_builder import cell_code
+from mitsuba_ext.transport.walk import Walk
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -9,10 +9,10 @@ import pytest
 from lights import ball
 from maps import floor, lamp, learner_of, map_of, observe, row_of, surface
 
-from mitsuba_ext.decisions.defaults import EmitterSampling
-from mitsuba_ext.decisions.light_selection import LightSelection, OneRow
+from mitsuba_ext.decisions.next_event.light_table import LightSelection, OneRow
 from mitsuba_ext.lights import weights as lights_weights
 from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.transport.path_decisions import EmitterSampling
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -12,12 +12,13 @@ import pytest
 from maps import floor, lamp, learner_of, map_of, observe, row_of, surface, vertices
 from statistical import assert_same_mean
 
-from mitsuba_ext.decisions.light_roulette import LightRoulette
-from mitsuba_ext.decisions.light_selection import Choice, LightSelection
-from mitsuba_ext.learning.light_map import LightMap
-from mitsuba_ext.learning.scout import Scout, region
-from mitsuba_ext.learning.surface_rows import RowCounts, SurfaceRows
+from mitsuba_ext.decisions.next_event.light_map import LightMap
+from mitsuba_ext.decisions.next_event.light_table import Choice, LightSelection
+from mitsuba_ext.decisions.scout import Scout
+from mitsuba_ext.decisions.shadow_test.light_map_roulette import LightRoulette
 from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.regions.surface_rows import RowCounts, SurfaceRows
+from mitsuba_ext.regions.surface_sides import region
 
 pytestmark = pytest.mark.usefixtures("variant")
 

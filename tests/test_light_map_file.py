@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from maps import floor, lamp, map_of
 
-from mitsuba_ext.decisions.light_learner import LightLearner
-from mitsuba_ext.learning import light_map_file
+from mitsuba_ext.decisions.next_event import light_map_file
+from mitsuba_ext.decisions.next_event.light_map_learner import LightLearner
 from mitsuba_ext.lights.division import emitter_shapes
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from maps import floor, lamp, surface
 
-from mitsuba_ext.decisions.light_selection import LightSelection, OneRow
-from mitsuba_ext.decisions.linear_selection import LinearSelection
+from mitsuba_ext.decisions.next_event.light_table import LightSelection, OneRow
+from mitsuba_ext.decisions.next_event.linear_lights import LinearSelection
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.lights.power import emitter_powers
 from mitsuba_ext.lights.spectra import brightness

@@ -11,8 +11,8 @@ from scipy import stats
 from statistical import REFERENCE_SEEDS, SEEDS, assert_same_mean, batches
 from techniques import REFERENCE
 
-from mitsuba_ext.decisions.linear_selection import LinearSelection
-from mitsuba_ext.walk import Walk
+from mitsuba_ext.decisions.next_event.linear_lights import LinearSelection
+from mitsuba_ext.transport.walk import Walk
 
 pytestmark = pytest.mark.usefixtures("variant")
 

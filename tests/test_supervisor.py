@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from mitsuba_ext import interrupts, marks
+from mitsuba_ext import marks
 from mitsuba_ext.cli import supervisor
 from mitsuba_ext.compare import InputError
+from mitsuba_ext.rendering.render import interrupts
 
 #: What the lines of a worker can use. It is started anew with the same lines.
 WORKER = """

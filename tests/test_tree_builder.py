@@ -7,8 +7,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.learning.sample_trees import LEAF, SampleTrees
-from mitsuba_ext.learning.tree_builder import DEPTH, Samples, TreeBuilder, cell_centre, cell_code
+from mitsuba_ext.decisions.directions.sample_trees import LEAF, SampleTrees
+from mitsuba_ext.decisions.directions.tree_builder import (
+    DEPTH,
+    Samples,
+    TreeBuilder,
+    cell_centre,
+    cell_code,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -13,8 +13,8 @@ from batched import film_channels, render_batches, small_scene, with_variance
 from hard_cases import film, lookat, sensor, stage
 from statistical import THRESHOLD, z_exact
 
-from mitsuba_ext.batches import Batches, batch_seeds, each_batch
 from mitsuba_ext.compare import read_exr
+from mitsuba_ext.rendering.batches import Batches, batch_seeds, each_batch
 
 pytestmark = pytest.mark.usefixtures("variant")
 

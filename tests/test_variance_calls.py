@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from batched import film_channels, render_batches, small_scene, with_variance
 
-from mitsuba_ext.batches import batch_seeds
+from mitsuba_ext.rendering.batches import batch_seeds
 
 pytestmark = pytest.mark.usefixtures("variant")
 

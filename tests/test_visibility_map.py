@@ -7,9 +7,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.decisions.visibility_roulette import VisibilityLearner, VisibilityRoulette
-from mitsuba_ext.learning.visibility_map import MAX_VOXELS, VisibilityMap, _row_and_column
-from mitsuba_ext.learning.voxel_grid import VoxelGrid
+from mitsuba_ext.decisions.shadow_test.visibility_map import (
+    MAX_VOXELS,
+    VisibilityMap,
+    _row_and_column,
+)
+from mitsuba_ext.decisions.shadow_test.visibility_roulette import (
+    VisibilityLearner,
+    VisibilityRoulette,
+)
+from mitsuba_ext.regions.voxel_grid import VoxelGrid
 
 pytestmark = pytest.mark.usefixtures("variant")
 

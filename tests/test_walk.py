@@ -11,7 +11,7 @@ import mitsuba as mi
 import pytest
 
 from mitsuba_ext.decisions import DirectionSamples, EmitterSampling, SceneQuery, ShadowTest
-from mitsuba_ext.walk import Walk
+from mitsuba_ext.transport.walk import Walk
 
 BOUNCES = 4
 

@@ -11,13 +11,13 @@ import mitsuba as mi
 import numpy as np
 from rich.progress import Progress
 
-from ..batches import sample_count
 from ..compare import timing
 from ..errors import InputError
 from ..progress import progress_bars
+from ..rendering.batches import sample_count
+from ..rendering.seed_passes import SeedPasses, can_render, is_independent
 from ..scene_remarks import scene_remarks
 from ..scenes import LoadedScene, load_scene, one_line
-from ..seed_passes import SeedPasses, can_render, is_independent
 from ..specifications import make_named
 
 

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 
-from .. import interrupts
+from ..rendering import interrupts
 from .common import INTERRUPTED, say
 
 

@@ -24,8 +24,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from .. import interrupts, marks
+from .. import marks
 from ..processes import python_command
+from ..rendering import interrupts
 from .common import INTERRUPTED, say
 
 #: What the context's ``obj`` is in a process that was started from a shell.

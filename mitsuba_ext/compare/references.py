@@ -22,9 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..batches import Batches, batch_seeds, each_batch
 from ..files import replacing
 from ..marks import mark_of, marked
+from ..rendering.batches import Batches, batch_seeds, each_batch
 from ..scenes import InputError, LoadedScene, one_line, scene_name
 from ..specifications import NamedIntegrator, Specification, make_named
 from . import images, metrics

@@ -6,13 +6,13 @@ import gc
 import time
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..batches import sample_count
-from ..decisions.moving_scene import check_motion_is_seen
+from ..movers import check_motion_is_seen
+from ..rendering.batches import sample_count
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from ..rendering import RenderStatistics
+    from ..rendering.render import RenderStatistics
 
 #: More would not fit into the 2^32 samples of a wavefront even for a film of 16x16 pixels.
 _MAX_SPP = 2**24
@@ -87,7 +87,7 @@ def timed_render(
 
 def own_statistics(integrator: mi.Integrator) -> RenderStatistics | None:
     """What an integrator of ours says about its last render; Mitsuba's say nothing."""
-    from ..rendering import RenderStatistics
+    from ..rendering.render import RenderStatistics
 
     report = getattr(integrator, "statistics", None)
     return report if isinstance(report, RenderStatistics) else None

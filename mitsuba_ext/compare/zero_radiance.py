@@ -17,8 +17,8 @@ def zero_radiance_share(integrator: mi.Integrator, scene: mi.Scene, seed: int) -
     import drjit as dr
     import mitsuba as mi
 
-    from .. import camera
-    from ..decisions.camera_samples import CameraSamples
+    from ..rendering import camera
+    from ..rendering.camera_samples import CameraSamples
 
     if not isinstance(integrator, mi.SamplingIntegrator):
         return None

@@ -5,6 +5,12 @@ loop (draw there what a whole path needs), and methods that take the state and r
 the state of a decision that remembers nothing. Attributes are read-only while the walk runs.
 """
 
-from .defaults import AlwaysTest, DirectionSamples, EmitterSampling, SceneQuery, ShadowTest
+from ..transport.path_decisions import (
+    AlwaysTest,
+    DirectionSamples,
+    EmitterSampling,
+    SceneQuery,
+    ShadowTest,
+)
 
 __all__ = ["AlwaysTest", "DirectionSamples", "EmitterSampling", "SceneQuery", "ShadowTest"]

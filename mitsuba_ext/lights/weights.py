@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..learning.surface_rows import SurfaceRows
-from ..learning.voxel_grid import VoxelGrid
+from ..regions.surface_rows import SurfaceRows
+from ..regions.voxel_grid import VoxelGrid
 from .environment import brightness, some_wavelengths
 from .light_cells import LightCells
 from .power import emitter_powers

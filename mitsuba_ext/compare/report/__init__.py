@@ -28,7 +28,7 @@ def write_report(folder: str | Path) -> Path:
         InputError: There is no ``results.json``, or it cannot be read.
         OSError: The report cannot be written; one that was there before stays.
     """
-    from .page import render_page  # what it needs is only loaded where a report is written
+    from .page import render_page
 
     folder = Path(folder)
     page = render_page(read_results(folder), folder)

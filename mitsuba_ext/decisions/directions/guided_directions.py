@@ -1,0 +1,103 @@
+"""Choosing directions by trees of primary samples.
+
+Source: Guo, PhD thesis, chapter 2; Eq. 2.12 (the factors of a path's samples).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from ...transport.path_decisions import DirectionSamples, EmitterSampling
+from .sample_trees import SampleTrees
+
+
+class Regions(Protocol):
+    """What decides which tree a sample is drawn from."""
+
+    def begin(self, pixel: mi.UInt32 | None) -> Any:
+        """The state of paths that begin in ``pixel``."""
+
+    def label(
+        self, si: mi.SurfaceInteraction3f, pixel: mi.UInt32, active: mi.Bool
+    ) -> mi.UInt32:
+        """The region by which a sample is recorded."""
+
+    def tree(self, state: Any, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
+        """The tree for a vertex."""
+
+    def after(
+        self, state: Any, trees: SampleTrees, leaf: mi.UInt32, active: mi.Bool
+    ) -> Any:
+        """The state after a sample was drawn from a leaf."""
+
+
+class GuidedDirections(DirectionSamples):
+    """Draws the samples of a path's first directions from trees. Everything that a path brings
+    after a bounce is divided by the density of its sample; MIS weights remain those of uniform
+    samples, which is unbiased, as they add up to one in each direction.
+
+    Parameters (and attributes):
+        trees: Densities of samples.
+        regions: Which of them a sample is drawn from.
+        bounces: How many directions of a path are guided.
+    """
+
+    def __init__(self, trees: SampleTrees, regions: Regions, bounces: int) -> None:
+        self.trees, self.regions, self.bounces = trees, regions, bounces
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
+        return self.regions.begin(pixel)
+
+    def draw(self, state, sampler, si, depth, active):
+        sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
+        # A branch: later bounces are to cost nothing
+        sample_2, weight, state = dr.if_stmt(
+            (state, si, sample_2),
+            active & (depth < self.bounces),
+            self._guide,
+            lambda state, si, sample: (sample, mi.Float(1), state),
+        )
+        return sample_1, sample_2, weight, state
+
+    def _guide(self, state, si, sample):
+        active = mi.Bool(True)
+        tree = self.regions.tree(state, si, active)
+        sample, density, leaf = self.trees.sample(tree, sample, active)
+        return sample, dr.rcp(density), self.regions.after(state, self.trees, leaf, active)
+
+    def density(
+        self, si: mi.SurfaceInteraction3f, pixel: mi.UInt32 | None, u: mi.Point2f
+    ) -> mi.Float:
+        """The density of ``u`` among the samples that choose the first direction, for paths that
+        begin in ``pixel`` of the film (row by row) and meet ``si`` first."""
+        active = mi.Bool(True)
+        tree = self.regions.tree(self.regions.begin(pixel), si, active)
+        return self.trees.density(tree, u, active)[0]
+
+
+class LaterConnections(EmitterSampling):
+    """Another choice of lights, but for a path's first vertex: there, light is found by BSDF
+    samples only (the setting of the thesis's section 2.4.2)."""
+
+    def __init__(self, choice: EmitterSampling) -> None:
+        self._choice = choice
+
+    def begin(self, sampler, ray):
+        return mi.UInt32(0), self._choice.begin(sampler, ray)
+
+    def sample(self, state, scene, sampler, si, active):
+        vertex, inner = state
+        ds, weight, inner = self._choice.sample(inner, scene, sampler, si, active)
+        # No BSDF sample runs into a light without extent
+        connects = (vertex > 0) | ds.delta
+        ds.pdf = dr.select(connects, ds.pdf, 0)
+        return ds, dr.select(connects, weight, 0), (vertex + 1, inner)
+
+    def pdf(self, state, scene, ref, si, ds, active):
+        vertex, inner = state
+        is_later = vertex > 1
+        pdf, inner = self._choice.pdf(inner, scene, ref, si, ds, active & is_later)
+        return dr.select(is_later, pdf, 0), (vertex, inner)

@@ -1,0 +1,150 @@
+"""Recording which primary samples paths used, and what they brought back from there on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+
+from ...transport.observer import Observer
+from .tree_builder import DEPTH, cell_code, joined
+
+#: Bytes of a record, at most: what is kept of it, and what trees are built from.
+BYTES_PER_RECORD = 320
+
+#: Paths that follow each other, and so begin close together: their mean is what errors are
+#: relative to, but for this share of the squared mean of all.
+_NEIGHBOURS, _FLOOR = 64, 1e-2
+
+
+class PathRecords(Observer):
+    """Records the first bounces of paths.
+
+    Parameters:
+        region: To which region the number of a vertex belongs (a surface interaction, the pixel of
+            each lane and a mask are given).
+        bounces: Bounces of a path that are recorded.
+        stride: One in so many paths is recorded.
+
+    Attributes:
+        paths (int): How many paths were recorded.
+        region, code (mi.UInt32): Of each sample: its region, and the cell of the primary sample.
+        history (mi.UInt32): The cells of the path's earlier samples, the last one in the low byte.
+        bounce (mi.UInt32): 0 for the first.
+        value (mi.Float): What the path brought from there on, divided by densities of samples.
+        weight (mi.Float): 1 / density of the sample.
+        importance (mi.Float): By how much a squared error counts, at the place in the image.
+        variance (float): Sum over the paths of the squared errors that they make, weighted so.
+    """
+
+    def __init__(
+        self,
+        region: Callable[[mi.SurfaceInteraction3f, mi.UInt32, mi.Bool], mi.UInt32],
+        bounces: int,
+        stride: int,
+    ) -> None:
+        self._region, self.bounces, self._stride = region, bounces, stride
+        self._lanes, self._passes = 0, []
+        self.restart_counting()
+
+    def restart_counting(self) -> None:
+        """Lets ``paths``, ``variance`` and ``first_new`` speak of what comes from now on."""
+        self.paths, self.variance = 0, 0.0
+        self.first_new = self.count
+
+    @property
+    def count(self) -> int:
+        """How many samples there are, after :meth:`finish`."""
+        return len(self.code) if self._passes else 0
+
+    # ---- Observer of the walk ----
+
+    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
+        self._collect()
+        self._lanes = -(-lanes // self._stride)
+        self._pixel = pixel
+        lane = dr.arange(mi.UInt32, lanes)
+        stride = dr.opaque(mi.UInt32, self._stride)
+        self._path = lane // stride
+        self._is_recorded = self._path * stride == lane
+        slots = self._lanes * self.bounces
+        self._keys, self._weights, self._before, self._total = (
+            dr.zeros(mi.UInt32, slots), dr.zeros(mi.Float, slots), dr.zeros(mi.Float, slots),
+            dr.zeros(mi.Float, self._lanes),
+        )
+        self._slots = dr.opaque(mi.UInt32, self._lanes)
+        dr.eval(self._keys, self._weights, self._before, self._total)
+
+    def direction(self, si, depth, sample, weight, L, active) -> None:
+        active = active & self._is_recorded & (depth < self.bounces)
+        key = (self._region(si, self._pixel, active) << DEPTH) | cell_code(sample)
+        slot = depth * self._slots + self._path
+        dr.scatter(self._keys, key, slot, active)
+        dr.scatter(self._weights, mi.Float(weight), slot, active)
+        dr.scatter(self._before, _brightness(L), slot, active)
+
+    def end(self, L: mi.Spectrum) -> None:
+        dr.scatter(self._total, _brightness(L), self._path, self._is_recorded)
+
+    # ---- Between passes ----
+
+    def finish(self) -> None:
+        """Ends the observation of a stage."""
+        self._collect()
+        if not self._passes:
+            return
+        columns = [joined(parts) for parts in zip(*self._passes)]
+        self.region, self.code, self.history, self.bounce = columns[:4]
+        self.value, self.weight, self.importance = columns[4:]
+        self._passes = [columns]
+
+    def _collect(self) -> None:
+        """Keeps what the last pass has recorded."""
+        if self._lanes == 0:
+            return
+        importance, error = _importance(self._total)
+        self.paths += self._lanes
+        self.variance += float(dr.sum(mi.Float64(error))[0])
+        slot = dr.compress(self._weights > 0)
+        self._lanes = 0
+        if len(slot) == 0:
+            return
+        key, weight, before = (
+            dr.gather(type(x), x, slot) for x in (self._keys, self._weights, self._before)
+        )
+        bounce = slot // self._slots
+        path = slot - bounce * self._slots
+        value = dr.maximum(dr.gather(mi.Float, self._total, path) - before, 0)
+        # A path of infinite radiance must not decide
+        value = dr.select(dr.isfinite(value), value, 0)
+        history = dr.zeros(mi.UInt32, len(slot))
+        for earlier in range(min(self.bounces - 1, 32 // DEPTH)):
+            is_earlier = earlier < bounce
+            code = dr.gather(mi.UInt32, self._keys, earlier * self._slots + path, is_earlier)
+            code &= (1 << DEPTH) - 1
+            history = dr.select(is_earlier, (history << DEPTH) | code, history)
+        columns = [
+            key >> DEPTH, key & ((1 << DEPTH) - 1), history, bounce, value, weight,
+            dr.gather(mi.Float, importance, path),
+        ]
+        dr.eval(columns)
+        self._passes.append(columns)
+        self._keys = self._weights = self._before = self._total = self._pixel = None
+
+
+def _importance(total: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """For each path, by how much squared errors count at its place, and its own, weighted so."""
+    total = dr.select(dr.isfinite(total), total, 0)
+    path = dr.arange(mi.UInt32, -(-len(total) // _NEIGHBOURS) * _NEIGHBOURS)
+    # The last group is filled up from the beginning
+    filled = dr.gather(mi.Float, total, path % dr.opaque(mi.UInt32, len(total)))
+    mean = dr.repeat(dr.block_sum(filled, _NEIGHBOURS) / _NEIGHBOURS, _NEIGHBOURS)
+    mean = dr.gather(mi.Float, mean, dr.arange(mi.UInt32, len(total)))
+    importance = dr.rcp(dr.square(mean) + _FLOOR * dr.square(dr.mean(total)) + 1e-30)
+    return importance, dr.square(total - mean) * importance
+
+
+def _brightness(L: mi.Spectrum) -> mi.Float:
+    """One number for a path's radiance: errors count the same in all channels."""
+    return dr.mean(L)

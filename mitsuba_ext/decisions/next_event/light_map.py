@@ -1,0 +1,210 @@
+"""What is learned about lights: how much of each cell reaches each row of surfaces.
+
+Sources: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, section 4.2 (=
+Guo's thesis, section 3.4.2) for the idea; cells, sides, contributions and the estimators are ours.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ...lights.environment import brightness
+from ...lights.light_cells import LightCells
+from ...lights.weights import unoccluded_weights
+from ...regions.surface_rows import SurfaceRows
+from ...transport.observer import Observer
+from .light_table import Choice
+
+#: Fixed point of the squared ratios. They are clipped: a single one must not decide.
+_UNIT, _LIMIT = 2.0**20, 16.0
+
+#: What one test can add to the sum of squares.
+MOST_SQUARED = int(_UNIT * _LIMIT)
+
+#: What the expectation is worth, in tests: for visibility, and for the mean square.
+_PRIOR_TESTS, _PRIOR_SQUARES = 1.0, 4.0
+
+#: What a diffuse surface of little albedo reflects, in units of a white one without the 1/π.
+_DARK = 0.1
+
+#: Tests of an entry, about, that are enough: where a pilot brings more, not all are recorded.
+_ENOUGH_TESTS, _TESTS_PER_SAMPLE = 32, 2
+
+#: Relative variance of a row, at most: few dark ones must not decide for all.
+_MOST_VARIANCE = 100.0
+
+#: Bytes of an entry, at most: the expectation, the counters, the table that is made of them, and
+#: what that takes in between.
+BYTES_PER_ENTRY = 128
+
+
+class LightMap(Observer):
+    """Counts, for each row of surfaces and each cell of the lights, shadow rays and what they
+    brought. An observer of the walk, whose lights must be chosen by a selection with these rows and
+    cells. Counters are integers, so that the same samples give bitwise the same map.
+
+    Parameters:
+        scene: The scene to learn.
+        rows, cells: What is lit, and by what.
+        samples: How many samples will be observed, about.
+
+    Attributes:
+        unoccluded (mi.Float): What each cell contributes to each row if nothing is in between.
+        tests, successes (mi.UInt32): Shadow rays, and how many of them arrived.
+        squares (mi.UInt64): Sum of the squared contributions in units of ``unoccluded``.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, rows: SurfaceRows, cells: LightCells, samples: int = 0
+    ) -> None:
+        self.rows, self.cells = rows, cells
+        self.unoccluded = unoccluded_weights(scene, rows, cells)
+        self._count = dr.opaque(mi.UInt32, cells.count)
+        entries = rows.count * cells.count
+        # Tests in the low half, successes in the high one: one addition counts both
+        self._counts = dr.zeros(mi.UInt64, entries)
+        self.squares = dr.zeros(mi.UInt64, entries)
+        # Opaque, too: one in so many lanes is recorded
+        enough = _ENOUGH_TESTS * entries
+        self._stride = dr.opaque(mi.UInt32, max(1, samples * _TESTS_PER_SAMPLE // enough))
+        self._is_recorded = mi.Bool(True)
+        dr.eval(self.unoccluded, self._counts, self.squares)
+
+    # ---- Observer of the walk ----
+
+    def begin(self, lanes: int, pixel: mi.UInt32 | None = None) -> None:
+        # Scattered: lanes that follow each other are the samples of one pixel, row by row
+        scattered = (dr.arange(mi.UInt32, lanes) * 0x9E3779B9) >> 8
+        self._is_recorded = scattered % self._stride == 0
+
+    def connection(
+        self,
+        choice: Choice,
+        si: mi.SurfaceInteraction3f,
+        ds: mi.DirectionSample3f,
+        contribution: mi.Spectrum,
+        visible: mi.Bool,
+        tested: mi.Bool,
+    ) -> None:
+        """A shadow ray was traced; it would have brought ``contribution``."""
+        entry = choice.row * self._count + choice.cell
+        tested = tested & self._is_recorded
+        expected = dr.gather(mi.Float, self.unoccluded, entry, tested)
+        known = visible & tested & (expected > 0)
+        # What the cell contributes, whatever the probability of choosing it
+        value = brightness(contribution) * choice.probability
+        square = dr.square(dr.select(known, value / expected, 0))
+        square = dr.select(dr.isfinite(square), dr.minimum(square, _LIMIT), 0)
+        dr.scatter_add(
+            self._counts, dr.select(visible, mi.UInt64((1 << 32) + 1), 1), entry, tested
+        )
+        dr.scatter_add(self.squares, mi.UInt64(square * _UNIT), entry, known)
+
+    # ---- What was learned ----
+
+    @property
+    def tests(self) -> mi.UInt32:
+        return mi.UInt32(self._counts & 0xFFFFFFFF)
+
+    @property
+    def successes(self) -> mi.UInt32:
+        return mi.UInt32(self._counts >> 32)
+
+    def restore(self, tests: mi.UInt32, successes: mi.UInt32, squares: mi.UInt64) -> None:
+        """Takes over the counts of another map with the same rows and cells."""
+        self._counts = mi.UInt64(tests) | (mi.UInt64(successes) << 32)
+        self.squares = mi.UInt64(squares)
+        self.evaluate()
+
+    def evaluate(self) -> None:
+        """Ends the observation of a stage."""
+        dr.eval(self._counts, self.squares)
+
+    def visibility(self) -> mi.Float:
+        """The probability that a shadow ray from a row to a cell arrives; shape [rows · cells].
+
+        Where few were tested, the expectation decides: that of the same cell in the surroundings
+        (twice the voxel), behind which stands that of the cell in the whole scene, and behind that
+        one the mean of all.
+        """
+        count = self.cells.count
+        entry = dr.arange(mi.UInt32, self.rows.count * count)
+        row = entry // count
+        cell = entry - row * count
+        tests, successes = (int(dr.sum(mi.UInt64(n))[0]) for n in (self.tests, self.successes))
+        # Half a success in one more test: the prior is never certain
+        overall = dr.opaque(mi.Float, (successes + 0.5) / (tests + 1))
+        expected = self._shrunk(cell, count, overall)
+        near, near_count = self.rows.coarse()
+        # The last row has no surroundings
+        near = dr.concat([near, dr.full(mi.UInt32, near_count, 1)])
+        group = dr.gather(mi.UInt32, near, row) * count + cell
+        expected = self._shrunk(group, (near_count + 1) * count, expected)
+        return (mi.Float(self.successes) + _PRIOR_TESTS * expected) / (
+            mi.Float(self.tests) + _PRIOR_TESTS
+        )
+
+    def _shrunk(self, group: mi.UInt32, group_count: int, expected: mi.Float) -> mi.Float:
+        """For each entry, the success rate of its group, drawn to ``expected``."""
+        tests, successes = (dr.zeros(mi.UInt32, group_count) for _ in range(2))
+        dr.scatter_add(tests, self.tests, group)
+        dr.scatter_add(successes, self.successes, group)
+        tests, successes = (mi.Float(dr.gather(mi.UInt32, n, group)) for n in (tests, successes))
+        return (successes + _PRIOR_TESTS * expected) / (tests + _PRIOR_TESTS)
+
+    def weights(self, target: str) -> mi.Float:
+        """The weights of a selection; shape [rows · cells].
+
+        Parameters:
+            target: ``visibility`` for the unoccluded contribution times the probability that a
+                shadow ray arrives, ``contribution`` for the root of the mean square of what
+                arrived, BSDF included.
+        """
+        visibility = self.visibility()
+        if target == "visibility":
+            return self.unoccluded * visibility
+        return self.unoccluded * dr.sqrt(self._square(visibility))
+
+    def _square(self, visibility: mi.Float) -> mi.Float:
+        """The mean square of what a shadow ray brought, in units of ``unoccluded`` squared."""
+        squares = mi.Float(self.squares) / _UNIT
+        # The mean square of what arrived, and of one more success of a dark surface
+        total = int(dr.sum(self.squares)[0]) / _UNIT + _DARK**2
+        arrived = dr.opaque(mi.Float, total / (int(dr.sum(mi.UInt64(self.successes))[0]) + 1))
+        return (squares + _PRIOR_SQUARES * visibility * arrived) / (
+            mi.Float(self.tests) + _PRIOR_SQUARES
+        )
+
+    def relative_variances(self, *selections: mi.Float) -> list[float]:
+        """How much next event estimation will scatter: its variance in units of its squared mean,
+        averaged over the vertices that were observed.
+
+        Parameters:
+            selections: Probabilities of the cells in each row, which add up to one there.
+        """
+        count = self.cells.count
+        visibility = self.visibility()
+        # In units of the row: squares of any light's brightness are numbers then
+        row = dr.repeat(dr.block_sum(self.unoccluded, count), count)
+        square = dr.square(self.unoccluded / row) * self._square(visibility)
+        # What a cell brings on average, if all that arrives of it is alike
+        mean = dr.block_sum(dr.sqrt(square * visibility), count)
+        vertices = mi.Float(dr.block_sum(self.tests, count))
+        results = []
+        for p in selections:
+            second_moment = dr.block_sum(dr.select(p > 0, square / p, 0), count)
+            variance = dr.clip(second_moment / dr.square(mean) - 1, 0, _MOST_VARIANCE)
+            is_known = (vertices > 0) & dr.isfinite(variance)
+            total = dr.sum(dr.select(is_known, vertices * variance, 0))
+            results.append(float(total[0]) / max(1.0, float(dr.sum(vertices)[0])))
+        return results
+
+    def __str__(self) -> str:
+        seen, succeeded = (int(dr.count(n > 0)[0]) for n in (self.tests, self.successes))
+        entries = len(self.tests)
+        return (
+            f"light map: grid {self.rows.resolution}, {self.rows.count} rows, {self.cells.count} "
+            f"cells of lights, {entries} entries ({seen} seen, {succeeded} with a success), "
+            f"{entries * BYTES_PER_ENTRY / 2**20:.1f} MiB"
+        )

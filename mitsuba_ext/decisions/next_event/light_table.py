@@ -1,0 +1,126 @@
+"""Choosing among lights by a table of probabilities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from ...lights.light_cells import LightCells
+from ...lights.searching import alias_tables
+from ...transport.path_decisions import EmitterSampling
+
+#: Entries of a table that are computed together: they need some memory.
+_ENTRIES_AT_ONCE = 1 << 20
+
+#: Bytes of an entry, and of the weights that it is made of while they are computed.
+TABLE_BYTES = 40
+
+
+class Rows(Protocol):
+    """What decides which row of a table a surface point uses."""
+
+    count: int
+
+    def row(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
+        """The row of a point."""
+
+
+class OneRow:
+    """The same probabilities everywhere."""
+
+    count = 1
+
+    def row(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
+        return mi.UInt32(0)
+
+
+@dataclass
+class Choice:
+    """The state of a light selection: the last choice.
+
+    Attributes:
+        row: Row of the table at the last vertex.
+        cell: What was chosen there.
+        probability: With what probability.
+    """
+
+    row: mi.UInt32
+    cell: mi.UInt32
+    probability: mi.Float
+
+
+class LightSelection(EmitterSampling):
+    """Chooses a cell with the probabilities of the vertex's row, then a point on it.
+
+    Parameters:
+        rows: Which row a vertex uses.
+        cells: What there is to choose.
+        weights: For each row, a weight for each cell; shape [rows · cells], not negative. A row of
+            zeros chooses uniformly.
+    """
+
+    def __init__(self, rows: Rows, cells: LightCells, weights: mi.Float) -> None:
+        self.rows, self.cells = rows, cells
+        self._table = _table(weights, rows.count, cells.count)
+        # Opaque: scenes that differ in it only share their kernels
+        self._count = dr.opaque(mi.UInt32, cells.count)
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Choice:
+        return Choice(mi.UInt32(0), mi.UInt32(0), mi.Float(0))
+
+    def sample(self, state, scene, sampler, si, active):
+        row = self.rows.row(si, active)
+        # Two numbers: what is left of one, after choosing among many entries, is too coarse
+        x, y = sampler.next_2d()
+        cell = dr.minimum(mi.UInt32(x * mi.Float(self._count)), self._count - 1)
+        entry = dr.gather(mi.Vector4f, self._table, row * self._count + cell, active)
+        is_taken = y < entry[0]
+        cell = dr.select(is_taken, cell, dr.reinterpret_array(mi.UInt32, entry[1]))
+        probability = dr.select(is_taken, entry[2], entry[3])
+        ds, weight = self.cells.sample(cell, si, sampler.next_2d(), active)
+        ds.pdf *= probability
+        weight = dr.select(probability > 0, weight / probability, 0)
+        return ds, weight, Choice(row, cell, probability)
+
+    def pdf(self, state, scene, ref, si, ds, active):
+        # Few rays run into a light: the others jump over all this
+        return _if(active, self._density, (state.row, ref, si, ds, active)), state
+
+    def _density(self, row, ref, si, ds, active) -> mi.Float:
+        cell, pdf = self.cells.pdf(ref, si, ds, active)
+        entry = row * self._count + cell
+        probability = dr.gather(mi.Float, self._table, 4 * entry + 2, active)
+        # Also where the lookups above were masked, the density must be a number
+        return dr.select(active, pdf * probability, 0)
+
+
+def _table(weights: mi.Float, rows: int, count: int) -> mi.Float:
+    """For each entry of an alias table its threshold, the cell of its alias, its own probability
+    and that of the alias. Side by side: a draw reads them with one access to memory."""
+    table = dr.empty(mi.Float, 4 * rows * count)
+    step = max(1, _ENTRIES_AT_ONCE // count)
+    for begin in range(0, rows, step):
+        entry = dr.arange(mi.UInt32, min(step, rows - begin) * count)
+        offset = dr.opaque(mi.UInt32, begin * count)
+        part = mi.Float64(dr.gather(mi.Float, weights, entry + offset))
+        total = dr.repeat(dr.block_sum(part, count), count)
+        relative = dr.select(total > 0, part * (count / total), 1)
+        first = entry - entry % count
+        threshold, alias = alias_tables(relative, first, first + (count - 1), count)
+        probability = mi.Float(relative / count)
+        dr.eval(threshold, alias, probability)
+        cell = dr.reinterpret_array(mi.Float, alias - first)
+        values = mi.Vector4f(threshold, cell, probability, dr.gather(mi.Float, probability, alias))
+        dr.scatter(table, values, entry + offset)
+        dr.eval(table)
+    return table
+
+
+def _if(active: mi.Bool, function, arguments: tuple) -> mi.Float:
+    """``function(*arguments)`` where ``active``, 0 elsewhere."""
+    return dr.if_stmt(
+        arguments, active, lambda *values: function(*values), lambda *_values: mi.Float(0)
+    )

@@ -1,0 +1,143 @@
+"""How a ray meets a scene in which things move: what moves is traced in a scene of its own, by a
+ray that is taken to the frame in which the things rest."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...motion import PoseTable
+from ...movers import movers
+from ...transport.path_decisions import SceneQuery
+
+#: The owner of what does not move.
+_NOBODY = 0xFFFFFFFF
+
+
+def scene_query(scene: mi.Scene) -> SceneQuery:
+    """The query that sees all of ``scene``; the default one where nothing moves.
+
+    Raises:
+        ValueError: A shape belongs to two movers, or to one and to the static scene.
+    """
+    moving = movers(scene)
+    return MovingSceneQuery(scene, moving) if moving else SceneQuery()
+
+
+class MovingSceneQuery(SceneQuery):
+    """Static scene and moving things.
+
+    Parameters:
+        scene: The static scene.
+        moving: What moves, as from :func:`movers`.
+    """
+
+    def __init__(self, scene: mi.Scene, moving: Sequence[mi.Shape]) -> None:
+        self._scenes = [mover.at_rest for mover in moving]
+        self._poses = PoseTable([mover.motion for mover in moving])
+        self._boxes = [_Box(mover.bbox()) for mover in moving]
+        self._owners = self._find_owners(scene, moving)
+
+    def closest(self, scene, ray, coherent, active):
+        pi = super().closest(scene, ray, coherent, active)
+        ray = mi.Ray3f(ray)
+        for index, (at_rest, box) in enumerate(zip(self._scenes, self._boxes)):
+            # What is behind that which was found already cannot be hit
+            ray.maxt = dr.select(pi.valid, pi.t, ray.maxt)
+            pi = dr.if_stmt(
+                (pi, ray),
+                active & box.is_met(ray),
+                functools.partial(self._closer, at_rest, index, coherent),
+                lambda pi, _ray: pi,
+                label="mover",
+            )
+        return pi
+
+    def _closer(self, at_rest, index, coherent, pi, ray):
+        found = at_rest.ray_intersect_preliminary(
+            self._to_rest(mi.UInt32(index), ray), coherent=coherent, reorder=False
+        )
+        return dr.select(found.valid, found, pi)
+
+    def interaction(self, pi, ray):
+        shape = dr.select(pi.instance != None, pi.instance, pi.shape)  # noqa: E711
+        owner = dr.gather(mi.UInt32, self._owners, _number(shape), pi.valid)
+        moves = pi.valid & (owner != _NOBODY)
+        # One call of the shape's method for all, wherever the ray is
+        ray = dr.if_stmt((owner, ray), moves, self._to_rest, lambda _owner, ray: ray)
+        si = super().interaction(pi, ray)
+        return dr.if_stmt((owner, si), moves, self._to_world, lambda _owner, si: si)
+
+    def occluded(self, scene, si, ds, active):
+        ray = self.shadow_ray(scene, si, ds)
+        occluded = scene.ray_test(ray, active=active)
+        for index, (at_rest, box) in enumerate(zip(self._scenes, self._boxes)):
+            occluded = dr.if_stmt(
+                (occluded, ray),
+                active & ~occluded & box.is_met(ray),
+                functools.partial(self._blocks, at_rest, index),
+                lambda occluded, _ray: occluded,
+                label="mover",
+            )
+        return occluded
+
+    def _blocks(self, at_rest, index, _occluded, ray):
+        return at_rest.ray_test(self._to_rest(mi.UInt32(index), ray))
+
+    # ---- Helpers ----
+
+    def _to_rest(self, index: mi.UInt32, ray: mi.Ray3f) -> mi.Ray3f:
+        return self._poses.pose(index, ray.time).to_rest(ray)
+
+    def _to_world(self, index: mi.UInt32, si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+        return self._poses.pose(index, si.time).to_world(si)
+
+    def _find_owners(self, scene: mi.Scene, moving: Sequence[mi.Shape]) -> mi.UInt32:
+        """The index of the mover to which a shape belongs, by the number of the shape."""
+        numbers = [[_number_of(shape) for shape in scene.shapes()]]
+        numbers += [[_number_of(shape) for shape in at_rest.shapes()] for at_rest in self._scenes]
+        owners = np.full(max(map(max, numbers)) + 1, _NOBODY, dtype=np.uint32)
+        taken = set(numbers[0])
+        for index, mover in enumerate(moving):
+            if not taken.isdisjoint(numbers[index + 1]):
+                raise ValueError(
+                    f'"{mover.name}": a shape that is nested in it is elsewhere in the scene as '
+                    f"well; give each place a shape of its own (or an instance of a shapegroup)"
+                )
+            taken.update(numbers[index + 1])
+            owners[numbers[index + 1]] = index
+        return mi.UInt32(owners)
+
+
+class _Box:
+    """A box that tells which rays may meet what it contains. Most rays miss what moves, and if all
+    rays of a packet do, they are spared the change of the frame and the search."""
+
+    def __init__(self, bounds: mi.ScalarBoundingBox3f) -> None:
+        # Rounding of the poses on the device
+        margin = 1e-5 * max(map(abs, [*bounds.min, *bounds.max]))
+        self._low = mi.Point3f(bounds.min) - margin
+        self._high = mi.Point3f(bounds.max) + margin
+        # Another motion must not ask for another kernel
+        dr.make_opaque(self._low, self._high)
+
+    def is_met(self, ray: mi.Ray3f) -> mi.Bool:
+        """May there be a hit before ``ray.maxt``?"""
+        # A component 0 gives ±∞, and NaN only in the plane of a side, where there is nothing
+        inverse = dr.rcp(ray.d)
+        a, b = (self._low - ray.o) * inverse, (self._high - ray.o) * inverse
+        near, far = dr.max(dr.fmin(a, b)), dr.min(dr.fmax(a, b))
+        # Slightly more than the rounding errors of both distances
+        return (near <= far * (1 + 1e-6)) & (far >= 0) & (near <= ray.maxt)
+
+
+def _number(shape: mi.ShapePtr) -> mi.UInt32:
+    return dr.reinterpret_array(mi.UInt32, shape)
+
+
+def _number_of(shape: mi.Shape) -> int:
+    return int(_number(mi.ShapePtr(shape))[0])

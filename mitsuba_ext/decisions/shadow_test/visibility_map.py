@@ -1,0 +1,176 @@
+"""The voxel-to-voxel visibility map of NEE++.
+
+Source: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, sections 3.1-3.2
+(= Guo's thesis, section 3.3).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ...regions.voxel_grid import VoxelGrid
+
+#: Two counters, and twice a number in the roulette's table if there were lights in all voxels.
+_BYTES_PER_ENTRY = 16
+
+#: Rays of a refinement, however many entries there are.
+_MAX_REFINEMENT = 1 << 22
+
+#: Above, the numbers of the entries would not fit into 32 bits while they are computed.
+MAX_VOXELS = 0xFFFF
+
+#: The grid's table of numbers, and the marks that it is made of.
+_BYTES_PER_CELL = 8
+
+#: Length of the test segments of :meth:`VisibilityMap.refine`, short of the end point.
+_SEGMENT = 1 - 1e-4
+
+
+class VisibilityMap:
+    """Counts, for each pair of occupied voxels, how many segments between them were unoccluded.
+
+    The map is symmetric, so the lower triangle is stored. Counters are integers, so that the same
+    samples give bitwise the same map.
+
+    Parameters:
+        scene: The scene to learn.
+        grid: Voxels along each axis of the scene's bounding box.
+        max_memory: Bytes that the map may take. Where ``grid`` needs more, a coarser one is taken,
+            with a warning.
+
+    Attributes:
+        voxels: The grid.
+        tests, successes (mi.UInt32): The counters, one for each entry.
+    """
+
+    def __init__(self, scene: mi.Scene, grid: int, max_memory: int) -> None:
+        # The grid's own tables count too: they bound the resolution before anything is allocated
+        resolution = min(grid, max(1, int((max_memory / _BYTES_PER_CELL) ** (1 / 3))))
+        self.voxels = VoxelGrid(scene, resolution)
+        while self._memory() > max_memory or self.voxels.occupied_count > MAX_VOXELS:
+            if self.voxels.resolution == 1:
+                break
+            self.voxels = VoxelGrid(scene, int(0.8 * self.voxels.resolution))
+        if self.voxels.resolution < grid:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"The visibility map of grid={grid} would exceed max_memory="
+                f"{max_memory / 2**20:g} MiB: grid={self.voxels.resolution} is used.",
+            )
+        entries = self._entry_count()
+        self.tests = dr.zeros(mi.UInt32, entries)
+        self.successes = dr.zeros(mi.UInt32, entries)
+        self._holds_light = dr.zeros(mi.UInt32, self.voxels.occupied_count)
+
+    def _entry_count(self) -> int:
+        n = self.voxels.occupied_count
+        return n * (n + 1) // 2
+
+    def _memory(self) -> int:
+        cells = self.voxels.resolution**3
+        return self._entry_count() * _BYTES_PER_ENTRY + cells * _BYTES_PER_CELL
+
+    def entry(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """The index of the pair of voxels that hold ``p`` and ``q``, and whether both are known
+        (points at infinity and in voxels without geometry are not)."""
+        i, i_known = self.voxels.index(p, active)
+        j, j_known = self.voxels.index(q, active)
+        return self.entry_of(i, j), i_known & j_known
+
+    def entry_of(self, i: mi.UInt32, j: mi.UInt32) -> mi.UInt32:
+        """The index of a pair of voxels, in either order."""
+        row, column = dr.maximum(i, j), dr.minimum(i, j)
+        return row * (row + 1) // 2 + column
+
+    # ---- What the walk saw ----
+
+    def shadow_ray(self, p: mi.Point3f, q: mi.Point3f, visible: mi.Bool, active: mi.Bool) -> None:
+        """A shadow ray was traced from ``p`` to the point ``q`` on a light."""
+        entry, known = self.entry(p, q, active)
+        self._count(entry, visible, known)
+        light_voxel, known = self.voxels.index(q, known)
+        dr.scatter(self._holds_light, mi.UInt32(1), light_voxel, known)
+
+    def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
+        """A path went from ``p`` to ``q``: they see each other."""
+        entry, known = self.entry(p, q, active)
+        self._count(entry, mi.Bool(True), known)
+
+    def _count(self, entry: mi.UInt32, visible: mi.Bool, active: mi.Bool) -> None:
+        dr.scatter_add(self.tests, mi.UInt32(1), entry, active)
+        dr.scatter_add(self.successes, mi.UInt32(1), entry, active & visible)
+
+    # ---- Between the stages ----
+
+    def refine(self, scene: mi.Scene, test_count: int) -> None:
+        """Adds ``test_count`` random tests to the entries in which a success was seen (section
+        3.2): segments between uniform random points of the two voxels. Only entries of a voxel
+        with a light are refined, since next event estimation asks for no others. Where these are
+        very many, each gets fewer tests."""
+        entry = dr.compress(self.successes > 0)
+        if len(entry) == 0:
+            return
+        i, j = _row_and_column(entry)
+        lit = dr.gather(mi.UInt32, self._holds_light, i) > 0
+        lit |= dr.gather(mi.UInt32, self._holds_light, j) > 0
+        entry = dr.gather(mi.UInt32, entry, dr.compress(lit))
+        test_count = min(test_count, _MAX_REFINEMENT // max(1, len(entry)))
+        if test_count == 0 or len(entry) == 0:
+            return
+        lane = dr.arange(mi.UInt32, len(entry) * test_count)
+        entry = dr.gather(mi.UInt32, entry, lane // test_count)
+        i, j = _row_and_column(entry)
+        rng = mi.PCG32(size=len(lane))
+
+        def uniform() -> mi.Point3f:
+            return mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+
+        p, q = self.voxels.point(i, uniform()), self.voxels.point(j, uniform())
+        ray = mi.Ray3f(p, q - p, _SEGMENT, 0.0, dr.zeros(mi.Ray3f).wavelengths)
+        self._count(entry, ~scene.ray_test(ray), mi.Bool(True))
+        dr.eval(self.tests, self.successes)
+
+    # ---- What was learned ----
+
+    def light_voxels(self) -> mi.UInt32:
+        """The voxels that shadow rays went to."""
+        return dr.compress(self._holds_light > 0)
+
+    def test_count(self, entry: mi.UInt32) -> mi.UInt32:
+        """How many segments were tested."""
+        return dr.gather(mi.UInt32, self.tests, entry)
+
+    def ratio(self, entry: mi.UInt32) -> mi.Float:
+        """The share of the tests that succeeded; 0 where there was none."""
+        tests = dr.gather(mi.UInt32, self.tests, entry)
+        successes = dr.gather(mi.UInt32, self.successes, entry)
+        return mi.Float(successes) / mi.Float(dr.maximum(tests, 1))
+
+    def posterior_mean(self, entry: mi.UInt32) -> mi.Float:
+        """The probability that two points of the pair of voxels see each other: the mean of a Beta
+        posterior, whose prior is worth one test and expects the share of successes of the whole
+        map."""
+        tests, successes = (int(dr.sum(mi.UInt64(n))[0]) for n in (self.tests, self.successes))
+        # Half a success in one more test: the prior is never certain
+        prior = dr.opaque(mi.Float, (successes + 0.5) / (tests + 1))
+        tests = mi.Float(dr.gather(mi.UInt32, self.tests, entry))
+        successes = mi.Float(dr.gather(mi.UInt32, self.successes, entry))
+        return (successes + prior) / (tests + 1)
+
+    def __str__(self) -> str:
+        seen, succeeded = (int(dr.count(n > 0)[0]) for n in (self.tests, self.successes))
+        return (
+            f"visibility map: grid {self.voxels.resolution}, {self.voxels.occupied_count} occupied "
+            f"voxels, {self._entry_count()} entries ({seen} seen, {succeeded} with a success), "
+            f"{self._memory() / 2**20:.1f} MiB"
+        )
+
+
+def _row_and_column(entry: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+    """Inverts ``entry = row (row + 1) / 2 + column``."""
+    row = mi.UInt32(dr.sqrt(2 * mi.Float(entry)))
+    # The square root is rounded: the exact row is at most one off
+    row[row * (row + 1) // 2 > entry] -= 1
+    row[(row + 1) * (row + 2) // 2 <= entry] += 1
+    return row, entry - row * (row + 1) // 2

@@ -1,0 +1,128 @@
+"""Russian roulette on the shadow ray, by learned visibility.
+
+Source: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, sections 3.3.1 and
+4.1 (= Guo's thesis, sections 3.3.3.1 and 3.4.1).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...bounds import scene_bounds
+from ...regions.voxel_grid import EMPTY
+from ...transport.path_decisions import ShadowTest
+from ..learner import Learner
+from .visibility_map import VisibilityMap
+
+#: Initial value of a map entry in the paper; with its law, the least probability of a test.
+PAPER_EPSILON = 1e-4
+
+#: Share of rejected segments below which looking them up costs more than it saves: by this measure
+#: staircase has 0.05, kitchen 0.07 (which about breaks even), veach-ajar 0.2, door_ajar 0.5.
+WORTHWHILE = 0.05
+
+
+class VisibilityRoulette(ShadowTest):
+    """Tests a connection with a probability that grows with the visibility of its voxels.
+
+    Connections to points that the map does not know (at infinity, in voxels without geometry, on
+    lights that the pilot did not sample) are always tested.
+
+    Parameters:
+        visibility: The learned map, which must have seen a light.
+        slope, floor: p = min(1, slope · V + floor).
+        law: ``affine`` for the above, ``paper`` for p = max(V, 1e-4) (Eq. 2).
+    """
+
+    def __init__(self, visibility: VisibilityMap, slope: float, floor: float, law: str) -> None:
+        self.voxels = visibility.voxels
+        # Connections end on lights: of the whole map, the columns of their voxels are enough, and
+        # stay in the cache.
+        lights = visibility.light_voxels()
+        voxel_count, light_count = self.voxels.occupied_count, len(lights)
+        self._column = dr.full(mi.UInt32, EMPTY, voxel_count)
+        dr.scatter(self._column, dr.arange(mi.UInt32, light_count), lights)
+        # Opaque: the number of columns differs from seed to seed, the kernel must not
+        self._light_count = dr.opaque(mi.UInt32, light_count)
+        index = dr.arange(mi.UInt32, voxel_count * light_count)
+        voxel = index // self._light_count
+        light = dr.gather(mi.UInt32, lights, index - voxel * self._light_count)
+        entry = visibility.entry_of(voxel, light)
+        if law == "paper":
+            # The paper's map holds plain ratios, and ε where no success was seen (section 3.2)
+            self._p = dr.maximum(visibility.ratio(entry), PAPER_EPSILON)
+        else:
+            self._p = dr.minimum(1, slope * visibility.posterior_mean(entry) + floor)
+        dr.eval(self._column, self._p)
+        # In integers: a share near the threshold must not depend on the order of a sum
+        tests = mi.UInt64(visibility.test_count(entry))
+        total, kept = dr.sum(tests), dr.sum(tests * mi.UInt64(self._p * 1024))
+        #: Share of the segments that the map saw end on a light and that the law would not test.
+        self.rejected_share = 1 - int(kept[0]) / (1024 * int(total[0]))
+
+    def probability(self, state, choice, si, ds, active):
+        voxel, active = self.voxels.index(si.p, active)
+        light, active = self.voxels.index(ds.p, active)
+        column = dr.gather(mi.UInt32, self._column, light, active)
+        known = active & (column != EMPTY)
+        p = dr.gather(mi.Float, self._p, voxel * self._light_count + column, known)
+        return dr.select(known, p, 1), state
+
+
+class VisibilityLearner(Learner):
+    """Learns a visibility map in the pilots, and rejects shadow rays with it in the last stage.
+
+    Parameters:
+        grid, max_memory, refine, law, slope, floor: See the integrator ``neepp``.
+    """
+
+    def __init__(
+        self, grid: int, max_memory: float, refine: int, law: str, slope: float, floor: float
+    ) -> None:
+        self._grid, self._max_memory, self._refine = grid, int(max_memory * 2**20), refine
+        self._law = {"law": law, "slope": slope, "floor": floor}
+        self._summary = ""
+
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
+        self._map = VisibilityMap(scene, self._grid, self._max_memory)
+        return {}
+
+    def connection(self, choice, si, ds, contribution, visible, tested) -> None:
+        self._map.shadow_ray(si.p, ds.p, visible, tested)
+
+    def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
+        self._map.segment(p, q, active)
+
+    def learn(self, scene: mi.Scene, is_last: bool) -> dict[str, Any]:
+        if not is_last:
+            return {}
+        self._map.refine(scene, self._refine)
+        self._summary = str(self._map)
+        decisions = {}
+        if len(self._map.light_voxels()) > 0:
+            roulette = VisibilityRoulette(self._map, **self._law)
+            if roulette.rejected_share >= WORTHWHILE:
+                decisions["shadow_test"] = roulette
+            else:
+                self._summary += f"; not used, it would reject only {roulette.rejected_share:.0%}"
+        del self._map  # the counters: the last stage needs the roulette's table only
+        return decisions
+
+    def __str__(self) -> str:
+        return self._summary
+
+
+def has_lights_at_points(scene: mi.Scene) -> bool:
+    """Is there a light that the map can cover: not at infinity, nor outside its voxels?"""
+    bounds = scene_bounds(scene)
+    if not bounds.valid():
+        return False
+    at_point = int(mi.EmitterFlags.DeltaPosition)
+    return any(
+        mi.has_flag(e.flags(), mi.EmitterFlags.Surface)
+        or (int(e.flags()) & at_point and bounds.contains(e.bbox().min))
+        for e in scene.emitters()
+    )

@@ -1,1 +1,0 @@
-"""What is learned from samples: tables that a decision reads, filled between the stages."""

@@ -1,0 +1,28 @@
+"""The region in which paths scatter, and the sides of its surfaces."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Share of the vertices that may lie outside of the region, on either side of each axis.
+_OUTSIDE = 2e-3
+
+#: What is added to the region on each side.
+_MARGIN = 0.02
+
+
+def region(p: mi.Point3f) -> mi.ScalarBoundingBox3f:
+    """A box that holds nearly all of the points: a few that got far must not make it coarse."""
+    points = p.numpy()
+    low, high = np.quantile(points, [_OUTSIDE, 1 - _OUTSIDE], axis=1)
+    # A flat region still has some depth, and distant coordinates are rounded
+    size = max((high - low).max(), 1e-4 * np.abs(points).max(), 1e-30)
+    margin = _MARGIN * (high - low) + 1e-3 * size
+    return mi.ScalarBoundingBox3f(low - margin, high + margin)
+
+
+def lit_normal(si: mi.SurfaceInteraction3f) -> mi.Normal3f:
+    """The geometric normal on the side from which a surface is seen."""
+    return dr.select(dr.dot(si.n, si.to_world(si.wi)) < 0, -si.n, si.n)

@@ -1,0 +1,116 @@
+"""The base class of our integrators that render in stages: what Mitsuba calls, and errors where
+Mitsuba's are cryptic.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mitsuba as mi
+
+from ..parameters import read_parameter
+from . import render as rendering
+from .render import Stage
+
+#: What stands for "as many as there are".
+NO_LIMIT = 0xFFFFFFFF
+
+
+class StagedIntegrator(mi.SamplingIntegrator):
+    """An integrator that renders in stages and passes (``rendering.py``).
+
+    Common parameters:
+
+    Parameters:
+        timeout (float): Seconds after which to stop; 0 or less for no limit. Default: −1.
+
+    Attributes:
+        progress: Called after each pass with the fraction done; it may raise or call ``cancel``.
+        statistics: Of the last render (:class:`~mitsuba_ext.rendering.render.RenderStatistics`).
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.name = props.plugin_name()
+        # Read before the base class reads them: its errors do not name the plugin
+        self.timeout = self.parameter(props, "timeout", -1.0)
+        self.parameter(props, "hide_emitters", False)
+        super().__init__(props)
+        # Deprecated by Mitsuba, which says so in the log
+        self.samples_per_pass = self.parameter(props, "samples_per_pass", NO_LIMIT, minimum=1)
+        self.progress: Callable[[float], None] | None = None
+        self.statistics = rendering.RenderStatistics()
+        self.is_cancelled = False
+
+    # ---- What a subclass says ----
+
+    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
+        """The samples per pixel of each pilot stage, out of ``spp``; none where nothing learns."""
+        return []
+
+    @property
+    def sample_cost(self) -> int:
+        """The time of a sample in units of that of a path, about: passes are the shorter."""
+        return 1
+
+    def samples_per_set(self, spp: int) -> int:
+        """So many samples of a pixel belong together, out of ``spp``: a timeout keeps them whole.
+        """
+        return 1
+
+    def stages(
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: list[int], seed: int
+    ) -> Iterator[Stage]:
+        """Yields one stage for each entry of ``samples``: pilots, and the last one. What stands
+        between two ``yield`` runs between the stages."""
+        raise NotImplementedError
+
+    def parameters(self) -> dict[str, Any]:
+        """What ``str()`` shows besides the common parameters."""
+        return {}
+
+    def common_parameters(self) -> dict[str, Any]:
+        """What ``str()`` shows of all integrators of a kind."""
+        return {"timeout": self.timeout}
+
+    # ---- What Mitsuba calls ----
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        self.is_cancelled = False
+        return rendering.render(self, scene, sensor, seed, spp, develop, evaluate)
+
+    def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
+        """The values of the channels that :meth:`aov_names` names, where the walk has none."""
+        return []
+
+    def cancel(self) -> None:
+        """Ends the running render after the current pass (call it from ``progress`` or from another
+        thread); the image of the finished passes is returned."""
+        self.is_cancelled = True
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        raise self.no_gradients()
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        raise self.no_gradients()
+
+    def to_string(self) -> str:
+        parameters = {**self.common_parameters(), **self.parameters()}
+        lines = ",\n".join(f"  {key} = {value}" for key, value in parameters.items())
+        return f"{self.name}[\n{lines}\n]"
+
+    # ---- Helpers ----
+
+    def parameter(self, props: mi.Properties, key: str, default: Any, **accepted: Any) -> Any:
+        """A parameter of the scene, checked: see :func:`mitsuba_ext.parameters.read_parameter`,
+        which also says what ``accepted`` can be."""
+        return read_parameter(self.name, props, key, default, **accepted)
+
+    def no_gradients(self) -> NotImplementedError:
+        """What to raise where gradients are asked for."""
+        return NotImplementedError(
+            f'"{self.name}" does not compute gradients: use an integrator made for that, such as '
+            f'"prb".'
+        )

@@ -1,0 +1,83 @@
+"""What the walk tells those who learn from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mitsuba as mi
+
+
+class Observer:
+    """What the walk tells while it is traced; whoever listens overrides what it wants to hear.
+    Observers scatter into arrays of their own; they see no return value and change nothing.
+
+    No observer is a dataclass: Dr.Jit would take one that a loop uses for a part of its state.
+    """
+
+    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
+        """A pass of so many paths begins, one in each lane, in ``pixel`` of the film."""
+
+    def vertex(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, active: mi.Bool) -> None:
+        """A path is about to connect ``si`` to a light; ``depth`` is 0 at the first vertex."""
+
+    def connection(
+        self,
+        choice: Any,
+        si: mi.SurfaceInteraction3f,
+        ds: mi.DirectionSample3f,
+        contribution: mi.Spectrum,
+        visible: mi.Bool,
+        tested: mi.Bool,
+    ) -> None:
+        """A shadow ray was traced where ``tested``. ``choice`` is the state of the next event
+        decision; ``contribution`` is BSDF · radiance / pdf, before throughput and MIS weights."""
+
+    def direction(
+        self,
+        si: mi.SurfaceInteraction3f,
+        depth: mi.UInt32,
+        sample: mi.Point2f,
+        weight: mi.Float | float,
+        L: mi.Spectrum,
+        active: mi.Bool,
+    ) -> None:
+        """The number ``sample``, of density 1 / ``weight``, chose the direction in which a path
+        goes on; it has brought ``L`` until now."""
+
+    def end(self, L: mi.Spectrum) -> None:
+        """All paths of the pass are at their end, and bring ``L``."""
+
+    def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
+        """A path went from ``p`` to ``q``."""
+
+
+class Observers(Observer):
+    """Tells several observers the same."""
+
+    def __init__(self, observers: Sequence[Observer]) -> None:
+        self._observers = observers
+
+    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
+        for observer in self._observers:
+            observer.begin(lanes, pixel)
+
+    def vertex(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.vertex(*arguments)
+
+    def connection(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.connection(*arguments)
+
+    def direction(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.direction(*arguments)
+
+    def end(self, L: mi.Spectrum) -> None:
+        for observer in self._observers:
+            observer.end(L)
+
+    def segment(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.segment(*arguments)
