@@ -7,9 +7,8 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.composition.light_parameters import METHODS, LightSampling
+from mitsuba_ext.composition.slots import SLOTS, read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
-from mitsuba_ext.decisions.learner import Learner
 
 
 @registry.plugin
@@ -89,34 +88,8 @@ class ComposedPath(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.shadow_test = self.parameter(
-            props, "shadow_test", "always", choices=("always", "visibility_roulette")
-        )
-        self.next_event = self.parameter(props, "next_event", "uniform", choices=METHODS)
-        rejects = self.shadow_test == "visibility_roulette"
-        # The parameters of what does not learn are unknown, and typos are found
-        self.light_sampling = None
-        if rejects or self.next_event != "uniform":
-            self.light_sampling = LightSampling.from_properties(
-                self, props, self.next_event, rejects
-            )
-
-    def decisions(self, scene: mi.Scene, seed: int) -> dict[str, Any]:
-        return self.light_sampling.decisions(scene) if self.light_sampling else {}
-
-    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
-        if self.light_sampling is None or self.max_depth < 2:
-            return []
-        return self.light_sampling.pilots(scene, spp)
-
-    def learners(self, scene: mi.Scene, sensor: mi.Sensor, samples: int) -> list[Learner]:
-        return self.light_sampling.learners(scene, samples) if self.light_sampling else []
+        self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in SLOTS})
 
     def parameters(self) -> dict[str, Any]:
-        learned = self.light_sampling.parameters() if self.light_sampling else {}
-        named_differently = ("light_sampling", "rejection")
-        return {
-            "shadow_test": self.shadow_test,
-            "next_event": self.next_event,
-            **{k: v for k, v in learned.items() if k not in named_differently},
-        }
+        defaults = {slot: next(iter(words)) for slot, words in SLOTS.items()}
+        return {**defaults, **super().parameters()}

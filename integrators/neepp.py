@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.composition.light_parameters import METHODS, LightSampling
+from mitsuba_ext.composition.next_event import METHODS, LearnedLights
+from mitsuba_ext.composition.shadow_test import RejectedShadowRays
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
-from mitsuba_ext.decisions.learner import Learner
+
+_LEARNING = "lights that are chosen by what was learned (visibility or contribution)"
+_REJECTING = "shadow rays that are rejected"
+
+#: What parameters need to have an effect.
+_CONDITIONS = {
+    "grid": f"{_LEARNING} or spatially, or {_REJECTING}",
+    "max_memory": f"{_LEARNING} or spatially, or {_REJECTING}",
+    "pilot_spp": f"{_LEARNING}, or {_REJECTING}",
+    "refine": f"{_REJECTING}, and lights not learned",
+    "law": _REJECTING,
+    "slope": f"{_REJECTING} by the affine law",
+    "floor": f"{_REJECTING} by the affine law",
+    "load_map": _LEARNING,
+    "save_map": _LEARNING,
+}
 
 
 @registry.plugin
@@ -140,18 +154,12 @@ class NEEPlusPlus(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        light_sampling = self.parameter(props, "light_sampling", "contribution", choices=METHODS)
-        rejection = self.parameter(props, "rejection", False)
-        self.next_event = LightSampling.from_properties(self, props, light_sampling, rejection)
-
-    def decisions(self, scene: mi.Scene, seed: int) -> dict[str, Any]:
-        return self.next_event.decisions(scene)
-
-    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
-        return self.next_event.pilots(scene, spp) if self.max_depth > 1 else []
-
-    def learners(self, scene: mi.Scene, sensor: mi.Sensor, samples: int) -> list[Learner]:
-        return self.next_event.learners(scene, samples)
-
-    def parameters(self) -> dict[str, Any]:
-        return self.next_event.parameters()
+        read = self.reader(props)
+        method = read("light_sampling", "contribution", choices=tuple(METHODS))
+        rejects = read("rejection", False)
+        make_lights = METHODS[method]
+        lights = make_lights(read) if make_lights else None
+        learns = isinstance(lights, LearnedLights)
+        rejection = RejectedShadowRays(read, has_own_map=not learns) if rejects else None
+        read.refuse_without_effect(_CONDITIONS)
+        self.fill(props, next_event=lights, shadow_test=rejection)

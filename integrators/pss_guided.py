@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.composition.guide_parameters import Guiding
+from mitsuba_ext.composition.connections import Connections
+from mitsuba_ext.composition.directions import Guided
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
-from mitsuba_ext.decisions.directions.guided_directions import LaterConnections
-from mitsuba_ext.decisions.learner import Learner
-from mitsuba_ext.transport.path_decisions import EmitterSampling
+from mitsuba_ext.decisions.directions.guide_learner import GuideLearner
+from mitsuba_ext.decisions.directions.guided_directions import GuidedDirections
 
 
 @registry.plugin
@@ -117,31 +115,21 @@ class PSSGuided(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.guiding = Guiding(self, props)
-        self.nee_first_bounce = self.parameter(props, "nee_first_bounce", True)
+        connects_first = self.parameter(props, "nee_first_bounce", True)
+        read = self.reader(props, count=0)
+        self.fill(
+            props,
+            directions=Guided(read),
+            connections=None if connects_first else Connections(read),
+        )
 
     @property
-    def guide(self):
-        """What the last render has learned (``GuidedDirections``); ``None`` where nothing was
-        guided."""
-        return self.guiding.guide
+    def learner(self) -> GuideLearner | None:
+        """Who learned in the last render, with what it measured; ``None`` where there was no
+        pilot."""
+        return self.learners.get("directions")
 
     @property
-    def learner(self):
-        """Who learned in the last render (``GuideLearner``), with what it measured; ``None``
-        where there was no pilot."""
-        return self.guiding.learner
-
-    def decisions(self, scene: mi.Scene, seed: int) -> dict[str, Any]:
-        if self.nee_first_bounce:
-            return {}
-        return {"next_event": LaterConnections(EmitterSampling())}
-
-    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
-        return self.guiding.pilots(scene, spp, self.max_depth)
-
-    def learners(self, scene: mi.Scene, sensor: mi.Sensor, samples: int) -> list[Learner]:
-        return self.guiding.learners(scene, sensor, samples, self.max_depth)
-
-    def parameters(self) -> dict[str, Any]:
-        return {**self.guiding.parameters(), "nee_first_bounce": self.nee_first_bounce}
+    def guide(self) -> GuidedDirections | None:
+        """What the last render has learned; ``None`` where nothing was guided."""
+        return self.learner.guide if self.learner is not None else None

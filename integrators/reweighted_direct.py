@@ -7,14 +7,8 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext import registry
+from mitsuba_ext.composition.connections import Connections
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
-from mitsuba_ext.decisions.connections.many_connections import ManyConnections
-from mitsuba_ext.decisions.weighted_sets import MOST_SLOW_POINTS, SetKind
-
-_MOST_LIGHT_SAMPLES = 4096
-
-#: Connections that take as long as a path, about.
-_CONNECTIONS_PER_PATH = 16
 
 
 @registry.plugin
@@ -101,27 +95,13 @@ class ReweightedDirect(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.set_kind = SetKind(self.name, props, pattern="hammersley", weights="none")
         self.camera_samples = self.parameter(props, "camera_samples", 0, minimum=0)
-        most = MOST_SLOW_POINTS if self.set_kind.is_slow else _MOST_LIGHT_SAMPLES
-        self.light_samples = self.parameter(props, "light_samples", 256, minimum=1, maximum=most)
-
-    @property
-    def sample_cost(self) -> int:
-        return max(1, self.light_samples // _CONNECTIONS_PER_PATH)
+        read = self.reader(props, {"count": "light_samples"}, count=256)
+        self.fill(props, connections=Connections(read))
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         spp = spp or self.camera_samples
         return super().render(scene, sensor, seed, spp, develop, evaluate)
 
-    def decisions(self, scene: mi.Scene, seed: int) -> dict[str, Any]:
-        if not scene.emitters() or self.max_depth < 2:
-            return {}
-        return {"next_event": ManyConnections(self.set_kind.sets(self.light_samples, 2, seed))}
-
     def parameters(self) -> dict[str, Any]:
-        return {
-            **vars(self.set_kind),
-            "camera_samples": self.camera_samples,
-            "light_samples": self.light_samples,
-        }
+        return {"camera_samples": self.camera_samples, **super().parameters()}

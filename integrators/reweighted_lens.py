@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
-
 from mitsuba_ext import registry
 from mitsuba_ext.composition.reweighted_camera import ReweightedCamera
 
@@ -79,9 +77,3 @@ class ReweightedLens(ReweightedCamera):
     """
 
     purpose = "aperture"
-    dimension = 2
-
-    def reason_to_do_nothing(self, sensor: mi.Sensor) -> str | None:
-        if not sensor.needs_aperture_sample():
-            return 'the sensor has no aperture; use a "thinlens".'
-        return None

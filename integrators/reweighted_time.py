@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
-
 from mitsuba_ext import registry
 from mitsuba_ext.composition.reweighted_camera import ReweightedCamera
 
@@ -83,8 +81,3 @@ class ReweightedTime(ReweightedCamera):
     """
 
     purpose = "time"
-
-    def reason_to_do_nothing(self, sensor: mi.Sensor) -> str | None:
-        if sensor.shutter_open_time() <= 0:
-            return "the sensor's shutter does not stay open; set shutter_open and shutter_close."
-        return None

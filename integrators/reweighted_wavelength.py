@@ -83,16 +83,7 @@ class ReweightedWavelength(ReweightedCamera):
     """
 
     purpose = "wavelength"
-    periods = 4
-    accepted_weights = ("none", "voronoi", "torus")
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        if not mi.is_spectral:
-            raise RuntimeError(
-                f'"{self.name}" does not work in the variant "{mi.variant()}", which has no '
-                f'wavelengths: use a spectral one, such as "llvm_ad_spectral".'
-            )
-
-    def reason_to_do_nothing(self, sensor: mi.Sensor) -> str | None:
-        return None
+        self.numbers.check_slot(self.name, self.purpose)

@@ -1,8 +1,8 @@
 """Registers every plugin of the package in each variant that is selected.
 
-A plugin is a file in ``integrators/``, ``emitters/``, ``bsdfs/`` or ``shapes/``: the file's name is
-the plugin's name in a scene, and the one class that the file defines and decorates with
-:func:`plugin` is what Mitsuba instantiates. Deleting the file removes the plugin.
+A plugin is a file in ``integrators/``, ``emitters/``, ``bsdfs/``, ``samplers/`` or ``shapes/``.
+The file's name is the plugin's name in a scene, and the one class that the file defines and
+decorates with :func:`plugin` is what Mitsuba instantiates. Deleting the file removes the plugin.
 
 Mitsuba's base classes differ from variant to variant, so a class body binds to the variant that is
 active when it runs. The plugin files are therefore executed once per variant (as Mitsuba does with
@@ -27,12 +27,14 @@ _KINDS: dict[str, str] = {
     "integrators": "register_integrator",
     "emitters": "register_emitter",
     "bsdfs": "register_bsdf",
+    "samplers": "register_sampler",
     "shapes": "register_shape",
 }
 
 #: Variant-bound base classes, executed before the plugins that derive from them.
 _BASES = (
     "mitsuba_ext.rendering.staged_integrator",
+    "mitsuba_ext.composition.decision_plugin",
     "mitsuba_ext.composition.walk_integrator",
     "mitsuba_ext.composition.reweighted_camera",
 )

@@ -5,25 +5,18 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 
 from ..decisions.camera.pixel_sets import PixelSets
-from ..decisions.weighted_sets import WEIGHTS, SetKind
 from ..garbage import garbage_left_alone
 from ..movers import check_motion_is_seen
-from ..rendering.render import Stage
-from ..rendering.staged_integrator import StagedIntegrator
-from ..transport.walk import PathSample
-
-#: Points of a set, at most, and with a timeout.
-_MOST_POINTS, _MOST_POINTS_TIMED = 1024, 64
-
-#: Purposes of numbers: each has sets of its own.
-_PURPOSES = ("aperture", "time", "wavelength")
+from ..rendering.staged_integrator import NO_LIMIT, StagedIntegrator
+from ..rendering.stages import OneStage, Schedule, Stage
+from ..transport.estimator import CameraRays, Sample
+from .camera_numbers import PURPOSES, WeightedNumbers, samples_per_set
+from .decision_parameters import ParameterReader, Setting
 
 
 class ReweightedCamera(StagedIntegrator):
@@ -35,18 +28,10 @@ class ReweightedCamera(StagedIntegrator):
     together.
 
     Attributes:
-        purpose: Attribute of :class:`CameraSamples` that is taken over.
-        dimension: Of the sets.
-        periods: See :class:`WeightedSets`.
-        default_pattern, default_weights, accepted_weights: Of the parameters.
+        purpose: The attribute of :class:`CameraSamples` that is taken over.
     """
 
     purpose: str
-    dimension = 1
-    periods = 1
-    default_pattern = "lattice"
-    default_weights = "none"
-    accepted_weights = WEIGHTS
 
     def __init__(self, props: mi.Properties) -> None:
         if "hide_emitters" in props:
@@ -54,14 +39,9 @@ class ReweightedCamera(StagedIntegrator):
                 f'"{props.plugin_name()}": "hide_emitters" is for the nested integrator to know'
             )
         super().__init__(props)
-        self.set_kind = SetKind(
-            self.name, props, self.default_pattern, self.default_weights, self.accepted_weights
-        )
+        reader = ParameterReader(self.name, props)
+        self.numbers = WeightedNumbers(reader, PURPOSES[self.purpose].weights)
         self.nested = self._nested(props)
-
-    def reason_to_do_nothing(self, sensor: mi.Sensor) -> str | None:
-        """Why the numbers do not matter, and what to do about it; ``None`` if they do."""
-        raise NotImplementedError
 
     # ---- What the base class asks for ----
 
@@ -73,36 +53,27 @@ class ReweightedCamera(StagedIntegrator):
         return self.nested.sample_cost if self._is_staged else 1
 
     def samples_per_set(self, spp: int) -> int:
-        most = _MOST_POINTS_TIMED if self.timeout > 0 else _MOST_POINTS
-        return -(-spp // -(-spp // most))
+        return samples_per_set(spp, self.timeout > 0)
 
-    def stages(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: list[int], seed: int
-    ) -> Iterator[Stage]:
+    def schedule(
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
+    ) -> Schedule:
         if self._is_staged:
             # Sets of all purposes must be cut alike
             self.nested.timeout = self.timeout
-            stages = self.nested.stages(scene, sensor, samples, seed)
+            schedule = self.nested.schedule(scene, sensor, samples, seed)
         else:
             check_motion_is_seen(self.nested, scene)
-            stages = iter([Stage(_NestedWalk(self.nested, sensor.get_medium()))])
-        reason = self.reason_to_do_nothing(sensor)
-        if reason is not None:
-            mi.Log(mi.LogLevel.Warn, f'"{self.name}" reweights nothing: {reason}')
-            yield from stages
-            return
-        seeds = [seed, _PURPOSES.index(self.purpose)]
-        count = self.samples_per_set(sum(samples))
-        sets = self.set_kind.sets(count, self.dimension, seeds, self.periods)
-        numbers = PixelSets(sets, seeds)
-        for stage in stages:
-            if not stage.is_scout:
-                setattr(stage.camera, self.purpose, numbers)
-            yield stage
+            schedule = OneStage(_NestedEstimator(self.nested, sensor.get_medium()))
+        setting = Setting(
+            scene, sensor, seed, NO_LIMIT, sum(samples), is_timed=self.timeout > 0
+        )
+        numbers = self.numbers.numbers(self.name, self.purpose, setting)
+        return _Reweighted(schedule, self.purpose, numbers) if numbers else schedule
 
     def parameters(self) -> dict[str, Any]:
         nested = str(self.nested).replace("\n", "\n  ")
-        return {**vars(self.set_kind), "nested": nested}
+        return {**self.numbers.parameters(), "nested": nested}
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """A sample of the nested integrator: the ray is another's."""
@@ -136,7 +107,7 @@ class ReweightedCamera(StagedIntegrator):
     def _is_staged(self) -> bool:
         """Is the nested integrator one of ours, which can learn in pilots?"""
         # Not by class: once another variant is selected, the module's name is that one's class
-        return hasattr(self.nested, "stages")
+        return hasattr(self.nested, "schedule")
 
 
 def _purposes(integrator: mi.Integrator) -> list[str]:
@@ -146,16 +117,34 @@ def _purposes(integrator: mi.Integrator) -> list[str]:
     return [integrator.purpose, *_purposes(integrator.nested)]
 
 
-class _NestedWalk:
-    """A walk that draws the samples of an integrator. All four wavelengths survive in it."""
+class _Reweighted:
+    """A schedule whose camera rays take some numbers from weighted sets.
+
+    Parameters:
+        nested: The schedule whose stages these are.
+        purpose: What the numbers are for.
+        numbers: The numbers.
+    """
+
+    def __init__(self, nested: Schedule, purpose: str, numbers: PixelSets) -> None:
+        self._nested, self._purpose, self._numbers = nested, purpose, numbers
+
+    def next_stage(self) -> Stage:
+        stage = self._nested.next_stage()
+        if not stage.is_scout:
+            setattr(stage.camera, self._purpose, self._numbers)
+        return stage
+
+
+class _NestedEstimator:
+    """Draws the samples of an integrator. All four wavelengths survive in it."""
 
     def __init__(self, nested: mi.SamplingIntegrator, medium: mi.Medium | None) -> None:
         self._nested, self._medium = nested, medium
 
     def __call__(
-        self, scene, sampler, ray, active, pixel=None, hero_weight=1.0
-    ) -> PathSample:
+        self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
+    ) -> Sample:
         with garbage_left_alone():
-            L, valid, aovs = self._nested.sample(scene, sampler, ray, self._medium, active)
-        zero = dr.zeros(mi.UInt32)
-        return PathSample(L, valid, zero, zero, zero, aovs)
+            L, valid, aovs = self._nested.sample(scene, sampler, rays.ray, self._medium, active)
+        return Sample(L, valid, aovs=aovs)

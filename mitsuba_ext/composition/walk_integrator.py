@@ -5,29 +5,30 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 from typing import Any
 
 import mitsuba as mi
 
 from ..decisions.learner import Learner
 from ..decisions.query.moving_scene import scene_query
-from ..decisions.scout import SCOUT_DEPTH, NoConnections, Scout
 from ..movers import refuse_movers
-from ..rendering import camera
 from ..rendering.aovs import check_aovs
-from ..rendering.render import Stage
 from ..rendering.staged_integrator import NO_LIMIT, StagedIntegrator
-from ..transport.observer import Observers
+from ..transport.estimator import CameraRays
 from ..transport.path_decisions import SceneQuery
 from ..transport.walk import Walk
+from .camera_numbers import PURPOSES, samples_per_set
+from .decision_parameters import DecisionParameters, ParameterReader, Setting
+from .schedule import Schedule, pilot_samples
+from .slots import SLOTS
 
 
 class WalkIntegrator(StagedIntegrator):
     """An integrator whose samples are random walks.
 
-    A subclass reads its own parameters and says, in :meth:`decisions` and :meth:`learners`, which
-    decisions of the walk it takes over. Common parameters:
+    A subclass reads its own parameters and says with :meth:`fill` which decisions of the walk it
+    takes over. Common parameters:
 
     Parameters:
         max_depth (int): Longest path in the image, −1 for no limit, 1 for visible emitters only.
@@ -37,6 +38,10 @@ class WalkIntegrator(StagedIntegrator):
         timeout (float): Seconds after which to stop; 0 or less for no limit. Default: −1.
         aovs (str): Arbitrary output variables, as in Mitsuba's ``aov`` integrator
             (``"depth:depth,nn:sh_normal"``). Default: none.
+
+    Attributes:
+        slots (dict[str, DecisionParameters]): What fills the slots of the walk.
+        learners (dict[str, Learner]): Who learned in the last render, by slot.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -46,52 +51,71 @@ class WalkIntegrator(StagedIntegrator):
         self.rr_depth = self.parameter(props, "rr_depth", 5, minimum=1, maximum=NO_LIMIT)
         self.aovs = self.parameter(props, "aovs", "")
         self._aovs = self._aov_integrator(self.aovs)
+        self.slots: dict[str, DecisionParameters] = {}
+        self.learners: Mapping[str, Learner] = {}
+        self._pilot_spp: int | None = None
 
     # ---- What a subclass says ----
 
-    def stage(self, learned: str = "", **decisions: Any) -> Stage:
-        """A stage whose walk has this integrator's parameters and the given decisions."""
-        walk = Walk(self.max_depth, self.rr_depth, self.hide_emitters, **decisions)
-        return Stage(walk, learned)
+    def reader(
+        self, props: mi.Properties, names: Mapping[str, str] | None = None, **defaults: Any
+    ) -> ParameterReader:
+        """Reads parameters of a decision from those of the integrator; ``names`` are those that the
+        integrator calls differently, ``defaults`` its own."""
+        return ParameterReader(self.name, props, names, **defaults)
 
-    def decisions(self, scene: mi.Scene, seed: int) -> dict[str, Any]:
-        """The decisions that are taken over without learning, as parameters of :class:`Walk`;
-        ``seed`` is that of the render."""
-        return {}
+    def fill(self, props: mi.Properties, **slots: DecisionParameters | None) -> None:
+        """Fills slots of the walk; ``None`` leaves one to Mitsuba's choice. Where something learns,
+        reads the common parameter ``pilot_spp``.
 
-    def learners(self, scene: mi.Scene, sensor: mi.Sensor, samples: int) -> list[Learner]:
-        """Who learns from ``samples`` pilot samples (of all pixels together; with 0, only those who
-        know something already)."""
-        return []
+        Raises:
+            TypeError, ValueError: Two decisions do not go together, or the parameter is wrong.
+        """
+        self.slots = {slot: slots[slot] for slot in SLOTS if slots.get(slot) is not None}
+        for parameters in self.slots.values():
+            parameters.check_together(self.name, self.slots)
+        wishes = [p.pilot_spp for p in self.slots.values() if p.pilot_spp]
+        if wishes:
+            self._pilot_spp = self.parameter(props, "pilot_spp", max(wishes), minimum=0)
 
-    def stages(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: list[int], seed: int
-    ) -> Iterator[Stage]:
-        """Between the stages, learners turn observations into tables."""
-        width, height = camera.film_extent(sensor.film())
-        decisions = {"query": self._query(scene), **self.decisions(scene, seed)}
+    def parameters(self) -> dict[str, Any]:
+        slots = {
+            slot: str(parameters).replace("\n", "\n  ") for slot, parameters in self.slots.items()
+        }
+        return {**slots, **({} if self._pilot_spp is None else {"pilot_spp": self._pilot_spp})}
+
+    # ---- What the render asks for ----
+
+    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
+        self.learners = {}
+        if self.max_depth < 2:
+            return []
+        return pilot_samples(self.slots, scene, spp, self._pilot_spp or 0)
+
+    @property
+    def sample_cost(self) -> int:
+        return max((parameters.sample_cost for parameters in self.slots.values()), default=1)
+
+    def samples_per_set(self, spp: int) -> int:
+        is_needed = any(slot in PURPOSES for slot in self.slots)
+        return samples_per_set(spp, self.timeout > 0) if is_needed else 1
+
+    def schedule(
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
+    ) -> Schedule:
         *pilots, _rest = samples
-        learners = self.learners(scene, sensor, width * height * sum(pilots))
-        p, n = mi.Point3f(), mi.Normal3f()
-        if any(learner.wants_scout for learner in learners):
-            scout = Scout()
-            depth = min(SCOUT_DEPTH, self.max_depth)
-            walk = Walk(
-                depth, depth, next_event=NoConnections(), query=decisions["query"], observer=scout
-            )
-            yield Stage(walk, is_scout=True)
-            p, n = scout.vertices()
-        for learner in learners:
-            decisions.update(learner.start(scene, p, n))
-        observer = learners[0] if len(learners) == 1 else Observers(learners)
-        for index in range(len(pilots)):
-            yield self.stage(observer=observer, **decisions)
-            for learner in learners:
-                decisions.update(learner.learn(scene, is_last=index == len(pilots) - 1))
-        if not pilots:
-            for learner in learners:
-                decisions.update(learner.learn(scene, is_last=True))
-        yield self.stage("; ".join(map(str, learners)), **decisions)
+        setting = Setting(
+            scene, sensor, seed, self.max_depth, sum(samples), sum(pilots), self.timeout > 0
+        )
+        schedule = Schedule(
+            self.name, self.slots, setting, len(pilots), self.walk, self._query(scene)
+        )
+        self.learners = schedule.learners
+        return schedule
+
+    def walk(self, **decisions: Any) -> Walk:
+        """A walk with this integrator's parameters and the given decisions."""
+        return Walk(self.max_depth, self.rr_depth, self.hide_emitters, **decisions)
 
     # ---- What Mitsuba calls ----
 
@@ -99,9 +123,11 @@ class WalkIntegrator(StagedIntegrator):
         """One sample, for integrators that nest this one and draw its samples (``moment``; ``aov``
         calls :meth:`render`). Nothing is learned there: each decision that needs a pilot falls
         back to its default."""
-        decisions = {"query": self._query(scene), **self.decisions(scene, 0)}
-        walk = self.stage(**decisions).walk
-        sample = walk(scene, sampler, mi.Ray3f(ray), mi.Bool(active))
+        setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, 1)
+        decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}
+        decisions = {slot: decision for slot, decision in decisions.items() if decision}
+        walk = self.walk(query=self._query(scene), **decisions)
+        sample = walk(scene, sampler, CameraRays(ray), mi.Bool(active))
         return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
 
     def aov_names(self) -> list[str]:

@@ -10,20 +10,24 @@ from ..transport.observer import Observer
 
 
 class Learner(Observer):
-    """A technique that learns in pilot stages. One object serves one render."""
+    """Learns one decision of the walk in pilot stages. One object serves one render."""
 
     #: Does :meth:`start` need to know where paths scatter?
     wants_scout = False
 
-    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
-        """The decisions of the first pilot. ``p``, ``n``: vertices and normals of the scout, none
-        if no learner wants one."""
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> Any | None:
+        """The decision of the first pilot; ``None`` for the one that is there. ``p``, ``n``:
+        vertices and normals of the scout, none if no learner wants one."""
         raise NotImplementedError
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> dict[str, Any]:
-        """The decisions of the next stage, which is the last one if ``is_last`` says so."""
+    def learn(self, scene: mi.Scene, is_last: bool) -> Any | None:
+        """The decision of the next stage, which is the last one if ``is_last`` says so; ``None``
+        for the same as before."""
         raise NotImplementedError
+
+    def finish(self) -> None:
+        """All have learned: lets go of what the last stage does not need."""
 
     def __str__(self) -> str:
-        """A summary of what was learned."""
+        """A summary of what was learned; empty if another learner's says it."""
         raise NotImplementedError

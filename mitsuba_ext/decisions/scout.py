@@ -7,20 +7,13 @@ import mitsuba as mi
 
 from ..regions.surface_sides import lit_normal
 from ..transport.observer import Observer
-from ..transport.path_decisions import EmitterSampling
+from ..transport.vertex import Vertex
 
 #: Paths, about, and vertices of each.
 _PATHS, _VERTICES = 1 << 16, 3
 
 #: Longest path of a scout in segments.
 SCOUT_DEPTH = _VERTICES + 1
-
-
-class NoConnections(EmitterSampling):
-    """Connects to no light: what is left are the directions of the BSDFs."""
-
-    def sample(self, state, scene, sampler, si, active):
-        return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), state
 
 
 class Scout(Observer):
@@ -37,9 +30,10 @@ class Scout(Observer):
         self._seen = dr.zeros(mi.UInt32, paths * _VERTICES)
         dr.eval(self._path, self._is_recorded, self._p, self._n, self._seen)
 
-    def vertex(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, active: mi.Bool) -> None:
-        slot = self._path * _VERTICES + depth
-        active = active & self._is_recorded & (depth < _VERTICES)
+    def vertex(self, vertex: Vertex, active: mi.Bool) -> None:
+        si = vertex.si
+        slot = self._path * _VERTICES + vertex.depth
+        active = active & self._is_recorded & (vertex.depth < _VERTICES)
         dr.scatter(self._p, si.p, slot, active)
         dr.scatter(self._n, lit_normal(si), slot, active)
         dr.scatter(self._seen, mi.UInt32(1), slot, active)

@@ -12,8 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..parameters import read_parameter
-from ..pointsets import PATTERNS, points, voronoi_weights
+from ..pointsets import points, voronoi_weights
 
 #: How the points of a set are weighed.
 WEIGHTS = ("none", "voronoi", "torus", "unbiased")
@@ -22,35 +21,7 @@ WEIGHTS = ("none", "voronoi", "torus", "unbiased")
 _POINTS, _MOST_SETS = 1 << 13, 32
 
 #: A pattern whose points are slow to find; more of them than this take ten seconds.
-_SLOW, _FEW_SETS, MOST_SLOW_POINTS = "poisson_disk", 2, 1024
-
-
-class SetKind:
-    """The parameters ``pattern`` and ``weights`` of a plugin, with its defaults.
-
-    Raises:
-        TypeError, ValueError: A parameter has a wrong type or value.
-    """
-
-    def __init__(
-        self,
-        plugin: str,
-        props: mi.Properties,
-        pattern: str,
-        weights: str,
-        accepted: tuple[str, ...] = WEIGHTS,
-    ) -> None:
-        self.pattern = read_parameter(plugin, props, "pattern", pattern, choices=PATTERNS)
-        self.weights = read_parameter(plugin, props, "weights", weights, choices=accepted)
-
-    @property
-    def is_slow(self) -> bool:
-        """Are its points slow to find? There should be no more than ``MOST_SLOW_POINTS``."""
-        return self.pattern == _SLOW
-
-    def sets(self, count: int, dimension: int, seed: Any, periods: int = 1) -> WeightedSets:
-        """Sets of ``count`` points; another seed gives others."""
-        return WeightedSets(self.pattern, self.weights, count, dimension, seed, periods)
+SLOW_PATTERN, _FEW_SETS, MOST_SLOW_POINTS = "poisson_disk", 2, 1024
 
 
 class WeightedSets:
@@ -79,7 +50,7 @@ class WeightedSets:
     ) -> None:
         self.count, self._kind, self._dimension = count, weights, dimension
         self._weight_count = 1 if periods == 1 else 2
-        most = _FEW_SETS if pattern == _SLOW else _MOST_SETS
+        most = _FEW_SETS if pattern == SLOW_PATTERN else _MOST_SETS
         self._set_count = min(max(2, _POINTS // count), most)
         rng = np.random.default_rng(seed)
         # Rows of two or four numbers are read at once

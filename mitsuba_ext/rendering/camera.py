@@ -7,28 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.estimator import CameraRays, Sample, Splats
 from .camera_samples import CameraSamples
-
-
-@dataclass
-class CameraRays:
-    """The rays of a pass.
-
-    Attributes:
-        ray: The rays themselves.
-        importance: What the sensor makes of the radiance that they bring back.
-        weight: By how much a sample counts; 1.0 where all count the same.
-        hero_weight: The same where one of the four wavelengths is left, relative to ``weight``.
-        position: Where on the film (in pixels) to put it.
-        pixel: The number of the ray's pixel, row by row in the film's extent.
-    """
-
-    ray: mi.RayDifferential3f
-    importance: mi.Spectrum
-    weight: mi.Float | float
-    hero_weight: mi.Float | float
-    position: mi.Point2f
-    pixel: mi.UInt32
 
 
 def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
@@ -53,6 +33,109 @@ def film_extent(film: mi.Film) -> tuple[int, int]:
     return int(width) + border, int(height) + border
 
 
+@dataclass
+class Lanes:
+    """Which sample of which pixel each lane of a pass takes.
+
+    Attributes:
+        pixel: The number of the pixel, row by row in the film's extent.
+        corner: Its corner on the film.
+        index: The number of the sample among all of the render in this pixel.
+    """
+
+    pixel: mi.UInt32
+    corner: mi.Vector2i
+    index: mi.UInt32
+
+
+def lanes_of(film: mi.Film, spp_per_pass: int, first: int = 0) -> Lanes:
+    """The lanes of a pass of ``spp_per_pass`` samples for each pixel, after ``first`` ones of
+    earlier passes."""
+    width, height = film_extent(film)
+    # The divisor is opaque, so that passes of different length share a kernel
+    lane = dr.arange(mi.UInt32, width * height * spp_per_pass)
+    pixel = lane // dr.opaque(mi.UInt32, spp_per_pass)
+    y = pixel // width
+    corner = mi.Vector2i(mi.Int32(pixel - y * width), mi.Int32(y))
+    if film.sample_border():
+        corner -= film.rfilter().border_size()
+    corner += mi.Vector2i(film.crop_offset())
+    index = lane - pixel * dr.opaque(mi.UInt32, spp_per_pass) + dr.opaque(mi.UInt32, first)
+    return Lanes(pixel, corner, index)
+
+
+@dataclass
+class CameraNumbers:
+    """The numbers, in [0, 1), that make a camera ray.
+
+    Attributes:
+        film: Where in its pixel the ray begins.
+        aperture, time, wavelength: Point of the aperture, time in the shutter interval, and what
+            chooses the wavelengths.
+        weight, hero_weight: See :class:`CameraRays`.
+    """
+
+    film: mi.Point2f
+    aperture: mi.Point2f
+    time: mi.Float
+    wavelength: mi.Float
+    weight: mi.Float | float = 1.0
+    hero_weight: mi.Float | float = 1.0
+
+
+def draw_numbers(
+    sensor: mi.Sensor, sampler: mi.Sampler, lanes: Lanes, samples: CameraSamples
+) -> CameraNumbers:
+    """Numbers in the order in which ``mi.SamplingIntegrator`` draws them, so that the same seed
+    gives the same rays as Mitsuba's own integrators. ``samples`` says which come from elsewhere."""
+    numbers = CameraNumbers(sampler.next_2d(), mi.Point2f(0.5), mi.Float(0), mi.Float(0))
+    pixel, index = lanes.pixel, lanes.index
+    if sensor.needs_aperture_sample():
+        if samples.aperture is None:
+            numbers.aperture = sampler.next_2d()
+        else:
+            numbers.aperture, numbers.weight = samples.aperture.draw(pixel, index)
+    if sensor.shutter_open_time() > 0:
+        if samples.time is None:
+            numbers.time = sampler.next_1d()
+        else:
+            numbers.time, weight = samples.time.draw(pixel, index)
+            numbers.weight *= weight
+    if mi.is_spectral:
+        if samples.wavelength is None:
+            numbers.wavelength = sampler.next_1d()
+        else:
+            numbers.wavelength, hero, all_four = samples.wavelength.draw(pixel, index)
+            numbers.weight *= all_four
+            numbers.hero_weight = hero / all_four
+    return numbers
+
+
+def camera_rays(
+    sensor: mi.Sensor, lanes: Lanes, numbers: CameraNumbers, spp: int
+) -> CameraRays:
+    """The rays that these numbers stand for; ``spp`` samples per pixel of the whole render scale
+    the ray differentials."""
+    film = sensor.film()
+    scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
+    offset = -mi.ScalarVector2f(film.crop_offset()) * scale
+    position = mi.Point2f(lanes.corner) + numbers.film
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += numbers.time * sensor.shutter_open_time()
+    ray, importance = sensor.sample_ray_differential(
+        time, numbers.wavelength, dr.fma(position, scale, offset), numbers.aperture
+    )
+    if ray.has_differentials:
+        ray.scale_differential(dr.opaque(mi.Float, spp**-0.5))
+    # A box filter ignores the offset inside the pixel: it would only add rounding errors
+    if film.rfilter().is_box_filter():
+        position = mi.Point2f(lanes.corner)
+    return CameraRays(
+        ray, lanes.pixel, importance, position, numbers.weight, numbers.hero_weight
+    )
+
+
 def sample_rays(
     sensor: mi.Sensor,
     sampler: mi.Sampler,
@@ -63,101 +146,64 @@ def sample_rays(
 ) -> CameraRays:
     """Camera rays of one pass: ``spp_per_pass`` for each pixel of the film.
 
-    The random numbers are drawn in the order in which ``mi.SamplingIntegrator`` draws them, so that
-    the same seed gives the same rays as Mitsuba's own integrators.
-
     Parameters:
         sensor, sampler: The sampler is seeded for ``width · height · spp_per_pass`` lanes.
         spp_per_pass: Samples per pixel of this pass.
-        spp: Samples per pixel of the whole render; it scales the ray differentials.
+        spp: Samples per pixel of the whole render.
         samples: Which numbers choose aperture, time and wavelengths.
         first: Samples per pixel that earlier passes took.
     """
-    film = sensor.film()
-    width, height = film_extent(film)
-
-    # The divisor is opaque, so that passes of different length share a kernel
-    lane = dr.arange(mi.UInt32, width * height * spp_per_pass)
-    pixel = lane // dr.opaque(mi.UInt32, spp_per_pass)
-    y = pixel // width
-    corner = mi.Vector2i(mi.Int32(pixel - y * width), mi.Int32(y))
-    if film.sample_border():
-        corner -= film.rfilter().border_size()
-    corner += mi.Vector2i(film.crop_offset())
-
-    position = mi.Point2f(corner) + sampler.next_2d()
-    scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
-    offset = -mi.ScalarVector2f(film.crop_offset()) * scale
-    film_sample = dr.fma(position, scale, offset)
-
-    index = lane - pixel * dr.opaque(mi.UInt32, spp_per_pass) + dr.opaque(mi.UInt32, first)
-    weight, hero_weight = 1.0, 1.0
-    aperture_sample = mi.Point2f(0.5)
-    if sensor.needs_aperture_sample():
-        if samples.aperture is None:
-            aperture_sample = sampler.next_2d()
-        else:
-            aperture_sample, weight = samples.aperture.draw(pixel, index)
-    time = mi.Float(sensor.shutter_open())
-    if sensor.shutter_open_time() > 0:
-        if samples.time is None:
-            time_sample = sampler.next_1d()
-        else:
-            time_sample, time_weight = samples.time.draw(pixel, index)
-            weight *= time_weight
-        time += time_sample * sensor.shutter_open_time()
-    wavelength_sample = mi.Float(0)
-    if mi.is_spectral:
-        if samples.wavelength is None:
-            wavelength_sample = sampler.next_1d()
-        else:
-            wavelength_sample, hero, all_four = samples.wavelength.draw(pixel, index)
-            weight *= all_four
-            hero_weight = hero / all_four
-
-    ray, importance = sensor.sample_ray_differential(
-        time, wavelength_sample, film_sample, aperture_sample
-    )
-    if ray.has_differentials:
-        ray.scale_differential(dr.opaque(mi.Float, spp**-0.5))
-
-    # A box filter ignores the offset inside the pixel: it would only add rounding errors
-    if film.rfilter().is_box_filter():
-        position = mi.Point2f(corner)
-    return CameraRays(ray, importance, weight, hero_weight, position, pixel)
+    lanes = lanes_of(sensor.film(), spp_per_pass, first)
+    return camera_rays(sensor, lanes, draw_numbers(sensor, sampler, lanes, samples), spp)
 
 
-def splat(
-    film: mi.Film,
-    block: mi.ImageBlock,
-    rays: CameraRays,
-    L: mi.Spectrum,
-    valid: mi.Bool,
-    aovs: list[mi.Float],
+def put(
+    film: mi.Film, block: mi.ImageBlock, rays: CameraRays, sample: Sample, aovs: list[mi.Float]
 ) -> None:
-    """Puts samples into an image block, in the channels that the film asks for.
-
-    Parameters:
-        L: Radiance that the rays bring back.
-        valid: Did the ray meet something? (alpha)
-        aovs: One value per channel that the integrator announced to ``film.prepare``.
-    """
-    L = L * rays.importance * rays.weight
-    alpha = dr.select(valid, mi.Float(rays.weight), 0)
+    """Puts samples into an image block, in the channels that the film asks for. ``aovs`` has one
+    value per channel that the integrator announced to ``film.prepare``."""
+    L = sample.L * rays.importance * rays.weight
+    alpha = dr.select(sample.valid, mi.Float(rays.weight), 0)
     aovs = [value * rays.weight for value in aovs]
-    position, wavelengths = rays.position, rays.ray.wavelengths
+    wavelengths = rays.ray.wavelengths
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         values = film.prepare_sample(
-            L, wavelengths, block.channel_count(), weight=1, alpha=alpha, active=valid
+            L, wavelengths, block.channel_count(), weight=1, alpha=alpha, active=sample.valid
         )
-        block.put(position, values)
-        return
+        block.put(rays.position, values)
+    else:
+        block.put(
+            rays.position, [*_channels(film, L, wavelengths, alpha), mi.Float(1.0), *aovs]
+        )
+    for splats in sample.splats:
+        _put_splats(film, block, splats, len(aovs))
+
+
+def _put_splats(
+    film: mi.Film, block: mi.ImageBlock, splats: Splats, aov_count: int
+) -> None:
+    """Adds splats to the same block, without a weight: the film divides by the filter weights of
+    the camera samples, of which there are as many as light paths, also at the film's edges."""
+    if film.sample_border() or mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        raise NotImplementedError(
+            f'light that reaches other pixels cannot be added to the film "{film.class_name()}"'
+            f'{" with a sampled border" if film.sample_border() else ""}'
+        )
+    channels = _channels(film, splats.value, splats.wavelengths, mi.Float(0))
+    zeros = [mi.Float(0)] * (1 + aov_count)
+    block.put(splats.position, [*channels, *zeros], splats.active)
+
+
+def _channels(
+    film: mi.Film, L: mi.Spectrum, wavelengths: mi.Spectrum | None, alpha: mi.Float
+) -> list[mi.Float]:
+    """The colour channels of a film, and alpha where it has that."""
     if mi.is_spectral:
         rgb = mi.spectrum_to_srgb(L, wavelengths)
     else:
         rgb = mi.Color3f(L.x) if mi.is_monochromatic else L
     has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-    block.put(position, [rgb.x, rgb.y, rgb.z, *([alpha] if has_alpha else []), 1.0, *aovs])
+    return [rgb.x, rgb.y, rgb.z, *([alpha] if has_alpha else [])]
 
 
 def develop(film: mi.Film, develop: bool, evaluate: bool) -> mi.TensorXf:

@@ -11,43 +11,43 @@ from __future__ import annotations
 import operator
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
 
-from ..parameters import MOST_SPP
-from ..transport import heroes as dispersion
-from ..transport.walk import Walk
+from ..transport import heroes
 from . import camera
-from .camera_samples import CameraSamples
 from .interrupts import deferred_interrupt
+from .plan import Planned, plan_render
+from .stages import Schedule, Stage
 from .time_budget import TimeBudget
 
-if TYPE_CHECKING:
-    from .staged_integrator import StagedIntegrator
 
-#: Samples per pass. Tracing a pass in Python takes 5 to 70 ms (many materials take longest), the
-#: pass itself two or three seconds on two CPU cores. A GPU gets longer passes.
-_PASS_SAMPLES = {dr.JitBackend.LLVM: 1 << 21, dr.JitBackend.CUDA: 1 << 24}
+class Staged(Planned, Protocol):
+    """What :func:`render` asks of an integrator."""
 
-#: Samples per pixel and pass, at least, however large the film is: neighbouring lanes that share a
-#: pixel trace rays that stay together. At 1920x1080, passes of one sample take 1.6 times as long.
-#: Not with a structured sampler, which keeps a state for each sample of a pass.
-_PASS_SPP = 16
+    progress: Callable[[float], None] | None
+    statistics: RenderStatistics
+    is_cancelled: bool
 
-#: Passes of a structured sampler that learns, at least: a pilot is one of them or more.
-_MIN_STRUCTURED_PASSES = 16
+    def schedule(
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
+    ) -> Schedule:
+        """The stages of a render, which take so many samples per pixel each."""
 
-#: With a timeout, passes of a structured sampler are shorter by this factor: they cannot differ in
-#: length, and are what the timeout is kept with.
-_TIMEOUT_PASS_DIVISOR = 4
+    def aov_names(self) -> list[str]:
+        """Channels besides colour and alpha."""
 
-_MAX_WAVEFRONT = 1 << 32
+    def sample_aovs(
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f
+    ) -> list[mi.Float]:
+        """Their values along camera rays, but for those that the estimator finds."""
 
-#: Passes of a render, at most: they last weeks.
-_MOST_PASSES = 1 << 20
+    def no_gradients(self) -> NotImplementedError:
+        """What to raise where gradients are asked for."""
 
 
 @dataclass
@@ -85,25 +85,8 @@ class RenderStatistics:
     interrupted: bool = False
 
 
-@dataclass
-class Stage:
-    """One stage of a render.
-
-    Attributes:
-        walk: What its samples do.
-        learned: What had been learned before.
-        is_scout: Does it take one sample per pixel that is none of the image's?
-        camera: What chooses points of the aperture, times and wavelengths.
-    """
-
-    walk: Walk
-    learned: str = ""
-    is_scout: bool = False
-    camera: CameraSamples = field(default_factory=CameraSamples)
-
-
 def render(
-    integrator: StagedIntegrator,
+    integrator: Staged,
     scene: mi.Scene,
     sensor: int | mi.Sensor,
     seed: int | mi.UInt32,
@@ -111,7 +94,7 @@ def render(
     develop: bool,
     evaluate: bool,
 ) -> mi.TensorXf:
-    """Renders ``scene`` with the estimators that ``integrator.stages()`` yields.
+    """Renders ``scene`` with the estimators that ``integrator.schedule()`` makes.
 
     Parameters are those of ``mi.Integrator.render``. The statistics are left in
     ``integrator.statistics``.
@@ -147,18 +130,10 @@ class _Job:
             integrator, scene, sensor, sensor.film(),
         )
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
-        self.seed = seed & 0xFFFFFFFF
         self.sampler = _own_sampler(sensor)
-        if not 0 <= spp <= MOST_SPP:
-            raise ValueError(
-                f'"{integrator.name}": spp is {spp}; it must be 1 to {MOST_SPP}, or 0 for as many '
-                f"as the sampler says"
-            )
-        if spp:
-            self.sampler.set_sample_count(spp)
-        self.spp = self.sampler.sample_count()
-        self.width, self.height = camera.film_extent(self.film)
-        check_extent(self.film)
+        self.plan = plan_render(
+            integrator, scene, self.film, self.sampler, seed & 0xFFFFFFFF, spp
+        )
         self.statistics = integrator.statistics = RenderStatistics()
         self.tally = dr.zeros(mi.UInt64, 4)
         aovs = integrator.aov_names()
@@ -168,85 +143,39 @@ class _Job:
                 f'"{self.film.class_name()}": use an "hdrfilm".'
             )
         self.film.prepare(aovs)
-        self._plan()
+        if self.plan.structured:
+            self.sampler.set_samples_per_wavefront(self.plan.limit)
+            self.sampler.seed(dr.opaque(mi.UInt32, self.plan.seed), self._lanes(self.plan.limit))
+        pilot_spp = sum(self.plan.stages[:-1])
+        self.budget = TimeBudget(
+            integrator.timeout, self.start, self.plan.pixel_count, pilot_spp
+        )
         self.block = self.film.create_block()
         # One kernel for all passes: coalescing is decided once
-        longest = max(self._pass_length(samples) for samples in self.stages)
-        self.block.set_coalesce(self.block.coalesce() and longest >= 4)
-
-    def _plan(self) -> None:
-        """Decides the samples of each stage and the length of passes."""
-        pixel_count = self.width * self.height
-        self.structured = self.sampler.class_name() != "IndependentSampler"
-        cost = self.integrator.sample_cost
-        limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // (pixel_count * cost)
-        if not self.structured:
-            limit = max(limit, min(_PASS_SPP // cost, (_MAX_WAVEFRONT - 1) // pixel_count))
-        is_timed = self.integrator.timeout > 0
-        if self.structured and is_timed:
-            limit //= _TIMEOUT_PASS_DIVISOR
-        self.limit = max(1, min(limit, self.integrator.samples_per_pass))
-        if self.spp > self.limit * _MOST_PASSES:
-            raise ValueError(
-                f'"{self.integrator.name}": {self.spp} samples for each of {pixel_count} pixels '
-                f"are too many: give at most {self.limit * _MOST_PASSES}"
-            )
-        pilots = self.integrator.pilots(self.scene, self.spp)
-        # With a timeout, sets of samples are kept whole
-        self.set_size = self.integrator.samples_per_set(self.spp) if is_timed else 1
-        if self.structured:
-            pilots = self._plan_structured(pilots)
-        self.stages = [*pilots, self.spp - sum(pilots)]
-        self.budget = TimeBudget(self.integrator.timeout, self.start, pixel_count, sum(pilots))
-        self.pass_index = 0
-
-    def _plan_structured(self, pilots: list[int]) -> list[int]:
-        """Independent samples can be cut anywhere, and each pass gets a seed of its own. Samples
-        that are stratified over the whole render must come in passes of equal length, to which
-        the pilots are rounded."""
-        if pilots:
-            self.limit = min(self.limit, max(*pilots, self.spp // _MIN_STRUCTURED_PASSES))
-        self.limit = length = max(d for d in range(1, self.limit + 1) if self._can_be_cut(d))
-        self.sampler.set_samples_per_wavefront(length)
-        self.sampler.seed(dr.opaque(mi.UInt32, self.seed), self._lanes(length))
-        return [length * max(1, samples // length) for samples in pilots]
-
-    def _can_be_cut(self, length: int) -> bool:
-        """Into passes of this length?"""
-        if self.spp % length != 0:
-            return False
-        return self.set_size % length == 0 or length % self.set_size == 0
-
-    def _pass_length(self, samples: int) -> int:
-        """Of passes of about equal length that take ``samples`` samples."""
-        if self.structured:
-            return self.limit
-        pass_count = -(-samples // self.limit)
-        return max(1, -(-samples // max(1, pass_count)))
+        self.block.set_coalesce(self.block.coalesce() and self.plan.longest_pass >= 4)
 
     def _lanes(self, spp: int) -> int:
-        return self.width * self.height * spp
+        return self.plan.pixel_count * spp
 
     def run(self, interrupt: threading.Event) -> None:
+        plan = self.plan
         mi.Log(
             mi.LogLevel.Info,
-            f"Starting render job ({self.width}x{self.height}, {self.spp} samples, "
-            f"{len(self.stages)} stage(s))",
+            f"Starting render job ({plan.pixel_count} pixels, {plan.spp} samples, "
+            f"{len(plan.stages)} stage(s))",
         )
         self.statistics.interrupted = True  # until the last stage has all its samples
-        plan = iter(enumerate(self.stages))
-        for stage in self.integrator.stages(self.scene, self.sensor, self.stages, self.seed):
-            if stage.is_scout:
+        schedule = self.integrator.schedule(self.scene, self.sensor, plan.stages, plan.seed)
+        for index, samples in enumerate(plan.stages):
+            while (stage := schedule.next_stage()).is_scout:
                 self._run_scout(stage)
-                continue
-            index, samples = next(plan)
-            is_last = index == len(self.stages) - 1
+            is_last = index == len(plan.stages) - 1
             self.statistics.learned = stage.learned
             if is_last:
-                samples = self.spp - self.statistics.spp  # pilots may have been cut short
+                samples = plan.spp - self.statistics.spp  # pilots may have been cut short
                 self.statistics.learning_seconds = time.perf_counter() - self.start
                 if stage.camera.wavelength is None:
-                    dispersion.warn_of_sampler(self.scene, self.sampler)
+                    heroes.warn_of_sampler(self.scene, self.sampler)
             self._run_stage(stage, samples, is_last, interrupt)
             if self._stopped(interrupt):
                 return
@@ -255,11 +184,11 @@ class _Job:
         """Runs the passes of a stage: all of them, or as many as the timeout allows."""
         before = self.statistics.spp
         budget = self.budget.stage(samples, before, is_last)
-        length, done = self._pass_length(samples), 0
-        while done < (wanted := self._whole(before, budget.samples, samples)):
+        length, done = self.plan.pass_length(samples), 0
+        while done < (wanted := self.plan.whole(before, budget.samples, samples)):
             if self._stopped(interrupt):
                 return
-            spp = length if self.structured else min(length, budget.longest, wanted - done)
+            spp = length if self.plan.structured else min(length, budget.longest, wanted - done)
             begin = time.perf_counter()
             compiled = self._run_pass(stage, spp)
             done += spp
@@ -267,15 +196,10 @@ class _Job:
                 budget.passed(spp, done, time.perf_counter() - begin)
             if self.integrator.progress is not None:
                 is_known = is_last and not budget.is_open
-                wanted = max(done, self._whole(before, budget.samples, samples))
-                total = before + wanted if is_known else self.spp
+                wanted = max(done, self.plan.whole(before, budget.samples, samples))
+                total = before + wanted if is_known else self.plan.spp
                 self.integrator.progress((before + done) / total)
         self.statistics.interrupted = not is_last
-
-    def _whole(self, before: int, samples: int, most: int) -> int:
-        """The samples of a stage, so many that the render ends with a whole set; ``most`` would do
-        so."""
-        return min(most, samples + -(before + samples) % self.set_size)
 
     def _stopped(self, interrupt: threading.Event) -> bool:
         return interrupt.is_set() or self.integrator.is_cancelled
@@ -285,8 +209,8 @@ class _Job:
         sampler = mi.load_dict({"type": "independent"})
         # The same for all seeds: what a scout decides changes the size of tables, and kernels
         sampler.seed(dr.opaque(mi.UInt32, 0), self._lanes(1))
-        rays = camera.sample_rays(self.sensor, sampler, 1, self.spp, stage.camera)
-        sample = stage.walk(self.scene, sampler, rays.ray, mi.Bool(True), rays.pixel)
+        rays = camera.sample_rays(self.sensor, sampler, 1, self.plan.spp, stage.camera)
+        sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
         dr.eval(sample.L)
         self.statistics.compile_seconds += time.perf_counter() - begin
         dr.sync_thread()
@@ -297,36 +221,34 @@ class _Job:
         misses = kernel_cache_misses()
         sampler = self._pass_sampler(spp)
         rays = camera.sample_rays(
-            self.sensor, sampler, spp, self.spp, stage.camera, self.statistics.spp
+            self.sensor, sampler, spp, self.plan.spp, stage.camera, self.statistics.spp
         )
-        sample = stage.walk(
-            self.scene, sampler, rays.ray, mi.Bool(True), rays.pixel, rays.hero_weight
-        )
+        sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
         if dr.grad_enabled(sample.L):
             raise self.integrator.no_gradients()
         aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
-        camera.splat(self.film, self.block, rays, sample.L, sample.valid, aovs)
+        camera.put(self.film, self.block, rays, sample, aovs)
         self._count(sample)
-        if self.structured:
+        if self.plan.structured:
             sampler.advance()
             sampler.schedule_state()
         dr.eval(self.block.tensor(), self.tally)
         self.statistics.compile_seconds += time.perf_counter() - begin
         dr.sync_thread()
 
-        self.pass_index += 1
         self.statistics.passes += 1
         self.statistics.spp += spp
         self.statistics.rays["camera"] += self._lanes(spp)
         return kernel_cache_misses() > misses
 
     def _pass_sampler(self, spp: int) -> mi.Sampler:
-        if self.structured:
+        if self.plan.structured:
             return self.sampler
         # The first pass is seeded as Mitsuba's own integrators do: it draws the same numbers
-        seed = self.seed
-        if self.pass_index > 0:
-            seed = mi.sample_tea_32(mi.UInt32(self.seed), mi.UInt32(self.pass_index))[0][0]
+        seed = self.plan.seed
+        if self.statistics.passes > 0:
+            index = mi.UInt32(self.statistics.passes)
+            seed = mi.sample_tea_32(mi.UInt32(seed), index)[0][0]
         sampler = self.sampler.clone()
         sampler.seed(dr.opaque(mi.UInt32, seed), self._lanes(spp))
         return sampler
@@ -357,20 +279,7 @@ class _Job:
             mi.LogLevel.Info,
             f"Rendering {'interrupted' if statistics.interrupted else 'finished'}. "
             f"(took {statistics.seconds:.2f}s, {statistics.passes} pass(es), "
-            f"{statistics.spp} of {self.spp} samples)",
-        )
-
-
-def check_extent(film: mi.Film) -> None:
-    """Refuses a film that one pass cannot fill.
-
-    Raises:
-        ValueError: It has more pixels than a wavefront can hold.
-    """
-    width, height = camera.film_extent(film)
-    if width * height >= _MAX_WAVEFRONT:
-        raise ValueError(
-            f"a film of {width}x{height} pixels exceeds the 2^32 samples of one pass"
+            f"{statistics.spp} of {self.plan.spp} samples)",
         )
 
 

@@ -6,14 +6,14 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
 
 from ..parameters import read_parameter
 from . import render as rendering
-from .render import Stage
+from .stages import Schedule
 
 #: What stands for "as many as there are".
 NO_LIMIT = 0xFFFFFFFF
@@ -60,11 +60,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
         """
         return 1
 
-    def stages(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: list[int], seed: int
-    ) -> Iterator[Stage]:
-        """Yields one stage for each entry of ``samples``: pilots, and the last one. What stands
-        between two ``yield`` runs between the stages."""
+    def schedule(
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
+    ) -> Schedule:
+        """Makes one stage for each entry of ``samples`` (samples per pixel): pilots, and the last
+        one."""
         raise NotImplementedError
 
     def parameters(self) -> dict[str, Any]:

@@ -7,6 +7,8 @@ from typing import Any
 
 import mitsuba as mi
 
+from .vertex import Vertex
+
 
 class Observer:
     """What the walk tells while it is traced; whoever listens overrides what it wants to hear.
@@ -18,8 +20,8 @@ class Observer:
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         """A pass of so many paths begins, one in each lane, in ``pixel`` of the film."""
 
-    def vertex(self, si: mi.SurfaceInteraction3f, depth: mi.UInt32, active: mi.Bool) -> None:
-        """A path is about to connect ``si`` to a light; ``depth`` is 0 at the first vertex."""
+    def vertex(self, vertex: Vertex, active: mi.Bool) -> None:
+        """A path is about to connect ``vertex`` to lights."""
 
     def connection(
         self,
@@ -30,13 +32,13 @@ class Observer:
         visible: mi.Bool,
         tested: mi.Bool,
     ) -> None:
-        """A shadow ray was traced where ``tested``. ``choice`` is the state of the next event
-        decision; ``contribution`` is BSDF · radiance / pdf, before throughput and MIS weights."""
+        """A shadow ray was traced where ``tested``. ``choice`` is what the next event decision told
+        of its choice; ``contribution`` is BSDF · radiance / pdf, before throughput and MIS
+        weights."""
 
     def direction(
         self,
-        si: mi.SurfaceInteraction3f,
-        depth: mi.UInt32,
+        vertex: Vertex,
         sample: mi.Point2f,
         weight: mi.Float | float,
         L: mi.Spectrum,

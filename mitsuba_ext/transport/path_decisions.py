@@ -1,12 +1,21 @@
-"""The decisions that Mitsuba's ``path`` takes. They leave no code of their own in the kernel, but
-for shadow rays to lights at infinity."""
+"""The decisions of a random walk, as Mitsuba's ``path`` takes them, and at the same time what their
+replacements have to offer. They leave no code of their own in the kernel, but for shadow rays to
+lights at infinity.
+
+Dr.Jit's loops see local variables only. Whatever a decision changes from one bounce to the next is
+therefore a *state* that its methods take and return; its attributes are read-only during the walk.
+``()`` is the state of a decision that remembers nothing.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
+from .vertex import PathState, Vertex
 
 
 class DirectionSamples:
@@ -17,27 +26,19 @@ class DirectionSamples:
         return ()
 
     def draw(
-        self,
-        state: Any,
-        sampler: mi.Sampler,
-        si: mi.SurfaceInteraction3f,
-        depth: mi.UInt32,
-        active: mi.Bool,
+        self, state: Any, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
     ) -> tuple[mi.Float, mi.Point2f, mi.Float | float, Any]:
         """The lobe's number, the direction's numbers, the factor by which the throughput is to be
         multiplied (1 / density of the numbers), and the new state."""
         return sampler.next_1d(), sampler.next_2d(), 1.0, state
 
 
-class EmitterSampling:
-    """Which point of which light to connect to: Mitsuba's choice (uniform, or by the emitters'
-    ``sampling_weight``).
+class Scattering:
+    """Where a path goes on: where the BSDF's own samples lead.
 
-    Attributes:
-        gathers: Has it a method ``gather``, which connects a path's first vertex to many points?
+    Another distribution of directions can be mixed in. Then the densities that are returned must be
+    those of the mixture: they go into the MIS weights of connections.
     """
-
-    gathers = False
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
         """The state before the first bounce."""
@@ -46,17 +47,86 @@ class EmitterSampling:
     def sample(
         self,
         state: Any,
+        ctx: mi.BSDFContext,
+        vertex: Vertex,
+        wo: mi.Vector3f,
+        sample_1: mi.Float,
+        sample_2: mi.Point2f,
+    ) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum, Any]:
+        """Chooses a direction and looks at another one.
+
+        Parameters:
+            wo: The other direction (local, towards the light of a connection).
+            sample_1, sample_2: Uniform numbers.
+
+        Returns:
+            The BSDF's value (cosine included) and the density of this decision for ``wo``; the
+            direction that was chosen, with its density; value / density there; the new state.
+        """
+        return *vertex.bsdf.eval_pdf_sample(ctx, vertex.si, wo, sample_1, sample_2), state
+
+    def eval_pdf(
+        self, state: Any, ctx: mi.BSDFContext, vertex: Vertex, wo: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        """The first two results of :meth:`sample` alone; ``state`` is that before it."""
+        return vertex.bsdf.eval_pdf(ctx, vertex.si, wo, active)
+
+
+@dataclass
+class LightNumbers:
+    """The primary samples of one connection.
+
+    Attributes:
+        point: Chooses the point on the light (and the light, where ``choice`` is not there).
+        choice: Chooses the light: ``None``, a number, or two, as ``choice_dimension`` of
+            :class:`EmitterSampling` says.
+    """
+
+    point: mi.Point2f
+    choice: mi.Float | mi.Point2f | None = None
+
+
+class EmitterSampling:
+    """Which point of which light to connect to: Mitsuba's choice (uniform, or by the emitters'
+    ``sampling_weight``).
+
+    At each vertex the walk asks for what is known of the place (:meth:`visit`), with which it draws
+    one connection or many. What :meth:`density` needs at the next vertex is the state.
+
+    Attributes:
+        choice_dimension: Numbers that choose the light, before those that choose a point on it.
+    """
+
+    choice_dimension = 0
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
+        """The state before the first bounce."""
+        return ()
+
+    def visit(
+        self, state: Any, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> Any:
+        """What is known of the vertex ``si``."""
+        return ()
+
+    def sample(
+        self,
+        place: Any,
         scene: mi.Scene,
-        sampler: mi.Sampler,
+        numbers: LightNumbers,
         si: mi.SurfaceInteraction3f,
         active: mi.Bool,
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, Any]:
-        """A direction sample towards a light, its radiance / pdf (visibility not tested), and the
-        new state."""
-        ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, active)
-        return ds, weight, state
+        """A direction sample towards a light, its radiance / pdf (visibility not tested), and what
+        shadow tests and observers can know of the choice. ``place`` is from :meth:`visit`."""
+        ds, weight = scene.sample_emitter_direction(si, numbers.point, False, active)
+        return ds, weight, place
 
-    def pdf(
+    def remember(self, place: Any) -> Any:
+        """The state when the vertex of ``place`` is left."""
+        return place
+
+    def density(
         self,
         state: Any,
         scene: mi.Scene,
@@ -64,10 +134,50 @@ class EmitterSampling:
         si: mi.SurfaceInteraction3f,
         ds: mi.DirectionSample3f,
         active: mi.Bool,
-    ) -> tuple[mi.Float, Any]:
+    ) -> mi.Float:
         """The solid angle density with which :meth:`sample`, at ``ref``, gives the direction
-        ``ds`` in which a BSDF sample ran into the light at ``si``, and the new state."""
-        return scene.pdf_emitter_direction(ref, ds, active), state
+        ``ds`` in which a BSDF sample ran into the light at ``si``; ``state`` is that with which
+        ``ref`` was left."""
+        return scene.pdf_emitter_direction(ref, ds, active)
+
+
+class NoConnections(EmitterSampling):
+    """Connects to no light: light is found by BSDF samples only."""
+
+    def sample(self, place, scene, numbers, si, active):
+        return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), place
+
+    def density(self, state, scene, ref, si, ds, active):
+        return mi.Float(0)
+
+
+class ConnectionCount:
+    """To how many points of lights a vertex is connected: to one.
+
+    Attributes:
+        first, later: Number of connections of a path's first vertex, and of each later one. With 0,
+            lights that a BSDF sample cannot hit (points and directions) are connected to all the
+            same.
+    """
+
+    first, later = 1, 1
+
+    def weight(self, depth: mi.UInt32) -> mi.Float | float:
+        """The number of connections of a vertex at ``depth``, for MIS weights."""
+        if self.first == self.later == 1:
+            return 1.0
+        first, later = (dr.opaque(mi.Float, n) for n in (self.first, self.later))
+        return dr.select(depth == 0, first, later)
+
+    def begin(self, sampler: mi.Sampler, choice_dimension: int) -> Any:
+        """Chooses the set of numbers of a vertex that has more than one connection."""
+        raise NotImplementedError
+
+    def numbers(
+        self, chosen: Any, index: mi.UInt32, choice_dimension: int, active: mi.Bool
+    ) -> tuple[LightNumbers, mi.Float | float]:
+        """The numbers of connection ``index``, and their weight."""
+        raise NotImplementedError
 
 
 class ShadowTest:
@@ -86,8 +196,8 @@ class ShadowTest:
         active: mi.Bool,
     ) -> tuple[mi.Float | None, Any]:
         """The probability, in (0, 1], of testing the connection from ``si`` to ``ds.p``, and the
-        new state. ``choice`` is the state of the next event decision that made the connection.
-        ``None`` means always, and leaves the roulette out of the kernel."""
+        new state. ``choice`` is what the next event decision told of its choice. ``None`` means
+        always, and leaves the roulette out of the kernel."""
         raise NotImplementedError
 
 
@@ -137,3 +247,21 @@ class SceneQuery:
             is_infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
             ray.maxt = dr.select(is_infinite, dr.largest(mi.Float), ray.maxt)
         return ray
+
+
+class Roulette:
+    """Which paths go on: the rule of Mitsuba's ``path``, by throughput."""
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
+        """The state before the first bounce."""
+        return ()
+
+    def survival(
+        self, state: Any, vertex: Vertex, path: PathState, active: mi.Bool
+    ) -> tuple[mi.Float, Any]:
+        """The probability, in (0, 1], with which a path goes on from ``vertex`` in the direction
+        that was chosen there, and the new state. ``path`` is what it would carry along."""
+        # Where guided samples are dense, paths have little throughput because they matter; a hero
+        # has more since it stands for four
+        β_max = dr.max(path.β)
+        return dr.minimum(β_max / path.sampling_weight * dr.square(path.η), 0.95), state

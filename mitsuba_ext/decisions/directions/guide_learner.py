@@ -77,14 +77,13 @@ class GuideLearner(Learner):
         self._records: PathRecords | None = None
         self._share, self._summary = _FIRST_SHARE, ""
 
-    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> None:
         self._summary = "no guide: no path scatters"
         if self.wants_scout and dr.width(p) == 0:
-            return {}
+            return
         self._regions = self.make_regions(p, n)
         most = self.pilot_samples * self.bounces * BYTES_PER_RECORD
         self._records = PathRecords(self._regions.label, self.bounces, -(-most // self.max_memory))
-        return {}
 
     # ---- Observer ----
 
@@ -102,14 +101,14 @@ class GuideLearner(Learner):
 
     # ---- Between the stages ----
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> dict[str, Any]:
+    def learn(self, scene: mi.Scene, is_last: bool) -> DirectionSamples | None:
         records = self._records
         if records is None:
-            return {}
+            return None
         records.finish()
         if records.count == 0:
             self._records, self._summary = None, "no guide: no path scatters"
-            return {}
+            return None
         bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
         self.sample_count = records.count
         if self.guide is not None and records.count > records.first_new:
@@ -119,7 +118,7 @@ class GuideLearner(Learner):
             if efficiency < _LEAST_EFFICIENCY and not self.always:
                 self.guide, self._records = None, None
                 self._summary = f"no guide: with {self._regions}, {effect}"
-                return {"directions": DirectionSamples()}
+                return DirectionSamples()
         builder, roots, below = self._regions.build(records)
         trees = SampleTrees(
             builder.probability,
@@ -137,9 +136,10 @@ class GuideLearner(Learner):
             f"samples, {effect}"
         )
         self.guide = GuidedDirections(trees, self._regions, bounces)
-        if is_last:
-            self._records = None
-        return {"directions": self.guide}
+        return self.guide
+
+    def finish(self) -> None:
+        self._records = None
 
     def gains(self, records: PathRecords) -> dict[float, np.ndarray]:
         """By how much, relatively, the trees that drew the last samples lower the variance: for

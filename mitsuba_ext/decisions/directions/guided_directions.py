@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from ...transport.path_decisions import DirectionSamples, EmitterSampling
+from ...transport.path_decisions import DirectionSamples
 from .sample_trees import SampleTrees
 
 
@@ -51,12 +51,12 @@ class GuidedDirections(DirectionSamples):
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
         return self.regions.begin(pixel)
 
-    def draw(self, state, sampler, si, depth, active):
+    def draw(self, state, sampler, vertex, active):
         sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
         # A branch: later bounces are to cost nothing
         sample_2, weight, state = dr.if_stmt(
-            (state, si, sample_2),
-            active & (depth < self.bounces),
+            (state, vertex.si, sample_2),
+            active & (vertex.depth < self.bounces),
             self._guide,
             lambda state, si, sample: (sample, mi.Float(1), state),
         )
@@ -76,28 +76,3 @@ class GuidedDirections(DirectionSamples):
         active = mi.Bool(True)
         tree = self.regions.tree(self.regions.begin(pixel), si, active)
         return self.trees.density(tree, u, active)[0]
-
-
-class LaterConnections(EmitterSampling):
-    """Another choice of lights, but for a path's first vertex: there, light is found by BSDF
-    samples only (the setting of the thesis's section 2.4.2)."""
-
-    def __init__(self, choice: EmitterSampling) -> None:
-        self._choice = choice
-
-    def begin(self, sampler, ray):
-        return mi.UInt32(0), self._choice.begin(sampler, ray)
-
-    def sample(self, state, scene, sampler, si, active):
-        vertex, inner = state
-        ds, weight, inner = self._choice.sample(inner, scene, sampler, si, active)
-        # No BSDF sample runs into a light without extent
-        connects = (vertex > 0) | ds.delta
-        ds.pdf = dr.select(connects, ds.pdf, 0)
-        return ds, dr.select(connects, weight, 0), (vertex + 1, inner)
-
-    def pdf(self, state, scene, ref, si, ds, active):
-        vertex, inner = state
-        is_later = vertex > 1
-        pdf, inner = self._choice.pdf(inner, scene, ref, si, ds, active & is_later)
-        return dr.select(is_later, pdf, 0), (vertex, inner)

@@ -76,10 +76,10 @@ class PathRecords(Observer):
         self._slots = dr.opaque(mi.UInt32, self._lanes)
         dr.eval(self._keys, self._weights, self._before, self._total)
 
-    def direction(self, si, depth, sample, weight, L, active) -> None:
-        active = active & self._is_recorded & (depth < self.bounces)
-        key = (self._region(si, self._pixel, active) << DEPTH) | cell_code(sample)
-        slot = depth * self._slots + self._path
+    def direction(self, vertex, sample, weight, L, active) -> None:
+        active = active & self._is_recorded & (vertex.depth < self.bounces)
+        key = (self._region(vertex.si, self._pixel, active) << DEPTH) | cell_code(sample)
+        slot = vertex.depth * self._slots + self._path
         dr.scatter(self._keys, key, slot, active)
         dr.scatter(self._weights, mi.Float(weight), slot, active)
         dr.scatter(self._before, _brightness(L), slot, active)

@@ -39,10 +39,10 @@ class OneRow:
 
 @dataclass
 class Choice:
-    """The state of a light selection: the last choice.
+    """What was chosen for a connection.
 
     Attributes:
-        row: Row of the table at the last vertex.
+        row: Row of the table at the vertex.
         cell: What was chosen there.
         probability: With what probability.
     """
@@ -62,32 +62,37 @@ class LightSelection(EmitterSampling):
             zeros chooses uniformly.
     """
 
+    # What is left of one number, after choosing among many entries, is too coarse
+    choice_dimension = 2
+
     def __init__(self, rows: Rows, cells: LightCells, weights: mi.Float) -> None:
         self.rows, self.cells = rows, cells
         self._table = _table(weights, rows.count, cells.count)
         # Opaque: scenes that differ in it only share their kernels
         self._count = dr.opaque(mi.UInt32, cells.count)
 
-    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Choice:
-        return Choice(mi.UInt32(0), mi.UInt32(0), mi.Float(0))
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> mi.UInt32:
+        return mi.UInt32(0)
 
-    def sample(self, state, scene, sampler, si, active):
-        row = self.rows.row(si, active)
-        # Two numbers: what is left of one, after choosing among many entries, is too coarse
-        x, y = sampler.next_2d()
+    def visit(self, state, scene, si, active) -> mi.UInt32:
+        return self.rows.row(si, active)
+
+    def sample(self, place, scene, numbers, si, active):
+        row = place
+        x, y = numbers.choice
         cell = dr.minimum(mi.UInt32(x * mi.Float(self._count)), self._count - 1)
         entry = dr.gather(mi.Vector4f, self._table, row * self._count + cell, active)
         is_taken = y < entry[0]
         cell = dr.select(is_taken, cell, dr.reinterpret_array(mi.UInt32, entry[1]))
         probability = dr.select(is_taken, entry[2], entry[3])
-        ds, weight = self.cells.sample(cell, si, sampler.next_2d(), active)
+        ds, weight = self.cells.sample(cell, si, numbers.point, active)
         ds.pdf *= probability
         weight = dr.select(probability > 0, weight / probability, 0)
         return ds, weight, Choice(row, cell, probability)
 
-    def pdf(self, state, scene, ref, si, ds, active):
+    def density(self, state, scene, ref, si, ds, active):
         # Few rays run into a light: the others jump over all this
-        return _if(active, self._density, (state.row, ref, si, ds, active)), state
+        return _if(active, self._density, (state, ref, si, ds, active))
 
     def _density(self, row, ref, si, ds, active) -> mi.Float:
         cell, pdf = self.cells.pdf(ref, si, ds, active)

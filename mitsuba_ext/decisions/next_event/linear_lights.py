@@ -28,8 +28,8 @@ _BUMPED = ("BumpMap[", "NormalMap[")
 
 
 @dataclass
-class Vertex:
-    """The state of a linear selection: what the estimates at the last vertex were made from.
+class Estimates:
+    """What the estimates at a vertex were made from.
 
     Attributes:
         normal: Shading normal, on the side that is seen.
@@ -67,6 +67,7 @@ class LinearSelection(EmitterSampling):
 
     def __init__(self, scene: mi.Scene) -> None:
         self.count = len(scene.emitters())
+        self.choice_dimension = 1 if self.count > 1 else 0
         if self.count == 0:
             return
         self.cells = LightCells(scene, None)
@@ -104,33 +105,41 @@ class LinearSelection(EmitterSampling):
         self._uniform = mi.Float((positive / len(candidates)).astype(np.float32))
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
-        return Vertex(mi.Normal3f(0), mi.Bool(False), mi.Float(0)) if self.count > 1 else ()
+        return Estimates(mi.Normal3f(0), mi.Bool(False), mi.Float(0)) if self.count > 1 else ()
 
-    def sample(self, state, scene, sampler, si, active):
+    def visit(self, state, scene, si, active):
         if self.count == 1:
-            ds, weight = self.cells.sample(mi.UInt32(0), si, sampler.next_2d(), active)
-            return ds, weight, state
+            return ()
         normal = dr.mulsign(si.sh_frame.n, si.wi.z)
         bsdf = dr.reinterpret_array(mi.UInt32, si.bsdf())
         known = active & (bsdf < len(self._opaque))
         is_opaque = known & dr.gather(mi.Bool, self._opaque, bsdf, known)
         total, sums = self._sums(si.p, normal, is_opaque, active)
-        index, probability = self._choose(
-            si.p, normal, is_opaque, total, sums, sampler.next_1d(), active
-        )
-        ds, weight = self.cells.sample(index, si, sampler.next_2d(), active)
-        ds.pdf *= probability
-        weight = dr.select(probability > 0, weight / probability, 0)
-        return ds, weight, Vertex(normal, is_opaque, total)
+        return Estimates(normal, is_opaque, total), sums
 
-    def pdf(self, state, scene, ref, si, ds, active):
+    def sample(self, place, scene, numbers, si, active):
+        if self.count == 1:
+            return *self.cells.sample(mi.UInt32(0), si, numbers.point, active), ()
+        made_from, sums = place
+        index, probability = self._choose(
+            si.p, made_from.normal, made_from.is_opaque, made_from.total, sums, numbers.choice,
+            active,
+        )  # fmt: skip
+        ds, weight = self.cells.sample(index, si, numbers.point, active)
+        ds.pdf *= probability
+        return ds, dr.select(probability > 0, weight / probability, 0), ()
+
+    def remember(self, place):
+        return place[0] if self.count > 1 else ()
+
+    def density(self, state, scene, ref, si, ds, active):
         # Whole emitters: the number of a cell is that of its emitter
         index, pdf = self.cells.pdf(ref, si, ds, active)
         if self.count > 1:
             e = self._estimate(index, ref.p, state.normal, state.is_opaque, active)
             pdf *= self._probability(index, e, state.total, active)
         # Also where the lookups above were masked, the density must be a number
-        return dr.select(active, pdf, 0), state
+        return dr.select(active, pdf, 0)
 
     # The second pass does not visit the emitters again, but the blocks of about √n of them and then
     # one block. Reservoir sampling would do without it, but rescale the random number at each

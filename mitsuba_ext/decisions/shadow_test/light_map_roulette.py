@@ -6,8 +6,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ...transport.path_decisions import ShadowTest
+from ..learner import Learner
 from ..next_event.light_map import LightMap
-from .visibility_roulette import PAPER_EPSILON
+from ..next_event.light_map_learner import LightLearner
+from .visibility_roulette import PAPER_EPSILON, WORTHWHILE
 
 
 class LightRoulette(ShadowTest):
@@ -38,3 +40,32 @@ class LightRoulette(ShadowTest):
     def probability(self, state, choice, si, ds, active):
         entry = choice.row * self._count + choice.cell
         return dr.gather(mi.Float, self._p, entry, active), state
+
+
+class LightMapRouletteLearner(Learner):
+    """Makes a roulette of the light map that another learner fills.
+
+    Parameters:
+        lights: Who learns the map; comes before this learner.
+        slope, floor, law: See :class:`LightRoulette`.
+    """
+
+    def __init__(self, lights: LightLearner, slope: float, floor: float, law: str) -> None:
+        self._lights, self._law = lights, {"slope": slope, "floor": floor, "law": law}
+        self._summary = ""
+        lights.keep_map()
+
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> None:
+        return None
+
+    def learn(self, scene: mi.Scene, is_last: bool) -> ShadowTest | None:
+        if not is_last or self._lights.map is None:
+            return None
+        roulette = LightRoulette(self._lights.map, **self._law)
+        pays = roulette.rejected_share >= WORTHWHILE
+        verb = "rejects" if pays else "does not reject"
+        self._summary = f"{verb} {roulette.rejected_share:.0%} of the shadow rays"
+        return roulette if pays else None
+
+    def __str__(self) -> str:
+        return self._summary

@@ -6,8 +6,6 @@ Source: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, 
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
@@ -86,9 +84,8 @@ class VisibilityLearner(Learner):
         self._law = {"law": law, "slope": slope, "floor": floor}
         self._summary = ""
 
-    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> None:
         self._map = VisibilityMap(scene, self._grid, self._max_memory)
-        return {}
 
     def connection(self, choice, si, ds, contribution, visible, tested) -> None:
         self._map.shadow_ray(si.p, ds.p, visible, tested)
@@ -96,20 +93,21 @@ class VisibilityLearner(Learner):
     def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
         self._map.segment(p, q, active)
 
-    def learn(self, scene: mi.Scene, is_last: bool) -> dict[str, Any]:
+    def learn(self, scene: mi.Scene, is_last: bool) -> ShadowTest | None:
         if not is_last:
-            return {}
+            return None
         self._map.refine(scene, self._refine)
         self._summary = str(self._map)
-        decisions = {}
+        roulette = None
         if len(self._map.light_voxels()) > 0:
             roulette = VisibilityRoulette(self._map, **self._law)
-            if roulette.rejected_share >= WORTHWHILE:
-                decisions["shadow_test"] = roulette
-            else:
+            if roulette.rejected_share < WORTHWHILE:
                 self._summary += f"; not used, it would reject only {roulette.rejected_share:.0%}"
+                roulette = None
+        return roulette
+
+    def finish(self) -> None:
         del self._map  # the counters: the last stage needs the roulette's table only
-        return decisions
 
     def __str__(self) -> str:
         return self._summary

@@ -1,0 +1,99 @@
+"""The slots ``aperture``, ``time`` and ``wavelength``: where these numbers of a camera ray come
+from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+
+from ..decisions.camera.pixel_sets import PixelSets
+from ..decisions.weighted_sets import WEIGHTS, WeightedSets
+from ..pointsets import PATTERNS
+from .decision_parameters import DecisionParameters, ParameterReader, Setting
+
+#: Points of a set, at most, and with a timeout.
+_MOST_POINTS, _MOST_POINTS_TIMED = 1024, 64
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """What numbers are for.
+
+    Attributes:
+        index: Each purpose has sets of its own.
+        dimension: Of the sets.
+        periods: See :class:`WeightedSets`.
+        weights: Those that are accepted.
+    """
+
+    index: int
+    dimension: int = 1
+    periods: int = 1
+    weights: tuple[str, ...] = WEIGHTS
+
+
+PURPOSES = {
+    "aperture": Purpose(0, dimension=2),
+    "time": Purpose(1),
+    "wavelength": Purpose(2, periods=4, weights=("none", "voronoi", "torus")),
+}
+
+
+class WeightedNumbers(DecisionParameters):
+    """Numbers from weighted sets. The attributes are the parameters of the plugin
+    ``weighted_numbers``; see there.
+
+    Raises:
+        TypeError, ValueError: A parameter has a wrong type or value.
+    """
+
+    slots = tuple(PURPOSES)
+
+    def __init__(self, read: ParameterReader, accepted: tuple[str, ...] = WEIGHTS) -> None:
+        self.pattern = read("pattern", "lattice", choices=PATTERNS)
+        self.weights = read("weights", "none", choices=accepted)
+
+    def check_slot(self, plugin: str, slot: str) -> None:
+        super().check_slot(plugin, slot)
+        accepted = PURPOSES[slot].weights
+        if self.weights not in accepted:
+            raise ValueError(
+                f'"{plugin}": the parameter "{slot}" has weights = {self.weights}; it must be one '
+                f"of {', '.join(accepted)}"
+            )
+        if slot == "wavelength" and not mi.is_spectral:
+            raise RuntimeError(
+                f'"{plugin}": the parameter "wavelength" does not work in the variant '
+                f'"{mi.variant()}", which has no wavelengths: use a spectral one, such as '
+                f'"llvm_ad_spectral".'
+            )
+
+    def numbers(self, plugin: str, slot: str, setting: Setting) -> PixelSets | None:
+        """The numbers of a render; ``None``, with a warning, where they do not matter."""
+        reason = _reason_to_do_nothing(slot, setting.sensor)
+        if reason is not None:
+            mi.Log(mi.LogLevel.Warn, f'"{plugin}" reweights nothing: {reason}')
+            return None
+        purpose = PURPOSES[slot]
+        seeds = [setting.seed, purpose.index]
+        count = samples_per_set(setting.spp, setting.is_timed)
+        sets = WeightedSets(
+            self.pattern, self.weights, count, purpose.dimension, seeds, purpose.periods
+        )
+        return PixelSets(sets, seeds)
+
+
+def samples_per_set(spp: int, is_timed: bool) -> int:
+    """The points of a set, of which each sample of a pixel uses one."""
+    most = _MOST_POINTS_TIMED if is_timed else _MOST_POINTS
+    return -(-spp // -(-spp // most))
+
+
+def _reason_to_do_nothing(slot: str, sensor: mi.Sensor) -> str | None:
+    """Why the numbers do not matter, and what to do about it; ``None`` if they do."""
+    if slot == "aperture" and not sensor.needs_aperture_sample():
+        return 'the sensor has no aperture; use a "thinlens".'
+    if slot == "time" and sensor.shutter_open_time() <= 0:
+        return "the sensor's shutter does not stay open; set shutter_open and shutter_close."
+    return None

@@ -1,0 +1,47 @@
+"""The slot ``connections``: to how many points of lights a vertex is connected."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..decisions.connections.weighted_connections import NoFirstConnections, WeightedConnections
+from ..decisions.weighted_sets import MOST_SLOW_POINTS, SLOW_PATTERN, WEIGHTS, WeightedSets
+from ..pointsets import PATTERNS
+from .decision_parameters import DecisionParameters, ParameterReader, Setting
+
+#: Connections of a vertex, at most.
+_MOST = 4096
+
+#: Connections that take as long as a path, about.
+_PER_PATH = 16
+
+
+class Connections(DecisionParameters):
+    """How many connections there are, and which numbers choose them. The attributes are the
+    parameters of the plugin ``weighted_connections``; see there.
+
+    Raises:
+        TypeError, ValueError: A parameter has a wrong type or value.
+    """
+
+    slots = ("connections",)
+
+    def __init__(self, read: ParameterReader) -> None:
+        self.pattern = read("pattern", "hammersley", choices=PATTERNS)
+        self.weights = read("weights", "none", choices=WEIGHTS)
+        most = MOST_SLOW_POINTS if self.pattern == SLOW_PATTERN else _MOST
+        self.count = read("count", 16, minimum=0, maximum=most)
+        self.vertices = read("vertices", "first", choices=("first", "all"))
+
+    @property
+    def sample_cost(self) -> int:
+        return max(1, self.count // _PER_PATH)
+
+    def decision(self, setting: Setting) -> Any | None:
+        if not setting.scene.emitters() or setting.max_depth < 2:
+            return None
+        everywhere = self.vertices == "all"
+        if self.count == 0:
+            return NoFirstConnections(everywhere)
+        sets = WeightedSets(self.pattern, self.weights, self.count, 2, setting.seed)
+        return WeightedConnections(sets, everywhere)

@@ -1,0 +1,148 @@
+"""The parameters of a decision: what a scene says of it, and what that means for one render."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+
+from ..decisions.learner import Learner
+from ..parameters import read_parameter
+from ..rendering.camera import film_extent
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a decision has to suit.
+
+    Attributes:
+        scene, sensor: What is rendered.
+        seed: Of the render.
+        max_depth: Longest path in segments.
+        spp: Samples per pixel of the render.
+        pilot_spp: Of these, in pilots.
+        is_timed: Can a timeout end the render before it has all samples?
+    """
+
+    scene: mi.Scene
+    sensor: mi.Sensor
+    seed: int
+    max_depth: int
+    spp: int
+    pilot_spp: int = 0
+    is_timed: bool = False
+
+    @property
+    def pixel_count(self) -> int:
+        """Sampled pixels of the film."""
+        width, height = film_extent(self.sensor.film())
+        return width * height
+
+    @property
+    def pilot_samples(self) -> int:
+        """Samples of all pilots together."""
+        return self.pixel_count * self.pilot_spp
+
+
+class ParameterReader:
+    """Reads the parameters of a plugin for those who use them.
+
+    Parameters:
+        plugin: What errors call the plugin.
+        props: The parameters of the scene.
+        names: What the plugin calls a parameter, where that differs.
+        defaults: The plugin's own defaults.
+    """
+
+    def __init__(
+        self,
+        plugin: str,
+        props: mi.Properties,
+        names: Mapping[str, str] | None = None,
+        **defaults: Any,
+    ) -> None:
+        self.plugin, self._props = plugin, props
+        self._names, self._defaults = names or {}, defaults
+        self._read: set[str] = set()
+
+    def __call__(self, key: str, default: Any, **accepted: Any) -> Any:
+        """A parameter, checked: see :func:`mitsuba_ext.parameters.read_parameter`."""
+        name = self._names.get(key, key)
+        self._read.add(name)
+        default = self._defaults.get(key, default)
+        return read_parameter(self.plugin, self._props, name, default, **accepted)
+
+    def is_given(self, key: str) -> bool:
+        """Does the scene say anything?"""
+        return self._names.get(key, key) in self._props
+
+    def refuse_without_effect(self, conditions: Mapping[str, str]) -> None:
+        """Refuses parameters that nobody has read.
+
+        Parameters:
+            conditions: By name, what a parameter needs to have an effect.
+
+        Raises:
+            ValueError: The scene gives such a parameter.
+        """
+        for key, condition in conditions.items():
+            if key in self._props and key not in self._read:
+                raise ValueError(
+                    f'"{self.plugin}": the parameter "{key}" needs {condition}; leave it out'
+                )
+
+
+class DecisionParameters:
+    """The parameters of what can take over one decision of the walk. One object serves all renders:
+    it holds nothing that belongs to one.
+
+    Attributes:
+        slots: The slots of an integrator that it can fill.
+        pilot_spp: Samples per pixel from which it would learn, by default; 0 if it does not learn.
+        pilot_count: Into how many pilots it would have them divided.
+        sample_cost: The time of a sample in units of that of a path, about.
+    """
+
+    slots: tuple[str, ...] = ()
+    pilot_spp = 0
+    pilot_count = 1
+    sample_cost = 1
+
+    def check_slot(self, plugin: str, slot: str) -> None:
+        """
+        Raises:
+            ValueError: It cannot fill this slot of the plugin with these parameters.
+        """
+        if slot not in self.slots:
+            raise ValueError(
+                f'"{plugin}": the parameter "{slot}" cannot be this decision, which is for '
+                f'{" or ".join(self.slots)}: {self}'
+            )
+
+    def check_together(self, plugin: str, slots: Mapping[str, DecisionParameters]) -> None:
+        """
+        Raises:
+            ValueError: One of these parameters has no effect beside what fills the other slots.
+        """
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        """Is there something to learn in ``scene``, from ``spp`` pilot samples per pixel?"""
+        return False
+
+    def decision(self, setting: Setting) -> Any | None:
+        """What is decided without learning; ``None`` for the decision of Mitsuba's ``path``."""
+        return None
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        """Who learns, if anyone does; ``others`` are the learners of earlier slots."""
+        return None
+
+    def parameters(self) -> dict[str, Any]:
+        """Names and values of all parameters, for ``str()``."""
+        return {key: value for key, value in vars(self).items() if not key.startswith("_")}
+
+    def __str__(self) -> str:
+        values = ", ".join(f"{key} = {value}" for key, value in self.parameters().items())
+        return f"{type(self).__name__}[{values}]"

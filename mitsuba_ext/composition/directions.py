@@ -1,0 +1,67 @@
+"""The slot ``directions``: which primary samples choose the directions of a path."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mitsuba as mi
+
+from ..decisions.directions.guide_learner import GuideLearner
+from ..decisions.directions.surface_regions import SurfaceRegions
+from ..decisions.directions.tile_regions import MOST_BOUNCES, TileRegions
+from ..decisions.learner import Learner
+from ..rendering.camera import film_extent
+from .decision_parameters import DecisionParameters, ParameterReader, Setting
+
+#: Samples that a region of surfaces has in the pilots, at least.
+_REGION_SAMPLES = 64
+
+
+class Guided(DecisionParameters):
+    """Directions that are guided in primary sample space. The attributes are the parameters of the
+    plugin ``guided_directions``; see there.
+
+    Raises:
+        TypeError, ValueError: A parameter has a wrong type or value.
+    """
+
+    slots = ("directions",)
+    pilot_spp, pilot_count = 32, 3
+
+    def __init__(self, read: ParameterReader) -> None:
+        self.regions = read("regions", "surfaces", choices=("surfaces", "tiles"))
+        if self.regions == "tiles":
+            self.tile = read("tile", 16, minimum=1)
+            self.bounces = read("bounces", 2, minimum=1, maximum=MOST_BOUNCES)
+        else:
+            self.bounces = read("bounces", 6, minimum=1, maximum=64)
+        self.always_guide = read("always_guide", False)
+        self.max_memory = read("max_memory", 512.0, minimum=1e-3)
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        # The first pilot teaches what the second one tests; the third is drawn from the better
+        # trees of both
+        return spp >= self.pilot_count and bool(scene.emitters())
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        if not self.can_learn(setting.scene, setting.pilot_spp):
+            return None
+        samples = setting.pilot_samples
+        width, height = film_extent(setting.sensor.film())
+
+        def tiles(p: mi.Point3f, n: mi.Normal3f) -> TileRegions:
+            return TileRegions(width, height, self.tile)
+
+        def surfaces(p: mi.Point3f, n: mi.Normal3f) -> SurfaceRegions:
+            # The scout has one path in each pixel
+            return SurfaceRegions(p, n, max(1.0, _REGION_SAMPLES * width * height / samples))
+
+        by_tiles = self.regions == "tiles"
+        return GuideLearner(
+            tiles if by_tiles else surfaces,
+            not by_tiles,
+            min(self.bounces, setting.max_depth - 1),
+            int(self.max_memory * 2**20),
+            samples,
+            self.always_guide,
+        )

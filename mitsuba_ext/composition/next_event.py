@@ -1,0 +1,148 @@
+"""The slot ``next_event``: which light a vertex is connected to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from ..bounds import scene_bounds
+from ..decisions.learner import Learner
+from ..decisions.next_event.light_map_learner import LightLearner
+from ..decisions.next_event.light_table import TABLE_BYTES, LightSelection, OneRow
+from ..decisions.next_event.linear_lights import LinearSelection
+from ..errors import InputError
+from ..files import check_target
+from ..lights.light_cells import LightCells
+from ..lights.weights import VoxelRows, power_weights, spatial_weights
+from ..regions.voxel_grid import VoxelGrid
+from .decision_parameters import DecisionParameters, ParameterReader, Setting
+
+#: Voxels along each axis for ``spatial``, where the scene's author does not say.
+_SPATIAL_GRID = 32
+
+
+class PowerLights(DecisionParameters):
+    """Lights by their power."""
+
+    slots = ("next_event",)
+
+    def decision(self, setting: Setting) -> Any | None:
+        if len(setting.scene.emitters()) < 2:
+            return None
+        cells = LightCells(setting.scene, None)
+        return LightSelection(OneRow(), cells, power_weights(setting.scene, cells))
+
+
+class LinearLights(DecisionParameters):
+    """Lights by an estimate of what each contributes to the vertex."""
+
+    slots = ("next_event",)
+
+    def decision(self, setting: Setting) -> Any | None:
+        return LinearSelection(setting.scene) if len(setting.scene.emitters()) > 1 else None
+
+
+class SpatialLights(DecisionParameters):
+    """Lights by what they contribute to a voxel if nothing is in between. The attributes are the
+    parameters of the plugin ``spatial_lights``; see there."""
+
+    slots = ("next_event",)
+
+    def __init__(self, read: ParameterReader) -> None:
+        self.grid = _grid(read)
+        self.max_memory = read("max_memory", 512.0, minimum=1e-3)
+
+    def decision(self, setting: Setting) -> Any | None:
+        scene = setting.scene
+        if len(scene.emitters()) < 2 or not scene_bounds(scene).valid():
+            return None
+        cells = LightCells(scene, None)
+        rows = self.voxel_rows(scene, cells.count)
+        return LightSelection(rows, cells, spatial_weights(scene, rows, cells))
+
+    def voxel_rows(self, scene: mi.Scene, cells: int) -> VoxelRows:
+        """Voxels, not more than there is memory for."""
+        rows = VoxelRows(VoxelGrid(scene, self.grid or _SPATIAL_GRID))
+        limit = self.max_memory * 2**20 / (cells * TABLE_BYTES)
+        while rows.count > limit and rows.voxels.resolution > 1:
+            rows = VoxelRows(VoxelGrid(scene, int(0.8 * rows.voxels.resolution)))
+        if self.grid > rows.voxels.resolution:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"The table of grid={self.grid} would exceed max_memory={self.max_memory:g} MiB: "
+                f"grid={rows.voxels.resolution} is used.",
+            )
+        return rows
+
+
+class LearnedLights(DecisionParameters):
+    """Lights by what pilots saw of them. The attributes are the parameters of the plugin
+    ``learned_lights``; see there.
+
+    Raises:
+        TypeError, ValueError: A parameter has a wrong type or value.
+    """
+
+    slots = ("next_event",)
+    pilot_spp, pilot_count = 16, 2
+
+    def __init__(self, read: ParameterReader, target: str = "") -> None:
+        self.target = target or read("target", TARGETS[0], choices=TARGETS)
+        self.grid = _grid(read)
+        self.max_memory = read("max_memory", 512.0, minimum=1e-3)
+        self.load_map = read("load_map", "")
+        self.save_map = read("save_map", "")
+        self._plugin = read.plugin
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        learns = spp > 0 and bool(scene.emitters()) and bool(scene.shapes())
+        if self.save_map and not self.load_map and not learns:
+            mi.Log(mi.LogLevel.Warn, f'Nothing is learned: "{self.save_map}" is not written.')
+        return learns
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        """
+        Raises:
+            ValueError: The map that is going to be learned cannot be written.
+        """
+        if self.save_map:
+            try:
+                check_target(Path(self.save_map))
+            except InputError as error:
+                raise ValueError(f'"{self._plugin}": "save_map": {error}') from None
+        scene = setting.scene
+        if not scene.emitters() or not scene.shapes():
+            return None
+        if setting.pilot_spp == 0 and not self.load_map:
+            return None
+        return LightLearner(
+            self.target,
+            self.grid,
+            int(self.max_memory * 2**20),
+            setting.pilot_samples,
+            Path(self.load_map) if self.load_map else None,
+            Path(self.save_map) if self.save_map else None,
+            self._plugin,
+        )
+
+
+#: What lights can be learned for, the default first.
+TARGETS = ("contribution", "visibility")
+
+#: Ways to choose a light, and who reads the parameters of each; ``None`` for that of ``path``.
+METHODS: dict[str, Callable[[ParameterReader], DecisionParameters] | None] = {
+    "uniform": None,
+    "power": lambda read: PowerLights(),
+    "spatial": SpatialLights,
+    "linear": lambda read: LinearLights(),
+    "visibility": lambda read: LearnedLights(read, "visibility"),
+    "contribution": lambda read: LearnedLights(read, "contribution"),
+}
+
+
+def _grid(read: ParameterReader) -> int:
+    """Voxels along each axis; 0 where the scene's author leaves the choice to us."""
+    return read("grid", 1, minimum=1, maximum=1024) if read.is_given("grid") else 0

@@ -1,0 +1,129 @@
+"""The stages of a render whose decisions learn: a scout, pilots, and the last stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import mitsuba as mi
+
+from ..decisions.learner import Learner
+from ..decisions.scout import SCOUT_DEPTH, Scout
+from ..rendering.camera_samples import CameraSamples
+from ..rendering.stages import Stage
+from ..transport.observer import Observers
+from ..transport.path_decisions import NoConnections
+from ..transport.walk import Walk
+from .decision_parameters import DecisionParameters, Setting
+
+
+def pilot_samples(
+    slots: Mapping[str, DecisionParameters], scene: mi.Scene, spp: int, pilot_spp: int | None
+) -> list[int]:
+    """The samples per pixel of each pilot: at most a quarter of all, as beyond that there is little
+    left to gain. What the first ones teach makes the later ones better.
+
+    Parameters:
+        slots: Whose parameters say what they would learn from.
+        spp: Samples per pixel of the render.
+        pilot_spp: What the scene wants; ``None`` for the most that any of the slots does.
+    """
+    if pilot_spp is None:
+        pilot_spp = max((parameters.pilot_spp for parameters in slots.values()), default=0)
+    samples = min(pilot_spp, spp // 4)
+    learning = [p for p in slots.values() if p.pilot_spp and p.can_learn(scene, samples)]
+    if not learning:
+        return []
+    count = max(parameters.pilot_count for parameters in learning)
+    if count == 1 or samples < count + (count == 2) * 2:
+        return [samples]
+    first = samples // 4 or 1
+    return [first] * (count - 1) + [samples - (count - 1) * first]
+
+
+class Schedule:
+    """One render. All learners watch the same pilots; each returns the decision of its own slot.
+
+    Parameters:
+        plugin: What errors and warnings call the integrator.
+        slots: What fills the slots of the walk.
+        setting: What is rendered.
+        pilot_count: Number of pilots.
+        walk: Makes a walk with the integrator's parameters from the decisions that differ from
+            those of ``path``.
+        query: How rays meet the scene.
+
+    Attributes:
+        learners: Who learns, by slot.
+        decisions: Those of the next stage, by slot, where they are not those of ``path``.
+    """
+
+    def __init__(
+        self,
+        plugin: str,
+        slots: Mapping[str, DecisionParameters],
+        setting: Setting,
+        pilot_count: int,
+        walk: Callable[..., Walk],
+        query: Any,
+    ) -> None:
+        self._setting, self._pilot_count, self._walk = setting, pilot_count, walk
+        self.decisions: dict[str, Any] = {"query": query}
+        self.learners: dict[str, Learner] = {}
+        self._camera = CameraSamples()
+        for slot, parameters in slots.items():
+            if hasattr(self._camera, slot):
+                setattr(self._camera, slot, parameters.numbers(plugin, slot, setting))
+                continue
+            decision = parameters.decision(setting)
+            if decision is not None:
+                self.decisions[slot] = decision
+            if setting.max_depth > 1:
+                learner = parameters.learner(setting, self.learners)
+                if learner is not None:
+                    self.learners[slot] = learner
+        self._scout: Scout | None = None
+        self._finished_stages = -1
+
+    def next_stage(self) -> Stage:
+        """See :class:`mitsuba_ext.rendering.stages.Schedule`."""
+        learners = list(self.learners.values())
+        if self._scout is None and any(learner.wants_scout for learner in learners):
+            self._scout = Scout()
+            return self._scout_stage()
+        self._finished_stages += 1
+        if self._finished_stages == 0:
+            p, n = self._scout.vertices() if self._scout else (mi.Point3f(), mi.Normal3f())
+            for slot, learner in self.learners.items():
+                self._replace(slot, learner.start(self._setting.scene, p, n))
+        if self._finished_stages == self._pilot_count:
+            self._learn(is_last=True)
+            learned = "; ".join(filter(None, map(str, learners)))
+            return Stage(self._walk(**self.decisions), learned, camera=self._camera)
+        if self._finished_stages > 0:
+            self._learn(is_last=False)
+        observer = _one_observer(learners)
+        return Stage(self._walk(observer=observer, **self.decisions), camera=self._camera)
+
+    def _scout_stage(self) -> Stage:
+        depth = min(SCOUT_DEPTH, self._setting.max_depth)
+        walk = Walk(
+            depth, depth, next_event=NoConnections(), query=self.decisions["query"],
+            observer=self._scout,
+        )  # fmt: skip
+        return Stage(walk, is_scout=True)
+
+    def _learn(self, is_last: bool) -> None:
+        for slot, learner in self.learners.items():
+            self._replace(slot, learner.learn(self._setting.scene, is_last))
+        if is_last:
+            for learner in self.learners.values():
+                learner.finish()
+
+    def _replace(self, slot: str, decision: Any | None) -> None:
+        if decision is not None:
+            self.decisions[slot] = decision
+
+
+def _one_observer(learners: Sequence[Learner]) -> Any:
+    return learners[0] if len(learners) == 1 else Observers(learners)

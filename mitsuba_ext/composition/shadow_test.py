@@ -1,0 +1,71 @@
+"""The slot ``shadow_test``: whether the shadow ray of a connection is traced."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mitsuba as mi
+
+from ..decisions.learner import Learner
+from ..decisions.next_event.light_map_learner import LightLearner
+from ..decisions.shadow_test.light_map_roulette import LightMapRouletteLearner
+from ..decisions.shadow_test.visibility_roulette import VisibilityLearner, has_lights_at_points
+from .decision_parameters import DecisionParameters, ParameterReader, Setting
+from .next_event import LearnedLights
+
+#: Voxels along each axis where the scene's author does not say.
+_GRID = 16
+
+
+class RejectedShadowRays(DecisionParameters):
+    """Russian roulette by learned visibility. The attributes are the parameters of the plugin
+    ``visibility_roulette``; see there.
+
+    Where lights are learned as well, the visibility is that of the light map.
+
+    Parameters:
+        read: Reads the parameters.
+        has_own_map: False: lights are learned, and parameters of a map of its own have no effect.
+
+    Raises:
+        TypeError, ValueError: A parameter has a wrong type or value.
+    """
+
+    slots = ("shadow_test",)
+    pilot_spp = 16
+
+    def __init__(self, read: ParameterReader, has_own_map: bool = True) -> None:
+        self.law = read("law", "affine", choices=("affine", "paper"))
+        if self.law == "affine":
+            self.slope = read("slope", 10.0, minimum=0.0)
+            self.floor = read("floor", 0.1, minimum=1e-6, maximum=1.0)
+        self._has_own_map = has_own_map
+        self._given: list[str] = []
+        if has_own_map:
+            self.grid = read("grid", _GRID, minimum=1, maximum=1024)
+            self.max_memory = read("max_memory", 512.0, minimum=1e-3)
+            self.refine = read("refine", 16, minimum=0, maximum=1024)
+            self._given = [key for key in ("grid", "max_memory", "refine") if read.is_given(key)]
+
+    def check_together(self, plugin: str, slots: Mapping[str, DecisionParameters]) -> None:
+        if self._given and isinstance(slots.get("next_event"), LearnedLights):
+            raise ValueError(
+                f'"{plugin}": the parameter "{self._given[0]}" of "shadow_test" needs lights that '
+                f"are not learned; leave it out"
+            )
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        return spp > 0 and (not self._has_own_map or has_lights_at_points(scene))
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        law = {
+            "law": self.law,
+            "slope": getattr(self, "slope", 0.0),
+            "floor": getattr(self, "floor", 1.0),
+        }
+        lights = others.get("next_event")
+        if isinstance(lights, LightLearner):
+            return LightMapRouletteLearner(lights, **law)
+        if not self.can_learn(setting.scene, setting.pilot_spp):
+            return None
+        return VisibilityLearner(self.grid, self.max_memory, self.refine, **law)

@@ -1,0 +1,61 @@
+"""The slots of an integrator: which decisions of the walk a scene can replace, and by what."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import mitsuba as mi
+
+from .camera_numbers import PURPOSES, WeightedNumbers
+from .connections import Connections
+from .decision_parameters import DecisionParameters, ParameterReader
+from .directions import Guided
+from .next_event import METHODS
+from .shadow_test import RejectedShadowRays
+
+_Maker = Callable[[ParameterReader], DecisionParameters]
+
+#: By slot, what a scene can say in one word: the name of a decision, and who makes it with all
+#: defaults; ``None`` stands for what Mitsuba's ``path`` does, and comes first. The order is that in
+#: which learners are made, of which later ones can use earlier ones.
+SLOTS: dict[str, dict[str, _Maker | None]] = {
+    "directions": {"uniform": None, "guided": Guided},
+    "next_event": METHODS,
+    "connections": {"one": None},
+    "shadow_test": {"always": None, "visibility_roulette": RejectedShadowRays},
+    **{slot: {"sampler": None} for slot in PURPOSES},
+}
+
+
+def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameters | None:
+    """What the scene puts into a slot: a word, or a nested plugin; for ``connections`` a number
+    also. ``None`` for what ``path`` does.
+
+    Raises:
+        TypeError, ValueError: It is none of these, or belongs into another slot.
+    """
+    words = SLOTS[slot]
+    value = props.get(slot, next(iter(words)))
+    parameters = getattr(value, "decision_parameters", None)
+    if parameters is not None:
+        parameters.check_slot(plugin, slot)
+        return parameters
+    if slot == "connections" and type(value) is int:
+        return Connections(_defaults(plugin, count=value))
+    if slot in PURPOSES and isinstance(value, str) and value not in words:
+        parameters = WeightedNumbers(_defaults(plugin, pattern=value))
+        parameters.check_slot(plugin, slot)
+        return parameters
+    if not isinstance(value, str) or value not in words:
+        kind = value.class_name() if isinstance(value, mi.Object) else repr(value)
+        raise ValueError(
+            f'"{plugin}": the parameter "{slot}" is {kind}; it must be one of {", ".join(words)}, '
+            f"or a nested plugin that makes such decisions"
+        )
+    maker = words[value]
+    return None if maker is None else maker(_defaults(plugin))
+
+
+def _defaults(plugin: str, **values: Any) -> ParameterReader:
+    return ParameterReader(plugin, mi.Properties(plugin), **values)

@@ -1,0 +1,160 @@
+"""What a render is going to do, decided before its first pass: stages, and how they are cut into
+passes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from ..parameters import MOST_SPP
+from .camera import film_extent
+
+#: Samples per pass. Tracing a pass in Python takes 5 to 70 ms (many materials take longest), the
+#: pass itself two or three seconds on two CPU cores. A GPU gets longer passes.
+_PASS_SAMPLES = {dr.JitBackend.LLVM: 1 << 21, dr.JitBackend.CUDA: 1 << 24}
+
+#: Samples per pixel and pass, at least, however large the film is: neighbouring lanes that share a
+#: pixel trace rays that stay together. At 1920x1080, passes of one sample take 1.6 times as long.
+#: Not with a structured sampler, which keeps a state for each sample of a pass.
+_PASS_SPP = 16
+
+#: Passes of a structured sampler that learns, at least: a pilot is one of them or more.
+_MIN_STRUCTURED_PASSES = 16
+
+#: With a timeout, passes of a structured sampler are shorter by this factor. They cannot differ in
+#: length, so that the timeout can be missed by one of them.
+_TIMEOUT_PASS_DIVISOR = 4
+
+_MAX_WAVEFRONT = 1 << 32
+
+#: Passes of a render, at most: they last weeks.
+_MOST_PASSES = 1 << 20
+
+
+class Planned(Protocol):
+    """What the plan of a render asks of an integrator."""
+
+    name: str
+    timeout: float
+    samples_per_pass: int
+
+    @property
+    def sample_cost(self) -> int:
+        """The time of a sample in units of that of a path, about."""
+
+    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
+        """The samples per pixel of each pilot stage, out of ``spp``."""
+
+    def samples_per_set(self, spp: int) -> int:
+        """So many samples of a pixel belong together."""
+
+
+@dataclass(frozen=True)
+class RenderPlan:
+    """The samples of a render.
+
+    Attributes:
+        seed: Of the render.
+        spp: Samples per pixel.
+        stages: Samples per pixel of each stage: pilots, and the last one.
+        pixel_count: Sampled pixels of the film.
+        structured: Are the samples stratified over the whole render? Then all passes have the same
+            length.
+        limit: Samples per pixel of a pass, at most.
+        set_size: Samples of a pixel that a timeout does not separate.
+    """
+
+    seed: int
+    spp: int
+    stages: tuple[int, ...]
+    pixel_count: int
+    structured: bool
+    limit: int
+    set_size: int
+
+    def pass_length(self, samples: int) -> int:
+        """Samples per pixel of passes of about equal length that take ``samples`` samples."""
+        if self.structured:
+            return self.limit
+        pass_count = -(-samples // self.limit)
+        return max(1, -(-samples // max(1, pass_count)))
+
+    @property
+    def longest_pass(self) -> int:
+        """Samples per pixel of the longest pass."""
+        return max(self.pass_length(samples) for samples in self.stages)
+
+    def whole(self, before: int, samples: int, most: int) -> int:
+        """The samples of a stage, so many that the render ends with a whole set; ``most`` would do
+        so. ``before`` were taken in earlier stages."""
+        return min(most, samples + -(before + samples) % self.set_size)
+
+
+def plan_render(
+    integrator: Planned, scene: mi.Scene, film: mi.Film, sampler: mi.Sampler, seed: int, spp: int
+) -> RenderPlan:
+    """The plan of ``integrator.render(scene, …)``. Sets the sampler's number of samples.
+
+    Raises:
+        ValueError: ``spp`` is out of range, the film has more pixels than a wavefront can hold, or
+            these are too many samples for so many pixels.
+    """
+    if not 0 <= spp <= MOST_SPP:
+        raise ValueError(
+            f'"{integrator.name}": spp is {spp}; it must be 1 to {MOST_SPP}, or 0 for as many '
+            f"as the sampler says"
+        )
+    if spp:
+        sampler.set_sample_count(spp)
+    spp = sampler.sample_count()
+    check_extent(film)
+    width, height = film_extent(film)
+    pixel_count = width * height
+    structured = sampler.class_name() != "IndependentSampler"
+    cost = integrator.sample_cost
+    limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // (pixel_count * cost)
+    if not structured:
+        limit = max(limit, min(_PASS_SPP // cost, (_MAX_WAVEFRONT - 1) // pixel_count))
+    is_timed = integrator.timeout > 0
+    if structured and is_timed:
+        limit //= _TIMEOUT_PASS_DIVISOR
+    limit = max(1, min(limit, integrator.samples_per_pass))
+    if spp > limit * _MOST_PASSES:
+        raise ValueError(
+            f'"{integrator.name}": {spp} samples for each of {pixel_count} pixels '
+            f"are too many: give at most {limit * _MOST_PASSES}"
+        )
+    pilots = integrator.pilots(scene, spp)
+    # With a timeout, sets of samples are kept whole
+    set_size = integrator.samples_per_set(spp) if is_timed else 1
+    if structured:
+        # Independent samples can be cut anywhere, and each pass gets a seed of its own. Samples
+        # that are stratified over the whole render must come in passes of equal length, to which
+        # the pilots are rounded
+        if pilots:
+            limit = min(limit, max(*pilots, spp // _MIN_STRUCTURED_PASSES))
+        limit = max(d for d in range(1, limit + 1) if _divides(d, spp, set_size))
+        pilots = [limit * max(1, samples // limit) for samples in pilots]
+    stages = (*pilots, spp - sum(pilots))
+    return RenderPlan(seed, spp, stages, pixel_count, structured, limit, set_size)
+
+
+def _divides(length: int, spp: int, set_size: int) -> bool:
+    """Can the samples be cut into passes of this length?"""
+    return spp % length == 0 and (set_size % length == 0 or length % set_size == 0)
+
+
+def check_extent(film: mi.Film) -> None:
+    """Refuses a film that one pass cannot fill.
+
+    Raises:
+        ValueError: It has more pixels than a wavefront can hold.
+    """
+    width, height = film_extent(film)
+    if width * height >= _MAX_WAVEFRONT:
+        raise ValueError(
+            f"a film of {width}x{height} pixels exceeds the 2^32 samples of one pass"
+        )

@@ -1,0 +1,44 @@
+"""The stages of a render, and who makes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from ..transport.estimator import Estimator
+from .camera_samples import CameraSamples
+
+
+@dataclass
+class Stage:
+    """One stage of a render.
+
+    Attributes:
+        estimator: What its samples are.
+        learned: What had been learned before.
+        is_scout: Does it take one sample per pixel that is not added to the film?
+        camera: What chooses points of the aperture, times and wavelengths.
+    """
+
+    estimator: Estimator
+    learned: str = ""
+    is_scout: bool = False
+    camera: CameraSamples = field(default_factory=CameraSamples)
+
+
+class Schedule(Protocol):
+    """Makes the stages of one render, one after the other."""
+
+    def next_stage(self) -> Stage:
+        """The next stage. All samples of the one before have been taken: what they teach is learned
+        now. Scouts come besides the stages of the plan."""
+
+
+class OneStage:
+    """The schedule of an estimator that learns nothing."""
+
+    def __init__(self, estimator: Estimator) -> None:
+        self._estimator = estimator
+
+    def next_stage(self) -> Stage:
+        return Stage(self._estimator)

@@ -1,0 +1,176 @@
+"""Connecting a vertex to points of lights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .heroes import Heroes
+from .mis import power_heuristic
+from .observer import Observer
+from .path_decisions import (
+    ConnectionCount,
+    EmitterSampling,
+    LightNumbers,
+    Scattering,
+    SceneQuery,
+    ShadowTest,
+)
+from .vertex import Vertex
+
+
+@dataclass
+class Connection:
+    """A point of a light, seen from a vertex.
+
+    Attributes:
+        ds: The direction towards it.
+        weight: Its radiance / density.
+        choice: What the next event decision told of its choice.
+    """
+
+    ds: mi.DirectionSample3f
+    weight: mi.Spectrum
+    choice: Any
+
+
+# Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
+class Connector:
+    """Connects vertices to lights: chooses points, tests them, and weighs what they bring.
+
+    The parameters are the decisions of the walk that take part.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        next_event: EmitterSampling,
+        connections: ConnectionCount,
+        shadow_test: ShadowTest,
+        scattering: Scattering,
+        query: SceneQuery,
+        heroes: Heroes,
+        observer: Observer,
+    ) -> None:
+        self._scene, self._query, self._heroes = scene, query, heroes
+        self._next_event, self._connections = next_event, connections
+        self._shadow_test, self._scattering, self._observer = shadow_test, scattering, observer
+        #: Has any vertex one connection, and has any more than one?
+        self.single = connections.first <= 1 or connections.later <= 1
+        self.many = connections.first > 1 or connections.later > 1
+
+    def one(
+        self, place: Any, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
+    ) -> Connection:
+        """The connection of a vertex that has one. Its density is 0 at other vertices."""
+        dimension = self._next_event.choice_dimension
+        choice = None
+        if dimension > 0:
+            choice = sampler.next_1d() if dimension == 1 else sampler.next_2d()
+        connection = self._choose(place, LightNumbers(sampler.next_2d(), choice), vertex, active)
+        if self._connections.first != 1 or self._connections.later != 1:
+            count = self._connections.weight(vertex.depth)
+            # Without connections: lights that no BSDF sample can hit are not left out
+            is_made = (count == 1) | ((count == 0) & connection.ds.delta)
+            connection.ds.pdf = dr.select(is_made, connection.ds.pdf, 0)
+            connection.weight = dr.select(is_made, connection.weight, 0)
+        return connection
+
+    def _choose(self, place, numbers: LightNumbers, vertex: Vertex, active) -> Connection:
+        return Connection(
+            *self._next_event.sample(place, self._scene, numbers, vertex.si, active)
+        )
+
+    def unoccluded(
+        self,
+        state: Any,
+        sampler: mi.Sampler,
+        vertex: Vertex,
+        β: mi.Spectrum,
+        connection: Connection,
+        bsdf_value: mi.Spectrum,
+        pdf: mi.Float,
+        count: mi.Float | float,
+        active: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.Bool, mi.Bool, mi.Bool, Any]:
+        """What a connection brings.
+
+        Parameters:
+            state: Of the shadow test.
+            β: Multiplies the result.
+            bsdf_value, pdf: The BSDF's value towards the light (cosine included), and the density
+                with which scattering finds this direction.
+            count: Number of the vertex's connections.
+
+        Returns:
+            The light that arrives where nothing is in between, with its MIS weight; where it was
+            considered, where a shadow ray was traced, and where that found nothing; the new state.
+        """
+        si, ds = vertex.si, connection.ds
+        bsdf_value = si.to_world_mueller(bsdf_value, -si.to_local(ds.d), si.wi)
+        mis = dr.select(ds.delta, 1, power_heuristic(count * ds.pdf, pdf))
+        contribution = bsdf_value * connection.weight
+        value = β * contribution * mis
+        considered = active & (ds.pdf != 0)
+        # A connection that cannot contribute needs no shadow ray
+        tested = considered & (dr.max(dr.abs(value)) > 0)
+        value, tested, state = self._roulette(state, connection, sampler, si, value, tested)
+        visible = tested & ~self._query.occluded(self._scene, si, ds, tested)
+        self._observer.connection(connection.choice, si, ds, contribution, visible, tested)
+        return value, considered, tested, visible, state
+
+    def _roulette(self, state, connection, sampler, si, value, active):
+        """Lets the shadow test's decision drop connections; the survivors weigh 1/p."""
+        p, state = self._shadow_test.probability(
+            state, connection.choice, si, connection.ds, active
+        )
+        if p is None:
+            return value, active, state
+        survives = sampler.next_1d() < p
+        # p > 0 wherever a lane survives: the random number is not negative
+        return value * dr.select(survives, dr.rcp(p), 0), active & survives, state
+
+    @dr.syntax
+    def gather(
+        self,
+        shadow_state: Any,
+        scattering_state: Any,
+        place: Any,
+        ctx: mi.BSDFContext,
+        sampler: mi.Sampler,
+        vertex: Vertex,
+        active: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.UInt32, mi.UInt32, Any]:
+        """The light of all connections of vertices that have more than one: the scattered radiance,
+        the number of connections that were considered, that of shadow rays, and the new state of
+        the shadow test."""
+        dimension = self._next_event.choice_dimension
+        chosen = self._connections.begin(sampler, dimension)
+        total, index = mi.Spectrum(0), mi.UInt32(0)
+        connection_count, shadow_count = mi.UInt32(0), mi.UInt32(0)
+        count = self._connections.weight(vertex.depth)
+        active = active & (count > 1)
+        while active:
+            numbers, weight = self._connections.numbers(
+                chosen, index, dimension, active
+            )
+            connection = self._choose(place, numbers, vertex, active)
+            wo = vertex.si.to_local(connection.ds.d)
+            bsdf_value, pdf = self._scattering.eval_pdf(scattering_state, ctx, vertex, wo, active)
+            bsdf_value = self._heroes.connect(
+                vertex.path.hero_is_alone, bsdf_value, vertex.bsdf, vertex.si, wo
+            )
+            value, considered, tested, visible, shadow_state = self.unoccluded(
+                shadow_state, sampler, vertex, mi.Spectrum(weight), connection, bsdf_value, pdf,
+                count, active,
+            )  # fmt: skip
+            total[visible] += value
+            connection_count += dr.select(considered, 1, 0)
+            shadow_count += dr.select(tested, 1, 0)
+            index += 1
+            active &= mi.Float(index) < count
+        # Where there is one connection or none, the total is 0
+        return total / dr.maximum(count, 1), connection_count, shadow_count, shadow_state

@@ -1,0 +1,39 @@
+"""The light that a path runs into."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from .mis import power_heuristic
+from .path_decisions import EmitterSampling
+from .vertex import Arrival
+
+
+def emission(
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    arrival: Arrival,
+    next_event: EmitterSampling,
+    state: Any,
+    count: mi.Float | float = 1.0,
+) -> mi.Spectrum:
+    """The radiance that ``si`` (or the environment, if nothing was hit) emits towards the vertex
+    before it, times the MIS weight of having been found by scattering.
+
+    Parameters:
+        next_event, state: The decision whose connections could have found the light as well, and
+            its state when it left the vertex before.
+        count: Number of its connections there.
+    """
+    ds = mi.DirectionSample3f(scene, si, arrival.ref)
+    is_connectable = ~arrival.is_delta & (ds.emitter != None)  # noqa: E711
+    pdf = next_event.density(state, scene, arrival.ref, si, ds, is_connectable)
+    return ds.emitter.eval(si, arrival.pdf > 0) * power_heuristic(arrival.pdf, count * pdf)
+
+
+def can_be_hit(scene: mi.Scene) -> bool:
+    """Is there a light that a scattered ray can run into?"""
+    delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+    return any(not (int(e.flags()) & int(delta)) for e in scene.emitters())

@@ -1,0 +1,85 @@
+"""What a render asks for radiance: camera rays in, samples out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass
+class CameraRays:
+    """The rays of a pass, one in each lane.
+
+    Attributes:
+        ray: The rays themselves.
+        pixel: The number of the ray's pixel, row by row in the film's extent; ``None`` for rays
+            that belong to no film.
+        importance: What the sensor makes of the radiance that a ray brings back.
+        position: Where on the film (in pixels) to put it.
+        weight: Importance weight of a sample; 1.0 where all count the same.
+        hero_weight: The factor of ``weight`` for paths of which only the first wavelength is left
+            (``heroes.py``). The estimator applies it.
+    """
+
+    ray: mi.RayDifferential3f
+    pixel: mi.UInt32 | None = None
+    importance: mi.Spectrum | float = 1.0
+    position: mi.Point2f | None = None
+    weight: mi.Float | float = 1.0
+    hero_weight: mi.Float | float = 1.0
+
+
+@dataclass
+class Splats:
+    """Radiance for other pixels than those in which the camera rays begin: what light paths bring
+    to the sensor.
+
+    Attributes:
+        value: Radiance times importance; the mean over all camera samples of a pixel's splats is
+            added to it.
+        position: Where on the film, in pixels of its crop window plus that window's offset.
+        wavelengths: Of ``value``, in spectral variants.
+        active: Which lanes have something to add.
+    """
+
+    value: mi.Spectrum
+    position: mi.Point2f
+    wavelengths: mi.Spectrum | None
+    active: mi.Bool
+
+
+@dataclass
+class Sample:
+    """What one camera ray brings back.
+
+    Attributes:
+        L: Radiance estimate.
+        valid: Did the path meet a surface (or the visible environment)? It becomes alpha.
+        scatter_count: Rays traced in directions that a BSDF chose.
+        shadow_count: Shadow rays traced.
+        connection_count: Connections to a light that were considered: ``path`` traces a shadow ray
+            for each of them.
+        aovs: Values of arbitrary output variables, if the estimator finds any.
+        splats: What it found for other pixels.
+    """
+
+    L: mi.Spectrum
+    valid: mi.Bool
+    scatter_count: mi.UInt32 = field(default_factory=lambda: dr.zeros(mi.UInt32))
+    shadow_count: mi.UInt32 = field(default_factory=lambda: dr.zeros(mi.UInt32))
+    connection_count: mi.UInt32 = field(default_factory=lambda: dr.zeros(mi.UInt32))
+    aovs: list[mi.Float] = field(default_factory=list)
+    splats: list[Splats] = field(default_factory=list)
+
+
+class Estimator(Protocol):
+    """Estimates the radiance along camera rays."""
+
+    def __call__(
+        self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
+    ) -> Sample:
+        """One sample for each lane of ``rays``. ``sampler`` may be anything that has ``next_1d``
+        and ``next_2d`` (``numbers.py``)."""

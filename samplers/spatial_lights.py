@@ -1,0 +1,14 @@
+"""TODO"""
+
+from __future__ import annotations
+
+from mitsuba_ext import registry
+from mitsuba_ext.composition.decision_plugin import DecisionPlugin
+from mitsuba_ext.composition.next_event import SpatialLights
+
+
+@registry.plugin
+class SpatialLightsPlugin(DecisionPlugin):
+    r"""TODO"""
+
+    kind = SpatialLights
