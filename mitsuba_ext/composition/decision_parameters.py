@@ -101,13 +101,13 @@ class DecisionParameters:
     Attributes:
         slots: The slots of an integrator that it can fill.
         pilot_spp: Samples per pixel from which it would learn, by default; 0 if it does not learn.
-        pilot_count: Into how many pilots it would have them divided.
+        tries: Does what it learns in a first pilot make the next ones better?
         sample_cost: The time of a sample in units of that of a path, about.
     """
 
     slots: tuple[str, ...] = ()
     pilot_spp = 0
-    pilot_count = 1
+    tries = False
     sample_cost = 1
 
     def check_slot(self, plugin: str, slot: str) -> None:

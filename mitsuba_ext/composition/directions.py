@@ -26,7 +26,7 @@ class Guided(DecisionParameters):
     """
 
     slots = ("directions",)
-    pilot_spp, pilot_count = 32, 3
+    pilot_spp, tries = 32, True
 
     def __init__(self, read: ParameterReader) -> None:
         self.regions = read("regions", "surfaces", choices=("surfaces", "tiles"))
@@ -41,7 +41,7 @@ class Guided(DecisionParameters):
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
         # The first pilot teaches what the second one tests; the third is drawn from the better
         # trees of both
-        return spp >= self.pilot_count and bool(scene.emitters())
+        return spp >= 3 and bool(scene.emitters())
 
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
         if not self.can_learn(setting.scene, setting.pilot_spp):

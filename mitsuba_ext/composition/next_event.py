@@ -87,7 +87,7 @@ class LearnedLights(DecisionParameters):
     """
 
     slots = ("next_event",)
-    pilot_spp, pilot_count = 16, 2
+    pilot_spp, tries = 16, True
 
     def __init__(self, read: ParameterReader, target: str = "") -> None:
         self.target = target or read("target", TARGETS[0], choices=TARGETS)

@@ -45,8 +45,8 @@ class ReweightedCamera(StagedIntegrator):
 
     # ---- What the base class asks for ----
 
-    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
-        return self.nested.pilots(scene, spp) if self._is_staged else []
+    def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
+        return self.nested.pilots(scene, pixel_count, spp) if self._is_staged else []
 
     @property
     def sample_cost(self) -> int:

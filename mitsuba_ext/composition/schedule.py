@@ -16,29 +16,42 @@ from ..transport.path_decisions import NoConnections
 from ..transport.walk import Walk
 from .decision_parameters import DecisionParameters, Setting
 
+#: Paths of each of the first two pilots, about: they show what learning is worth.
+_TRIAL_PATHS = 1 << 17
+
 
 def pilot_samples(
-    slots: Mapping[str, DecisionParameters], scene: mi.Scene, spp: int, pilot_spp: int | None
+    slots: Mapping[str, DecisionParameters],
+    scene: mi.Scene,
+    pixel_count: int,
+    spp: int,
+    pilot_spp: int,
 ) -> list[int]:
     """The samples per pixel of each pilot: at most a quarter of all, as beyond that there is little
-    left to gain. What the first ones teach makes the later ones better.
+    left to gain.
+
+    The first two are short trials: who finds that learning does not pay has spent little. What is
+    learned from all up to then makes the later ones better.
 
     Parameters:
         slots: Whose parameters say what they would learn from.
+        scene: The scene.
+        pixel_count: Sampled pixels of the film.
         spp: Samples per pixel of the render.
-        pilot_spp: What the scene wants; ``None`` for the most that any of the slots does.
+        pilot_spp: Those of the pilots that the scene wants.
     """
-    if pilot_spp is None:
-        pilot_spp = max((parameters.pilot_spp for parameters in slots.values()), default=0)
     samples = min(pilot_spp, spp // 4)
     learning = [p for p in slots.values() if p.pilot_spp and p.can_learn(scene, samples)]
     if not learning:
         return []
-    count = max(parameters.pilot_count for parameters in learning)
-    if count == 1 or samples < count + (count == 2) * 2:
+    if samples < 3 or all(not parameters.tries for parameters in learning):
         return [samples]
-    first = samples // 4 or 1
-    return [first] * (count - 1) + [samples - (count - 1) * first]
+    quarter = samples // 4 or 1
+    trial = max(1, _TRIAL_PATHS // pixel_count)
+    if 2 * trial > quarter:
+        return [quarter, quarter, samples - 2 * quarter]
+    rest = samples - 2 * trial
+    return [trial, trial, quarter, rest - quarter]
 
 
 class Schedule:

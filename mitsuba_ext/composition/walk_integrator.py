@@ -86,11 +86,11 @@ class WalkIntegrator(StagedIntegrator):
 
     # ---- What the render asks for ----
 
-    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
+    def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
         self.learners = {}
         if self.max_depth < 2:
             return []
-        return pilot_samples(self.slots, scene, spp, self._pilot_spp or 0)
+        return pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
 
     @property
     def sample_cost(self) -> int:

@@ -45,7 +45,7 @@ class Planned(Protocol):
     def sample_cost(self) -> int:
         """The time of a sample in units of that of a path, about."""
 
-    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
+    def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
         """The samples per pixel of each pilot stage, out of ``spp``."""
 
     def samples_per_set(self, spp: int) -> int:
@@ -127,7 +127,7 @@ def plan_render(
             f'"{integrator.name}": {spp} samples for each of {pixel_count} pixels '
             f"are too many: give at most {limit * _MOST_PASSES}"
         )
-    pilots = integrator.pilots(scene, spp)
+    pilots = integrator.pilots(scene, pixel_count, spp)
     # With a timeout, sets of samples are kept whole
     set_size = integrator.samples_per_set(spp) if is_timed else 1
     if structured:

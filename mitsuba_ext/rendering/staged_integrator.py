@@ -46,7 +46,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
 
     # ---- What a subclass says ----
 
-    def pilots(self, scene: mi.Scene, spp: int) -> list[int]:
+    def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
         """The samples per pixel of each pilot stage, out of ``spp``; none where nothing learns."""
         return []
 

@@ -119,7 +119,9 @@ class Connector:
         tested = considered & (dr.max(dr.abs(value)) > 0)
         value, tested, state = self._roulette(state, connection, sampler, si, value, tested)
         visible = tested & ~self._query.occluded(self._scene, si, ds, tested)
-        self._observer.connection(connection.choice, si, ds, contribution, visible, tested)
+        self._observer.connection(
+            connection.choice, vertex, ds, contribution, value, visible, tested
+        )
         return value, considered, tested, visible, state
 
     def _roulette(self, state, connection, sampler, si, value, active):

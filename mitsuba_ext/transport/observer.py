@@ -26,15 +26,16 @@ class Observer:
     def connection(
         self,
         choice: Any,
-        si: mi.SurfaceInteraction3f,
+        vertex: Vertex,
         ds: mi.DirectionSample3f,
         contribution: mi.Spectrum,
+        value: mi.Spectrum,
         visible: mi.Bool,
         tested: mi.Bool,
     ) -> None:
         """A shadow ray was traced where ``tested``. ``choice`` is what the next event decision told
-        of its choice; ``contribution`` is BSDF · radiance / pdf, before throughput and MIS
-        weights."""
+        of its choice; ``contribution`` is BSDF · radiance / pdf; ``value`` is this times MIS weight
+        and throughput: what the path gains where the light is ``visible``."""
 
     def direction(
         self,

@@ -19,6 +19,9 @@ from .sample_trees import SampleTrees
 #: chosen as soon as it is known what they are worth.
 _FIRST_SHARE, _SHARES = 0.6, (0.4, 0.6, 0.8)
 
+#: Share of all pilots' paths from which the number of bounces is chosen, at least.
+_LEAST_SHARE = 0.2
+
 #: What guiding the first direction of a path and each further one costs, in units of the time of a
 #: path (measured: 0 to 10 %, and 1 to 8 %); and the efficiency that it must reach.
 _COST, _COST_OF_BOUNCE, _LEAST_EFFICIENCY = 0.05, 0.05, 1.02
@@ -114,6 +117,9 @@ class GuideLearner(Learner):
         if self.guide is not None and records.count > records.first_new:
             self.guidance = most_efficient(self.gains(records), all_bounces=self.always)
             share, bounces, gain, efficiency = self.guidance
+            # A trial tells whether guiding pays, but not for how many bounces
+            if records.paths < _LEAST_SHARE * self.pilot_samples / records.stride:
+                bounces = self.bounces
             effect = f"about {gain:.0%} less variance"
             if efficiency < _LEAST_EFFICIENCY and not self.always:
                 self.guide, self._records = None, None

@@ -8,14 +8,12 @@ import drjit as dr
 import mitsuba as mi
 
 from ...transport.observer import Observer
+from ..path_importance import brightness
+from ..path_importance import importance as path_importance
 from .tree_builder import DEPTH, cell_code, joined
 
 #: Bytes of a record, at most: what is kept of it, and what trees are built from.
 BYTES_PER_RECORD = 320
-
-#: Paths that follow each other, and so begin close together: their mean is what errors are
-#: relative to, but for this share of the squared mean of all.
-_NEIGHBOURS, _FLOOR = 64, 1e-2
 
 
 class PathRecords(Observer):
@@ -44,7 +42,7 @@ class PathRecords(Observer):
         bounces: int,
         stride: int,
     ) -> None:
-        self._region, self.bounces, self._stride = region, bounces, stride
+        self._region, self.bounces, self.stride = region, bounces, stride
         self._lanes, self._passes = 0, []
         self.restart_counting()
 
@@ -62,10 +60,10 @@ class PathRecords(Observer):
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         self._collect()
-        self._lanes = -(-lanes // self._stride)
+        self._lanes = -(-lanes // self.stride)
         self._pixel = pixel
         lane = dr.arange(mi.UInt32, lanes)
-        stride = dr.opaque(mi.UInt32, self._stride)
+        stride = dr.opaque(mi.UInt32, self.stride)
         self._path = lane // stride
         self._is_recorded = self._path * stride == lane
         slots = self._lanes * self.bounces
@@ -82,10 +80,10 @@ class PathRecords(Observer):
         slot = vertex.depth * self._slots + self._path
         dr.scatter(self._keys, key, slot, active)
         dr.scatter(self._weights, mi.Float(weight), slot, active)
-        dr.scatter(self._before, _brightness(L), slot, active)
+        dr.scatter(self._before, brightness(L), slot, active)
 
     def end(self, L: mi.Spectrum) -> None:
-        dr.scatter(self._total, _brightness(L), self._path, self._is_recorded)
+        dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
 
     # ---- Between passes ----
 
@@ -103,7 +101,7 @@ class PathRecords(Observer):
         """Keeps what the last pass has recorded."""
         if self._lanes == 0:
             return
-        importance, error = _importance(self._total)
+        importance, error = path_importance(self._total)
         self.paths += self._lanes
         self.variance += float(dr.sum(mi.Float64(error))[0])
         slot = dr.compress(self._weights > 0)
@@ -131,20 +129,3 @@ class PathRecords(Observer):
         dr.eval(columns)
         self._passes.append(columns)
         self._keys = self._weights = self._before = self._total = self._pixel = None
-
-
-def _importance(total: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """For each path, by how much squared errors count at its place, and its own, weighted so."""
-    total = dr.select(dr.isfinite(total), total, 0)
-    path = dr.arange(mi.UInt32, -(-len(total) // _NEIGHBOURS) * _NEIGHBOURS)
-    # The last group is filled up from the beginning
-    filled = dr.gather(mi.Float, total, path % dr.opaque(mi.UInt32, len(total)))
-    mean = dr.repeat(dr.block_sum(filled, _NEIGHBOURS) / _NEIGHBOURS, _NEIGHBOURS)
-    mean = dr.gather(mi.Float, mean, dr.arange(mi.UInt32, len(total)))
-    importance = dr.rcp(dr.square(mean) + _FLOOR * dr.square(dr.mean(total)) + 1e-30)
-    return importance, dr.square(total - mean) * importance
-
-
-def _brightness(L: mi.Spectrum) -> mi.Float:
-    """One number for a path's radiance: errors count the same in all channels."""
-    return dr.mean(L)

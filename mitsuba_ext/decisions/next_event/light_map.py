@@ -14,6 +14,7 @@ from ...lights.light_cells import LightCells
 from ...lights.weights import unoccluded_weights
 from ...regions.surface_rows import SurfaceRows
 from ...transport.observer import Observer
+from ...transport.vertex import Vertex
 from .light_table import Choice
 
 #: Fixed point of the squared ratios. They are clipped: a single one must not decide.
@@ -30,9 +31,6 @@ _DARK = 0.1
 
 #: Tests of an entry, about, that are enough: where a pilot brings more, not all are recorded.
 _ENOUGH_TESTS, _TESTS_PER_SAMPLE = 32, 2
-
-#: Relative variance of a row, at most: few dark ones must not decide for all.
-_MOST_VARIANCE = 100.0
 
 #: Bytes of an entry, at most: the expectation, the counters, the table that is made of them, and
 #: what that takes in between.
@@ -81,9 +79,10 @@ class LightMap(Observer):
     def connection(
         self,
         choice: Choice,
-        si: mi.SurfaceInteraction3f,
+        vertex: Vertex,
         ds: mi.DirectionSample3f,
         contribution: mi.Spectrum,
+        value: mi.Spectrum,
         visible: mi.Bool,
         tested: mi.Bool,
     ) -> None:
@@ -93,8 +92,8 @@ class LightMap(Observer):
         expected = dr.gather(mi.Float, self.unoccluded, entry, tested)
         known = visible & tested & (expected > 0)
         # What the cell contributes, whatever the probability of choosing it
-        value = brightness(contribution) * choice.probability
-        square = dr.square(dr.select(known, value / expected, 0))
+        brought = brightness(contribution) * choice.probability
+        square = dr.square(dr.select(known, brought / expected, 0))
         square = dr.select(dr.isfinite(square), dr.minimum(square, _LIMIT), 0)
         dr.scatter_add(
             self._counts, dr.select(visible, mi.UInt64((1 << 32) + 1), 1), entry, tested
@@ -176,29 +175,18 @@ class LightMap(Observer):
             mi.Float(self.tests) + _PRIOR_SQUARES
         )
 
-    def relative_variances(self, *selections: mi.Float) -> list[float]:
-        """How much next event estimation will scatter: its variance in units of its squared mean,
-        averaged over the vertices that were observed.
-
-        Parameters:
-            selections: Probabilities of the cells in each row, which add up to one there.
-        """
+    def square_ratios(self, default: mi.Float, other: mi.Float) -> mi.Float:
+        """For each row, what the mean square of a connection becomes if its cell is chosen with
+        ``other`` probabilities, relative to ``default`` ones; shapes [rows], [rows · cells]."""
         count = self.cells.count
-        visibility = self.visibility()
         # In units of the row: squares of any light's brightness are numbers then
         row = dr.repeat(dr.block_sum(self.unoccluded, count), count)
-        square = dr.square(self.unoccluded / row) * self._square(visibility)
-        # What a cell brings on average, if all that arrives of it is alike
-        mean = dr.block_sum(dr.sqrt(square * visibility), count)
-        vertices = mi.Float(dr.block_sum(self.tests, count))
-        results = []
-        for p in selections:
-            second_moment = dr.block_sum(dr.select(p > 0, square / p, 0), count)
-            variance = dr.clip(second_moment / dr.square(mean) - 1, 0, _MOST_VARIANCE)
-            is_known = (vertices > 0) & dr.isfinite(variance)
-            total = dr.sum(dr.select(is_known, vertices * variance, 0))
-            results.append(float(total[0]) / max(1.0, float(dr.sum(vertices)[0])))
-        return results
+        square = dr.square(self.unoccluded / row) * self._square(self.visibility())
+        before, after = (
+            dr.block_sum(dr.select(p > 0, square / p, 0), count) for p in (default, other)
+        )
+        ratio = after / before
+        return dr.select(dr.isfinite(ratio), dr.minimum(ratio, 1), 1)
 
     def __str__(self) -> str:
         seen, succeeded = (int(dr.count(n > 0)[0]) for n in (self.tests, self.successes))

@@ -12,9 +12,11 @@ from ...lights.light_cells import LightCells
 from ...lights.weights import uniform_weights
 from ...regions.surface_rows import BYTES_PER_VOXEL, RowCounts, SurfaceRows, voxel_edges
 from ...regions.surface_sides import region
+from ...transport.observer import Observer
 from ...transport.path_decisions import EmitterSampling
 from ..learner import Learner
 from . import light_map_file
+from .connection_records import ConnectionRecords
 from .light_map import BYTES_PER_ENTRY, LightMap
 from .light_table import LightSelection
 
@@ -27,9 +29,9 @@ _DEFENSIVE = 0.1
 #: the map for each sample of the pilots (with about three connections each), at most.
 _GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 
-#: By how much the variance must fall, relatively: what learning costs in time. And the relative
-#: variance of everything that does not depend on the choice, at least.
-_LEAST_GAIN, _OTHER_VARIANCE = 0.07, 0.1
+#: What choosing from a table costs, in units of the time of a path (measured: 0 to 15 %), and the
+#: efficiency that it must reach.
+_COST, _LEAST_EFFICIENCY = 0.06, 1.02
 
 
 class LightLearner(Learner):
@@ -68,6 +70,7 @@ class LightLearner(Learner):
         self.wants_scout = load is None
         self._is_needed = grid > 0 or load is not None or save is not None
         self.map: LightMap | None = None
+        self._records: ConnectionRecords | None = None
         self._summary = ""
 
     def keep_map(self) -> None:
@@ -75,7 +78,8 @@ class LightLearner(Learner):
         self._is_needed = True
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> EmitterSampling | None:
-        self.map, self._summary = None, "nothing: no path scatters"
+        self.map, self._records = None, None
+        self._summary = "lights: no path scatters"
         if self.load is not None:
             self.map = light_map_file.load(
                 self.load, scene, self.pilot_samples, self.max_memory,
@@ -86,12 +90,14 @@ class LightLearner(Learner):
             # Mitsuba samples these with a wrong density
             self._is_needed |= self.map.cells.has_smooth_meshes
             if self.map.cells.count == 1 and not self._is_needed:
-                self.map, self._summary = None, "nothing: there is one light to choose"
+                self.map, self._summary = None, "lights: there is one to choose"
         if self.map is None:
             return None
         self._as_path = _normalized(
             uniform_weights(scene, self.map.cells), self.map.cells.count
         )
+        if not self._is_needed:
+            self._records = ConnectionRecords(self.map.rows.count, self._as_path)
         return self._selection(self._probabilities(self.map.unoccluded))
 
     def _new_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
@@ -123,12 +129,19 @@ class LightLearner(Learner):
     # ---- Observer ----
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
-        if self.map is not None:
-            self.map.begin(lanes)
+        for observer in self._observers():
+            observer.begin(lanes, pixel)
 
-    def connection(self, choice, si, ds, contribution, visible, tested) -> None:
-        if self.map is not None:
-            self.map.connection(choice, si, ds, contribution, visible, tested)
+    def connection(self, *arguments) -> None:
+        for observer in self._observers():
+            observer.connection(*arguments)
+
+    def end(self, L: mi.Spectrum) -> None:
+        if self._records is not None:
+            self._records.end(L)
+
+    def _observers(self) -> list[Observer]:
+        return [observer for observer in (self.map, self._records) if observer is not None]
 
     # ---- Between the stages ----
 
@@ -137,12 +150,12 @@ class LightLearner(Learner):
             return None
         self.map.evaluate()
         probabilities = self._probabilities(self.map.weights(self.target))
-        if not self._is_needed:
+        if self._records is not None:
             gain = self._gain(probabilities)
-            if gain < _LEAST_GAIN:
+            self._records = None
+            if (1 - gain) * (1 + _COST) * _LEAST_EFFICIENCY > 1:
                 self._summary = (
-                    f"{self.map}; not used, it would lower the variance by only "
-                    f"{max(0.0, gain):.0%}"
+                    f"{self.map}; not used, the variance would be only {max(0.0, gain):.0%} lower"
                 )
                 self.map = None
                 return EmitterSampling()
@@ -156,12 +169,11 @@ class LightLearner(Learner):
         self.map = None
 
     def _gain(self, probabilities: mi.Float) -> float:
-        """By how much, relatively, these probabilities lower the variance below that of Mitsuba's
-        choice."""
-        default, learned = self.map.relative_variances(
-            dr.tile(self._as_path, self.map.rows.count), probabilities
-        )
-        return (default - learned) / (default + _OTHER_VARIANCE)
+        """By how much, relatively, these probabilities lower the variance of the image below that
+        with Mitsuba's choice."""
+        self._records.finish()
+        as_path = dr.tile(self._as_path, self.map.rows.count)
+        return self._records.gain(self.map.square_ratios(as_path, probabilities))
 
     def _probabilities(self, weights: mi.Float) -> mi.Float:
         """Probabilities that no wrong expectation can keep from any cell."""

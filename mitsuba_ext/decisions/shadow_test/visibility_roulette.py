@@ -87,8 +87,8 @@ class VisibilityLearner(Learner):
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> None:
         self._map = VisibilityMap(scene, self._grid, self._max_memory)
 
-    def connection(self, choice, si, ds, contribution, visible, tested) -> None:
-        self._map.shadow_ray(si.p, ds.p, visible, tested)
+    def connection(self, choice, vertex, ds, contribution, value, visible, tested) -> None:
+        self._map.shadow_ray(vertex.si.p, ds.p, visible, tested)
 
     def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
         self._map.segment(p, q, active)

@@ -1,0 +1,91 @@
+"""Recording what the connections of paths contribute to the variance of the image."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ...transport.observer import Observer
+from ..path_importance import brightness, importance
+from .light_table import Choice
+
+#: Connections of a path that are recorded, those of its first vertices; and paths of a pass, at
+#: most, about.
+_VERTICES, _MOST_PATHS = 6, 1 << 18
+
+
+class ConnectionRecords(Observer):
+    """Records connections that were chosen from a light table.
+
+    Parameters:
+        rows: Rows of the table.
+        as_path: The probabilities, for each cell, with which Mitsuba would choose.
+
+    Attributes:
+        row_squares (mi.Float64): For each row, the sum of the squares of what its connections would
+            bring if Mitsuba had chosen, in the image, weighted by :func:`importance`; shape [rows].
+        variance (float): Sum of the squared errors of the paths, weighted so, if Mitsuba had
+            chosen.
+    """
+
+    def __init__(self, rows: int, as_path: mi.Float) -> None:
+        self._as_path = as_path
+        self.row_squares = dr.zeros(mi.Float64, rows)
+        self.variance = 0.0
+        self._lanes = 0
+
+    # ---- Observer of the walk ----
+
+    def begin(self, lanes: int, pixel: mi.UInt32 | None = None) -> None:
+        self._collect()
+        stride = max(1, lanes // _MOST_PATHS)
+        self._lanes = -(-lanes // stride)
+        lane = dr.arange(mi.UInt32, lanes)
+        stride = dr.opaque(mi.UInt32, stride)
+        self._path = lane // stride
+        self._is_recorded = self._path * stride == lane
+        self._slots = dr.opaque(mi.UInt32, self._lanes)
+        slots = self._lanes * _VERTICES
+        self._row = dr.zeros(mi.UInt32, slots)
+        self._value, self._ratio = dr.zeros(mi.Float, slots), dr.zeros(mi.Float, slots)
+        self._total = dr.zeros(mi.Float, self._lanes)
+        dr.eval(self._row, self._value, self._ratio, self._total)
+
+    def connection(self, choice: Choice, vertex, ds, contribution, value, visible, tested) -> None:
+        active = visible & self._is_recorded & (vertex.depth < _VERTICES)
+        slot = vertex.depth * self._slots + self._path
+        as_path = dr.gather(mi.Float, self._as_path, choice.cell, active)
+        dr.scatter(self._row, choice.row, slot, active)
+        dr.scatter(self._value, brightness(value), slot, active)
+        dr.scatter(self._ratio, choice.probability / as_path, slot, active)
+
+    def end(self, L: mi.Spectrum) -> None:
+        dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
+
+    # ---- Between passes ----
+
+    def finish(self) -> None:
+        """Ends the observation of a stage."""
+        self._collect()
+
+    def _collect(self) -> None:
+        """Keeps what the last pass has recorded."""
+        if self._lanes == 0:
+            return
+        weight, error = importance(self._total)
+        slot = dr.arange(mi.UInt32, len(self._value))
+        weight = dr.gather(mi.Float, weight, slot % self._slots)
+        actual = mi.Float64(dr.square(self._value) * weight)
+        actual = dr.select(dr.isfinite(actual), actual, 0)
+        as_path = dr.select(dr.isfinite(self._ratio), actual * self._ratio, 0)
+        dr.scatter_add(self.row_squares, as_path, self._row)
+        change = float(dr.sum(as_path - actual)[0])
+        self.variance += float(dr.sum(mi.Float64(error))[0]) + change
+        self._lanes = 0
+        self._row = self._value = self._ratio = self._total = None
+
+    def gain(self, ratio: mi.Float) -> float:
+        """By how much, relatively, the variance of the image falls if the mean squares of the
+        connections of each row become ``ratio`` times those of Mitsuba's choice; shape [rows]."""
+        removed = float(dr.sum(self.row_squares * mi.Float64(1 - ratio))[0])
+        return removed / max(self.variance, 1e-30)
