@@ -18,7 +18,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .spectra import brightness, some_wavelengths
+from ..regions.voxel_sides import SIDES, sides, voxel_number
+from .spectra import brightness, comparison_wavelengths
 
 #: Cells of one emitter, at most.
 _MAX_CELLS = 64
@@ -132,7 +133,7 @@ def _is_even(emitter: mi.Emitter, shape: mi.Shape, division: Division) -> bool:
     pieces = division.pieces[:, None]
     points = (pieces[..., :2] + grid * pieces[..., 2:]).reshape(-1, 2).T
     ps = shape.sample_position(0.0, mi.Point2f(points.astype(np.float32)))
-    si = mi.SurfaceInteraction3f(ps, some_wavelengths(points.shape[1]))
+    si = mi.SurfaceInteraction3f(ps, comparison_wavelengths(points.shape[1]))
     si.wi = mi.Vector3f(0, 0, 1)
     value = brightness(emitter.eval(si)).numpy().astype(np.float64).reshape(-1, n * n)
     area = division.pieces[:, 2] * division.pieces[:, 3]
@@ -260,15 +261,14 @@ def _groups(
     """Numbers, without gaps, of at most ``limit`` groups of pieces."""
     if voxel is None:
         return np.zeros(len(middle), int)
-    axis = np.abs(normal).argmax(axis=1)
-    facing = 2 * axis + (np.take_along_axis(normal, axis[:, None], 1)[:, 0] < 0)
+    side = sides(normal)
     extent = np.ptp(middle, axis=0) / voxel
     # Boxes of equal size, none longer than a voxel to begin with, but not more than can be cells
     boxes = np.clip(np.ceil(extent - _TOLERANCE), 1, limit)
     relative = (middle - middle.min(axis=0)) / np.maximum(np.ptp(middle, axis=0), 1e-300)
     while True:
         x, y, z = np.minimum(relative * boxes, boxes - 1).astype(int).T
-        key = facing + 6 * (x + limit * (y + limit * z))
+        key = side + SIDES * voxel_number(x, y, z, limit)
         groups = np.unique(key, return_inverse=True)[1].reshape(-1)
         if groups.max() < limit:
             return groups

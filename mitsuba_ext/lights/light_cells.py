@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .cells import EmitterCells
-from .environment import EnvironmentBins
+from .emitter_cells import EmitterCells
+from .environment_bins import EnvironmentBins
 
 
 class LightCells:

@@ -11,7 +11,7 @@ def brightness(value: mi.Spectrum) -> mi.Float:
     return mi.luminance(value) if mi.is_rgb else dr.mean(value)
 
 
-def some_wavelengths(width: int) -> mi.Spectrum:
+def comparison_wavelengths(width: int) -> mi.Spectrum:
     """Wavelengths of the middle sample in spectral variants, none in the others."""
     wavelengths = dr.zeros(mi.Interaction3f, width).wavelengths
     if mi.is_spectral:

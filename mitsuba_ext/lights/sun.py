@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .spectra import brightness, some_wavelengths
+from .spectra import brightness, comparison_wavelengths
 
 #: Angles at which the edge of the disk is looked for, up to the largest aperture, in radians.
 _ANGLES = np.geomspace(1e-4, 0.5, 4096)
@@ -57,7 +57,7 @@ class SunDisk:
         sin, cos = dr.sincos(mi.Float(_ANGLES.astype(np.float32)))
         si = dr.zeros(mi.SurfaceInteraction3f, len(_ANGLES))
         si.wi = -(sun * cos + upwards * sin)
-        si.wavelengths = some_wavelengths(len(_ANGLES))
+        si.wavelengths = comparison_wavelengths(len(_ANGLES))
         value = brightness(emitter.eval(si)).numpy()
         contrast = value[:-1] / np.maximum(value[1:], 1e-30)
         edge = int(contrast.argmax())

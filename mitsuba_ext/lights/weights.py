@@ -10,9 +10,9 @@ import numpy as np
 
 from ..regions.surface_rows import SurfaceRows
 from ..regions.voxel_grid import VoxelGrid
-from .environment import brightness, some_wavelengths
 from .light_cells import LightCells
 from .power import emitter_powers
+from .spectra import brightness, comparison_wavelengths
 
 #: Least weight of a cell, relative to the mean of its row (pbrt's).
 _FLOOR = 1e-3
@@ -97,7 +97,7 @@ def _light(
     """The brightness of radiance / pdf of a sample of ``cell`` at ``p``, and its direction."""
     lanes = dr.width(cell)
     ref = dr.zeros(mi.SurfaceInteraction3f, lanes)
-    ref.p, ref.wavelengths = p, some_wavelengths(lanes)
+    ref.p, ref.wavelengths = p, comparison_wavelengths(lanes)
     ds, weight = cells.sample(cell, ref, sampler.next_2d(), mi.Bool(True))
     value = brightness(weight)
     # Some emitters send the same everywhere: one number for all lanes

@@ -7,15 +7,13 @@ import mitsuba as mi
 import numpy as np
 
 from ...regions.surface_sides import lit_normal, region
+from ...regions.voxel_sides import SIDES, VoxelSides, voxel_coordinates
 from .path_records import PathRecords
 from .sample_trees import SampleTrees
 from .tree_builder import UNIFORM, Samples, TreeBuilder
 
 #: Voxels along each axis, level by level: each of them divides those of the one before.
 _GRIDS = (4, 8, 16, 32)
-
-#: The six directions of the axes.
-_SIDES = 6
 
 
 class SurfaceRegions:
@@ -37,20 +35,18 @@ class SurfaceRegions:
     def __init__(self, p: mi.Point3f, n: mi.Normal3f, least: float) -> None:
         bbox = region(p)
         finest = _GRIDS[-1]
-        # Opaque: other scenes and sensors share the kernels
-        self._origin = mi.Point3f(bbox.min)
-        self._scale = finest / mi.Vector3f(bbox.max - bbox.min)
-        dr.make_opaque(self._origin, self._scale)
-        cell, side, inside = self._locate(p, n, mi.Bool(True))
-        inside = inside.numpy()
-        cell, side = cell.numpy().T[inside], side.numpy()[inside]
+        scale = finest / mi.Vector3f(bbox.max - bbox.min)
+        self._pairs = VoxelSides(mi.Point3f(bbox.min), scale, finest)
+        pair, inside = (x.numpy() for x in self._pairs.number(p, n, mi.Bool(True)))
+        voxel, side = np.divmod(pair[inside], SIDES)
+        cell = np.stack(voxel_coordinates(voxel, finest))
 
-        table = np.zeros((1, 1, 1, _SIDES), np.uint32)
+        table = np.zeros((1, 1, 1, SIDES), np.uint32)
         self._levels, parents, self.count = [slice(0, 1)], [np.zeros(1, np.uint32)], 1
         for grid in _GRIDS:
             for axis in range(3):
                 table = table.repeat(grid // table.shape[axis], axis)
-            x, y, z = (cell * grid // finest).T
+            x, y, z = cell * grid // finest
             seen, times = np.unique(
                 np.ravel_multi_index((z, y, x, side), table.shape), return_counts=True
             )
@@ -84,9 +80,8 @@ class SurfaceRegions:
 
     def label(self, si: mi.SurfaceInteraction3f, pixel, active: mi.Bool) -> mi.UInt32:
         """The region by which a sample is recorded."""
-        cell, side, inside = self._locate(si.p, lit_normal(si), active)
-        slot = (cell.x + _GRIDS[-1] * (cell.y + _GRIDS[-1] * cell.z)) * _SIDES + side
-        region = dr.gather(mi.UInt32, self._table, mi.UInt32(slot), inside)
+        pair, inside = self._pairs.number(si.p, lit_normal(si), active)
+        region = dr.gather(mi.UInt32, self._table, pair, inside)
         is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
         return dr.select(is_smooth, region, self._specular)
 
@@ -114,15 +109,6 @@ class SurfaceRegions:
         for smaller in self._levels[level + 1 :]:
             numbers[smaller] = numbers[self._parent[smaller]]
         return numbers
-
-    def _locate(self, p, n, active) -> tuple[mi.Vector3i, mi.Int32, mi.Bool]:
-        cell = mi.Vector3i(dr.floor((p - self._origin) * self._scale))
-        inside = active & dr.all((cell >= 0) & (cell < _GRIDS[-1]))
-        a = dr.abs(n)
-        x_longest, y_longest = (a.x >= a.y) & (a.x >= a.z), a.y >= a.z
-        axis = dr.select(x_longest, mi.Int32(0), dr.select(y_longest, mi.Int32(1), mi.Int32(2)))
-        component = dr.select(x_longest, n.x, dr.select(y_longest, n.y, n.z))
-        return cell, 2 * axis + dr.select(component < 0, mi.Int32(1), 0), inside
 
     def __str__(self) -> str:
         return f"{self.count} regions of surfaces"

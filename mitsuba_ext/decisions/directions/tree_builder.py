@@ -16,7 +16,7 @@ from collections.abc import Iterator
 import drjit as dr
 import mitsuba as mi
 
-from ...lights.searching import first_above
+from ...discrete_sampling import first_above
 from .sample_trees import LEAF
 
 #: The node of a tree without a split.

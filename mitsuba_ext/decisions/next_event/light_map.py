@@ -9,8 +9,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ...lights.environment import brightness
 from ...lights.light_cells import LightCells
+from ...lights.spectra import brightness
 from ...lights.weights import unoccluded_weights
 from ...regions.surface_rows import SurfaceRows
 from ...transport.observer import Observer

@@ -8,8 +8,8 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
+from ...discrete_sampling import alias_tables
 from ...lights.light_cells import LightCells
-from ...lights.searching import alias_tables
 from ...transport.path_decisions import EmitterSampling
 
 #: Entries of a table that are computed together: they need some memory.

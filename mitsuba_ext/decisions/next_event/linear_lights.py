@@ -11,8 +11,8 @@ import numpy as np
 
 from ...bounds import scene_bounds, shape_bounds
 from ...lights.division import emitter_shapes
-from ...lights.environment import some_wavelengths
 from ...lights.light_cells import LightCells
+from ...lights.spectra import comparison_wavelengths
 from ...lights.weights import power_weights
 from ...transport.path_decisions import EmitterSampling
 
@@ -210,7 +210,7 @@ def _samples(scene: mi.Scene, center: mi.Point3f) -> tuple[np.ndarray, np.ndarra
     each."""
     count = len(scene.emitters())
     ref = dr.zeros(mi.Interaction3f, count)
-    ref.p, ref.wavelengths = center, some_wavelengths(count)
+    ref.p, ref.wavelengths = center, comparison_wavelengths(count)
     ds, _weight = scene.emitters_dr().sample_direction(ref, mi.Point2f(0.5), mi.Bool(True))
     zero = dr.zeros(mi.Float, count)
     p, n, d = (np.array(v + zero, dtype=np.float64) for v in (ds.p, ds.n, ds.d))

@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..discrete_sampling import ONE_MINUS_EPSILON, first_above
 from .division import Division, divide, emitter_shapes, triangles
-from .searching import ONE_MINUS_EPSILON, first_above
 
 
 class EmitterCells:

@@ -7,11 +7,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..bounds import scene_bounds
-from .searching import ONE_MINUS_EPSILON, alias_tables
-from .spectra import brightness, some_wavelengths
+from ..discrete_sampling import ONE_MINUS_EPSILON, alias_tables
+from .spectra import brightness, comparison_wavelengths
 from .sun import SunDisk
-
-__all__ = ["EnvironmentBins", "brightness", "some_wavelengths"]
 
 #: Bins along the azimuth and along the polar angle.
 BINS = (32, 16)
@@ -100,7 +98,7 @@ class EnvironmentBins:
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(0, _OWN_SAMPLES)
         ref = dr.zeros(mi.Interaction3f, _OWN_SAMPLES)
-        ref.p, ref.wavelengths = self._center, some_wavelengths(_OWN_SAMPLES)
+        ref.p, ref.wavelengths = self._center, comparison_wavelengths(_OWN_SAMPLES)
         ds, weight = self.emitter.sample_direction(ref, sampler.next_2d())
         value = brightness(weight) * ds.pdf
         if self._sun is not None:
@@ -116,7 +114,7 @@ class EnvironmentBins:
     def _brightness(self, uv: mi.Point2f) -> mi.Float:
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
         si.wi = -(self._to_world @ self._direction(uv)[0])
-        si.wavelengths = some_wavelengths(dr.width(uv))
+        si.wavelengths = comparison_wavelengths(dr.width(uv))
         value = brightness(self.emitter.eval(si))
         counts = dr.isfinite(value)
         if self._sun is not None:
@@ -164,7 +162,8 @@ class EnvironmentBins:
             n = 64
             x, y = dr.meshgrid(*2 * [(dr.arange(mi.Float, n) + 0.5) / n])
             si = dr.zeros(mi.SurfaceInteraction3f, n * n)
-            si.wi, si.wavelengths = -self._sun.sample(mi.Point2f(x, y)), some_wavelengths(n * n)
+            si.wi = -self._sun.sample(mi.Point2f(x, y))
+            si.wavelengths = comparison_wavelengths(n * n)
             value = float(dr.mean(brightness(self.emitter.eval(si)))[0])
             emitted = np.append(emitted, value * self._sun.solid_angle)
         self.count = len(emitted)
