@@ -121,6 +121,13 @@ class LightMap(Observer):
         """Ends the observation of a stage."""
         dr.eval(self._counts, self.squares)
 
+    def ratio(self) -> mi.Float:
+        """The share of the shadow rays from a row to a cell that arrived, 1 where none was traced;
+        shape [rows · cells]."""
+        tests = self.tests
+        ratio = mi.Float(self.successes) / mi.Float(dr.maximum(tests, 1))
+        return dr.select(tests > 0, ratio, 1)
+
     def visibility(self) -> mi.Float:
         """The probability that a shadow ray from a row to a cell arrives; shape [rows · cells].
 

@@ -16,7 +16,7 @@ from ...regions.surface_sides import region
 from ...transport.path_decisions import EmitterSampling
 from ..learner import Learner
 from ..shadow_test.light_map_roulette import LightRoulette
-from ..shadow_test.visibility_roulette import WORTHWHILE
+from ..shadow_test.rejection_law import WORTHWHILE
 from . import light_map_file
 from .light_map import BYTES_PER_ENTRY, LightMap
 from .light_table import LightSelection
