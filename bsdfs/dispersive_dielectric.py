@@ -50,9 +50,10 @@ class DispersiveDielectric(mi.BSDF):
     and the noise becomes coloured. The noise is least with a :monosp:`reweighted_wavelength`
     around the integrator.
 
-    It needs a spectral variant (:monosp:`llvm_ad_spectral`) and an integrator of ours: Mitsuba's
-    own cannot let one wavelength go on alone, and stop with an error. With a number as int_ior it
-    works everywhere, as :monosp:`dielectric` does. Light that is reflected keeps all wavelengths.
+    It needs a spectral variant (:monosp:`llvm_ad_spectral`) and an integrator of this package:
+    Mitsuba's own cannot let one wavelength go on alone. There is a warning about them, and the
+    pixels whose paths meet the glass are infinite or NaN. With a number as int_ior it works
+    everywhere, as :monosp:`dielectric` does. Light that is reflected keeps all wavelengths.
     The normals of :monosp:`bumpmap` and :monosp:`normalmap` must be of the kind that they make
     themselves (flip_invalid_normals). Indices of catalogues hold for 360 to 830 nm; beyond, they
     stay what they are there. What is outside does not disperse; nothing is absorbed inside (tint it
@@ -86,8 +87,8 @@ class DispersiveDielectric(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def sample(self, ctx, si, sample1, sample2, active=True):
-        if not self._interface.serves(ctx):
-            return dr.zeros(mi.BSDFSample3f), mi.Spectrum(dr.nan)
+        if not self._interface.is_answerable(ctx):
+            return self._interface.infinite_sample(si, sample1)
         has_reflection = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0)
         has_transmission = ctx.is_enabled(mi.BSDFFlags.DeltaTransmission, 1)
         bs = dr.zeros(mi.BSDFSample3f)

@@ -99,8 +99,8 @@ class DispersiveRoughDielectric(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def sample(self, ctx, si, sample1, sample2, active=True):
-        if not self._interface.serves(ctx):
-            return dr.zeros(mi.BSDFSample3f), mi.Spectrum(dr.nan)
+        if not self._interface.is_answerable(ctx):
+            return self._interface.infinite_sample(si, sample1)
         has_reflection, has_transmission = _lobes(ctx)
         bs = dr.zeros(mi.BSDFSample3f)
         if not (has_reflection or has_transmission):
@@ -146,8 +146,8 @@ class DispersiveRoughDielectric(mi.BSDF):
         return bs, dr.select(active, value, 0)
 
     def eval_pdf(self, ctx, si, wo, active=True):
-        if not self._interface.serves(ctx):
-            return mi.Spectrum(dr.nan), mi.Float(0)
+        if not self._interface.is_answerable(ctx):
+            return mi.Spectrum(dr.inf), mi.Float(1)
         has_reflection, has_transmission = _lobes(ctx)
         cos_θ, cos_θ_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         reflects = cos_θ * cos_θ_o > 0

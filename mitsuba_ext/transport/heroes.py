@@ -75,9 +75,10 @@ class Heroes:
         self._factor = self._count * hero_weight
 
     def context(self) -> mi.BSDFContext:
-        """What BSDFs are to be asked with."""
+        """The context for all calls of BSDFs."""
         ctx = mi.BSDFContext()
-        if self._is_needed:
+        # Also where nothing disperses: Dr.Jit traces the BSDFs of all scenes in memory
+        if mi.is_spectral:
             ctx.type_mask |= DISPERSES
         return ctx
 
