@@ -1,4 +1,4 @@
-"""The parameters of dispersive dielectrics, and what happens between two media."""
+"""What dispersive dielectrics share: parameters, refractive indices, calls that they refuse."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import mitsuba as mi
 from ..transport.heroes import DISPERSES, knows_heroes
 from .glass import GLASSES, VISIBLE, Cauchy, Constant, Index, Sellmeier, check_index
 
-#: Mitsuba's gases and vacuum: what is outside has the same index at all wavelengths.
+#: The media that can be outside, by Mitsuba's names: their index is the same at all wavelengths.
 _OUTSIDE = {
     "vacuum": 1.0,
     "helium": 1.000036,
@@ -27,16 +27,16 @@ class DispersiveInterface:
     """A surface between a clear medium, which may be dispersive, and one outside, which is not.
 
     Parameters:
-        plugin: What errors call the plugin.
-        props: Its parameters: ``int_ior``, ``cauchy`` or ``sellmeier``, ``ext_ior``,
+        plugin: The plugin's name, for errors.
+        props: The plugin's parameters: ``int_ior``, ``cauchy`` or ``sellmeier``, ``ext_ior``,
             ``specular_reflectance``, ``specular_transmittance``.
 
     Attributes:
-        flags: What the flags of the plugin's components are to contain.
+        flags: Flags that the plugin adds to those of its components.
 
     Raises:
-        RuntimeError: It is dispersive, and the variant is not spectral.
-        TypeError, ValueError: A parameter is not what it must be.
+        RuntimeError: The medium inside is dispersive, and the variant is not spectral.
+        TypeError, ValueError: A parameter has a wrong type or value.
     """
 
     def __init__(self, plugin: str, props: mi.Properties) -> None:
@@ -112,19 +112,19 @@ class DispersiveInterface:
             )
 
     def η(self, si: mi.SurfaceInteraction3f) -> list[mi.Float]:
-        """The index inside relative to that outside, for the hero and then the other wavelengths;
-        only one value where all have the same."""
+        """The index inside relative to that outside, for the hero and then for the other
+        wavelengths; a single value if nothing disperses."""
         if not self._disperses:
             return [mi.Float(self._inside.n / self._outside)]
         η = self._inside(si.wavelengths) / self._outside
         return [η[k] for k in range(dr.size_v(mi.Spectrum))]
 
     def reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """What reflection is multiplied by, as the scene's author wishes."""
+        """The factor of reflection that the scene sets."""
         return self._texture("specular_reflectance", si, active)
 
     def transmittance(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """What refraction is multiplied by, as the scene's author wishes."""
+        """The factor of refraction that the scene sets."""
         return self._texture("specular_transmittance", si, active)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -206,10 +206,10 @@ class DispersiveInterface:
 def check_uniform(
     plugin: str, key: str, texture: mi.Texture, maximum: float = math.inf
 ) -> mi.Texture:
-    """The texture of the parameter ``key``.
+    """Returns the texture of the parameter ``key``, after a check of constant textures.
 
     Raises:
-        ValueError: It is a number, and that is negative, above ``maximum``, or not finite.
+        ValueError: The texture is a constant that is negative, above ``maximum``, or not finite.
     """
     if texture.class_name() == "UniformSpectrum":
         value = float(dr.slice(mi.traverse(texture)["value"]))

@@ -9,7 +9,7 @@ import numpy as np
 from ..bounds import scene_bounds
 from .voxel_sides import voxel_at, voxel_coordinates, voxel_number
 
-#: Index of the voxels that hold nothing.
+#: The index of an empty voxel.
 EMPTY = 0xFFFFFFFF
 
 #: Geometry that touches a voxel's face within this share of its size belongs to both neighbours:
@@ -21,7 +21,7 @@ class VoxelGrid:
     """Voxels of the scene's bounding box, numbered without gaps over those that hold geometry.
 
     Parameters:
-        scene: Its shapes, and its point-like emitters, occupy the voxels.
+        scene: The scene whose shapes and point-like emitters occupy the voxels.
         resolution: Voxels along each axis.
 
     Raises:
@@ -38,7 +38,7 @@ class VoxelGrid:
         if not bbox.valid():
             raise ValueError("a scene without geometry has no voxels")
         extent = bbox.max - bbox.min
-        # A flat scene still has voxels of some depth, and no point lies on the outer faces
+        # Voxels of a flat scene get some depth, and no point lies on the outer faces of the grid
         padding = mi.ScalarVector3f(1e-4 * dr.max(extent) or 1.0)
         self.origin = mi.Point3f(bbox.min - padding)
         self.size = mi.Vector3f((extent + 2 * padding) / resolution)

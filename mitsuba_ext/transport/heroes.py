@@ -107,8 +107,12 @@ class Heroes:
         si: mi.SurfaceInteraction3f,
         bs: mi.BSDFSample3f,
     ) -> tuple[mi.Spectrum, mi.Float | float, Any]:
-        """The same for a BSDF sample; how much more what is left of the wavelengths counts by now,
-        which is no reason to let a path live longer; and the new state."""
+        """The same for a BSDF sample.
+
+        Returns:
+            The weight by which the throughput is to be multiplied; the factor in it that makes up
+            for the lost wavelengths, which Russian roulette must divide out; and the new state.
+        """
         if not self._is_needed:
             return bsdf_weight, 1.0, is_alone
         # What passes a hole of a mask is not refracted

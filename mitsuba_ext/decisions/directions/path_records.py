@@ -1,4 +1,4 @@
-"""Recording which primary samples paths used, and what they brought back from there on."""
+"""Records the primary samples of paths, and the radiance that followed each of them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import mitsuba as mi
 from ...transport.observer import Observer
 from .tree_builder import DEPTH, cell_code, joined
 
-#: Bytes of a record, at most: what is kept of it, and what trees are built from.
+#: The most bytes of a record, including the temporaries while trees are built.
 BYTES_PER_RECORD = 320
 
-#: Paths that follow each other, and so begin close together: their mean is what errors are
-#: relative to, but for this share of the squared mean of all.
+#: Errors are relative to the mean of so many consecutive paths, which begin close together, plus
+#: this share of the squared mean of all paths.
 _NEIGHBOURS, _FLOOR = 64, 1e-2
 
 

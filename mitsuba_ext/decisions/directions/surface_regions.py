@@ -1,4 +1,4 @@
-"""Trees for regions of surfaces: the geometry decides which paths learn from each other."""
+"""Trees for regions of surfaces: paths that scatter in the same region share a tree."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from .path_records import PathRecords
 from .sample_trees import SampleTrees
 from .tree_builder import UNIFORM, Samples, TreeBuilder
 
-#: Voxels along each axis, level by level: each of them divides those of the one before.
+#: Voxels along each axis, level by level: the voxels of a level divide those of the level before.
 _GRIDS = (4, 8, 16, 32)
 
 
 class SurfaceRegions:
-    """Voxels of the region in which paths scatter, and the sides of their surfaces.
+    """Regions are pairs of a voxel of the box in which paths scatter and a side of its surfaces.
 
-    The number 0 stands for everything; large voxels come after it, and smaller ones inside of them
-    after these, each where paths meet it often enough. The last number stands for mirrors and
-    glass, whose directions do not depend on the sample: it has a tree without splits. All bounces
-    of a path use the trees of the places where they happen.
+    Region 0 is the whole scene. Regions of large voxels follow, then those of the smaller voxels
+    inside of them; a region exists only where paths scatter often enough. The last number stands
+    for mirrors and glass, whose directions do not depend on the sample: its tree has no splits. At
+    each bounce, a path uses the tree of the region in which it scatters.
 
     Parameters:
-        p, n: Where paths scatter, and normals on the side that is lit; not empty.
-        least: How many of these a region has, at least.
+        p, n: Vertices where paths scatter, and normals on the side that is lit; not empty.
+        least: The least number of these vertices in a region.
 
     Attributes:
         count: Number of regions that learn.
@@ -67,7 +67,7 @@ class SurfaceRegions:
         return ()
 
     def tree(self, state: tuple, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
-        """The tree of a vertex: that of the smallest region it belongs to."""
+        """The tree of a vertex: that of the smallest region that contains it."""
         return self.label(si, None, active)
 
     def after(
@@ -86,7 +86,12 @@ class SurfaceRegions:
         return dr.select(is_smooth, region, self._specular)
 
     def build(self, records: PathRecords) -> tuple[TreeBuilder, mi.UInt32, None]:
-        """The trees and their roots. A region expects what the one around it found."""
+        """Builds the trees.
+
+        Returns:
+            The builder, the root of each region, and ``None``: no tree stands below a leaf. The
+            tree of the surrounding region is the prior of a region's tree.
+        """
         samples = Samples(records.code, records.value, records.weight)
         samples, region = samples.merged(records.region)
         builder = TreeBuilder()
@@ -102,7 +107,8 @@ class SurfaceRegions:
         return builder, mi.UInt32(roots), None
 
     def _numbers(self, level: int) -> np.ndarray:
-        """For each region, which one of a level's it lies in; too large a number for none."""
+        """For each region, the number of the region of a level in which it lies; a number too large
+        if there is none."""
         numbers = np.full(self.count + 1, self.count, np.uint32)
         regions = self._levels[level]
         numbers[regions] = np.arange(regions.stop - regions.start)

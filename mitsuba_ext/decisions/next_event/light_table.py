@@ -12,10 +12,10 @@ from ...discrete_sampling import alias_tables
 from ...lights.light_cells import LightCells
 from ...transport.path_decisions import EmitterSampling
 
-#: Entries of a table that are computed together: they need some memory.
+#: Entries of a table that are computed together, which bounds the temporary memory.
 _ENTRIES_AT_ONCE = 1 << 20
 
-#: Bytes of an entry, and of the weights that it is made of while they are computed.
+#: Bytes of an entry of the table, including the weights and temporaries while it is computed.
 TABLE_BYTES = 40
 
 
@@ -43,8 +43,8 @@ class Choice:
 
     Attributes:
         row: Row of the table at the last vertex.
-        cell: What was chosen there.
-        probability: With what probability.
+        cell: The cell that was chosen there.
+        probability: The probability of that choice.
     """
 
     row: mi.UInt32
@@ -56,8 +56,8 @@ class LightSelection(EmitterSampling):
     """Chooses a cell with the probabilities of the vertex's row, then a point on it.
 
     Parameters:
-        rows: Which row a vertex uses.
-        cells: What there is to choose.
+        rows: Tells which row a vertex uses.
+        cells: The cells to choose from.
         weights: For each row, a weight for each cell; shape [rows · cells], not negative. A row of
             zeros chooses uniformly.
     """
@@ -73,7 +73,7 @@ class LightSelection(EmitterSampling):
 
     def sample(self, state, scene, sampler, si, active):
         row = self.rows.row(si, active)
-        # Two numbers: what is left of one, after choosing among many entries, is too coarse
+        # Two numbers: one, rescaled after choosing among many entries, would be too coarse
         x, y = sampler.next_2d()
         cell = dr.minimum(mi.UInt32(x * mi.Float(self._count)), self._count - 1)
         entry = dr.gather(mi.Vector4f, self._table, row * self._count + cell, active)
@@ -86,7 +86,7 @@ class LightSelection(EmitterSampling):
         return ds, weight, Choice(row, cell, probability)
 
     def pdf(self, state, scene, ref, si, ds, active):
-        # Few rays run into a light: the others jump over all this
+        # Few rays hit a light: the others skip this code
         return _if(active, self._density, (state.row, ref, si, ds, active)), state
 
     def _density(self, row, ref, si, ds, active) -> mi.Float:
@@ -98,8 +98,8 @@ class LightSelection(EmitterSampling):
 
 
 def _table(weights: mi.Float, rows: int, count: int) -> mi.Float:
-    """For each entry of an alias table its threshold, the cell of its alias, its own probability
-    and that of the alias. Side by side: a draw reads them with one access to memory."""
+    """Builds the alias tables of all rows. An entry has its threshold, the cell of its alias, its
+    own probability and that of the alias; a draw reads these four with one access to memory."""
     table = dr.empty(mi.Float, 4 * rows * count)
     step = max(1, _ENTRIES_AT_ONCE // count)
     for begin in range(0, rows, step):

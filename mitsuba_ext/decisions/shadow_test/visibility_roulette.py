@@ -36,13 +36,13 @@ class VisibilityRoulette(ShadowTest):
 
     def __init__(self, visibility: VisibilityMap, slope: float, floor: float, law: str) -> None:
         self.voxels = visibility.voxels
-        # Connections end on lights: of the whole map, the columns of their voxels are enough, and
-        # stay in the cache.
+        # Connections end on lights: of the whole map, only the columns of the lights' voxels are
+        # kept, which fit into the cache
         lights = visibility.light_voxels()
         voxel_count, light_count = self.voxels.occupied_count, len(lights)
         self._column = dr.full(mi.UInt32, EMPTY, voxel_count)
         dr.scatter(self._column, dr.arange(mi.UInt32, light_count), lights)
-        # Opaque: the number of columns differs from seed to seed, the kernel must not
+        # Opaque: the number of columns differs from seed to seed, and the kernel must not
         self._light_count = dr.opaque(mi.UInt32, light_count)
         index = dr.arange(mi.UInt32, voxel_count * light_count)
         voxel = index // self._light_count
@@ -100,7 +100,7 @@ class VisibilityLearner(Learner):
                 decisions["shadow_test"] = roulette
             else:
                 self._summary += f"; not used, it would reject only {roulette.rejected_share:.0%}"
-        del self._map  # the counters: the last stage needs the roulette's table only
+        del self._map  # frees the counters: the last stage needs the roulette's table only
         return decisions
 
     def __str__(self) -> str:
@@ -108,7 +108,8 @@ class VisibilityLearner(Learner):
 
 
 def has_lights_at_points(scene: mi.Scene) -> bool:
-    """Is there a light that the map can cover: not at infinity, nor outside its voxels?"""
+    """Is there a light in the voxels of the map? (Lights at infinity, and point lights outside of
+    the bounds of the shapes, are not.)"""
     bounds = scene_bounds(scene)
     if not bounds.valid():
         return False
