@@ -18,7 +18,7 @@ class DispersiveDielectric(mi.BSDF):
     --------------------------------------------------------------
 
     A smooth surface between air and a glass whose refractive index depends on the wavelength, so
-    that a prism spreads white light into a spectrum. But for that, it is Mitsuba's
+    that a prism spreads white light into a spectrum. Otherwise it is Mitsuba's
     :monosp:`dielectric`.
 
     .. pluginparameters::
@@ -45,18 +45,19 @@ class DispersiveDielectric(mi.BSDF):
        - Factors of reflection and refraction, 0 to 1, to be left at 1 for physical results.
          (Default: 1)
 
-    **Use it when** colours that glass makes are to be seen: prisms, gems, lenses, edges of thick
-    glass. **Not when** nobody will: where a path is refracted, one of its four wavelengths is left,
-    and the noise becomes coloured. The noise is least with a :monosp:`reweighted_wavelength`
-    around the integrator.
+    **Use it when** the colours of dispersion shall be visible: prisms, gems, lenses, edges of thick
+    glass. **Not when** they would not be: a refracted path keeps one of its four wavelengths, and
+    the noise becomes coloured. The noise is least with a :monosp:`reweighted_wavelength` around the
+    integrator.
 
-    It needs a spectral variant (:monosp:`llvm_ad_spectral`) and an integrator of ours: Mitsuba's
-    own cannot let one wavelength go on alone, and stop with an error. With a number as int_ior it
-    works everywhere, as :monosp:`dielectric` does. Light that is reflected keeps all wavelengths.
+    It needs a spectral variant (:monosp:`llvm_ad_spectral`) and an integrator of this package:
+    Mitsuba's own cannot let one wavelength go on alone. There is a warning about them, and the
+    pixels whose paths meet the glass are infinite or NaN. With a number as int_ior it works
+    everywhere, as :monosp:`dielectric` does. Light that is reflected keeps all wavelengths.
     The normals of :monosp:`bumpmap` and :monosp:`normalmap` must be of the kind that they make
-    themselves (flip_invalid_normals). Indices of catalogues hold for 360 to 830 nm; beyond, they
-    stay what they are there. What is outside does not disperse; nothing is absorbed inside (tint it
-    by specular_transmittance). Gradients are not supported.
+    themselves (flip_invalid_normals). Indices of catalogues hold for 360 to 830 nm; beyond this
+    range they are those of its nearer end. The medium outside does not disperse, and the one inside
+    does not absorb (tint it by specular_transmittance). Gradients are not supported.
 
     Source: A. Wilkie et al., *Hero Wavelength Spectral Sampling*, 2014. Indices: data sheets of
     Schott; I. H. Malitson 1965 (fused silica); M. Daimon and A. Masumura 2007 (water); F. Peter
@@ -86,8 +87,8 @@ class DispersiveDielectric(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def sample(self, ctx, si, sample1, sample2, active=True):
-        if not self._interface.serves(ctx):
-            return dr.zeros(mi.BSDFSample3f), mi.Spectrum(dr.nan)
+        if not self._interface.is_answerable(ctx):
+            return self._interface.infinite_sample(si, sample1)
         has_reflection = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0)
         has_transmission = ctx.is_enabled(mi.BSDFFlags.DeltaTransmission, 1)
         bs = dr.zeros(mi.BSDFSample3f)
@@ -99,7 +100,7 @@ class DispersiveDielectric(mi.BSDF):
         cos_θ = mi.Frame3f.cos_theta(si.wi)
         F, cos_θ_t, η_it, η_ti = mi.fresnel(cos_θ, η[0])
         if has_reflection and has_transmission:
-            # Where F is 0 nothing is reflected, whatever the number
+            # Where F is 0 nothing is reflected, also for the number 0
             reflects = (sample1 <= F) & (F > 0)
             bs.pdf = dr.select(reflects, F, 1 - F)
         else:
@@ -114,11 +115,11 @@ class DispersiveDielectric(mi.BSDF):
             mi.UInt32(+mi.BSDFFlags.DeltaTransmission),
         )
 
-        # ----- Each wavelength is reflected as it is, over the probability of the lobe -----
+        # ----- The reflectance of each wavelength, over the probability of the lobe -----
         active = mi.Bool(active) & (bs.pdf > 0)
         reflection = fresnel_spectrum(cos_θ, η) * self._interface.reflectance(si, active & reflects)
         transmission = self._interface.transmittance(si, active & ~reflects)
-        # Refraction squeezes the solid angle of radiance
+        # Refraction scales radiance by the change of its solid angle
         scale = dr.square(η_ti) if ctx.mode == mi.TransportMode.Radiance else 1
         value = dr.select(reflects, reflection, transmission * (1 - F) * scale)
         return bs, dr.select(active, value / dr.select(active, bs.pdf, 1), 0)

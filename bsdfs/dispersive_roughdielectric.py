@@ -25,7 +25,7 @@ class DispersiveRoughDielectric(mi.BSDF):
     ------------------------------------------------------------------
 
     A frosted surface of microfacets between air and a glass whose refractive index depends on the
-    wavelength. But for that, it is Mitsuba's :monosp:`roughdielectric`.
+    wavelength. Otherwise it is Mitsuba's :monosp:`roughdielectric`.
 
     .. pluginparameters::
 
@@ -44,18 +44,19 @@ class DispersiveRoughDielectric(mi.BSDF):
        - Instead of alpha: roughness along the tangent and the bitangent.
      * - sample_visible
        - |bool|
-       - Choose among microfacets that are seen, which is less noisy. (Default: true)
+       - Sample only microfacets that are visible, which is less noisy. (Default: true)
      * - specular_reflectance, specular_transmittance
        - |spectrum| or |texture|
        - Factors of reflection and refraction, 0 to 1, to be left at 1 for physical results.
          (Default: 1)
 
-    **Use it when** colours that frosted glass makes are to be seen. **Not when** it is so rough
-    that they run into each other: the noise remains, and :monosp:`roughdielectric` has less.
+    **Use it when** the colours of frosted glass shall be visible. **Not when** it is so rough that
+    the colours mix: the noise remains, and :monosp:`roughdielectric` has less.
 
-    It needs a spectral variant (:monosp:`llvm_ad_spectral`) and an integrator of ours, as
-    :monosp:`dispersive_dielectric` does; with a number as int_ior it works everywhere. Light is
-    scattered once: the rougher, the more is lost, as by Mitsuba's. Gradients are not supported.
+    It needs a spectral variant (:monosp:`llvm_ad_spectral`) and an integrator of this package, as
+    :monosp:`dispersive_dielectric` does; with a number as int_ior it works everywhere. Only single
+    scattering is modelled: as with Mitsuba's, rougher surfaces lose more energy. Gradients are not
+    supported.
 
     Source: A. Wilkie et al., *Hero Wavelength Spectral Sampling*, 2014; B. Walter et al.,
     *Microfacet Models for Refraction through Rough Surfaces*, 2007.
@@ -99,8 +100,8 @@ class DispersiveRoughDielectric(mi.BSDF):
         self.m_flags = self.m_components[0] | self.m_components[1]
 
     def sample(self, ctx, si, sample1, sample2, active=True):
-        if not self._interface.serves(ctx):
-            return dr.zeros(mi.BSDFSample3f), mi.Spectrum(dr.nan)
+        if not self._interface.is_answerable(ctx):
+            return self._interface.infinite_sample(si, sample1)
         has_reflection, has_transmission = _lobes(ctx)
         bs = dr.zeros(mi.BSDFSample3f)
         if not (has_reflection or has_transmission):
@@ -132,7 +133,7 @@ class DispersiveRoughDielectric(mi.BSDF):
         active &= (probability > 0) & is_regular
         bs.pdf = dr.select(active, pdf * probability * density, 0)
 
-        # ----- Each wavelength is reflected as it is, over the probability of the lobe -----
+        # ----- The reflectance of each wavelength, over the probability of the lobe -----
         value = self._reflection_or_transmission(
             ctx, si, η, F, η_ti, dr.dot(si.wi, m), reflects, active
         )
@@ -140,21 +141,21 @@ class DispersiveRoughDielectric(mi.BSDF):
         if self._samples_visible:
             value *= facets.smith_g1(bs.wo, m)
         else:
-            # Mitsuba's weight forgets that the facets are drawn from a rougher distribution
+            # Mitsuba's weight ignores that the facets are sampled from a rougher distribution
             value *= facets.eval(m) * facets.G(si.wi, bs.wo, m) * dr.dot(si.wi, m)
             value /= dr.select(active, cos_θ * pdf, 1)
         return bs, dr.select(active, value, 0)
 
     def eval_pdf(self, ctx, si, wo, active=True):
-        if not self._interface.serves(ctx):
-            return mi.Spectrum(dr.nan), mi.Float(0)
+        if not self._interface.is_answerable(ctx):
+            return mi.Spectrum(dr.inf), mi.Float(1)
         has_reflection, has_transmission = _lobes(ctx)
         cos_θ, cos_θ_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         reflects = cos_θ * cos_θ_o > 0
         active = mi.Bool(active) & (cos_θ != 0)
         active &= (reflects & has_reflection) | (~reflects & has_transmission)
 
-        # ----- Which microfacet leads the hero from wi to wo? It is to face both -----
+        # ----- Which microfacet scatters the hero from wi to wo? It must face both -----
         η = self._interface.η(si)
         η_it = dr.select(cos_θ > 0, η[0], dr.rcp(η[0]))
         m = dr.normalize(si.wi + wo * dr.select(reflects, 1, η_it))
@@ -216,7 +217,7 @@ class DispersiveRoughDielectric(mi.BSDF):
         return check_uniform(NAME, key, props.get_unbounded_texture(key, 0.1))
 
     def _facets(self, si, cos_θ, active):
-        """The distribution of microfacets, and that of which they are drawn."""
+        """The distribution of microfacets, and the one from which they are sampled."""
         alpha_u, alpha_v = (self._alphas[k].eval_1(si, active) for k in (0, -1))
         facets, sampled = (
             mi.MicrofacetDistribution(self._distribution, alpha_u, alpha_v, self._samples_visible)
@@ -228,10 +229,10 @@ class DispersiveRoughDielectric(mi.BSDF):
         return facets, sampled
 
     def _reflection_or_transmission(self, ctx, si, η, F, η_ti, wi_m, reflects, active):
-        """F at each wavelength, or 1 - F of the hero, times the author's factors."""
+        """F at each wavelength, or 1 - F of the hero, times the factors of the scene."""
         reflection = fresnel_spectrum(wi_m, η)
         reflection *= self._interface.reflectance(si, active & reflects)
-        # Refraction squeezes the solid angle of radiance
+        # Refraction scales radiance by the change of its solid angle
         scale = dr.square(η_ti) if ctx.mode == mi.TransportMode.Radiance else 1
         transmission = self._interface.transmittance(si, active & ~reflects) * (1 - F) * scale
         return dr.select(reflects, reflection, transmission)

@@ -107,6 +107,9 @@ class Variance(mi.AdjointIntegrator):
             }
     """
 
+    #: Each render asks the nested integrator whether it does.
+    sees_motion = True
+
     def __init__(self, props: mi.Properties) -> None:
         # Nothing for the base class to read: what it would accept has no effect here
         super().__init__(mi.Properties(props.plugin_name()))

@@ -1,8 +1,8 @@
-"""Where the things of a scene are.
+"""Bounding boxes of shapes and scenes.
 
-Mitsuba 3.9.1 merges meshes of one material when it loads a scene, and a rectangle that was merged
-is missing in the box of the result, and in that of the scene (``Mesh::merge`` looks at a member
-which rectangles do not fill). Vertices tell the truth.
+Mitsuba 3.9.1 merges meshes of one material when it loads a scene. The boxes of the merged mesh and
+of the scene then do not contain the merged rectangles (``Mesh::merge`` reads a member that
+rectangles do not fill). The boxes here are those of the vertices.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What identifies a scene or an integrator: the bytes of everything that it is made of."""
+"""Hashes that identify scenes and integrators by their files, parameters and code."""
 
 from __future__ import annotations
 
@@ -57,10 +57,15 @@ def hash_value(value: object) -> str:
 
 
 def hash_code(classes: Iterable[type]) -> str | None:
-    """SHA-256 over the Python files that define these classes of plugins; empty if all are written
-    in C++. With one that is in Python, all files of ours that take part in a render count, since
-    any of them may be imported there. ``None`` where a class has no file (it was written in a
-    notebook)."""
+    """SHA-256 over the Python files that define these classes of plugins.
+
+    If one of them is written in Python, all files of this package that take part in a render are
+    included, since the class may import any of them.
+
+    Returns:
+        Empty if all classes are written in C++; ``None`` if a class has no file (it was written in
+        a notebook).
+    """
     bases = {base for cls in classes for base in cls.__mro__ if base.__module__ not in _COMPILED}
     if not bases:
         return ""

@@ -1,4 +1,4 @@
-"""Rigid motion in time: what it is, where it goes, and its poses on the device.
+"""Rigid motion in time: its description, its bounds, and its poses on the device.
 
 A motion takes a point p of the *rest frame* to R(t) · (p − center) + position(t). It is a sequence
 of segments; during each, the position moves at constant velocity, and the rotation goes at constant
@@ -17,11 +17,11 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-#: Steps in which a rotation is followed to find its bounds.
+#: The largest angle, and the largest number, of the steps by which a rotation's bounds are found.
 _BOUNDS_STEP = math.radians(3)
 _MOST_BOUNDS_STEPS = 4096
 
-#: Vectors of four numbers that describe a segment on the device.
+#: The number of 4-vectors that describe a segment on the device.
 _ROW = 5
 
 
@@ -31,8 +31,8 @@ class Motion:
 
     Attributes:
         times: When the segments begin, and when the last one ends: [S + 1], increasing.
-        positions: Of the center, at these times: [S + 1, 3].
-        starts: Rotations with which the segments begin, as quaternions (x, y, z, w): [S, 4].
+        positions: Positions of the center at these times: [S + 1, 3].
+        starts: Rotations at the begin of the segments, as quaternions (x, y, z, w): [S, 4].
         turns: Rotation vectors of the segments (axis times angle in radians, which may exceed a
             full turn): [S, 3].
         center: The point of the rest frame about which it turns: [3].
@@ -78,14 +78,17 @@ class Motion:
         )
 
     def move(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Where the points [n, 3] of the rest frame are at ``time``."""
+        """The positions, at ``time``, of points [n, 3] of the rest frame."""
         k = int(np.clip(np.searchsorted(self.times, time, "right") - 1, 0, len(self.turns) - 1))
         x = np.clip((time - self.times[k]) / (self.times[k + 1] - self.times[k]), 0, 1)
         return self._move_in_segment(np.asarray(points), k, x)
 
     def bounds(self, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A box (its least and its greatest corner) which the convex hull of ``corners`` [n, 3], in
-        the rest frame, never leaves."""
+        """A box that the convex hull of ``corners`` [n, 3], given in the rest frame, never leaves.
+
+        Returns:
+            Its least and its greatest corner.
+        """
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for k, turn in enumerate(self.turns):
             angle = np.linalg.norm(turn)
@@ -109,14 +112,14 @@ class Motion:
 
 @dataclass
 class Pose:
-    """Where things are at one time per lane."""
+    """The pose of a mover at one time per lane."""
 
     rotation: mi.Matrix3f
     position: mi.Point3f
     center: mi.Point3f
 
     def to_rest(self, ray: mi.Ray3f) -> mi.Ray3f:
-        """The ray as the things at rest would see it; distances along it stay the same."""
+        """The ray in the rest frame; distances along it stay the same."""
         inverse = self.rotation.T
         moved = mi.Ray3f(ray)
         moved.o = inverse @ (ray.o - self.position) + self.center
@@ -124,8 +127,8 @@ class Pose:
         return moved
 
     def to_world(self, si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
-        """An interaction with things at rest, as it is in the world. What is relative to the
-        shading frame (``wi``) or to the surface (``uv``) stays the same."""
+        """Transforms an interaction from the rest frame to the world. ``wi``, which is relative to
+        the shading frame, and ``uv`` stay the same."""
         R = self.rotation
         si.p = R @ (si.p - self.center) + self.position
         si.n = R @ si.n
@@ -140,10 +143,10 @@ class PoseTable:
     """Several motions on the device."""
 
     def __init__(self, motions: Sequence[Motion]) -> None:
-        # Each motion gets as many rows as the longest one has; those left over are never reached
+        # Each motion gets as many rows as the longest one has; the excess rows are never reached
         self._stride = max(len(motion.turns) for motion in motions)
         rows = np.zeros((len(motions), self._stride, _ROW, 4))
-        rows[:, :, 2, 3] = np.inf  # when they begin
+        rows[:, :, 2, 3] = np.inf  # the time when a row's segment begins
         for index, motion in enumerate(motions):
             rows[index, : len(motion.turns)] = _rows(motion)
         self._rows = mi.Float(np.ravel(rows).astype(np.float32))
@@ -169,7 +172,7 @@ class PoseTable:
         last = self._stride - 1
 
         def has_begun(k: mi.UInt32) -> mi.Bool:
-            # The search also asks for k = last, whatever the answer
+            # The search also evaluates k = last, and ignores the result
             return self._column(first + dr.minimum(k + 1, last), 2).w <= time
 
         return first + dr.binary_search(0, last, has_begun)
@@ -179,8 +182,8 @@ class PoseTable:
 
 
 def _rows(motion: Motion) -> np.ndarray:
-    """The segments as the device wants them: start; axis and half the angle; position and time of
-    its begin; displacement and 1 / duration; center. [S, _ROW, 4]"""
+    """The segments in the layout of the device: start; axis and half the angle; position and time
+    at the begin; displacement and 1 / duration; center. Shape [S, _ROW, 4]."""
     angles = np.linalg.norm(motion.turns, axis=1, keepdims=True)
     axes = np.divide(motion.turns, angles, out=np.zeros_like(motion.turns), where=angles > 0)
     durations = np.diff(motion.times)[:, None]

@@ -1,10 +1,11 @@
-"""Which shapes of a scene move, and who does not see it."""
+"""Which shapes of a scene move, and errors where an integrator does not see that."""
 
 from __future__ import annotations
 
 import mitsuba as mi
 
 from .motion import Motion
+from .nesting import class_name
 
 
 def movers(scene: mi.Scene) -> list[mi.Shape]:
@@ -13,11 +14,11 @@ def movers(scene: mi.Scene) -> list[mi.Shape]:
 
 
 def refuse_movers(scene: mi.Scene, what: str, instead: str) -> None:
-    """For what cannot show moving shapes.
+    """Raises an error if something moves in ``scene``.
 
     Parameters:
-        what: Begins the sentence: which plugin or parameter does not see them.
-        instead: Ends it: what to do.
+        what: Begins the message: the plugin or the parameter that does not see moving shapes.
+        instead: Ends the message: what to do.
 
     Raises:
         NotImplementedError: Something moves in ``scene``.
@@ -29,11 +30,13 @@ def refuse_movers(scene: mi.Scene, what: str, instead: str) -> None:
 
 
 def check_motion_is_seen(integrator: mi.Integrator, scene: mi.Scene) -> None:
-    """
+    """Refuses to render a scene in which something moves with an integrator that does not see it.
+
+    Those that see it say so by the attribute ``sees_motion``. Mitsuba's own integrators and those
+    of other packages would render the scene without the shapes that move.
+
     Raises:
-        NotImplementedError: Something moves in ``scene``, and the integrator is one of Mitsuba's
-            own, which would render it without that.
+        NotImplementedError: Something moves in ``scene``, and the integrator does not see it.
     """
-    if type(integrator).__module__.split(".")[0] == "mitsuba":
-        name = f'"{integrator.class_name()}", an integrator of Mitsuba\'s own,'
-        refuse_movers(scene, name, 'use "composed_path"')
+    if not getattr(integrator, "sees_motion", False):
+        refuse_movers(scene, f'"{class_name(integrator)}"', 'use "composed_path"')

@@ -1,4 +1,4 @@
-"""Integrators inside of integrators."""
+"""Integrators as users and scene files know them: what is nested in them, and their classes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,19 @@ def with_nested(integrator: mi.Integrator) -> list[mi.Integrator]:
     return found
 
 
+def class_name(integrator: mi.Integrator) -> str:
+    """The name of the integrator's class, whether that is written in Python or in C++."""
+    name, python_class = integrator.class_name(), type(integrator)
+    # Mitsuba does not know classes in Python: it gives the name of the base class in C++
+    is_python = name in {base.__name__ for base in python_class.__mro__}
+    return python_class.__name__ if is_python else name
+
+
 def _children(integrator: mi.Integrator) -> list[mi.Integrator]:
-    if type(integrator).__module__.split(".")[0] != "mitsuba":
-        nested = getattr(integrator, "nested", None)  # as ours call it
-        return [nested] if isinstance(nested, mi.Integrator) else []
+    # Our integrators keep a nested one in this attribute, and do not traverse it
+    nested = getattr(integrator, "nested", None)
+    if isinstance(nested, mi.Integrator):
+        return [nested]
 
     # The base class is known once a variant is selected
     class Collector(mi.TraversalCallback):

@@ -1,4 +1,4 @@
-"""What an integrator passes over in a scene without a word."""
+"""Warnings about what an integrator ignores in a scene."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Iterable
 
 import mitsuba as mi
 
-from .nesting import with_nested
+from .nesting import class_name, with_nested
 
-#: Integrators that need no light and have nothing to do with media: two look at surfaces only, one
+#: Integrators that need no light and ignore media by design: two show properties of surfaces, one
 #: renders primitives that emit.
 _NO_LIGHT_NEEDED = {
     "AOVIntegrator", "DepthIntegrator", "BasicVolumetricPrimitiveRadianceFieldIntegrator",
@@ -21,17 +21,24 @@ _SEES_MEDIA = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpa
 def scene_remarks(
     scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator, name: str
 ) -> list[str]:
-    """Sentences about media that ``integrator``, to be called ``name``, does not see, and about
-    missing lights. Nothing is said about integrators that are neither Mitsuba's nor ours."""
+    """Warns of media that ``integrator`` does not see, and of a scene without lights.
+
+    Parameters:
+        name: What the sentences call the integrator.
+
+    Returns:
+        Sentences. There is none about integrators that are neither Mitsuba's nor ours: they may see
+        media, and need no lights.
+    """
     tracers = [
         each
         for each in with_nested(integrator)
         if type(each).__module__.split(".")[0] in ("mitsuba", "mitsuba_ext")
-        and not _is_one_of(each, _NO_LIGHT_NEEDED)
+        and class_name(each) not in _NO_LIGHT_NEEDED
         and len(with_nested(each)) == 1
     ]
     remarks = []
-    blind = [each for each in tracers if not _is_one_of(each, _SEES_MEDIA)]
+    blind = [each for each in tracers if class_name(each) not in _SEES_MEDIA]
     if blind and (sensor.get_medium() is not None or _has_media(scene.shapes())):
         remarks.append(
             f'the scene has participating media, and "{name}" treats them as absent: use "volpath"'
@@ -39,11 +46,6 @@ def scene_remarks(
     if tracers and not scene.emitters():
         remarks.append("the scene has no light: the image is black")
     return remarks
-
-
-def _is_one_of(integrator: mi.Integrator, classes: set[str]) -> bool:
-    # Classes in Python are called by their name there, those in C++ by Mitsuba's
-    return not classes.isdisjoint([integrator.class_name(), type(integrator).__name__])
 
 
 def _has_media(shapes: Iterable[mi.Shape]) -> bool:

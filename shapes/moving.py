@@ -14,7 +14,7 @@ from mitsuba_ext.bounds import shape_bounds
 from mitsuba_ext.motion import Motion
 from mitsuba_ext.parameters import read_parameter
 
-#: By how much a pose may differ from a rigid one: rounding of matrices that were written as text.
+#: The most that a pose may differ from a rigid one: matrices in text files are rounded.
 _RIGID_TOLERANCE = 1e-4
 
 
@@ -26,27 +26,27 @@ class Moving(mi.Mesh):
     Moving shapes (:monosp:`moving`)
     --------------------------------
 
-    Makes the shapes that are nested in it move, rigidly and together, while the shutter is open.
-    The integrators of this package then show them blurred by their motion, with the shadows,
-    reflections and indirect light that go with it.
+    Moves the shapes that are nested in it, rigidly and together, while the shutter is open. The
+    integrators of this package show their motion blur, also in shadows, reflections and indirect
+    light.
 
     .. pluginparameters::
 
      * - (nested plugin)
        - |shape|
-       - One shape or more, of any type, with their materials: what moves. Where they are put is
+       - The shapes that move, one or more, of any type, with their materials. Their own place is
          where they rest before the motion. Next to an :monosp:`instance`, nest its
          :monosp:`shapegroup` (or a :monosp:`ref` to it) as well.
      * - translate
        - |vector|
-       - By how much they are displaced in all, at constant velocity. (Default: 0, 0, 0)
+       - The total displacement, at constant velocity. (Default: 0, 0, 0)
      * - axis
        - |vector|
        - The axis about which they turn, at constant speed; it needs not be of unit length.
          (Default: none)
      * - angle
        - |float|
-       - By how many degrees they turn in all; it may exceed 360. Required with :monosp:`axis`.
+       - The total rotation in degrees; it may exceed 360. Required with :monosp:`axis`.
      * - center
        - |point|
        - A point of the axis, before the motion; it is displaced with the shapes. Known only with
@@ -62,7 +62,7 @@ class Moving(mi.Mesh):
          the origin are interpolated linearly, rotations by slerp (the shorter way).
      * - time_0, time_1, …
        - |float|
-       - When; each pose needs its time, later than that of the one before.
+       - The times of the poses: one for each, in increasing order.
 
     **Use it when** something moves or turns visibly between the sensor's :monosp:`shutter_open` and
     :monosp:`shutter_close`, which must be set: they are both 0 by default, and such a sensor sees
@@ -71,20 +71,20 @@ class Moving(mi.Mesh):
     **Not when** light sources or the camera move, or shapes deform: that is not supported.
 
     Only integrators of this package see these shapes. **Mitsuba's own**, such as :monosp:`path` or
-    :monosp:`aov`, **render the scene without them, and cannot be stopped from it**; use
+    :monosp:`aov`, **render the scene without them, and there is no way to stop them**; use
     :monosp:`composed_path`, which is :monosp:`path` otherwise. The parameter :monosp:`aovs` is
     refused.
 
-    Every motion costs: its shapes are searched apart from all others, by those rays that meet the
-    box which they sweep. Compared with the same things at rest, one motion took 1.15 to 1.3 times
-    as long and four took 1.3 to 1.6 times (less where boxes are small in the view, more where they
-    fill it). Shapes that move together belong into one :monosp:`moving`.
+    Every motion costs time: its shapes have an acceleration structure of their own, which all rays
+    traverse that hit the bounding box of the motion. Compared with the same shapes at rest, one
+    motion took 1.15 to 1.3 times as long and four took 1.3 to 1.6 times (less where boxes are small
+    in the view, more where they fill it). Put shapes that move together into one :monosp:`moving`.
 
     A nested shape may be nowhere else in the scene. Emitters, sensors, and meshes with vertex
     attributes cannot be nested; participating media are ignored, as by :monosp:`path`. The scene's
-    bounds include all of the motion. Nested shapes do not show up in :monosp:`mi.traverse`:
-    what it shows is a placeholder, which keeps their place. Textures that depend on the position in
-    the world do not move along. An instance of a group that holds a :monosp:`merge` of rectangles
+    bounds include all of the motion. :monosp:`mi.traverse` does not show nested shapes: it shows a
+    placeholder mesh in their place. Textures that depend on the position in the world do not move
+    along. An instance of a group that holds a :monosp:`merge` of rectangles
     may be cut off, as Mitsuba 3.9.1 does not know its bounds.
 
     Source: R. L. Cook, T. Porter, L. Carpenter, *Distributed Ray Tracing*, 1984; K. Shoemake,
@@ -115,7 +115,7 @@ class Moving(mi.Mesh):
         self.children = self._nested(props)
         self.motion = self._motion(props)
         self._at_rest = None
-        # The base class gets no parameters: what it would accept has no meaning here
+        # The base class gets no parameters: those that it accepts have no meaning here
         own = mi.Properties(self.name)
         own.set_id(props.id())
         super().__init__(self.name, vertex_count=3, face_count=2, props=own)
@@ -186,7 +186,7 @@ class Moving(mi.Mesh):
         return np.array([list(box.corner(i)) for box in boxes for i in range(8)], dtype=np.float64)
 
     def _span(self, low: np.ndarray, high: np.ndarray) -> None:
-        """Two triangles without area, which no ray can hit, tell the scene about the bounds."""
+        """Makes the bounds known to the scene: two triangles without area, which no ray can hit."""
         parameters = mi.traverse(self)
         # Rounded outwards
         low = np.nextafter(low.astype(np.float32), np.float32(-np.inf))
@@ -284,5 +284,5 @@ class Moving(mi.Mesh):
 
 
 def _has_extent(shape: mi.Shape) -> bool:
-    """Is it anywhere? A shapegroup is only where its instances are."""
+    """Does the shape occupy space itself? A shapegroup does only by its instances."""
     return shape.class_name() != "ShapeGroupPlugin" and shape_bounds(shape).valid()

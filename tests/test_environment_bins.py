@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsuba_ext.lights.environment import BINS, EnvironmentBins, brightness, some_wavelengths
+from mitsuba_ext.discrete_sampling import alias_tables
+from mitsuba_ext.lights.environment_bins import BINS, EnvironmentBins
 from mitsuba_ext.lights.light_cells import LightCells
-from mitsuba_ext.lights.searching import alias_tables
+from mitsuba_ext.lights.spectra import brightness, comparison_wavelengths
 from mitsuba_ext.lights.sun import SunDisk
 
 LANES = 1 << 18
@@ -252,7 +253,7 @@ def test_bins_work_in_other_variants(variant, name):
     rng, numbers = np.random.default_rng(2), mi.PCG32(size=LANES)
     bin = rng.choice(bins.count, LANES, p=bins.share)
     ref = dr.zeros(mi.Interaction3f, LANES)
-    ref.wavelengths = some_wavelengths(LANES)
+    ref.wavelengths = comparison_wavelengths(LANES)
     index = mi.UInt32(bin.astype(np.uint32))
     ds, weight = bins.sample(index, ref, _square(numbers), mi.Bool(True))
     found, pdf = bins.pdf(ds.d, mi.Bool(True))

@@ -147,6 +147,10 @@ def test_what_does_not_see_motion_is_refused() -> None:
         variance.render(scene, spp=4)
     with pytest.raises(NotImplementedError, match='"PathIntegrator".*: use "composed_path"'):
         timed_render(mi.load_dict({"type": "path"}), scene, seed=0, spp=1)
+    with pytest.raises(NotImplementedError, match='"PRBIntegrator".*: use "composed_path"'):
+        timed_render(mi.load_dict({"type": "prb"}), scene, seed=0, spp=1)
+    for seeing in ({"type": "composed_path"}, {"type": "variance", "nested": {"type": "neepp"}}):
+        timed_render(mi.load_dict(seeing), scene, seed=0, spp=2)
     with pytest.raises(NotImplementedError, match="X does not see .*: do Y"):
         refuse_movers(scene, "X", "do Y")
     refuse_movers(mi.load_dict({"type": "scene"}), "X", "do Y")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from batched import film_channels, small_scene
 
+from mitsuba_ext.rendering import seed_passes
 from mitsuba_ext.rendering.batches import batch_seeds
-from mitsuba_ext.rendering.render import seed_passes
 from mitsuba_ext.rendering.seed_passes import SeedPasses
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -55,7 +55,6 @@ def test_the_film_is_what_all_samples_make_together(monkeypatch, integrator, fil
             kept.append((seed, spp, sensor.film().develop(raw=True).numpy()))
             return image
 
-    monkeypatch.setattr(seed_passes, "check_motion_is_seen", lambda *_: None)
     passes = SeedPasses(Recorder(), scene, sensor, 3)
     fractions = []
     passes.run(10, progress=fractions.append)

@@ -1,1 +1,1 @@
-"""Lights as what next event estimation chooses from: cells of emitters, tables over them."""
+"""What next event estimation chooses from: parts of emitters (cells), and their first weights."""

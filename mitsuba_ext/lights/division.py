@@ -1,13 +1,12 @@
-"""How emitters are divided into cells: rectangles of the unit square that their sampling maps to
-their surface.
+"""Divides emitters into cells: parts of the surface that are rectangles of the unit square.
 
-``emitter.sample_direction`` turns a point of [0, 1)² into a point on the light. For rectangles,
-disks, cylinders and meshes that map does not depend on the point that is lit, so that a part of the
-square is a part of the surface, and choosing among the parts needs nothing else from Mitsuba. All
-other emitters stay whole: spheres, which are sampled by the solid angle of their cone, textured
-lights, which are sampled by their texture, and those that cannot be hit.
+``emitter.sample_direction`` maps a point of [0, 1)² to a point on the light. For rectangles,
+disks, cylinders and meshes the map does not depend on the point that is lit. A part of the square
+then is a part of the surface, and Mitsuba's own sampling, given points of that part, samples it.
+All other emitters stay whole: spheres, which are sampled by the solid angle of their cone, textured
+lights whose radiance varies much within the cells, and emitters that cannot be hit.
 
-Mitsuba samples a cylinder uniformly only if its cross-section is a circle, and warns where not.
+Mitsuba samples a cylinder uniformly only if its cross-section is a circle, and warns otherwise.
 """
 
 from __future__ import annotations
@@ -18,19 +17,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .spectra import brightness, some_wavelengths
+from ..regions.voxel_sides import SIDES, sides, voxel_number
+from .spectra import brightness, comparison_wavelengths
 
 #: Cells of one emitter, at most.
 _MAX_CELLS = 64
 
-#: Cells of a scene, about, where it has fewer emitters than that.
+#: Approximate number of cells of a scene that has fewer emitters than this.
 _CELL_BUDGET = 1024
 
-#: An edge this much longer than a voxel is not worth a cut.
+#: An edge is cut only if it is longer than a whole number of voxels by more than this.
 _TOLERANCE = 0.25
 
-#: How much worse than sampling a texture it may be to sample cells of its light by area; and
-#: points along each edge of a cell by which that is decided.
+#: A textured light is divided if sampling its cells by area has at most this many times the second
+#: moment of sampling its texture; and the points along each edge of a cell where that is measured.
 _UNEVENNESS, _TEXTURE_SAMPLES = 1.5, 16
 
 #: Cuts along each side of a triangle, at most.
@@ -51,7 +51,8 @@ class Division:
         face_first: First piece of each face in the order (face, row, column); shape [faces + 1].
         face_pieces: Where these pieces are found in ``pieces``.
         is_smooth: Do the interpolated normals of the mesh differ from those of its faces?
-        is_textured: Does the radiance vary? The *shape* then maps the unit square to its surface.
+        is_textured: Does the radiance vary? Points are then sampled on the shape, since the emitter
+            would sample its texture.
     """
 
     pieces: np.ndarray
@@ -132,13 +133,13 @@ def _is_even(emitter: mi.Emitter, shape: mi.Shape, division: Division) -> bool:
     pieces = division.pieces[:, None]
     points = (pieces[..., :2] + grid * pieces[..., 2:]).reshape(-1, 2).T
     ps = shape.sample_position(0.0, mi.Point2f(points.astype(np.float32)))
-    si = mi.SurfaceInteraction3f(ps, some_wavelengths(points.shape[1]))
+    si = mi.SurfaceInteraction3f(ps, comparison_wavelengths(points.shape[1]))
     si.wi = mi.Vector3f(0, 0, 1)
     value = brightness(emitter.eval(si)).numpy().astype(np.float64).reshape(-1, n * n)
     area = division.pieces[:, 2] * division.pieces[:, 3]
     cell = np.repeat(np.arange(len(division.cell_sizes)), division.cell_sizes)
     share, square = (np.bincount(cell, w) for w in (area, area * np.square(value).mean(axis=1)))
-    # Cells are chosen by the root of their mean square, texels by their radiance
+    # At best, cells are chosen by the root of their mean square, and texels by their radiance
     by_texture = (area * value.mean(axis=1)).sum()
     # A light that is black, or has no area, is left whole
     return by_texture > 0 and np.sqrt(share * square).sum() ** 2 <= _UNEVENNESS * by_texture**2
@@ -200,7 +201,7 @@ def _divide_mesh(
     """Cuts large faces, and groups pieces that are close to each other and face the same way.
 
     A mesh samples its faces by area, in their order, with the second coordinate of the unit
-    square; what is left of it and the first one place the point in the triangle.
+    square. That coordinate, rescaled, and the first one then sample a point of the triangle.
     """
     a, b, c = triangles(mesh)
     normal = _normalized(np.cross(b - a, c - a))
@@ -225,7 +226,7 @@ def _divide_mesh(
     first = a[piece_face]
     middle = first + u[:, None] * (b[piece_face] - first) + v[:, None] * (c[piece_face] - first)
 
-    # What is never sampled, faces without area, makes no cells of its own
+    # Faces without area are never sampled: they make no cells of their own
     has_area = height > 0
     if len(pieces) == 1 and not is_smooth:
         return Division(_WHOLE, np.ones(1, int))
@@ -243,8 +244,8 @@ def _divide_mesh(
 def _faces_in_square(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Begin and end of each face in the unit square's second coordinate.
 
-    These are the single precision sums of Mitsuba's own table: where faces are many, others would
-    lead to the neighbour of the face that is meant.
+    The sums are those of Mitsuba's own table, in single precision: with many faces, other sums
+    would select neighbours of the intended faces.
     """
     index = mesh.face_indices(dr.arange(mi.UInt32, mesh.face_count()))
     a, b, c = (mesh.vertex_position(index[k]) for k in range(3))
@@ -260,15 +261,15 @@ def _groups(
     """Numbers, without gaps, of at most ``limit`` groups of pieces."""
     if voxel is None:
         return np.zeros(len(middle), int)
-    axis = np.abs(normal).argmax(axis=1)
-    facing = 2 * axis + (np.take_along_axis(normal, axis[:, None], 1)[:, 0] < 0)
+    side = sides(normal)
     extent = np.ptp(middle, axis=0) / voxel
-    # Boxes of equal size, none longer than a voxel to begin with, but not more than can be cells
+    # Boxes of equal size: at first none is longer than a voxel, then they grow until there are at
+    # most ``limit`` groups
     boxes = np.clip(np.ceil(extent - _TOLERANCE), 1, limit)
     relative = (middle - middle.min(axis=0)) / np.maximum(np.ptp(middle, axis=0), 1e-300)
     while True:
         x, y, z = np.minimum(relative * boxes, boxes - 1).astype(int).T
-        key = facing + 6 * (x + limit * (y + limit * z))
+        key = side + SIDES * voxel_number(x, y, z, limit)
         groups = np.unique(key, return_inverse=True)[1].reshape(-1)
         if groups.max() < limit:
             return groups

@@ -1,4 +1,4 @@
-"""What next event estimation can choose in a scene: cells of emitters, and bins of directions."""
+"""All that next event estimation can choose: cells of emitters, and bins of an environment."""
 
 from __future__ import annotations
 
@@ -6,26 +6,27 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .cells import EmitterCells
-from .environment import EnvironmentBins
+from .emitter_cells import EmitterCells
+from .environment_bins import EnvironmentBins
 
 
 class LightCells:
-    """What a scene is lit by, numbered from 0 to ``count`` − 1: first the cells of its emitters,
-    then the bins of directions of its environment.
+    """The lights of a scene in parts, numbered from 0 to ``count`` − 1: first the cells of its
+    emitters (:class:`EmitterCells`), then the bins of its environment (:class:`EnvironmentBins`).
+    Both are called cells here.
 
     Parameters:
         scene: A scene with at least one emitter.
-        voxel: Emitters longer than this (three edges) are divided into cells, an environment into
-            bins. ``None``: each emitter is one cell.
+        voxel: The three edges of a box. Emitters that are longer are divided into cells, an
+            environment into bins. With ``None``, each emitter is one cell.
 
     Attributes:
         count (int): Number of cells.
         emitter_index (numpy.ndarray): The number of each cell's emitter; shape [count].
-        share (numpy.ndarray): The part of its emitter that each cell is: of the area, or of what an
-            environment emits; shape [count].
-        has_smooth_meshes (bool): Is a light a mesh with interpolated normals? Mitsuba's own
-            sampling has a wrong density there.
+        share (numpy.ndarray): The share of each cell in the area of its emitter, or in the emitted
+            brightness of the environment; shape [count].
+        has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
+            Mitsuba's own sampling of such a mesh has a wrong density.
     """
 
     def __init__(self, scene: mi.Scene, voxel: mi.Vector3f | None) -> None:
@@ -52,8 +53,12 @@ class LightCells:
     def sample(
         self, cell: mi.UInt32, ref: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-        """A point on ``cell`` (or a direction in it): the direction sample, whose ``pdf`` is
-        conditional on the cell, and its radiance / pdf (visibility not tested)."""
+        """Samples a point on ``cell``, or a direction of an environment.
+
+        Returns:
+            The direction sample, whose ``pdf`` is conditional on the cell, and its radiance / pdf,
+            before any visibility test.
+        """
         if self._bins is None:
             return self._emitters.sample(cell, ref, sample, active)
         if self._emitters is None:
@@ -70,8 +75,8 @@ class LightCells:
         ds: mi.DirectionSample3f,
         active: mi.Bool,
     ) -> tuple[mi.UInt32, mi.Float]:
-        """The cell that a ray from ``ref`` ran into at ``si``, and the density, conditional on the
-        cell, with which :meth:`sample` gives that direction."""
+        """The cell that a ray from ``ref`` hit at ``si``, and the density, conditional on the cell,
+        with which :meth:`sample` would sample the ray's direction."""
         if self._bins is None:
             return self._emitters.pdf(ref, si, ds, active)
         escaped = active & (ds.emitter == self._bins.pointer)

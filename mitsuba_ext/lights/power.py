@@ -16,14 +16,15 @@ from .spectra import brightness
 #: Samples of an emitter.
 _SAMPLES = 256
 
-#: Texels of a spot's texture that are looked at, at most: those of larger ones are thinned out. And
-#: points along its edges where it is no bitmap.
+#: Most texels of a spot's texture that are evaluated: of larger textures, only some are. And the
+#: points along each edge of a texture that is no bitmap.
 _MOST_TEXELS, _POINTS = 1 << 22, 256
 
 
 def emitter_powers(scene: mi.Scene) -> np.ndarray:
-    """The power of each emitter, in units of brightness: what it sends out, or, from infinity, into
-    the bounding sphere of the scene. An estimate, which can be 0 where something is emitted.
+    """Estimates the power of each emitter, in units of brightness: the power that it emits or, for
+    an emitter at infinity, the power that enters the bounding sphere of the scene. An estimate can
+    be 0 although the emitter emits.
 
     Returns:
         Shape [emitters].
@@ -44,7 +45,8 @@ def _sent_out(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
     if len(indices) == 0:
         return np.zeros(0)
     shapes = emitter_shapes(scene)
-    # No calls by pointer: those ask all emitters that exist, also in other scenes
+    # Not by a call through a pointer: Dr.Jit would trace all emitters in memory, also those of
+    # other scenes
     senders = [functools.partial(_radiated, scene.emitters()[i], shapes[i]) for i in indices]
     index, sampler = _lanes(len(indices))
     numbers = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
@@ -54,7 +56,7 @@ def _sent_out(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
 def _radiated(
     emitter: mi.Emitter, shape: mi.Shape | None, x: mi.Float, y: mi.Point2f, z: mi.Point2f
 ) -> mi.Float:
-    """A sample of an emitter's power, for uniform numbers."""
+    """A sample of an emitter's power, from uniform numbers."""
     try:
         weight = emitter.sample_ray(0.0, x, y, z)[1]
     except RuntimeError:  # its texture cannot choose wavelengths (a checkerboard, an attribute)
@@ -69,8 +71,9 @@ def _radiated(
 
 
 def _sent_in(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
-    """Rays from infinity start on a disk that Mitsuba makes as large as it takes the scene to be,
-    which is wrong where rectangles were merged (``bounds.py``): directions do without."""
+    """The power that emitters at infinity send into the bounding sphere. Their directions are
+    sampled, not their rays: Mitsuba starts such rays on a disk of the scene's size, which is wrong
+    where rectangles were merged (``bounds.py``)."""
     if len(indices) == 0:
         return np.zeros(0)
     bbox = scene_bounds(scene)
@@ -86,7 +89,7 @@ def _sent_in(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
 
 
 def _lanes(count: int) -> tuple[mi.UInt32, mi.Sampler]:
-    """Lanes for the samples of so many emitters: whose they are, and their random numbers."""
+    """For the samples of ``count`` emitters: the emitter of each lane, and a sampler."""
     lanes = count * _SAMPLES
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, lanes)
@@ -107,8 +110,8 @@ def _means(value: mi.Float, count: int) -> np.ndarray:
 
 
 def _texture_size(emitter: mi.Emitter) -> tuple[int, int] | None:
-    """Width and height of the texture of a spot, which its samples do not heed; ``None`` for all
-    other emitters, and spots without one."""
+    """Width and height of the texture of a spot; ``None`` for all other emitters, and for spots
+    without a texture. (Mitsuba samples rays of a spot without regard to its texture.)"""
     is_textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
     if emitter.class_name() != "SpotLight" or not is_textured:
         return None
@@ -121,7 +124,7 @@ def _texture_size(emitter: mi.Emitter) -> tuple[int, int] | None:
 
 
 def _spot_power(emitter: mi.Emitter, width: int, height: int) -> float:
-    """The sum over texels, which divide a square in the plane at the distance of one."""
+    """The sum over texels, which divide a square in the plane at the distance 1 from the spot."""
     angle = float(dr.slice(mi.traverse(emitter)["cutoff_angle"]))
     edge = 2 * math.tan(math.radians(angle))
     index = dr.arange(mi.UInt32, width * height)

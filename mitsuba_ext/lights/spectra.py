@@ -1,4 +1,4 @@
-"""Spectra as numbers that lights are compared by."""
+"""Spectra as single numbers, by which lights are compared."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import mitsuba as mi
 
 
 def brightness(value: mi.Spectrum) -> mi.Float:
-    """One number for a spectrum: luminance, or the mean over the sampled wavelengths."""
+    """One number for a spectrum: the luminance in RGB variants, the mean of the channels (sampled
+    wavelengths) in the others."""
     return mi.luminance(value) if mi.is_rgb else dr.mean(value)
 
 
-def some_wavelengths(width: int) -> mi.Spectrum:
-    """Wavelengths of the middle sample in spectral variants, none in the others."""
+def comparison_wavelengths(width: int) -> mi.Spectrum:
+    """The wavelengths at which lights are compared: those of the sample 0.5 in spectral variants,
+    none in the others."""
     wavelengths = dr.zeros(mi.Interaction3f, width).wavelengths
     if mi.is_spectral:
         wavelengths[:] = mi.sample_rgb_spectrum(mi.sample_shifted(dr.full(mi.Float, 0.5, width)))[0]

@@ -8,16 +8,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .spectra import brightness, some_wavelengths
+from .spectra import brightness, comparison_wavelengths
 
-#: Angles at which the edge of the disk is looked for, up to the largest aperture, in radians.
+#: Angles at which the edge of the disk is searched, up to the largest aperture, in radians.
 _ANGLES = np.geomspace(1e-4, 0.5, 4096)
 
-#: At its edge, the sun is this many times brighter than the sky next to it, or it is not treated.
+#: The sun is treated as a disk only if it is this many times brighter, at its edge, than the sky.
 _CONTRAST = 4.0
 
-#: The disk is sampled with a little of what surrounds it: Mitsuba compares single precision cosines
-#: with that of the edge, which blurs it by half a percent.
+#: The sampled disk is larger than the sun by this factor: Mitsuba compares cosines in single
+#: precision with that of the edge, which blurs the edge by half a percent.
 _MARGIN = 1.015
 
 
@@ -26,7 +26,7 @@ class SunDisk:
 
     Parameters:
         direction: Its axis in world space, of unit length.
-        half_angle: In radians.
+        half_angle: The angle between the axis and the edge, in radians.
 
     Attributes:
         solid_angle (float): Of the cone.
@@ -41,7 +41,8 @@ class SunDisk:
 
     @classmethod
     def of(cls, emitter: mi.Emitter) -> SunDisk | None:
-        """The disk in an environment that says where its sun is, if it shines."""
+        """The sun's disk in a ``sunsky``; ``None`` for other emitters, and where the sun is not
+        visible."""
         parameters = mi.traverse(emitter)
         if emitter.class_name() != "SunskyEmitter" or "sun_direction" not in parameters:
             return None
@@ -50,14 +51,14 @@ class SunDisk:
         zenith = emitter.world_transform() @ mi.Vector3f(0, 0, 1)
         upwards = zenith - sun * dr.dot(zenith, sun)
         length = dr.norm(upwards)
-        # Any direction will do where the sun stands in the zenith
+        # Where the sun stands in the zenith, any direction does
         upwards = dr.select(
             length > 1e-3, upwards / dr.maximum(length, 1e-3), mi.coordinate_system(sun)[0]
         )
         sin, cos = dr.sincos(mi.Float(_ANGLES.astype(np.float32)))
         si = dr.zeros(mi.SurfaceInteraction3f, len(_ANGLES))
         si.wi = -(sun * cos + upwards * sin)
-        si.wavelengths = some_wavelengths(len(_ANGLES))
+        si.wavelengths = comparison_wavelengths(len(_ANGLES))
         value = brightness(emitter.eval(si)).numpy()
         contrast = value[:-1] / np.maximum(value[1:], 1e-30)
         edge = int(contrast.argmax())

@@ -1,4 +1,4 @@
-"""How much each light matters, before anything is learned."""
+"""The weights of light cells before anything is learned: uniform, by power, by contribution."""
 
 from __future__ import annotations
 
@@ -10,41 +10,44 @@ import numpy as np
 
 from ..regions.surface_rows import SurfaceRows
 from ..regions.voxel_grid import VoxelGrid
-from .environment import brightness, some_wavelengths
 from .light_cells import LightCells
 from .power import emitter_powers
+from .spectra import brightness, comparison_wavelengths
 
 #: Least weight of a cell, relative to the mean of its row (pbrt's).
 _FLOOR = 1e-3
 
-#: Points of a row from which a cell is evaluated, at least and at most. In voxels, most are pbrt's
-#: number.
+#: The least and the largest number of points of a row at which a cell is evaluated. The largest
+#: number in voxels is pbrt's.
 _VOXEL_POINTS, _SURFACE_POINTS = (1, 128), (2, 16)
 
-#: Evaluations of all cells in all rows, about, between these bounds; and again of the brighter.
+#: Approximate number of evaluations of all cells in all rows, within these bounds, and once more
+#: for the brighter cells.
 _EVALUATIONS = 1 << 22
 
-#: Added to the cosine at a surface, whose shading normal may differ.
+#: Added to the cosine at a surface: its shading normal may differ from the geometric one.
 _LEAST_COSINE = 0.02
 
-#: Evaluations of one kernel.
+#: Evaluations of one kernel launch.
 _CHUNK = 1 << 21
 
 
 def uniform_weights(scene: mi.Scene, cells: LightCells) -> mi.Float:
-    """Each emitter by its ``sampling_weight``, as Mitsuba chooses; shape [cells]."""
+    """The weights with which Mitsuba chooses: the ``sampling_weight`` of each emitter, divided
+    among its cells by area; shape [cells]."""
     weights = np.array([e.sampling_weight() for e in scene.emitters()])
     return mi.Float((weights[cells.emitter_index] * cells.share).astype(np.float32))
 
 
 def power_weights(scene: mi.Scene, cells: LightCells) -> mi.Float:
-    """Each emitter by its power times its ``sampling_weight``, in units of the brightest; shape
-    [cells]. Only a ``sampling_weight`` of 0 makes a weight 0."""
+    """The power of each emitter times its ``sampling_weight``, in units of the largest product,
+    divided among its cells by area; shape [cells]. A weight is 0 only where the ``sampling_weight``
+    is 0."""
     sampling_weight = np.array([e.sampling_weight() for e in scene.emitters()])
     weights = emitter_powers(scene) * sampling_weight
     weights /= max(weights.max(), 1e-300)
     cell = weights[cells.emitter_index] * cells.share
-    # What its samples missed, or rounding loses, would stay dark
+    # An emitter whose power was estimated as 0, or is lost in rounding, must still be chosen
     cell = np.maximum(cell, _FLOOR * (cell.mean() or 1.0))
     cell[sampling_weight[cells.emitter_index] <= 0] = 0
     return mi.Float(cell.astype(np.float32))
@@ -84,7 +87,7 @@ def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) ->
         index += dr.gather(mi.UInt32, rows.first, row)
         value, d = _light(cells, cell, dr.gather(mi.Point3f, rows.p, index), sampler)
         cosine = dr.maximum(dr.dot(d, dr.gather(mi.Normal3f, rows.n, index)), 0) + _LEAST_COSINE
-        # In double precision: the square of what shines brightly may be no single one
+        # In double precision: the square of a bright light may exceed the range of single precision
         return dr.square(mi.Float64(value * cosine))
 
     means = _means(rows.count - 1, cells.count, _SURFACE_POINTS, squared_contribution)
@@ -94,13 +97,13 @@ def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) ->
 def _light(
     cells: LightCells, cell: mi.UInt32, p: mi.Point3f, sampler: mi.Sampler
 ) -> tuple[mi.Float, mi.Vector3f]:
-    """The brightness of radiance / pdf of a sample of ``cell`` at ``p``, and its direction."""
+    """Samples ``cell`` from ``p``: the brightness of radiance / pdf, and the direction."""
     lanes = dr.width(cell)
     ref = dr.zeros(mi.SurfaceInteraction3f, lanes)
-    ref.p, ref.wavelengths = p, some_wavelengths(lanes)
+    ref.p, ref.wavelengths = p, comparison_wavelengths(lanes)
     ds, weight = cells.sample(cell, ref, sampler.next_2d(), mi.Bool(True))
     value = brightness(weight)
-    # Some emitters send the same everywhere: one number for all lanes
+    # Some emitters return a single number for all lanes: it is widened
     return dr.select(dr.isfinite(value), value, dr.zeros(mi.Float, lanes)), ds.d
 
 
@@ -111,11 +114,11 @@ def _means(
     measure: Callable[[mi.UInt32, mi.UInt32, mi.Sampler], mi.Float | mi.Float64],
 ) -> mi.Float | mi.Float64:
     """The mean of ``measure(row, cell, sampler)`` over samples, for each row and cell; shape
-    [rows · cells]. Where there is not the time for many samples of all, those above the mean of
-    their row have them.
+    [rows · cells]. Where the budget does not allow the largest number of samples for all cells,
+    those above the mean of their row are measured again, with more samples.
 
     Parameters:
-        bounds: The least and the largest number of samples.
+        bounds: The least and the largest number of samples of a cell in a row.
     """
     pairs = dr.arange(mi.UInt32, rows * cells)
     samples = _sample_count(len(pairs), bounds)
@@ -152,9 +155,9 @@ def _means_of(
 
 
 def _with_last_row(scene: mi.Scene, cells: LightCells, weights: mi.Float) -> mi.Float:
-    """Honours ``sampling_weight``, gives no cell less than a share of its row's mean (in a row that
-    nothing reaches, the same to all), and appends the row of all other points, which is the mean of
-    the others."""
+    """Completes the weights: multiplies them by ``sampling_weight``, raises each to at least a
+    share of its row's mean (in a row that no light reaches, all weights are equal), and appends the
+    last row, which stands for all other points and is the mean of the others."""
     count = cells.count
     sampling_weight = np.array([e.sampling_weight() for e in scene.emitters()], dtype=np.float32)
     factor = mi.Float(sampling_weight[cells.emitter_index])

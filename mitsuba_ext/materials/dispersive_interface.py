@@ -1,18 +1,17 @@
-"""The parameters of dispersive dielectrics, and what happens between two media."""
+"""What dispersive dielectrics share: parameters, refractive indices, calls that they refuse."""
 
 from __future__ import annotations
 
 import math
-import sys
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.heroes import DISPERSES, disperses, knows_heroes
+from ..transport.heroes import DISPERSES, knows_heroes
 from .glass import GLASSES, VISIBLE, Cauchy, Constant, Index, Sellmeier, check_index
 
-#: Mitsuba's gases and vacuum: what is outside has the same index at all wavelengths.
+#: The media that can be outside, by Mitsuba's names: their index is the same at all wavelengths.
 _OUTSIDE = {
     "vacuum": 1.0,
     "helium": 1.000036,
@@ -28,16 +27,16 @@ class DispersiveInterface:
     """A surface between a clear medium, which may be dispersive, and one outside, which is not.
 
     Parameters:
-        plugin: What errors call the plugin.
-        props: Its parameters: ``int_ior``, ``cauchy`` or ``sellmeier``, ``ext_ior``,
+        plugin: The plugin's name, for errors.
+        props: The plugin's parameters: ``int_ior``, ``cauchy`` or ``sellmeier``, ``ext_ior``,
             ``specular_reflectance``, ``specular_transmittance``.
 
     Attributes:
-        flags: What the flags of the plugin's components are to contain.
+        flags: Flags that the plugin adds to those of its components.
 
     Raises:
-        RuntimeError: It is dispersive, and the variant is not spectral.
-        TypeError, ValueError: A parameter is not what it must be.
+        RuntimeError: The medium inside is dispersive, and the variant is not spectral.
+        TypeError, ValueError: A parameter has a wrong type or value.
     """
 
     def __init__(self, plugin: str, props: mi.Properties) -> None:
@@ -50,6 +49,7 @@ class DispersiveInterface:
             if name in props
         }
         self._disperses = not isinstance(self._inside, Constant)
+        self._has_warned = False
         self.flags = DISPERSES if self._disperses else 0
         if self._disperses and not mi.is_spectral:
             raise RuntimeError(
@@ -58,23 +58,44 @@ class DispersiveInterface:
                 f'"int_ior".'
             )
 
-    def serves(self, ctx: mi.BSDFContext) -> bool:
-        """Can the caller be answered? If not, the answer is to be NaN: of a scene that is not being
-        rendered, it goes nowhere.
+    def is_answerable(self, ctx: mi.BSDFContext) -> bool:
+        """Does the caller let only the hero be refracted, or is there no dispersion? If neither,
+        the plugin must answer by :meth:`infinite_sample` or infinite values.
+
+        A caller that is being traced gets a warning, not an error: Dr.Jit traces the BSDFs of all
+        scenes in memory, and nothing tells whether this one is in the scene that is rendered. Only
+        if it is, the infinite values reach the image.
 
         Raises:
-            NotImplementedError: The caller, who renders a scene that disperses, lets all
-                wavelengths go the hero's way.
+            NotImplementedError: The caller would refract all wavelengths in the hero's direction,
+                and calls this BSDF itself.
         """
         if not self._disperses or knows_heroes(ctx):
             return True
-        if not _is_rendered():
-            return False
-        raise NotImplementedError(
+        message = (
             f'"{self._plugin}": dispersion needs an integrator of mitsuba_ext, such as '
             f'"composed_path". Mitsuba\'s own would refract all four wavelengths of a ray in the '
             f"direction of the first."
         )
+        if not dr.flag(dr.JitFlag.SymbolicScope):
+            raise NotImplementedError(message)
+        if not self._has_warned:
+            self._has_warned = True
+            consequence = "Pixels are infinite where its paths meet this BSDF."
+            mi.Log(mi.LogLevel.Warn, f"{message} {consequence}")
+        return False
+
+    @staticmethod
+    def infinite_sample(
+        si: mi.SurfaceInteraction3f, sample1: mi.Float
+    ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+        """A BSDF sample of infinite weight, reflected or straight on, so that it finds what would
+        be reflected or refracted. (Integrators end a path whose weight is NaN, as if it were 0.)"""
+        bs = dr.zeros(mi.BSDFSample3f)
+        bs.wo = dr.select(mi.Float(sample1) < 0.5, mi.reflect(si.wi), -si.wi)
+        bs.pdf, bs.eta = mi.Float(1), mi.Float(1)
+        bs.sampled_type = mi.UInt32(+mi.BSDFFlags.Delta)
+        return bs, mi.Spectrum(dr.inf)
 
     def check_differs(self) -> None:
         """
@@ -91,19 +112,19 @@ class DispersiveInterface:
             )
 
     def η(self, si: mi.SurfaceInteraction3f) -> list[mi.Float]:
-        """The index inside relative to that outside, for the hero and then the other wavelengths;
-        only one value where all have the same."""
+        """The index inside relative to that outside, for the hero and then for the other
+        wavelengths; a single value if nothing disperses."""
         if not self._disperses:
             return [mi.Float(self._inside.n / self._outside)]
         η = self._inside(si.wavelengths) / self._outside
         return [η[k] for k in range(dr.size_v(mi.Spectrum))]
 
     def reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """What reflection is multiplied by, as the scene's author wishes."""
+        """The factor of reflection that the scene sets."""
         return self._texture("specular_reflectance", si, active)
 
     def transmittance(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """What refraction is multiplied by, as the scene's author wishes."""
+        """The factor of refraction that the scene sets."""
         return self._texture("specular_transmittance", si, active)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -185,10 +206,10 @@ class DispersiveInterface:
 def check_uniform(
     plugin: str, key: str, texture: mi.Texture, maximum: float = math.inf
 ) -> mi.Texture:
-    """The texture of the parameter ``key``.
+    """Returns the texture of the parameter ``key``, after a check of constant textures.
 
     Raises:
-        ValueError: It is a number, and that is negative, above ``maximum``, or not finite.
+        ValueError: The texture is a constant that is negative, above ``maximum``, or not finite.
     """
     if texture.class_name() == "UniformSpectrum":
         value = float(dr.slice(mi.traverse(texture)["value"]))
@@ -198,21 +219,6 @@ def check_uniform(
                 f'"{plugin}": the parameter "{key}" is {value:g}; it must be {accepted}'
             )
     return texture
-
-
-def _is_rendered() -> bool:
-    """Does the scene that is being rendered disperse light?
-
-    While Dr.Jit traces a render, it calls the BSDFs of all scenes in memory. Which one is rendered
-    is known to those who called us: the nearest that holds a scene at all.
-    """
-    frame = sys._getframe()
-    while frame is not None:
-        scenes = [value for value in frame.f_locals.values() if isinstance(value, mi.Scene)]
-        if scenes:
-            return any(disperses(scene.shapes()) for scene in scenes)
-        frame = frame.f_back
-    return True
 
 
 def fresnel_spectrum(cos_θ: mi.Float, η: list[mi.Float]) -> mi.Spectrum:

@@ -1,6 +1,6 @@
 """Refractive indices of glasses and other clear materials as functions of the wavelength.
 
-Indices are those that catalogues give, in the visible range, relative to air at about 20 °C.
+As in catalogues, indices are relative to air at about 20 °C; they hold for the visible range.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 
 import drjit as dr
 
-#: The wavelengths, in nm, to which Mitsuba's colour matching functions are confined. Beyond them an
-#: index is that of the nearer end.
+#: The range of Mitsuba's colour matching functions, in nm. Beyond it, an index is that of the
+#: nearer end.
 VISIBLE = (360.0, 830.0)
 
 
@@ -32,7 +32,7 @@ class Cauchy:
     """n = A + B/λ² + C/λ⁴, λ in µm (A. L. Cauchy, 1836).
 
     Parameters:
-        coefficients: A, B (µm²) and, if there is one, C (µm⁴).
+        coefficients: A, B (µm²) and optionally C (µm⁴).
     """
 
     coefficients: tuple[float, ...]
@@ -68,7 +68,7 @@ def _sellmeier(b: tuple[float, ...], c: tuple[float, ...]) -> Sellmeier:
 
 
 def _resonances(*terms: tuple[float, float]) -> Sellmeier:
-    """From pairs of B and the wavelength √C in µm."""
+    """Sellmeier's formula from pairs of B and the wavelength √C in µm."""
     return Sellmeier(tuple((b, wavelength**2) for b, wavelength in terms))
 
 
@@ -115,10 +115,10 @@ GLASSES: dict[str, Sellmeier] = {
 
 
 def check_index(index: Index) -> None:
-    """Is ``index`` a positive number at each visible wavelength?
+    """Checks that ``index`` is a positive number at each visible wavelength.
 
     Raises:
-        ValueError: It is not: at that wavelength, or there is a pole of Sellmeier's formula.
+        ValueError: It is not at some wavelength, or Sellmeier's formula has a pole there.
     """
     for _b, c in getattr(index, "terms", ()):
         pole = 1000 * math.sqrt(max(c, 0.0))

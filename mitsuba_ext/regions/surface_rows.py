@@ -7,29 +7,27 @@ import mitsuba as mi
 import numpy as np
 
 from .surface_sides import lit_normal
+from .voxel_sides import SIDES, VoxelSides, sides, voxel_coordinates, voxel_number
 
-#: The six directions of the axes.
-_SIDES = 6
-
-#: The table of rows takes so much for each voxel of the region.
-BYTES_PER_VOXEL = 4 * _SIDES
+#: Bytes of the table of rows for each voxel of the region.
+BYTES_PER_VOXEL = 4 * SIDES
 
 
 class SurfaceRows:
-    """Numbers the pairs of a voxel and a side that vertices were found in.
-
-    The side is the axis, positive or negative, that is nearest to the normal: the two faces of a
-    wall that is thinner than a voxel, and the floor and the wall in a corner, see different lights.
+    """Numbers, without gaps, the pairs of a voxel and a side (:class:`VoxelSides`) in which
+    vertices were found. Each pair is a row of the tables: the two sides of a thin wall, and the
+    floor and the wall in a corner, are lit by different lights.
 
     Parameters:
-        bbox: What is divided into voxels.
+        bbox: The box that is divided into voxels.
         resolution: Voxels along each axis.
-        p, n: Vertices, and normals on the side that is lit. At least one lies in ``bbox``.
+        p, n: Vertices, and normals on the side that is lit. At least one vertex lies in ``bbox``.
 
     Attributes:
         count (int): Number of rows; the last one stands for all other points.
-        slots (mi.UInt32): What the other rows are, as 6 · voxel + side; shape [count − 1].
-        first, size (mi.UInt32): Where in ``p`` and ``n`` the vertices of a row are; [count − 1].
+        pairs (mi.UInt32): The pair of each other row, as 6 · voxel + side; shape [count − 1].
+        first, size (mi.UInt32): The vertices of a row are those from ``first`` to
+            ``first + size − 1`` in ``p`` and ``n``; shape [count − 1].
         p, n: The vertices inside of ``bbox``, row by row.
     """
 
@@ -37,51 +35,40 @@ class SurfaceRows:
         self, bbox: mi.ScalarBoundingBox3f, resolution: int, p: mi.Point3f, n: mi.Normal3f
     ) -> None:
         self.bbox, self.resolution = bbox, resolution
-        self._origin = mi.Point3f(bbox.min)
-        self._scale = 1 / voxel_edges(bbox, resolution)
+        scale = 1 / voxel_edges(bbox, resolution)
         # Opaque: other scenes and sensors share the kernels
-        self._size = mi.Int32(resolution)
-        dr.make_opaque(self._origin, self._scale, self._size)
-        slot, inside = self._slot(p, n, mi.Bool(True))
-        slot = np.where(inside.numpy(), slot.numpy(), resolution**3 * _SIDES)
-        order = np.argsort(slot, kind="stable")[: int(inside.numpy().sum())]
+        self._pairs = VoxelSides(mi.Point3f(bbox.min), scale, dr.opaque(mi.Int32, resolution))
+        pair, inside = (x.numpy() for x in self._pairs.number(p, n, mi.Bool(True)))
+        pair_count = resolution**3 * SIDES
+        pair = np.where(inside, pair, pair_count)
+        # Vertices outside come last, and are left out
+        order = np.argsort(pair, kind="stable")[: int(inside.sum())]
         order = mi.UInt32(order.astype(np.uint32))
         self.p, self.n = dr.gather(mi.Point3f, p, order), dr.gather(mi.Normal3f, n, order)
-        slots, first, size = np.unique(slot[order], return_index=True, return_counts=True)
-        self.slots, self.first, self.size = (
-            mi.UInt32(x.astype(np.uint32)) for x in (slots, first, size)
+        pairs, first, size = np.unique(pair[order], return_index=True, return_counts=True)
+        self.pairs, self.first, self.size = (
+            mi.UInt32(x.astype(np.uint32)) for x in (pairs, first, size)
         )
-        self.count = len(slots) + 1
-        self._row = dr.full(mi.UInt32, self.count - 1, resolution**3 * _SIDES)
-        dr.scatter(self._row, dr.arange(mi.UInt32, self.count - 1), self.slots)
+        self.count = len(pairs) + 1
+        self._row = dr.full(mi.UInt32, self.count - 1, pair_count)
+        dr.scatter(self._row, dr.arange(mi.UInt32, self.count - 1), self.pairs)
         self._last = dr.opaque(mi.UInt32, self.count - 1)
         dr.eval(self.p, self.n, self._row)
 
     def row(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
         """The row of a surface point, on the side that it is seen from."""
-        slot, inside = self._slot(si.p, lit_normal(si), active)
-        return dr.select(inside, dr.gather(mi.UInt32, self._row, slot, inside), self._last)
+        pair, inside = self._pairs.number(si.p, lit_normal(si), active)
+        return dr.select(inside, dr.gather(mi.UInt32, self._row, pair, inside), self._last)
 
     def coarse(self) -> tuple[mi.UInt32, int]:
         """For each row but the last, the number of the row of a grid of half the resolution that it
         is a part of, and how many such rows there are."""
-        r, half = self.resolution, (self.resolution + 1) // 2
-        voxel, side = self.slots // _SIDES, self.slots % _SIDES
-        x, y, z = voxel % r // 2, voxel // r % r // 2, voxel // (r * r) // 2
-        slots = ((x + half * (y + half * z)) * _SIDES + side).numpy()
-        numbers, index = np.unique(slots, return_inverse=True)
+        half = (self.resolution + 1) // 2
+        x, y, z = voxel_coordinates(self.pairs // SIDES, self.resolution)
+        voxel = voxel_number(x // 2, y // 2, z // 2, half)
+        pairs = (voxel * SIDES + self.pairs % SIDES).numpy()
+        numbers, index = np.unique(pairs, return_inverse=True)
         return mi.UInt32(index.astype(np.uint32)), len(numbers)
-
-    def _slot(self, p, n, active) -> tuple[mi.UInt32, mi.Bool]:
-        cell = mi.Vector3i(dr.floor((p - self._origin) * self._scale))
-        inside = active & dr.all((cell >= 0) & (cell < self._size))
-        voxel = mi.UInt32(cell.x + self._size * (cell.y + self._size * cell.z))
-        a = dr.abs(n)
-        x_longest = (a.x >= a.y) & (a.x >= a.z)
-        y_longest = a.y >= a.z
-        axis = dr.select(x_longest, mi.UInt32(0), dr.select(y_longest, mi.UInt32(1), mi.UInt32(2)))
-        component = dr.select(x_longest, n.x, dr.select(y_longest, n.y, n.z))
-        return voxel * _SIDES + 2 * axis + dr.select(component < 0, mi.UInt32(1), 0), inside
 
 
 def voxel_edges(bbox: mi.ScalarBoundingBox3f, resolution: int) -> mi.Vector3f:
@@ -90,16 +77,17 @@ def voxel_edges(bbox: mi.ScalarBoundingBox3f, resolution: int) -> mi.Vector3f:
 
 
 class RowCounts:
-    """How many rows there would be, by the resolution. Parameters are those of the rows."""
+    """The number of rows that :class:`SurfaceRows` would have, as a function of the resolution.
+
+    Parameters:
+        bbox, p, n: Those of the rows.
+    """
 
     def __init__(self, bbox: mi.ScalarBoundingBox3f, p: mi.Point3f, n: mi.Normal3f) -> None:
         low, high = np.array(bbox.min), np.array(bbox.max)
         self._relative = np.clip((p.numpy().T - low) / (high - low), 0, 1 - 1e-7)
-        normal = n.numpy().T
-        axis = np.abs(normal).argmax(axis=1)
-        self._side = 2 * axis + (np.take_along_axis(normal, axis[:, None], 1)[:, 0] < 0)
+        self._side = sides(n.numpy().T)
 
     def __call__(self, resolution: int) -> int:
-        cell = (self._relative * resolution).astype(np.int64)
-        slot = cell @ np.array([1, resolution, resolution**2]) * _SIDES + self._side
-        return len(np.unique(slot)) + 1
+        x, y, z = (self._relative * resolution).astype(np.int64).T
+        return len(np.unique(voxel_number(x, y, z, resolution) * SIDES + self._side)) + 1

@@ -1,4 +1,4 @@
-"""The region in which paths scatter, and the sides of its surfaces."""
+"""The region in which paths scatter, and the normals of its surfaces on the lit side."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ _MARGIN = 0.02
 
 
 def region(p: mi.Point3f) -> mi.ScalarBoundingBox3f:
-    """A box that holds nearly all of the points: a few that got far must not make it coarse."""
+    """A box that holds nearly all of the points. A few distant ones are left out: they would make
+    the voxels of the box coarse."""
     points = p.numpy()
     low, high = np.quantile(points, [_OUTSIDE, 1 - _OUTSIDE], axis=1)
     # A flat region still has some depth, and distant coordinates are rounded

@@ -7,8 +7,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..bounds import scene_bounds
+from .voxel_sides import voxel_at, voxel_coordinates, voxel_number
 
-#: Index of the voxels that hold nothing.
+#: The index of an empty voxel.
 EMPTY = 0xFFFFFFFF
 
 #: Geometry that touches a voxel's face within this share of its size belongs to both neighbours:
@@ -20,7 +21,7 @@ class VoxelGrid:
     """Voxels of the scene's bounding box, numbered without gaps over those that hold geometry.
 
     Parameters:
-        scene: Its shapes, and its point-like emitters, occupy the voxels.
+        scene: The scene whose shapes and point-like emitters occupy the voxels.
         resolution: Voxels along each axis.
 
     Raises:
@@ -28,7 +29,7 @@ class VoxelGrid:
 
     Attributes:
         occupied_count (int): Voxels that hold geometry.
-        cells (mi.UInt32): Their linear indices in the full grid; shape ``occupied_count``.
+        occupied (mi.UInt32): Their numbers in the full grid; shape [occupied_count].
     """
 
     def __init__(self, scene: mi.Scene, resolution: int) -> None:
@@ -37,49 +38,43 @@ class VoxelGrid:
         if not bbox.valid():
             raise ValueError("a scene without geometry has no voxels")
         extent = bbox.max - bbox.min
-        # A flat scene still has voxels of some depth, and no point lies on the outer faces
+        # Voxels of a flat scene get some depth, and no point lies on the outer faces of the grid
         padding = mi.ScalarVector3f(1e-4 * dr.max(extent) or 1.0)
         self.origin = mi.Point3f(bbox.min - padding)
         self.size = mi.Vector3f((extent + 2 * padding) / resolution)
         self._scale = 1 / self.size
         dr.make_opaque(self.origin, self.size, self._scale)
-        occupied = dr.zeros(mi.UInt32, resolution**3)
+        is_occupied = dr.zeros(mi.UInt32, resolution**3)
         boxes = [
             e.bbox() for e in scene.emitters()
             if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition)
         ]
         for shape in scene.shapes():
             if shape.is_mesh():
-                self._mark_mesh(occupied, shape)
+                self._mark_mesh(is_occupied, shape)
             else:
                 boxes.append(shape.bbox())
-        self._mark_boxes(occupied, [box for box in boxes if box.valid()])
-        dr.eval(occupied)
-        self.cells = dr.compress(occupied > 0)
-        self.occupied_count = len(self.cells)
+        self._mark_boxes(is_occupied, [box for box in boxes if box.valid()])
+        dr.eval(is_occupied)
+        self.occupied = dr.compress(is_occupied > 0)
+        self.occupied_count = len(self.occupied)
         self._index = dr.full(mi.UInt32, EMPTY, resolution**3)
-        dr.scatter(self._index, dr.arange(mi.UInt32, self.occupied_count), self.cells)
+        dr.scatter(self._index, dr.arange(mi.UInt32, self.occupied_count), self.occupied)
         dr.eval(self._index)
 
     def index(self, p: mi.Point3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         """The number of the occupied voxel that holds ``p``, and whether there is one."""
-        cell = mi.Vector3i(dr.floor(self._relative(p)))
-        inside = active & dr.all((cell >= 0) & (cell < self.resolution))
-        index = dr.gather(mi.UInt32, self._index, self._linear(cell), inside)
+        voxel, inside = voxel_at(self._relative(p), self.resolution, active)
+        index = dr.gather(mi.UInt32, self._index, mi.UInt32(voxel), inside)
         return index, inside & (index != EMPTY)
 
     def point(self, index: mi.UInt32, sample: mi.Point3f) -> mi.Point3f:
         """The point of an occupied voxel at relative coordinates in [0, 1)³."""
-        cell = dr.gather(mi.UInt32, self.cells, index)
-        r = self.resolution
-        corner = mi.Point3f(mi.Float(cell % r), mi.Float(cell // r % r), mi.Float(cell // (r * r)))
+        voxel = dr.gather(mi.UInt32, self.occupied, index)
+        corner = mi.Point3f(*map(mi.Float, voxel_coordinates(voxel, self.resolution)))
         return self.origin + (corner + sample) * self.size
 
-    def _linear(self, cell: mi.Vector3i) -> mi.UInt32:
-        r = self.resolution
-        return mi.UInt32(cell.x + r * (cell.y + r * cell.z))
-
-    def _mark_mesh(self, occupied: mi.UInt32, mesh: mi.Mesh) -> None:
+    def _mark_mesh(self, is_occupied: mi.UInt32, mesh: mi.Mesh) -> None:
         if mesh.face_count() == 0:
             return
         face = mesh.face_indices(dr.arange(mi.UInt32, mesh.face_count()))
@@ -88,9 +83,9 @@ class VoxelGrid:
             dr.minimum(a, dr.minimum(b, c)), dr.maximum(a, dr.maximum(b, c))
         )
         normal = dr.cross(b - a, c - a)
-        _mark(occupied, dr.opaque(mi.Int32, self.resolution), first, last, a, normal, inside)
+        _mark(is_occupied, dr.opaque(mi.Int32, self.resolution), first, last, a, normal, inside)
 
-    def _mark_boxes(self, occupied: mi.UInt32, boxes: list[mi.ScalarBoundingBox3f]) -> None:
+    def _mark_boxes(self, is_occupied: mi.UInt32, boxes: list[mi.ScalarBoundingBox3f]) -> None:
         """Shapes that are not meshes occupy their bounding boxes. A lane for each layer of each
         box, in one launch for all: corners are data, not literals of a kernel."""
         if not boxes:
@@ -109,7 +104,7 @@ class VoxelGrid:
         )
         inside &= (first.z <= layer) & (layer <= last.z)
         first.z, last.z = mi.Int32(layer), mi.Int32(layer)
-        _mark(occupied, resolution, first, last, mi.Point3f(0), mi.Vector3f(0), inside)
+        _mark(is_occupied, resolution, first, last, mi.Point3f(0), mi.Vector3f(0), inside)
 
     def _cells(
         self, low: mi.Point3f, high: mi.Point3f
@@ -129,7 +124,7 @@ class VoxelGrid:
 
 
 @dr.syntax
-def _mark(occupied, resolution, first, last, p, normal, active):
+def _mark(is_occupied, resolution, first, last, p, normal, active):
     """Marks the voxels from ``first`` to ``last`` that the plane through ``p`` crosses.
 
     For the voxels around a triangle and the triangle's plane that is the triangle's voxelisation,
@@ -140,8 +135,8 @@ def _mark(occupied, resolution, first, last, p, normal, active):
     cell = mi.Vector3i(first)
     while active:
         distance = dr.abs(dr.dot(normal, mi.Point3f(cell) + 0.5 - p))
-        linear = mi.UInt32(cell.x + resolution * (cell.y + resolution * cell.z))
-        dr.scatter(occupied, mi.UInt32(1), linear, active & (distance <= reach))
+        voxel = mi.UInt32(voxel_number(cell.x, cell.y, cell.z, resolution))
+        dr.scatter(is_occupied, mi.UInt32(1), voxel, active & (distance <= reach))
         # The next voxel of the box, x fastest
         cell.x += 1
         wrap_x = cell.x > last.x

@@ -28,9 +28,12 @@ class StagedIntegrator(mi.SamplingIntegrator):
         timeout (float): Seconds after which to stop; 0 or less for no limit. Default: −1.
 
     Attributes:
+        sees_motion: It renders ``moving`` shapes.
         progress: Called after each pass with the fraction done; it may raise or call ``cancel``.
         statistics: Of the last render (:class:`~mitsuba_ext.rendering.render.RenderStatistics`).
     """
+
+    sees_motion = True
 
     def __init__(self, props: mi.Properties) -> None:
         self.name = props.plugin_name()

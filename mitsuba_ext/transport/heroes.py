@@ -75,9 +75,10 @@ class Heroes:
         self._factor = self._count * hero_weight
 
     def context(self) -> mi.BSDFContext:
-        """What BSDFs are to be asked with."""
+        """The context for all calls of BSDFs."""
         ctx = mi.BSDFContext()
-        if self._is_needed:
+        # Also where nothing disperses: Dr.Jit traces the BSDFs of all scenes in memory
+        if mi.is_spectral:
             ctx.type_mask |= DISPERSES
         return ctx
 
@@ -106,8 +107,12 @@ class Heroes:
         si: mi.SurfaceInteraction3f,
         bs: mi.BSDFSample3f,
     ) -> tuple[mi.Spectrum, mi.Float | float, Any]:
-        """The same for a BSDF sample; how much more what is left of the wavelengths counts by now,
-        which is no reason to let a path live longer; and the new state."""
+        """The same for a BSDF sample.
+
+        Returns:
+            The weight by which the throughput is to be multiplied; the factor in it that makes up
+            for the lost wavelengths, which Russian roulette must divide out; and the new state.
+        """
         if not self._is_needed:
             return bsdf_weight, 1.0, is_alone
         # What passes a hole of a mask is not refracted

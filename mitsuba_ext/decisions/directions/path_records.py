@@ -1,4 +1,4 @@
-"""Recording which primary samples paths used, and what they brought back from there on."""
+"""Records the primary samples of paths, and the radiance that followed each of them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..path_importance import brightness
 from ..path_importance import importance as path_importance
 from .tree_builder import DEPTH, cell_code, joined
 
-#: Bytes of a record, at most: what is kept of it, and what trees are built from.
+#: The most bytes of a record, including the temporaries while trees are built.
 BYTES_PER_RECORD = 320
 
 

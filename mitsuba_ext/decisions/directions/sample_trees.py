@@ -8,7 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-#: What a leaf has in the place of a probability.
+#: The value that marks a leaf, in place of a probability.
 LEAF = -1.0
 
 #: Bits of a probability in a packed node. The density is that of the rounded probabilities.
@@ -20,22 +20,24 @@ _ALMOST_ONE = 1 - 2.0**-24
 
 class SampleTrees:
     """Many k-d trees in flat arrays. Cells are split at their middle, the first axis first, then
-    the axes in turn. A tree stands for a piecewise constant density, which is mixed with a
-    constant one: whatever the tree says, the density is at least 1 − ``share``.
+    the axes in turn. A tree is a piecewise constant density, which is mixed with the uniform one,
+    so that the density of a sample is at least 1 − ``share``.
 
-    The two coordinates of a sample are stretched on the way down, and no other random numbers are
-    drawn: strata of a sampler remain strata, and a tree that is a single leaf changes nothing.
+    On the way down, the two coordinates of a sample are rescaled at each split, and no other random
+    numbers are drawn. So strata of a sampler remain strata, and a tree that is a single leaf
+    returns the sample unchanged.
 
     A split along the first axis and the two below it are packed into a node of eight bytes: three
     probabilities, which of the four children are leaves, and where these stand.
 
     Parameters:
-        probability: Of each binary node's left child; ``LEAF`` for a leaf. Shape [nodes].
+        probability: The probability of each node's left child; ``LEAF`` for a leaf. Shape [nodes].
         child: The left child's number; the right one follows it. Shape [nodes].
         is_even: Is the node split along the first axis? Shape [nodes].
         root: The first node of each tree; it is split along the first axis, or a leaf. [trees].
-        share: The share of the samples that a tree decides, in [0, 1]; shape [trees].
-        value: For each node, a number that :meth:`value` gives where it is a leaf; shape [nodes].
+        share: The share of the samples that follow the tree, in [0, 1]; the others are uniform.
+            Shape [trees].
+        value: For each leaf, the number that :meth:`value` returns; shape [nodes].
     """
 
     def __init__(
@@ -50,7 +52,7 @@ class SampleTrees:
         # A node's children take a block of four
         inner = dr.compress(is_even & (probability >= 0))
         if len(inner) == 0:
-            inner = mi.UInt32(0)  # it is a leaf, and its block is never read
+            inner = mi.UInt32(0)  # a leaf, whose block is never read
         block = dr.zeros(mi.UInt32, len(probability))
         # Opaque: trees of other sizes share the kernels
         first = dr.opaque(mi.UInt32, len(root))
@@ -72,20 +74,20 @@ class SampleTrees:
             dr.scatter(self._nodes, dr.reinterpret_array(mi.Point2f, packed), slot)
             if value is not None:
                 dr.scatter(self._values, dr.gather(mi.UInt32, value, node), slot)
-        # Nothing is read of a tree without a split
+        # A tree without splits is skipped
         is_leaf = dr.gather(mi.Float, probability, root) < 0
         self.share = dr.select(is_leaf, 0, share)
         dr.eval(self._nodes, self.share, self._values)
 
     @property
     def bytes(self) -> int:
-        """Memory that the trees take."""
+        """Bytes of memory that the trees take."""
         return 4 * (len(self._nodes) + len(self.share) + len(self._values))
 
     def sample(
         self, tree: mi.UInt32, u: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Point2f, mi.Float, mi.UInt32]:
-        """Warps uniform numbers.
+        """Warps uniform numbers to the density of a tree.
 
         Returns:
             The sample in [0, 1)², its density, and the number of its leaf. In inactive lanes they
@@ -93,7 +95,7 @@ class SampleTrees:
         """
         share = dr.gather(mi.Float, self.share, tree, active)
         by_tree = u.x < share
-        # The number that chose between the two densities is as good as new in its part
+        # The number that chose between the two densities is rescaled to [0, 1)
         x = dr.select(by_tree, u.x / share, (u.x - share) / (1 - share))
         active = active & (share > 0)
         x = dr.select(active, dr.minimum(x, _ALMOST_ONE), u.x)
@@ -109,17 +111,18 @@ class SampleTrees:
         return dr.fma(share, density, 1 - share), leaf
 
     def value(self, leaf: mi.UInt32, active: mi.Bool) -> mi.UInt32:
-        """What the caller has given the leaf."""
+        """The number that the caller gave to the leaf."""
         return dr.gather(mi.UInt32, self._values, leaf, active)
 
     @dr.syntax
     def _descend(
         self, root: mi.UInt32, u: mi.Point2f, by_tree: mi.Bool, active: mi.Bool
     ) -> tuple[mi.Point2f, mi.Float, mi.UInt32]:
-        """Goes down to a leaf: by the probabilities, or to the one in which ``u`` lies."""
-        x, y = mi.Float(u.x), mi.Float(u.y)     # Where the sample lies in its cell,
-        column, row = mi.UInt32(0), mi.UInt32(0)  # which of the cells of this size that is,
-        edge = mi.Float(1)                      # and how long its edges are
+        """Goes down to a leaf: by the probabilities where ``by_tree``, else to the leaf that
+        contains ``u``."""
+        x, y = mi.Float(u.x), mi.Float(u.y)       # Coordinates of the sample within its cell
+        column, row = mi.UInt32(0), mi.UInt32(0)  # Number of the cell among those of its size
+        edge = mi.Float(1)                        # Edge of the cell
         density = mi.Float(1)
         node = mi.UInt32(root)
         active = mi.Bool(active)
@@ -146,8 +149,11 @@ class SampleTrees:
 
 
 def _choose(x: mi.Float, bits: mi.UInt32, by_tree: mi.Bool) -> tuple[mi.Float, mi.Bool, mi.Float]:
-    """Chooses a half: where ``x`` lies in it, whether it is the upper one, and the probability of
-    the tree for it."""
+    """Chooses a half of a cell.
+
+    Returns:
+        ``x`` rescaled to the half, whether it is the upper half, and its probability in the tree.
+    """
     p = mi.Float(bits & (_ONE - 1)) * (1 / _ONE)
     threshold = dr.select(by_tree, p, 0.5)
     is_upper = x >= threshold
@@ -156,8 +162,8 @@ def _choose(x: mi.Float, bits: mi.UInt32, by_tree: mi.Bool) -> tuple[mi.Float, m
 
 
 def _pack(probability: mi.Float, child: mi.UInt32) -> tuple[mi.UInt32, list[mi.UInt32]]:
-    """The first word of each node, as if it were split along the first axis; and the four nodes
-    that stand below it (twice the same, where there is no second split)."""
+    """The first word of each packed node, for nodes that are split along the first axis, and the
+    four nodes two levels below it (a child twice, where that child is not split)."""
     is_inner = probability >= 0
     bits = _rounded(probability)
     grandchildren = []

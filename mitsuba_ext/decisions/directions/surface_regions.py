@@ -1,4 +1,4 @@
-"""Trees for regions of surfaces: the geometry decides which paths learn from each other."""
+"""Trees for regions of surfaces: paths that scatter in the same region share a tree."""
 
 from __future__ import annotations
 
@@ -7,28 +7,26 @@ import mitsuba as mi
 import numpy as np
 
 from ...regions.surface_sides import lit_normal, region
+from ...regions.voxel_sides import SIDES, VoxelSides, voxel_coordinates
 from .path_records import PathRecords
 from .sample_trees import SampleTrees
 from .tree_builder import UNIFORM, Samples, TreeBuilder
 
-#: Voxels along each axis, level by level: each of them divides those of the one before.
+#: Voxels along each axis, level by level: the voxels of a level divide those of the level before.
 _GRIDS = (4, 8, 16, 32)
-
-#: The six directions of the axes.
-_SIDES = 6
 
 
 class SurfaceRegions:
-    """Voxels of the region in which paths scatter, and the sides of their surfaces.
+    """Regions are pairs of a voxel of the box in which paths scatter and a side of its surfaces.
 
-    The number 0 stands for everything; large voxels come after it, and smaller ones inside of them
-    after these, each where paths meet it often enough. The last number stands for mirrors and
-    glass, whose directions do not depend on the sample: it has a tree without splits. All bounces
-    of a path use the trees of the places where they happen.
+    Region 0 is the whole scene. Regions of large voxels follow, then those of the smaller voxels
+    inside of them; a region exists only where paths scatter often enough. The last number stands
+    for mirrors and glass, whose directions do not depend on the sample: its tree has no splits. At
+    each bounce, a path uses the tree of the region in which it scatters.
 
     Parameters:
-        p, n: Where paths scatter, and normals on the side that is lit; not empty.
-        least: How many of these a region has, at least.
+        p, n: Vertices where paths scatter, and normals on the side that is lit; not empty.
+        least: The least number of these vertices in a region.
 
     Attributes:
         count: Number of regions that learn.
@@ -37,20 +35,18 @@ class SurfaceRegions:
     def __init__(self, p: mi.Point3f, n: mi.Normal3f, least: float) -> None:
         bbox = region(p)
         finest = _GRIDS[-1]
-        # Opaque: other scenes and sensors share the kernels
-        self._origin = mi.Point3f(bbox.min)
-        self._scale = finest / mi.Vector3f(bbox.max - bbox.min)
-        dr.make_opaque(self._origin, self._scale)
-        cell, side, inside = self._locate(p, n, mi.Bool(True))
-        inside = inside.numpy()
-        cell, side = cell.numpy().T[inside], side.numpy()[inside]
+        scale = finest / mi.Vector3f(bbox.max - bbox.min)
+        self._pairs = VoxelSides(mi.Point3f(bbox.min), scale, finest)
+        pair, inside = (x.numpy() for x in self._pairs.number(p, n, mi.Bool(True)))
+        voxel, side = np.divmod(pair[inside], SIDES)
+        cell = np.stack(voxel_coordinates(voxel, finest))
 
-        table = np.zeros((1, 1, 1, _SIDES), np.uint32)
+        table = np.zeros((1, 1, 1, SIDES), np.uint32)
         self._levels, parents, self.count = [slice(0, 1)], [np.zeros(1, np.uint32)], 1
         for grid in _GRIDS:
             for axis in range(3):
                 table = table.repeat(grid // table.shape[axis], axis)
-            x, y, z = (cell * grid // finest).T
+            x, y, z = cell * grid // finest
             seen, times = np.unique(
                 np.ravel_multi_index((z, y, x, side), table.shape), return_counts=True
             )
@@ -71,7 +67,7 @@ class SurfaceRegions:
         return ()
 
     def tree(self, state: tuple, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
-        """The tree of a vertex: that of the smallest region it belongs to."""
+        """The tree of a vertex: that of the smallest region that contains it."""
         return self.label(si, None, active)
 
     def after(
@@ -84,14 +80,18 @@ class SurfaceRegions:
 
     def label(self, si: mi.SurfaceInteraction3f, pixel, active: mi.Bool) -> mi.UInt32:
         """The region by which a sample is recorded."""
-        cell, side, inside = self._locate(si.p, lit_normal(si), active)
-        slot = (cell.x + _GRIDS[-1] * (cell.y + _GRIDS[-1] * cell.z)) * _SIDES + side
-        region = dr.gather(mi.UInt32, self._table, mi.UInt32(slot), inside)
+        pair, inside = self._pairs.number(si.p, lit_normal(si), active)
+        region = dr.gather(mi.UInt32, self._table, pair, inside)
         is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
         return dr.select(is_smooth, region, self._specular)
 
     def build(self, records: PathRecords) -> tuple[TreeBuilder, mi.UInt32, None]:
-        """The trees and their roots. A region expects what the one around it found."""
+        """Builds the trees.
+
+        Returns:
+            The builder, the root of each region, and ``None``: no tree stands below a leaf. The
+            tree of the surrounding region is the prior of a region's tree.
+        """
         samples = Samples(records.code, records.value, records.weight)
         samples, region = samples.merged(records.region)
         builder = TreeBuilder()
@@ -107,22 +107,14 @@ class SurfaceRegions:
         return builder, mi.UInt32(roots), None
 
     def _numbers(self, level: int) -> np.ndarray:
-        """For each region, which one of a level's it lies in; too large a number for none."""
+        """For each region, the number of the region of a level in which it lies; a number too large
+        if there is none."""
         numbers = np.full(self.count + 1, self.count, np.uint32)
         regions = self._levels[level]
         numbers[regions] = np.arange(regions.stop - regions.start)
         for smaller in self._levels[level + 1 :]:
             numbers[smaller] = numbers[self._parent[smaller]]
         return numbers
-
-    def _locate(self, p, n, active) -> tuple[mi.Vector3i, mi.Int32, mi.Bool]:
-        cell = mi.Vector3i(dr.floor((p - self._origin) * self._scale))
-        inside = active & dr.all((cell >= 0) & (cell < _GRIDS[-1]))
-        a = dr.abs(n)
-        x_longest, y_longest = (a.x >= a.y) & (a.x >= a.z), a.y >= a.z
-        axis = dr.select(x_longest, mi.Int32(0), dr.select(y_longest, mi.Int32(1), mi.Int32(2)))
-        component = dr.select(x_longest, n.x, dr.select(y_longest, n.y, n.z))
-        return cell, 2 * axis + dr.select(component < 0, mi.Int32(1), 0), inside
 
     def __str__(self) -> str:
         return f"{self.count} regions of surfaces"

@@ -1,7 +1,7 @@
-"""Trees for tiles of the film: what a path's first samples are decides about the later ones.
+"""Trees for tiles of the film: the samples of a path's first bounces select the trees of the next.
 
-Source: Guo, PhD thesis, sections 2.3.1 to 2.3.5. That all splits of a bounce stand above those of
-the next is ours: the factors of the bounces used so far are then the density of their samples.
+Source: Guo, PhD thesis, sections 2.3.1 to 2.3.5. One difference: all splits of a bounce stand above
+those of the next, so that the density of the samples of the first bounces is known after each.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from .path_records import PathRecords
 from .sample_trees import SampleTrees
 from .tree_builder import DEPTH, UNIFORM, Samples, TreeBuilder, joined
 
-#: Along each axis, so many tiles make a larger one that they learn from, step by step.
+#: Edges, in tiles, of the larger tiles whose trees are the priors of the smaller ones.
 _GROUPS = (8, 4, 2, 1)
 
-#: Directions that a tree chooses, at most: so many cells fit into a record's history.
+#: The most directions that a tree chooses: so many cells fit into a record's history.
 MOST_BOUNCES = 1 + 32 // DEPTH
 
 
 class TileRegions:
-    """Square tiles of the film. The tree of a tile has the splits of the first bounce's sample on
-    top; below each leaf of these stands a tree for the sample of the second, and so on.
+    """Square tiles of the film. The tree of a tile first splits the sample of the first bounce.
+    Below each leaf of these splits stands a tree for the sample of the second bounce, and so on.
 
     Parameters:
         width, height: Of the film, with its border where that is sampled.
@@ -65,10 +65,13 @@ class TileRegions:
         return self.begin(pixel)
 
     def build(self, records: PathRecords) -> tuple[TreeBuilder, mi.UInt32, mi.UInt32]:
-        """The trees, their roots, and for each node which tree stands below it if it is a leaf.
+        """Builds the trees.
 
-        A tile expects what the larger ones around it found; a tree below a leaf expects what was
-        found for all samples of its bounce in the tile.
+        The prior of a tile's tree is the tree of the larger tile around it. The prior of a tree
+        below a leaf is the tree of all samples of its bounce in the tile.
+
+        Returns:
+            The builder, the roots, and for each leaf the tree that stands below it.
         """
         builder = TreeBuilder()
         # After the tiles' trees stands one without splits, for leaves that no path has reached
@@ -102,7 +105,7 @@ class TileRegions:
             number = dr.zeros(mi.UInt32, len(all_below))
             dr.scatter(number, dr.arange(mi.UInt32, len(leaves)), leaves)
             number = dr.gather(mi.UInt32, number, leaf)
-            # Neighbouring tiles can share a leaf: one of them is as good as the other
+            # Neighbouring tiles can share a leaf: either of them can give the prior
             expected = dr.zeros(mi.UInt32, len(leaves))
             dr.scatter_reduce(
                 dr.ReduceOp.Max, expected, dr.gather(mi.UInt32, tiles, tile), number
@@ -117,7 +120,8 @@ class TileRegions:
         return builder, joined(roots), joined(below)
 
     def _add_tiles(self, builder: TreeBuilder, samples: Samples, tile: mi.UInt32) -> mi.UInt32:
-        """Adds trees of all tiles, large ones first; the roots of the small ones."""
+        """Adds the trees of all tiles, those of large tiles first; returns the roots of the small
+        ones."""
         row, column = np.divmod(np.arange(self.count, dtype=np.uint32), self._columns)
         number, roots = np.zeros(self.count, np.uint32), None
         for group in _GROUPS:

@@ -1,10 +1,11 @@
-"""Building k-d trees of primary samples from what paths brought back, all trees at once.
+"""Builds k-d trees over primary samples from the contributions of paths, all trees at once.
 
-A tree's density is to be what samples bring on average. (The root of the mean square would give the
-least variance, but squares of path contributions are too noisy to be learned from few samples.) How
-a cell's halves share it is estimated from the samples in them, and drawn to what is expected:
-equal shares or, where there is a tree of larger surroundings, its shares in the same cell. A cell
-with too few samples to be split takes over the splits of that tree.
+The target density of a tree is proportional to the mean contribution of the samples. (The root of
+the mean square would give the least variance, but squares of contributions are too noisy to be
+learned from few samples.) The shares of the two halves of a cell are estimated from the samples in
+them, with a prior: equal shares or, where there is a tree for larger surroundings, the shares of
+that tree in the same cell. A cell with too few samples to be split takes over the splits of that
+tree.
 
 Source: Guo, PhD thesis, section 2.3.4 (mid-point splits, axes in turn); the estimates are ours.
 """
@@ -16,33 +17,33 @@ from collections.abc import Iterator
 import drjit as dr
 import mitsuba as mi
 
-from ...lights.searching import first_above
+from ...discrete_sampling import first_above
 from .sample_trees import LEAF
 
 #: The node of a tree without a split.
 UNIFORM = 0
 
-#: Splits of a tree from root to leaf, at most.
+#: The most splits from the root of a tree to a leaf.
 DEPTH = 8
 
-#: The number of samples that all bring the same stands for how certain an estimate is: so many are
-#: in a cell that is split, at least, and so many is the expectation worth.
+#: Certainty is measured in samples of equal contribution (the effective sample size): the least
+#: number in a cell that is split, and the weight of the prior.
 _SPLIT, _PRIOR = 4.0, 16.0
 
 #: A subtree that changes the mean square of the density by less than this share becomes a leaf.
 _LEAST_CHANGE = 0.05
 
-#: Fixed point of contributions, their squares and weights. Sums are exact: the same samples give
-#: the same trees.
+#: Fixed point of contributions, their squares and weights. Sums of integers are exact, so that the
+#: same samples give the same trees.
 _UNITS = 2.0**20, 2.0**26, 2.0**20
 
-#: Largest contribution, in units of their mean. No sum of squares exceeds this times the number of
-#: samples, and so 2⁶⁴ units.
+#: Contributions are clipped to this many times their mean. So a sum of squares is at most this
+#: times the number of samples, which is less than 2⁶⁴ units.
 _LIMIT = 2.0**12
 
 
 class Samples:
-    """What paths brought back.
+    """Primary samples and the contributions of their paths.
 
     Parameters:
         code: The cell of each primary sample; see :func:`cell_code`.
@@ -52,22 +53,23 @@ class Samples:
 
     def __init__(self, code: mi.UInt32, value: mi.Float, weight: mi.Float) -> None:
         self.code, self._value, self._weight = code, value, weight
-        # In double precision, so that the order of the samples does not tell; opaque: other counts
-        # share the kernel
+        # In double precision, so that the order of the samples does not matter. Opaque: other
+        # counts share the kernel
         mean = dr.sum(mi.Float64(value)) / dr.opaque(mi.Float64, len(value))
         self._scale = dr.rcp(dr.maximum(mean, 1e-30))
 
     def in_order(self, key: mi.UInt32) -> tuple[mi.UInt32, list[mi.UInt64]]:
-        """``key`` in ascending order, and up to each the sums of all values, squares and weights,
-        in units."""
+        """``key`` in ascending order, and the running sums of values, squares and weights in that
+        order, in units."""
         order = dr.argsort(key)
         key = dr.gather(mi.UInt32, key, order)
-        # One after the other: they are the largest arrays of all
+        # One after the other: these are the largest arrays
         running = [dr.cumsum(x) for x in self._fixed(order)]
         return key, running
 
     def merged(self, region: mi.UInt32) -> tuple[Samples, mi.UInt32]:
-        """All samples of a cell and a region as one, and the regions of those."""
+        """Merges all samples of the same cell and region; returns the merged samples, and the
+        region of each."""
         key, running = self.in_order((region << DEPTH) | self.code)
         index = dr.arange(mi.UInt32, len(key))
         begin = dr.compress((index == 0) | (key != dr.gather(mi.UInt32, key, index - 1, index > 0)))
@@ -83,7 +85,7 @@ class Samples:
     def _fixed(self, order: mi.UInt32) -> Iterator[mi.UInt64]:
         """Values, squares and weights in units, in another order."""
         weight = dr.gather(mi.Float, self._weight, order)
-        # No mean of numbers is below their largest one by more than their count
+        # The largest of n values is at most n times their mean
         value = mi.Float64(dr.gather(mi.Float, self._value, order)) * self._scale
         value = dr.minimum(value, _LIMIT)
         for x, unit in zip((value, dr.square(value), mi.Float64(weight)), _UNITS):
@@ -106,7 +108,7 @@ class _MergedSamples(Samples):
 
 
 def sums(running: list[mi.UInt64], begin: mi.UInt32, end: mi.UInt32) -> list[mi.UInt64]:
-    """What lies in [begin, end), by running sums."""
+    """The sums over [begin, end), from running sums."""
     return [
         dr.gather(mi.UInt64, x, end - 1, end > 0) - dr.gather(mi.UInt64, x, begin - 1, begin > 0)
         for x in running
@@ -114,8 +116,8 @@ def sums(running: list[mi.UInt64], begin: mi.UInt32, end: mi.UInt32) -> list[mi.
 
 
 def cell_code(u: mi.Point2f) -> mi.UInt32:
-    """The number of the smallest cell in which a sample of [0, 1)² lies: its first bit tells the
-    side of the first split, and so on."""
+    """The number of the smallest cell that contains a sample of [0, 1)². Its first (highest) bit is
+    the side of the first split, and so on."""
     cell = mi.Vector2u(u * (1 << DEPTH // 2))
     code = mi.UInt32(0)
     for level in range(DEPTH):
@@ -137,7 +139,7 @@ class TreeBuilder:
     """Builds trees, one forest after the other; later ones may refer to earlier ones.
 
     Attributes:
-        probability, child, is_even: As :class:`SampleTrees` wants them.
+        probability, child, is_even: The nodes, as parameters of :class:`SampleTrees`.
     """
 
     def __init__(self) -> None:
@@ -159,9 +161,9 @@ class TreeBuilder:
         """Adds ``tree_count`` trees.
 
         Parameters:
-            samples: Those that the trees are built from, and others.
-            tree: To which tree each sample belongs; ``tree_count`` or more for none.
-            expected: For each tree, the node of an earlier one whose shape it is expected to have.
+            samples: The samples from which the trees are built, and others.
+            tree: The tree to which each sample belongs; ``tree_count`` or more for none.
+            expected: For each tree, the root of the earlier tree that is its prior.
 
         Returns:
             The node of the first tree; those of the others follow.
@@ -186,7 +188,7 @@ class TreeBuilder:
         return first_node
 
     def leaf(self, root: mi.UInt32, code: mi.UInt32) -> mi.UInt32:
-        """The leaf of the tree at ``root`` in which a cell lies."""
+        """The leaf, of the tree at ``root``, that contains a cell."""
         node = mi.UInt32(root)
         for depth in range(DEPTH):
             is_inner = dr.gather(mi.Float, self.probability, node) >= 0
@@ -195,7 +197,7 @@ class TreeBuilder:
         return node
 
     def _split(self, level: _Level, splits: mi.UInt32, depth: int) -> _Level:
-        """Splits some of the nodes; their children are left and right ones in turn."""
+        """Splits some of the nodes of a level; left and right children alternate in the new one."""
         begin, end, code, twin = (
             dr.gather(mi.UInt32, x, splits)
             for x in (level.begin, level.end, level.code, level.twin)
@@ -215,7 +217,7 @@ class TreeBuilder:
         level.splits = splits
         level.probability = (evidence * found + _PRIOR * expected) / (evidence + _PRIOR)
         twin_l, twin_r = (dr.select(has_twins, x, twin) for x in (twins, twins + 1))
-        # All at once: each of them would be a kernel of its own
+        # Together: each of them alone would be a kernel of its own
         dr.eval(
             begin, middle, end, code, middle_code, twin_l, twin_r, evidence_l, evidence_r,
             level.probability,
@@ -233,20 +235,20 @@ class TreeBuilder:
         key = self._sorted[0]
         if first is None:
             first, last = mi.UInt32(0), dr.opaque(mi.UInt32, len(key))
-        # Powers of two: fewer kernels
+        # Rounded to a power of two, so that fewer kernels are compiled
         longest = 1 << len(key).bit_length()
         return first_above(key, first, last, code, mi.Bool(True), longest, reaches=True)
 
     def _sums(self, begin: mi.UInt32, end: mi.UInt32) -> list[mi.Float]:
-        """Of the values, the squares and the weights of the samples [begin, end)."""
+        """The sums of values, squares and weights of the samples [begin, end)."""
         found = sums(self._sorted[1], begin, end)
         return [mi.Float(mi.Float64(x) / unit) for x, unit in zip(found, _UNITS)]
 
     def _append(self, levels: list[_Level]) -> None:
-        """Adds the nodes of a forest to those that there are, without splits that do nothing."""
+        """Appends the nodes of the new trees, without the splits that hardly change the density."""
         columns, below = [], None
         for depth, level in reversed(list(enumerate(levels))):
-            # What is not split takes over the splits of its twin
+            # A node that is not split takes over the splits of its twin
             probability = dr.gather(mi.Float, self.probability, level.twin)
             child = dr.gather(mi.UInt32, self.child, level.twin)
             square = dr.gather(mi.Float, self._square, level.twin)
@@ -275,8 +277,8 @@ class TreeBuilder:
 
 
 class _Level:
-    """The nodes of one depth: their samples, codes, and earlier nodes of the same cells (or of one
-    around them)."""
+    """The nodes of one depth: the range of their samples, their codes, and their twins, which are
+    the nodes of the priors for the same cells (or for cells around them)."""
 
     def __init__(self, begin, end, code, twin, evidence) -> None:
         self.begin, self.end, self.code, self.twin = begin, end, code, twin
@@ -287,7 +289,7 @@ class _Level:
 
 
 def _evidence(value: mi.Float, square: mi.Float) -> mi.Float:
-    """So many samples that all bring the same would be as uncertain."""
+    """The effective sample size: so many samples of equal contribution would be as uncertain."""
     return dr.select(square > 0, dr.square(value) / square, 0)
 
 
@@ -299,7 +301,7 @@ def _alternate(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
 
 
 def joined(parts: list) -> mi.Float:
-    """Arrays of one type, one after the other. (``dr.concat`` compiles kernels for each size.)"""
+    """Concatenates arrays of one type. (``dr.concat`` compiles kernels for each size.)"""
     result, offset = dr.empty(type(parts[0]), sum(map(len, parts))), 0
     for part in parts:
         index = dr.arange(mi.UInt32, len(part)) + dr.opaque(mi.UInt32, offset)

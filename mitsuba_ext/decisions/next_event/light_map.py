@@ -1,4 +1,4 @@
-"""What is learned about lights: how much of each cell reaches each row of surfaces.
+"""Learns how much light of each cell reaches each row of surfaces.
 
 Sources: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, section 4.2 (=
 Guo's thesis, section 3.4.2) for the idea; cells, sides, contributions and the estimators are ours.
@@ -9,27 +9,28 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ...lights.environment import brightness
 from ...lights.light_cells import LightCells
+from ...lights.spectra import brightness
 from ...lights.weights import unoccluded_weights
 from ...regions.surface_rows import SurfaceRows
 from ...transport.observer import Observer
 from ...transport.vertex import Vertex
 from .light_table import Choice
 
-#: Fixed point of the squared ratios. They are clipped: a single one must not decide.
+#: Fixed point of the squared ratios. They are clipped, so that a single one cannot dominate.
 _UNIT, _LIMIT = 2.0**20, 16.0
 
-#: What one test can add to the sum of squares.
+#: The most that one test can add to the sum of squares.
 MOST_SQUARED = int(_UNIT * _LIMIT)
 
-#: What the expectation is worth, in tests: for visibility, and for the mean square.
+#: The weight of the prior, in tests: for visibility, and for the mean square.
 _PRIOR_TESTS, _PRIOR_SQUARES = 1.0, 4.0
 
-#: What a diffuse surface of little albedo reflects, in units of a white one without the 1/π.
+#: The reflection of a dark diffuse surface, in units of a white one without the factor 1/π.
 _DARK = 0.1
 
-#: Tests of an entry, about, that are enough: where a pilot brings more, not all are recorded.
+#: So many tests of an entry are enough: a pilot with more records only a part of them. And the
+#: approximate number of tests of a sample.
 _ENOUGH_TESTS, _TESTS_PER_SAMPLE = 32, 2
 
 #: Bytes of an entry, at most: the expectation, the counters, the table that is made of them, and
@@ -38,17 +39,20 @@ BYTES_PER_ENTRY = 128
 
 
 class LightMap(Observer):
-    """Counts, for each row of surfaces and each cell of the lights, shadow rays and what they
-    brought. An observer of the walk, whose lights must be chosen by a selection with these rows and
-    cells. Counters are integers, so that the same samples give bitwise the same map.
+    """Counts, for each row of surfaces and each light cell, the shadow rays, those that arrived,
+    and their squared contributions. It observes the walk, in which a selection with the same rows
+    and cells must choose the lights. Counters are integers, so that the same samples give bitwise
+    the same map.
 
     Parameters:
         scene: The scene to learn.
-        rows, cells: What is lit, and by what.
-        samples: How many samples will be observed, about.
+        rows: The surfaces that are lit.
+        cells: The lights.
+        samples: Approximate number of samples that will be observed.
 
     Attributes:
-        unoccluded (mi.Float): What each cell contributes to each row if nothing is in between.
+        unoccluded (mi.Float): The contribution of each cell to each row if nothing is in between;
+            shape [rows · cells].
         tests, successes (mi.UInt32): Shadow rays, and how many of them arrived.
         squares (mi.UInt64): Sum of the squared contributions in units of ``unoccluded``.
     """
@@ -63,7 +67,7 @@ class LightMap(Observer):
         # Tests in the low half, successes in the high one: one addition counts both
         self._counts = dr.zeros(mi.UInt64, entries)
         self.squares = dr.zeros(mi.UInt64, entries)
-        # Opaque, too: one in so many lanes is recorded
+        # One in so many lanes is recorded
         enough = _ENOUGH_TESTS * entries
         self._stride = dr.opaque(mi.UInt32, max(1, samples * _TESTS_PER_SAMPLE // enough))
         self._is_recorded = mi.Bool(True)
@@ -72,7 +76,7 @@ class LightMap(Observer):
     # ---- Observer of the walk ----
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None = None) -> None:
-        # Scattered: lanes that follow each other are the samples of one pixel, row by row
+        # By a hash: consecutive lanes are the samples of one pixel, and pixels come row by row
         scattered = (dr.arange(mi.UInt32, lanes) * 0x9E3779B9) >> 8
         self._is_recorded = scattered % self._stride == 0
 
@@ -86,7 +90,7 @@ class LightMap(Observer):
         visible: mi.Bool,
         tested: mi.Bool,
     ) -> None:
-        """A shadow ray was traced; it would have brought ``contribution``."""
+        """Records a shadow ray, whose contribution is ``contribution`` if it is ``visible``."""
         entry = choice.row * self._count + choice.cell
         tested = tested & self._is_recorded
         expected = dr.gather(mi.Float, self.unoccluded, entry, tested)
@@ -120,19 +124,26 @@ class LightMap(Observer):
         """Ends the observation of a stage."""
         dr.eval(self._counts, self.squares)
 
+    def ratio(self) -> mi.Float:
+        """The share of the shadow rays from a row to a cell that arrived, 1 where none was traced;
+        shape [rows · cells]."""
+        tests = self.tests
+        ratio = mi.Float(self.successes) / mi.Float(dr.maximum(tests, 1))
+        return dr.select(tests > 0, ratio, 1)
+
     def visibility(self) -> mi.Float:
         """The probability that a shadow ray from a row to a cell arrives; shape [rows · cells].
 
-        Where few were tested, the expectation decides: that of the same cell in the surroundings
-        (twice the voxel), behind which stands that of the cell in the whole scene, and behind that
-        one the mean of all.
+        It is the posterior mean of a Beta distribution. Its prior is the estimate for the same cell
+        in voxels of twice the size, whose prior is that for the cell in the whole scene, whose
+        prior is the mean over all cells.
         """
         count = self.cells.count
         entry = dr.arange(mi.UInt32, self.rows.count * count)
         row = entry // count
         cell = entry - row * count
         tests, successes = (int(dr.sum(mi.UInt64(n))[0]) for n in (self.tests, self.successes))
-        # Half a success in one more test: the prior is never certain
+        # Half a success in one more test keeps the prior from being 0 or 1
         overall = dr.opaque(mi.Float, (successes + 0.5) / (tests + 1))
         expected = self._shrunk(cell, count, overall)
         near, near_count = self.rows.coarse()
@@ -145,7 +156,7 @@ class LightMap(Observer):
         )
 
     def _shrunk(self, group: mi.UInt32, group_count: int, expected: mi.Float) -> mi.Float:
-        """For each entry, the success rate of its group, drawn to ``expected``."""
+        """For each entry, the success rate of its group, with ``expected`` as the prior."""
         tests, successes = (dr.zeros(mi.UInt32, group_count) for _ in range(2))
         dr.scatter_add(tests, self.tests, group)
         dr.scatter_add(successes, self.successes, group)
@@ -157,8 +168,8 @@ class LightMap(Observer):
 
         Parameters:
             target: ``visibility`` for the unoccluded contribution times the probability that a
-                shadow ray arrives, ``contribution`` for the root of the mean square of what
-                arrived, BSDF included.
+                shadow ray arrives, ``contribution`` for the root mean square of the contribution,
+                BSDF and visibility included.
         """
         visibility = self.visibility()
         if target == "visibility":
@@ -166,9 +177,9 @@ class LightMap(Observer):
         return self.unoccluded * dr.sqrt(self._square(visibility))
 
     def _square(self, visibility: mi.Float) -> mi.Float:
-        """The mean square of what a shadow ray brought, in units of ``unoccluded`` squared."""
+        """The mean squared contribution of a shadow ray, in units of ``unoccluded`` squared."""
         squares = mi.Float(self.squares) / _UNIT
-        # The mean square of what arrived, and of one more success of a dark surface
+        # The mean square of the shadow rays that arrived, and of one more on a dark surface
         total = int(dr.sum(self.squares)[0]) / _UNIT + _DARK**2
         arrived = dr.opaque(mi.Float, total / (int(dr.sum(mi.UInt64(self.successes))[0]) + 1))
         return (squares + _PRIOR_SQUARES * visibility * arrived) / (

@@ -1,4 +1,4 @@
-"""Light maps in files: what was learned from one view of a scene serves the others."""
+"""Light maps in files: a map that was learned from one view of a scene serves other views."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from .light_map import BYTES_PER_ENTRY, MOST_SQUARED, LightMap
 
 _FORMAT = 2
 
-#: The finest grid of a map, and coordinates whose differences are finite.
+#: The finest grid of a map, and a bound of the coordinates that keeps their differences finite.
 _MOST_VOXELS, _LARGEST = 1024, 1e38
 
 
 @dataclass
 class _Stored:
-    """What a file holds besides its format.
+    """The contents of a file, besides the number of its format.
 
     Attributes:
         scene: Fingerprint of the scene.
         bbox, resolution, p, n: Parameters of the rows; p and n of shape [3, vertices].
-        tests, successes, squares: What was counted; shape [rows, cells]. The cells are in the order
+        tests, successes, squares: The counters; shape [rows, cells]. The cells are in the order
             of their lights' digests: that of a scene's emitters differs from process to process.
     """
 
@@ -77,10 +77,10 @@ def load(
 
     Parameters:
         path: The file.
-        scene: What the map is about.
-        samples: About so many will be added.
-        max_memory: Bytes that the map may take.
-        parameter: What errors call the parameter that named the file.
+        scene: The scene of the map.
+        samples: Approximate number of samples that will be observed in addition.
+        max_memory: The most bytes that the map may take.
+        parameter: The parameter that named the file, for errors.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -130,11 +130,11 @@ def _load(path: Path, scene: mi.Scene, samples: int, max_memory: int) -> LightMa
 
 
 def _read(path: Path) -> _Stored:
-    """The arrays of a file, of the types and dimensions that they should have."""
+    """Reads the arrays of a file, and checks their types and dimensions."""
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files if name in {*_TYPES, "format"}}
-    except Exception:  # NumPy, zipfile and zlib raise a dozen kinds for what is no map
+    except Exception:  # NumPy, zipfile and zlib raise a dozen kinds for files that are no maps
         raise ValueError(
             'is no light map, or has been damaged: give it a file that "save_map" wrote'
         ) from None
@@ -154,7 +154,7 @@ def _read(path: Path) -> _Stored:
 
 
 def _check(stored: _Stored) -> None:
-    """Shapes and values of the arrays: what follows computes addresses from them."""
+    """Checks the shapes and the values of the arrays: later code computes addresses from them."""
     _require(
         1 <= int(stored.resolution) <= _MOST_VOXELS, f"resolution {int(stored.resolution)}"
     )
@@ -191,11 +191,11 @@ def _flat(values: np.ndarray, dtype: type) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=dtype).ravel()
 
 
-# ---- What identifies scenes and lights ----
+# ---- Fingerprints of scenes and lights ----
 
 
 def fingerprint(scene: mi.Scene) -> str:
-    """A hash of shapes, materials and lights; sensors and films do not count."""
+    """A hash of shapes, materials and lights, without sensors and films."""
     # Sorted: their order differs from one loading of a scene to the next
     digests = sorted(_of(part) for part in [*scene.shapes(), *scene.emitters()])
     return hashlib.sha256(b"".join(digests)).hexdigest()

@@ -8,14 +8,14 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
+from ...discrete_sampling import alias_tables
 from ...lights.light_cells import LightCells
-from ...lights.searching import alias_tables
 from ...transport.path_decisions import EmitterSampling
 
-#: Entries of a table that are computed together: they need some memory.
+#: Entries of a table that are computed together, which bounds the temporary memory.
 _ENTRIES_AT_ONCE = 1 << 20
 
-#: Bytes of an entry, and of the weights that it is made of while they are computed.
+#: Bytes of an entry of the table, including the weights and temporaries while it is computed.
 TABLE_BYTES = 40
 
 
@@ -56,8 +56,8 @@ class LightSelection(EmitterSampling):
     """Chooses a cell with the probabilities of the vertex's row, then a point on it.
 
     Parameters:
-        rows: Which row a vertex uses.
-        cells: What there is to choose.
+        rows: Tells which row a vertex uses.
+        cells: The cells to choose from.
         weights: For each row, a weight for each cell; shape [rows · cells], not negative. A row of
             zeros chooses uniformly.
     """
@@ -103,8 +103,8 @@ class LightSelection(EmitterSampling):
 
 
 def _table(weights: mi.Float, rows: int, count: int) -> mi.Float:
-    """For each entry of an alias table its threshold, the cell of its alias, its own probability
-    and that of the alias. Side by side: a draw reads them with one access to memory."""
+    """Builds the alias tables of all rows. An entry has its threshold, the cell of its alias, its
+    own probability and that of the alias; a draw reads these four with one access to memory."""
     table = dr.empty(mi.Float, 4 * rows * count)
     step = max(1, _ENTRIES_AT_ONCE // count)
     for begin in range(0, rows, step):

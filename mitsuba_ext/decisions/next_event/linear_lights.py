@@ -1,4 +1,4 @@
-"""Choosing among lights by an estimate of what each of them contributes."""
+"""Choosing among lights by an estimate of the contribution of each."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 
 from ...bounds import scene_bounds, shape_bounds
 from ...lights.division import emitter_shapes
-from ...lights.environment import some_wavelengths
 from ...lights.light_cells import LightCells
+from ...lights.spectra import comparison_wavelengths
 from ...lights.weights import power_weights
 from ...transport.path_decisions import EmitterSampling
 
-#: Added to the largest cosine under which a vertex sees a light: glossy reflection does not fall
-#: with the cosine, and a light must be this far below the tangent plane to be ruled out.
+#: Added to the largest cosine under which a vertex sees a light. Glossy reflection does not
+#: decrease with the cosine, and only a light this far below the tangent plane gets the estimate 0.
 _LEAST_COSINE = 0.02
 
 #: Rounding errors, relative to the largest coordinate of the scene.
@@ -33,7 +33,7 @@ class Estimates:
 
     Attributes:
         normal: Shading normal, on the side that is seen.
-        is_opaque: Does all light that matters come from the side of the normal?
+        is_opaque: Does only light from the side of the normal contribute?
         total: Sum of the estimates of all emitters.
     """
 
@@ -46,9 +46,9 @@ class LinearSelection(EmitterSampling):
     """Chooses emitter i with the probability α_i = e_i / Σ e_j, then a point on it; e_i estimates
     what emitter i contributes to the vertex if nothing is in between.
 
-    All emitters are visited at each vertex: the cost is linear in their number (hence the name),
-    in exchange for probabilities that fit each vertex and its normal, without a table to learn.
-    With 24 lamps a sample takes a third longer than with ``path``, with 1000 eight times as long.
+    All emitters are visited at each vertex: the cost is linear in their number (hence the name). In
+    exchange, the probabilities fit each vertex and its normal, and no table has to be learned. With
+    24 lamps a sample takes a third longer than with ``path``, with 1000 eight times as long.
 
     The estimate is the emitter's power, as irradiance at the distance of its bounding sphere, times
     the largest cosines under which the vertex sees this sphere and, if the light is flat, under
@@ -62,7 +62,7 @@ class LinearSelection(EmitterSampling):
     "Linear α_i", whose geometry term of one is replaced by a bound.
 
     Parameters:
-        scene: Whose emitters are chosen from.
+        scene: The scene whose emitters are chosen from.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -78,7 +78,7 @@ class LinearSelection(EmitterSampling):
             self._tabulate(scene)
 
     def _tabulate(self, scene: mi.Scene) -> None:
-        """The tables of the estimates: each row is one fetch of four, four, and two numbers."""
+        """Makes the tables of the estimates: a row is read by three fetches."""
         bbox = scene_bounds(scene)
         has_extent = bbox.valid()
         sphere = bbox.bounding_sphere() if has_extent else mi.ScalarBoundingSphere3f(0.0, 1.0)
@@ -93,7 +93,7 @@ class LinearSelection(EmitterSampling):
         ]
         place, plane, size = (np.array(column) for column in zip(*rows))
         size[:, 1] *= power
-        # In units in which neither a sum nor a quotient leaves the range of a float
+        # In units of the largest, so that neither a sum nor a quotient leaves the range of a float
         size[:, 1] /= max(size[:, 1].max(), 1e-300)
         self._place, self._plane, self._size = (
             mi.Float(table.astype(np.float32).ravel()) for table in (place, plane, size)
@@ -141,9 +141,10 @@ class LinearSelection(EmitterSampling):
         # Also where the lookups above were masked, the density must be a number
         return dr.select(active, pdf, 0)
 
-    # The second pass does not visit the emitters again, but the blocks of about √n of them and then
-    # one block. Reservoir sampling would do without it, but rescale the random number at each
-    # emitter: that wears its 24 bits off, and the strata of a stratified one would not survive.
+    # The first pass sums the estimates, also up to the end of each block of about √n emitters. The
+    # second pass searches the blocks, and then one block. Reservoir sampling needs no second pass,
+    # but rescales the random number at each emitter: its 24 bits would be used up, and stratified
+    # numbers would lose their strata.
 
     @dr.syntax
     def _sums(self, p, normal, is_opaque, active) -> tuple[mi.Float, dr.Local[mi.Float]]:
@@ -159,7 +160,7 @@ class LinearSelection(EmitterSampling):
     @dr.syntax
     def _choose(self, p, normal, is_opaque, total, sums, x, active) -> tuple[mi.UInt32, mi.Float]:
         """The first emitter at which the sum of the estimates exceeds x · Σ e_j, and α_i."""
-        # Where all estimates are zero, this is the choice, and the loops are skipped
+        # A uniform choice, for vertices where all estimates are zero: the loops are skipped there
         slot = dr.minimum(mi.UInt32(x * self._candidate_count), self._candidate_count - 1)
         chosen = dr.gather(mi.UInt32, self._candidates, slot, active)
         chosen_e = mi.Float(0)
@@ -174,8 +175,8 @@ class LinearSelection(EmitterSampling):
             searching &= (running <= target) & (block + 1 < self._block_count)
             block += dr.select(searching, 1, 0)
 
-        # The sums are those of the first pass. They can stay below the target by rounding only:
-        # then the last emitter of those visited is chosen whose estimate is not zero
+        # The sums are those of the first pass. Only by rounding can all stay below the target: then
+        # the last visited emitter whose estimate is not zero is chosen
         index = block * self._block
         searching = mi.Bool(is_searched)
         while dr.hint(searching, label="choice"):
@@ -219,7 +220,7 @@ def _samples(scene: mi.Scene, center: mi.Point3f) -> tuple[np.ndarray, np.ndarra
     each."""
     count = len(scene.emitters())
     ref = dr.zeros(mi.Interaction3f, count)
-    ref.p, ref.wavelengths = center, some_wavelengths(count)
+    ref.p, ref.wavelengths = center, comparison_wavelengths(count)
     ds, _weight = scene.emitters_dr().sample_direction(ref, mi.Point2f(0.5), mi.Bool(True))
     zero = dr.zeros(mi.Float, count)
     p, n, d = (np.array(v + zero, dtype=np.float64) for v in (ds.p, ds.n, ds.d))
@@ -235,8 +236,8 @@ def _row(
     scene_radius: float,
     extent: float,
 ) -> tuple[list[float], list[float], list[float]]:
-    """An emitter in the tables: centre and w; normal and reach; radius, and what turns power into
-    strength: the irradiance at the distance of one."""
+    """An emitter in the tables: centre and w; normal and reach; radius, and the factor that turns
+    power into strength, which is the irradiance at the distance 1."""
     not_flat = [0.0, 0.0, 0.0, np.inf]
     least_radius = _ROUNDING * extent
     if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
@@ -246,9 +247,9 @@ def _row(
         if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
             if is_delta:
                 return [*d, 0.0], not_flat, [_ROUNDING, 1 / (np.pi * scene_radius**2)]
-            # From everywhere
+            # Light from all directions
             return [0.0] * 4, not_flat, [1.0, 1 / (4 * np.pi * scene_radius**2)]
-        # A beam of parallel light, or something unknown: never ruled out
+        # A beam of parallel light, or an unknown emitter: its estimate is never 0
         area = np.pi * scene_radius**2 if shape is None else float(shape.surface_area()[0])
         return [0.0] * 4, not_flat, [1.0, 1 / max(area, 1e-300)]
     center, radius = _bounding_sphere(shape)
@@ -272,9 +273,9 @@ def _bounding_sphere(shape: mi.Shape) -> tuple[np.ndarray, float]:
 
 
 def _opaque_bsdfs(scene: mi.Scene) -> mi.Bool:
-    """Which BSDFs, by their numbers in Dr.Jit's registry, reflect nothing but what arrives on the
-    side from which the shading normal is seen. All that is not found here (BSDFs of instances) may
-    do otherwise, and so may bump and normal maps whose normals face away."""
+    """For each BSDF, by its number in Dr.Jit's registry: does it reflect only light from the side
+    of the shading normal that is seen? Not so for BSDFs that are not found here (those of
+    instances), and for bump and normal maps, whose normals may face away."""
     transmission = int(mi.BSDFFlags.Transmission)
     opaque = {}
     for shape in scene.shapes():

@@ -1,5 +1,5 @@
-"""How a ray meets a scene in which things move: what moves is traced in a scene of its own, by a
-ray that is taken to the frame in which the things rest."""
+"""Ray intersection in a scene with moving shapes. Each mover is a scene of its own: rays are
+transformed to the frame in which its shapes rest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ...motion import PoseTable
 from ...movers import movers
 from ...transport.path_decisions import SceneQuery
 
-#: The owner of what does not move.
+#: The owner of shapes that do not move.
 _NOBODY = 0xFFFFFFFF
 
 
@@ -29,11 +29,11 @@ def scene_query(scene: mi.Scene) -> SceneQuery:
 
 
 class MovingSceneQuery(SceneQuery):
-    """Static scene and moving things.
+    """Intersects rays with the static scene and with each mover.
 
     Parameters:
         scene: The static scene.
-        moving: What moves, as from :func:`movers`.
+        moving: The movers, as from :func:`movers`.
     """
 
     def __init__(self, scene: mi.Scene, moving: Sequence[mi.Shape]) -> None:
@@ -46,7 +46,7 @@ class MovingSceneQuery(SceneQuery):
         pi = super().closest(scene, ray, coherent, active)
         ray = mi.Ray3f(ray)
         for index, (at_rest, box) in enumerate(zip(self._scenes, self._boxes)):
-            # What is behind that which was found already cannot be hit
+            # Shapes behind the closest hit so far cannot be hit
             ray.maxt = dr.select(pi.valid, pi.t, ray.maxt)
             pi = dr.if_stmt(
                 (pi, ray),
@@ -67,7 +67,7 @@ class MovingSceneQuery(SceneQuery):
         shape = dr.select(pi.instance != None, pi.instance, pi.shape)  # noqa: E711
         owner = dr.gather(mi.UInt32, self._owners, _number(shape), pi.valid)
         moves = pi.valid & (owner != _NOBODY)
-        # One call of the shape's method for all, wherever the ray is
+        # A single call of the shape's method, for resting and moving shapes together
         ray = dr.if_stmt((owner, ray), moves, self._to_rest, lambda _owner, ray: ray)
         si = super().interaction(pi, ray)
         return dr.if_stmt((owner, si), moves, self._to_world, lambda _owner, si: si)
@@ -114,24 +114,25 @@ class MovingSceneQuery(SceneQuery):
 
 
 class _Box:
-    """A box that tells which rays may meet what it contains. Most rays miss what moves, and if all
-    rays of a packet do, they are spared the change of the frame and the search."""
+    """The bounding box of a mover. Most rays miss it; if all rays of a packet do, their
+    transformation and the traversal of the mover's scene are skipped."""
 
     def __init__(self, bounds: mi.ScalarBoundingBox3f) -> None:
-        # Rounding of the poses on the device
+        # For the rounding errors of the poses on the device
         margin = 1e-5 * max(map(abs, [*bounds.min, *bounds.max]))
         self._low = mi.Point3f(bounds.min) - margin
         self._high = mi.Point3f(bounds.max) + margin
-        # Another motion must not ask for another kernel
+        # Opaque: other motions share the kernel
         dr.make_opaque(self._low, self._high)
 
     def is_met(self, ray: mi.Ray3f) -> mi.Bool:
         """May there be a hit before ``ray.maxt``?"""
-        # A component 0 gives ±∞, and NaN only in the plane of a side, where there is nothing
+        # A zero component of the direction gives ±∞, and NaN only for an origin in the plane of a
+        # side, where the mover has no surface
         inverse = dr.rcp(ray.d)
         a, b = (self._low - ray.o) * inverse, (self._high - ray.o) * inverse
         near, far = dr.max(dr.fmin(a, b)), dr.min(dr.fmax(a, b))
-        # Slightly more than the rounding errors of both distances
+        # The margin is slightly larger than the rounding errors of both distances
         return (near <= far * (1 + 1e-6)) & (far >= 0) & (near <= ray.maxt)
 
 

@@ -9,33 +9,28 @@ from ...transport.path_decisions import ShadowTest
 from ..learner import Learner
 from ..next_event.light_map import LightMap
 from ..next_event.light_map_learner import LightLearner
-from .visibility_roulette import PAPER_EPSILON, WORTHWHILE
+from .rejection_law import WORTHWHILE, RejectionLaw, rejected_share
 
 
 class LightRoulette(ShadowTest):
     """Tests a connection with a probability that grows with the visibility of the chosen cell from
-    the vertex's row, wherever the light is: also at infinity.
+    the vertex's row. Lights at infinity have cells too.
 
     Parameters:
         light_map: What was learned. The next event decision must choose from its rows and cells.
-        slope, floor, law: See ``visibility_roulette.VisibilityRoulette``.
+        slope, floor, law: See :class:`.rejection_law.RejectionLaw`.
+
+    Attributes:
+        rejected_share (float): Share of the pilots' shadow rays that it would not trace.
     """
 
     def __init__(self, light_map: LightMap, slope: float, floor: float, law: str) -> None:
         self._count = dr.opaque(mi.UInt32, light_map.cells.count)
-        tests, successes = light_map.tests, light_map.successes
-        if law == "paper":
-            ratio = mi.Float(successes) / mi.Float(dr.maximum(tests, 1))
-            p = dr.select(tests > 0, dr.maximum(ratio, PAPER_EPSILON), 1)
-        else:
-            p = dr.minimum(1, slope * light_map.visibility() + floor)
-        self._p = p
+        self._p = RejectionLaw(law, slope, floor).probability(
+            light_map.ratio, light_map.visibility
+        )
         dr.eval(self._p)
-        # In integers: a share near the threshold must not depend on the order of a sum
-        weights = mi.UInt64(tests)
-        total, kept = dr.sum(weights), dr.sum(weights * mi.UInt64(p * 1024))
-        #: Share of the pilots' shadow rays that the law would not trace.
-        self.rejected_share = 1 - int(kept[0]) / (1024 * max(1, int(total[0])))
+        self.rejected_share = rejected_share(self._p, light_map.tests)
 
     def probability(self, state, choice, si, ds, active):
         entry = choice.row * self._count + choice.cell

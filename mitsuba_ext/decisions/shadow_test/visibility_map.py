@@ -11,16 +11,16 @@ import mitsuba as mi
 
 from ...regions.voxel_grid import VoxelGrid
 
-#: Two counters, and twice a number in the roulette's table if there were lights in all voxels.
+#: Two counters, and two numbers of the roulette's table in the worst case (lights in all voxels).
 _BYTES_PER_ENTRY = 16
 
-#: Rays of a refinement, however many entries there are.
+#: The most rays of a refinement.
 _MAX_REFINEMENT = 1 << 22
 
-#: Above, the numbers of the entries would not fit into 32 bits while they are computed.
+#: With more voxels, intermediate results of the numbers of entries would exceed 32 bits.
 MAX_VOXELS = 0xFFFF
 
-#: The grid's table of numbers, and the marks that it is made of.
+#: The grid's table of voxel numbers, and the marks from which it is built.
 _BYTES_PER_CELL = 8
 
 #: Length of the test segments of :meth:`VisibilityMap.refine`, short of the end point.
@@ -36,8 +36,8 @@ class VisibilityMap:
     Parameters:
         scene: The scene to learn.
         grid: Voxels along each axis of the scene's bounding box.
-        max_memory: Bytes that the map may take. Where ``grid`` needs more, a coarser one is taken,
-            with a warning.
+        max_memory: The most bytes that the map may take. If ``grid`` needs more, a coarser grid is
+            used, with a warning.
 
     Attributes:
         voxels: The grid.
@@ -83,17 +83,17 @@ class VisibilityMap:
         row, column = dr.maximum(i, j), dr.minimum(i, j)
         return row * (row + 1) // 2 + column
 
-    # ---- What the walk saw ----
+    # ---- Observations of the walk ----
 
     def shadow_ray(self, p: mi.Point3f, q: mi.Point3f, visible: mi.Bool, active: mi.Bool) -> None:
-        """A shadow ray was traced from ``p`` to the point ``q`` on a light."""
+        """Records a shadow ray that was traced from ``p`` to the point ``q`` on a light."""
         entry, known = self.entry(p, q, active)
         self._count(entry, visible, known)
         light_voxel, known = self.voxels.index(q, known)
         dr.scatter(self._holds_light, mi.UInt32(1), light_voxel, known)
 
     def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
-        """A path went from ``p`` to ``q``: they see each other."""
+        """Records a path segment from ``p`` to ``q``: the points see each other."""
         entry, known = self.entry(p, q, active)
         self._count(entry, mi.Bool(True), known)
 
@@ -134,7 +134,7 @@ class VisibilityMap:
     # ---- What was learned ----
 
     def light_voxels(self) -> mi.UInt32:
-        """The voxels that shadow rays went to."""
+        """The voxels in which shadow rays ended."""
         return dr.compress(self._holds_light > 0)
 
     def test_count(self, entry: mi.UInt32) -> mi.UInt32:
@@ -149,10 +149,10 @@ class VisibilityMap:
 
     def posterior_mean(self, entry: mi.UInt32) -> mi.Float:
         """The probability that two points of the pair of voxels see each other: the mean of a Beta
-        posterior, whose prior is worth one test and expects the share of successes of the whole
-        map."""
+        posterior. Its prior has the weight of one test, and the share of successes in the whole map
+        as its mean."""
         tests, successes = (int(dr.sum(mi.UInt64(n))[0]) for n in (self.tests, self.successes))
-        # Half a success in one more test: the prior is never certain
+        # Half a success in one more test keeps the prior from being 0 or 1
         prior = dr.opaque(mi.Float, (successes + 0.5) / (tests + 1))
         tests = mi.Float(dr.gather(mi.UInt32, self.tests, entry))
         successes = mi.Float(dr.gather(mi.UInt32, self.successes, entry))

@@ -13,14 +13,8 @@ from ...bounds import scene_bounds
 from ...regions.voxel_grid import EMPTY
 from ...transport.path_decisions import ShadowTest
 from ..learner import Learner
+from .rejection_law import WORTHWHILE, RejectionLaw, rejected_share
 from .visibility_map import VisibilityMap
-
-#: Initial value of a map entry in the paper; with its law, the least probability of a test.
-PAPER_EPSILON = 1e-4
-
-#: Share of rejected segments below which looking them up costs more than it saves: by this measure
-#: staircase has 0.05, kitchen 0.07 (which about breaks even), veach-ajar 0.2, door_ajar 0.5.
-WORTHWHILE = 0.05
 
 
 class VisibilityRoulette(ShadowTest):
@@ -31,35 +25,33 @@ class VisibilityRoulette(ShadowTest):
 
     Parameters:
         visibility: The learned map, which must have seen a light.
-        slope, floor: p = min(1, slope · V + floor).
-        law: ``affine`` for the above, ``paper`` for p = max(V, 1e-4) (Eq. 2).
+        slope, floor, law: See :class:`.rejection_law.RejectionLaw`.
+
+    Attributes:
+        rejected_share (float): Share of the segments that the map saw end on a light and that the
+            roulette would not test.
     """
 
     def __init__(self, visibility: VisibilityMap, slope: float, floor: float, law: str) -> None:
         self.voxels = visibility.voxels
-        # Connections end on lights: of the whole map, the columns of their voxels are enough, and
-        # stay in the cache.
+        # Connections end on lights: of the whole map, only the columns of the lights' voxels are
+        # kept, which fit into the cache
         lights = visibility.light_voxels()
         voxel_count, light_count = self.voxels.occupied_count, len(lights)
         self._column = dr.full(mi.UInt32, EMPTY, voxel_count)
         dr.scatter(self._column, dr.arange(mi.UInt32, light_count), lights)
-        # Opaque: the number of columns differs from seed to seed, the kernel must not
+        # Opaque: the number of columns differs from seed to seed, and the kernel must not
         self._light_count = dr.opaque(mi.UInt32, light_count)
         index = dr.arange(mi.UInt32, voxel_count * light_count)
         voxel = index // self._light_count
         light = dr.gather(mi.UInt32, lights, index - voxel * self._light_count)
         entry = visibility.entry_of(voxel, light)
-        if law == "paper":
-            # The paper's map holds plain ratios, and ε where no success was seen (section 3.2)
-            self._p = dr.maximum(visibility.ratio(entry), PAPER_EPSILON)
-        else:
-            self._p = dr.minimum(1, slope * visibility.posterior_mean(entry) + floor)
+        # The paper's law: plain ratios, and ε where no success was seen (section 3.2)
+        self._p = RejectionLaw(law, slope, floor).probability(
+            lambda: visibility.ratio(entry), lambda: visibility.posterior_mean(entry)
+        )
         dr.eval(self._column, self._p)
-        # In integers: a share near the threshold must not depend on the order of a sum
-        tests = mi.UInt64(visibility.test_count(entry))
-        total, kept = dr.sum(tests), dr.sum(tests * mi.UInt64(self._p * 1024))
-        #: Share of the segments that the map saw end on a light and that the law would not test.
-        self.rejected_share = 1 - int(kept[0]) / (1024 * int(total[0]))
+        self.rejected_share = rejected_share(self._p, visibility.test_count(entry))
 
     def probability(self, state, choice, si, ds, active):
         voxel, active = self.voxels.index(si.p, active)
@@ -114,7 +106,8 @@ class VisibilityLearner(Learner):
 
 
 def has_lights_at_points(scene: mi.Scene) -> bool:
-    """Is there a light that the map can cover: not at infinity, nor outside its voxels?"""
+    """Is there a light in the voxels of the map? (Lights at infinity, and point lights outside of
+    the bounds of the shapes, are not.)"""
     bounds = scene_bounds(scene)
     if not bounds.valid():
         return False

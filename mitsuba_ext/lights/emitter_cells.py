@@ -1,4 +1,4 @@
-"""The cells of emitters: sampling a point on one, and finding the cell of a point."""
+"""Cells (parts of emitters): sampling a point on a cell, and finding the cell of a point."""
 
 from __future__ import annotations
 
@@ -8,29 +8,31 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..discrete_sampling import ONE_MINUS_EPSILON, first_above
 from .division import Division, divide, emitter_shapes, triangles
-from .searching import ONE_MINUS_EPSILON, first_above
 
 
 class EmitterCells:
     """The cells of emitters, numbered from 0 to ``count`` − 1.
 
     Parameters:
-        scene: Whose emitters they are.
-        indices: Which of them, by their numbers in the scene; at least one.
-        voxel: Emitters longer than this (three edges) are divided; ``None``: none is.
+        scene: The scene that holds the emitters.
+        indices: The numbers, in the scene, of the emitters to divide; at least one.
+        voxel: The three edges of a box. Emitters that are longer are divided; with ``None``, each
+            emitter is one cell.
 
     Attributes:
         count (int): Number of cells.
         emitter_index (numpy.ndarray): The number, in the scene, of each cell's emitter; [count].
-        share (numpy.ndarray): The share of its emitter's samples that falls into each cell (of its
-            area, therefore); shape [count].
-        has_smooth_meshes (bool): Has a mesh among them interpolated normals, with which Mitsuba's
-            own sampling has a wrong density?
+        share (numpy.ndarray): The share of its emitter's area, and so of its emitter's samples,
+            that each cell has; shape [count].
+        has_smooth_meshes (bool): Is there a mesh with interpolated normals among the emitters?
+            Mitsuba's own sampling of such a mesh has a wrong density.
     """
 
     def __init__(self, scene: mi.Scene, indices: list[int], voxel: mi.Vector3f | None) -> None:
-        # An emitter whose shape is gone ends the process in any scene's next call of emitters
+        # Kept alive: once the shape of an emitter is freed, the next call of the emitters of any
+        # scene ends the process
         self._scene = scene
         edges = None if voxel is None else np.array(voxel, dtype=np.float64).reshape(3)
         everything = divide(scene, edges)
@@ -52,7 +54,8 @@ class EmitterCells:
         )
         self._emitter = mi.UInt32(number.astype(np.uint32))
         self._is_divided = any(d.shape for d in divisions)
-        # The emitter itself would sample the texture, whatever part of the unit square it is given
+        # A textured emitter maps the unit square by its texture: points of its cells are sampled on
+        # its shape
         self._by_area = [
             functools.partial(_sample_by_area, shapes[i], scene.emitters()[i])
             for i, d in zip(indices, divisions) if d.is_textured
@@ -63,7 +66,7 @@ class EmitterCells:
             self._textured_number = mi.UInt32((np.cumsum(is_textured) - 1).clip(0))
         self._longest = int(sizes.max())
         self._has_groups = self._longest > 1
-        # Rounding shall not lead into the neighbour of a piece
+        # So that rounding does not move a sample into the neighbouring piece
         inset = np.minimum(2.0**-23, 0.25 * pieces[:, 2:]).T
         corner, size = pieces[:, :2].T + inset, pieces[:, 2:].T - 2 * inset
         # Corner and size of a piece side by side: one access to memory reads all four
@@ -72,7 +75,7 @@ class EmitterCells:
         if self._has_groups:
             self._last_piece = mi.UInt32((ends - 1).astype(np.uint32))
             self._first_piece = mi.UInt32((ends - sizes).astype(np.uint32))
-            # The running share of the pieces of each cell
+            # The running sum, within each cell, of the shares of its pieces
             total = np.cumsum(measure)
             below = np.concatenate([[0.0], total])[ends - sizes]
             cumulative = (total - np.repeat(below, sizes)) / np.repeat(
@@ -89,7 +92,8 @@ class EmitterCells:
         cell_counts: np.ndarray,
         sizes: np.ndarray,
     ) -> None:
-        """Tables from an emitter, found by its number in Dr.Jit's registry, to its cells."""
+        """Makes the tables that lead from an emitter, by its number in Dr.Jit's registry, to its
+        cells."""
         ids = dr.reinterpret_array(mi.UInt32, self._emitters).numpy()
         kinds = {d.shape for d in divisions}
         self._kinds = kinds
@@ -114,7 +118,7 @@ class EmitterCells:
                                  for d in divisions])
         if "mesh" not in kinds:
             return
-        # Faces are numbered over all meshes; emitters that are none have one that leads nowhere
+        # Faces are numbered over all meshes. Entries of emitters that are no meshes are not used
         face_counts = [len(d.face_first) - 1 if d.shape == "mesh" else 0 for d in divisions]
         self._first_face = by_id(np.cumsum(face_counts) - face_counts)
         self._is_mesh = by_id([d.shape == "mesh" for d in divisions])
@@ -149,8 +153,12 @@ class EmitterCells:
     def sample(
         self, cell: mi.UInt32, ref: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-        """A point on ``cell``: the direction sample, whose ``pdf`` is conditional on the cell, and
-        its radiance / pdf (visibility not tested)."""
+        """Samples a point on ``cell``.
+
+        Returns:
+            The direction sample, whose ``pdf`` is conditional on the cell, and its radiance / pdf,
+            before any visibility test.
+        """
         if self._is_divided:
             piece, x = cell, sample.x
             if self._has_groups:
@@ -158,7 +166,7 @@ class EmitterCells:
             left, bottom, width, height = dr.gather(mi.Vector4f, self._pieces, piece, active)
             sample = mi.Point2f(dr.fma(x, width, left), dr.fma(sample.y, height, bottom))
         ds, weight = self._sample_emitter(cell, ref, sample, active)
-        # Not all emitters heed the mask
+        # Some emitters return values in masked lanes
         pdf = dr.select(active, ds.pdf, 0)
         weight = dr.select(active, weight, 0)
         if self._is_divided:
@@ -175,7 +183,7 @@ class EmitterCells:
         return ds, weight
 
     def _sample_emitter(self, cell, ref, sample, active):
-        """What the cell's emitter makes of a point of the unit square."""
+        """The direction sample to which the cell's emitter maps a point of the unit square."""
         emitter = self._pointer(cell, active)
         if not self._by_area:
             return emitter.sample_direction(ref, sample, active)
@@ -183,15 +191,19 @@ class EmitterCells:
         textured = dr.gather(mi.Bool, self._is_textured, number, active)
         ds, weight = emitter.sample_direction(ref, sample, active & ~textured)
         textured &= active
-        # No calls by pointer: those ask all shapes and emitters that exist, also in other scenes,
-        # and some cannot answer (a curve has no area to sample, a directional area no value)
+        # Not by a call through a pointer: Dr.Jit would trace all shapes and emitters in memory,
+        # also those of other scenes, and some raise errors (a curve cannot be sampled by area)
         number = dr.gather(mi.UInt32, self._textured_number, number, textured)
         by_area, value = dr.switch(number, self._by_area, ref, sample, textured)
         by_area.emitter = mi.EmitterPtr(emitter)
         return dr.select(textured, by_area, ds), dr.select(textured, value, weight)
 
     def _piece(self, cell, x, active) -> tuple[mi.UInt32, mi.Float]:
-        """The piece of ``cell`` at the number ``x``, and what is left of the number."""
+        """Chooses a piece of ``cell`` by the random number ``x``.
+
+        Returns:
+            The piece, and the number rescaled to [0, 1).
+        """
         first = dr.gather(mi.UInt32, self._first_piece, cell, active)
         last = dr.gather(mi.UInt32, self._last_piece, cell, active)
         piece = first_above(self._cumulative, first, last, x, active, self._longest)
@@ -214,8 +226,8 @@ class EmitterCells:
         ds: mi.DirectionSample3f,
         active: mi.Bool,
     ) -> tuple[mi.UInt32, mi.Float]:
-        """The cell that a ray from ``ref`` ran into at ``si``, and the density, conditional on the
-        cell, with which :meth:`sample` gives that direction."""
+        """The cell that a ray from ``ref`` hit at ``si``, and the density, conditional on the cell,
+        with which :meth:`sample` would sample the ray's direction."""
         id = dr.reinterpret_array(mi.UInt32, ds.emitter)
         textured = mi.Bool(False)
         if self._by_area:
@@ -241,7 +253,7 @@ class EmitterCells:
         return cell, dr.select(share > 0, pdf / share, 0)
 
     def _grid_cell(self, id, ds, active) -> mi.UInt32:
-        """The number, within its emitter, of the cell of a rectangle, disk or cylinder."""
+        """The cell of a point on a rectangle, disk or cylinder: its number within the emitter."""
         columns = dr.gather(mi.UInt32, self._columns, id, active)
         rows = dr.gather(mi.UInt32, self._rows, id, active)
         x, y = ds.uv.x, ds.uv.y
@@ -283,7 +295,7 @@ def _sample_by_area(
     sample: mi.Point2f,
     active: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """A point of the emitter's shape, and its radiance / pdf."""
+    """Samples a point by the area of the emitter's shape; also returns its radiance / pdf."""
     ds = shape.sample_direction(ref, sample, active)
     value = emitter.eval_direction(ref, ds, active)
     return ds, dr.select(ds.pdf > 0, value / ds.pdf, 0)
@@ -303,7 +315,7 @@ def _slot(x: mi.Float, count: mi.UInt32) -> mi.UInt32:
 
 
 def _cosine_ratio(ds: mi.DirectionSample3f, n: mi.Normal3f) -> mi.Float:
-    """What turns a density that was converted with the shading normal ``ds.n`` into the true one,
-    with the geometric normal ``n``."""
+    """The factor that corrects a solid angle density that Mitsuba computed with the shading normal
+    ``ds.n`` instead of the geometric normal ``n``."""
     cosine = dr.abs(dr.dot(ds.d, n))
     return dr.select(cosine > 0, dr.abs(dr.dot(ds.d, ds.n)) / cosine, 0)

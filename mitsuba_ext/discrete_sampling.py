@@ -8,7 +8,7 @@ import mitsuba as mi
 #: The largest number below one.
 ONE_MINUS_EPSILON = 1 - 2**-24
 
-#: Fixed point of the weights in an alias table.
+#: The weight 1 in the fixed point of an alias table.
 _ONE = 2.0**32
 
 
@@ -42,9 +42,10 @@ def alias_tables(
 ) -> tuple[mi.Float, mi.UInt32]:
     """Walker's alias tables for consecutive groups of weights, all groups at once.
 
-    An entry chosen uniformly in its group keeps a random number below its threshold and gives all
-    others to its alias. Lighter entries give what they lack to the heavier ones in their order, as
-    Vose's algorithm does; here, running sums tell which (Hübschle-Schneider and Sanders 2019).
+    To sample a group, choose an entry uniformly; take it if a random number is below its threshold,
+    else take its alias. As in Vose's algorithm, an entry lighter than the mean gets a heavier one
+    as its alias, in the order of the entries. Running sums find the aliases of all entries in
+    parallel (Hübschle-Schneider and Sanders 2019).
 
     Args:
         relative: The weights of all entries, in units of the mean of their group; shape [n].
@@ -61,8 +62,8 @@ def alias_tables(
     lack = _running_sum(one - dr.minimum(relative, one), first)
     entry = dr.arange(mi.UInt32, len(relative))
     is_heavy = relative > one
-    # A light entry is served by the first heavy one that has something left. That may give more
-    # than it has: then the next heavy one serves it.
+    # The alias of a light entry is the first heavy one with some excess left. A heavy entry may
+    # give more than its excess: it then becomes a light one, with the next heavy entry as alias
     served = dr.select(is_heavy, excess, dr.gather(mi.UInt64, lack, entry - 1, entry > first))
     alias = first_above(excess, first, last, served, mi.Bool(True), longest)
     final = first_above(lack, first, last, excess, is_heavy, longest, reaches=True)

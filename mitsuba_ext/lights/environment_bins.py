@@ -1,4 +1,4 @@
-"""An environment emitter as bins of directions."""
+"""Divides the directions of an environment emitter into bins."""
 
 from __future__ import annotations
 
@@ -7,23 +7,22 @@ import mitsuba as mi
 import numpy as np
 
 from ..bounds import scene_bounds
-from .searching import ONE_MINUS_EPSILON, alias_tables
-from .spectra import brightness, some_wavelengths
+from ..discrete_sampling import ONE_MINUS_EPSILON, alias_tables
+from .spectra import brightness, comparison_wavelengths
 from .sun import SunDisk
-
-__all__ = ["EnvironmentBins", "brightness", "some_wavelengths"]
 
 #: Bins along the azimuth and along the polar angle.
 BINS = (32, 16)
 
-#: Nodes of emitters that are no maps: their features must not be smaller than the 0.35° between
-#: two of them, or be found by the emitter's own sampling. The disk of the sun is a bin of its own.
+#: Nodes (columns, rows) at which emitters that are no maps are evaluated. Features smaller than the
+#: 0.35° between two nodes are found only if the emitter's own sampling finds them. The disk of the
+#: sun is a bin of its own.
 _NODES = (1024, 513)
 
-#: Nodes where only sin θ is interpolated.
+#: Nodes of a constant emitter, for which only sin θ is interpolated.
 _CONSTANT_NODES = (64, 33)
 
-#: Samples of an emitter that is no map, among them those of its own.
+#: Samples that the own sampling of an emitter that is no map takes.
 _OWN_SAMPLES = 1 << 16
 
 #: Weight of black texels relative to the mean.
@@ -41,7 +40,7 @@ class EnvironmentBins:
     what it emits. The sun of a ``sunsky`` is one more bin, the last, cut out of the others.
 
     Parameters:
-        scene: Its environment emitter is divided.
+        scene: The scene with the environment emitter.
 
     Attributes:
         count (int): Number of bins.
@@ -55,7 +54,7 @@ class EnvironmentBins:
         self._is_map = self.emitter.class_name() == "EnvironmentMapEmitter"
         bbox = scene_bounds(scene)
         sphere = bbox.bounding_sphere() if bbox.valid() else mi.ScalarBoundingSphere3f(0.0, 1.0)
-        # Samples lie behind everything, also after rounding
+        # So that samples lie behind all shapes, also after rounding
         self._center, self._radius = mi.Point3f(sphere.center), mi.Float(1.001 * sphere.radius)
         self._to_world = mi.Transform4f(self.emitter.world_transform())
         self._to_local = self._to_world.inverse()
@@ -63,7 +62,7 @@ class EnvironmentBins:
         self._sun = SunDisk.of(self.emitter)
         if self._is_map:
             height, width = mi.traverse(self.emitter)["data"].shape[:2]
-            # Two columns are copies; the rows have their nodes at the poles, too
+            # Mitsuba adds two columns, which are copies. The first and the last row are the poles
             self._columns, self._rows = width - 2, height - 1
         else:
             is_constant = self.emitter.class_name() == "ConstantBackgroundEmitter"
@@ -80,11 +79,12 @@ class EnvironmentBins:
         index = dr.arange(mi.UInt32, columns * (rows + 1))
         row = index // columns
         u = mi.Float(index - row * columns) / columns + self._shift
-        # At the poles themselves a direction does not say which column is meant
+        # Not at the poles: a direction there belongs to no column
         v = dr.clip(mi.Float(row), 1e-2, rows - 1e-2) / rows
         value = self._brightness(mi.Point2f(u, v)).numpy().reshape(rows + 1, columns)
         if not self._is_map:
-            # Whatever lies between the nodes: what is around, and what the emitter itself prefers
+            # The largest value around each node, and what the emitter's own samples found there: so
+            # that features between the nodes are not missed
             value = np.maximum(value, self._own_samples(value.shape))
             wide = np.maximum(value, np.maximum(np.roll(value, 1, 1), np.roll(value, -1, 1)))
             padded = np.pad(wide, ((1, 1), (0, 0)), mode="edge")
@@ -100,7 +100,7 @@ class EnvironmentBins:
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(0, _OWN_SAMPLES)
         ref = dr.zeros(mi.Interaction3f, _OWN_SAMPLES)
-        ref.p, ref.wavelengths = self._center, some_wavelengths(_OWN_SAMPLES)
+        ref.p, ref.wavelengths = self._center, comparison_wavelengths(_OWN_SAMPLES)
         ds, weight = self.emitter.sample_direction(ref, sampler.next_2d())
         value = brightness(weight) * ds.pdf
         if self._sun is not None:
@@ -116,7 +116,7 @@ class EnvironmentBins:
     def _brightness(self, uv: mi.Point2f) -> mi.Float:
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(uv))
         si.wi = -(self._to_world @ self._direction(uv)[0])
-        si.wavelengths = some_wavelengths(dr.width(uv))
+        si.wavelengths = comparison_wavelengths(dr.width(uv))
         value = brightness(self.emitter.eval(si))
         counts = dr.isfinite(value)
         if self._sun is not None:
@@ -157,14 +157,15 @@ class EnvironmentBins:
         self._entries = mi.UInt32(entries.ravel())
 
     def _set_shares(self, bin_weight: np.ndarray) -> None:
-        """Also that of the sun."""
+        """Sets the share of each bin in the emitted brightness, the sun's included."""
         # From the sum over texels to the integral over the sphere
         emitted = bin_weight * 2 * np.pi**2 / (self._columns * self._rows)
         if self._sun is not None:
             n = 64
             x, y = dr.meshgrid(*2 * [(dr.arange(mi.Float, n) + 0.5) / n])
             si = dr.zeros(mi.SurfaceInteraction3f, n * n)
-            si.wi, si.wavelengths = -self._sun.sample(mi.Point2f(x, y)), some_wavelengths(n * n)
+            si.wi = -self._sun.sample(mi.Point2f(x, y))
+            si.wavelengths = comparison_wavelengths(n * n)
             value = float(dr.mean(brightness(self.emitter.eval(si)))[0])
             emitted = np.append(emitted, value * self._sun.solid_angle)
         self.count = len(emitted)
@@ -173,8 +174,12 @@ class EnvironmentBins:
     def sample(
         self, bin: mi.UInt32, ref: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-        """A direction in ``bin``, whose ``pdf`` is conditional on the bin, and its radiance / pdf
-        (visibility not tested)."""
+        """Samples a direction in ``bin``.
+
+        Returns:
+            The direction sample, whose ``pdf`` is conditional on the bin, and its radiance / pdf,
+            before any visibility test.
+        """
         if self._sun is not None:
             in_sun = bin == self.count - 1
             bin = dr.minimum(bin, self.count - 2)  # a valid one; it is not used in the sun
@@ -192,7 +197,7 @@ class EnvironmentBins:
         ds.pdf = density / sin_theta
         if self._sun is not None:
             ds.d = dr.select(in_sun, self._sun.sample(sample), ds.d)
-            # What else is sampled in the disk is lost: these directions belong to the other bin
+            # Samples of other bins in the disk get no density: these directions are the sun's bin's
             is_lost = ~in_sun & self._sun.contains(ds.d)
             ds.pdf = dr.select(in_sun, 1 / self._sun.solid_angle, dr.select(is_lost, 0, ds.pdf))
         ds.dist = 2 * dr.maximum(self._radius, dr.norm(ref.p - self._center))
@@ -203,7 +208,7 @@ class EnvironmentBins:
         ds.pdf = dr.select(active, ds.pdf, 0)
         ds.emitter = self.pointer
         if self._is_map:
-            # Does not have to find the texel again
+            # By the sample's uv, without a search for the texel
             value = self.emitter.eval_direction(ref, ds, active)
         else:
             si = dr.zeros(mi.SurfaceInteraction3f)
@@ -213,7 +218,7 @@ class EnvironmentBins:
 
     def pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Float]:
         """The bin of the world space direction ``d``, and the density, conditional on the bin, with
-        which :meth:`sample` gives it."""
+        which :meth:`sample` would sample it."""
         uv, sin_theta = self._uv(d)
         x, y = uv.x * self._columns, uv.y * self._rows
         column = dr.minimum(mi.UInt32(x), self._columns - 1)
@@ -231,16 +236,19 @@ class EnvironmentBins:
         return bin, dr.select(active, pdf, 0)
 
     def _texel(self, bin, sample, active) -> tuple[mi.UInt32, mi.Point2f]:
-        """A texel of the bin with the probability of its weight, and what is left of the sample.
+        """Chooses a texel of the bin in proportion to its weight (alias method).
 
-        Each texel of a bin is as likely as the others to be the entry that is looked up; it is
-        either taken or gives way to its alias.
+        A texel of the bin is chosen uniformly, and then is either taken or replaced by its alias.
+
+        Returns:
+            The texel, and the sample rescaled to [0, 1)².
         """
         bin_row = bin // self._bins[0]
         bin_column = bin - bin_row * self._bins[0]
         column, x, width = _entry(bin_column, self._bins[0], self._columns, sample.x)
         row, y, _height = _entry(bin_row, self._bins[1], self._rows, sample.y)
-        # What is left of a number is coarse; thresholds of dark texels beside the sun are small
+        # A rescaled number has few digits, too few for the small thresholds of dark texels beside
+        # the sun: the other coordinate supplies more of them
         x = dr.minimum(dr.fma(y, width * 2.0**-23, x), ONE_MINUS_EPSILON)
         texel = row * self._columns + column
         entry = dr.gather(mi.Vector2u, self._entries, texel, active)
@@ -251,7 +259,8 @@ class EnvironmentBins:
         return dr.select(is_taken, texel, entry.y), mi.Point2f(x, y)
 
     def _corner_values(self, texel: mi.UInt32, active: mi.Bool) -> list[mi.Float]:
-        """What is interpolated between the corners of a texel; positive."""
+        """The values at the corners of a texel, all positive; its density is interpolated between
+        them."""
         corners = dr.gather(mi.Vector4f, self._corners, texel, active)
         return [dr.select(active, corner, 1) for corner in corners]
 
@@ -271,9 +280,12 @@ class EnvironmentBins:
 
 
 def _entry(part, parts: int, count: int, x: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-    """One of the columns (or rows) of a bin, each as likely as the others, what is left of the
-    random number, and the number of columns. All ``count`` columns are divided into ``parts``; the
-    bin's are ``part``."""
+    """Chooses one of the columns (or rows) of a bin uniformly. All ``count`` columns are divided
+    into ``parts``; those of the bin are ``part``.
+
+    Returns:
+        The column, the random number rescaled to [0, 1), and the number of columns of the bin.
+    """
     first = (part * count + (parts - 1)) // parts
     width = ((part + 1) * count + (parts - 1)) // parts - first
     x = x * mi.Float(width)
