@@ -142,7 +142,7 @@ def test_time_that_cannot_be_met_is_noted(clock, tmp_path):
     slow = {"slow": noisy_integrator(clock, cost=50.0)}
     record = compare_noisy(compare.equal_time(20), slow, tmp_path)["integrators"][0]
     assert record["runs"][0]["spp"] == 1
-    assert "3 of 3 runs took another time than 20 s" in record["notes"][0]
+    assert "3 of 3 runs missed the time of 20 s" in record["notes"][0]
 
 
 def test_fireflies_are_noted(clock, tmp_path):
@@ -265,7 +265,7 @@ def test_times_without_a_common_session_give_no_ratio(clock, tmp_path, monkeypat
     (scene,) = comparison.run()["scenes"]
     ratios = scene["integrators"][1]["levels"][0]["ratios"]
     assert ratios["seconds"] is None and ratios["efficiency"] is None and ratios["relmse"]
-    assert "second and first have no times of one session" in scene["warnings"][1]
+    assert "second and first have no times of a common session" in scene["warnings"][1]
     assert len(scene["integrators"][1]["runs"]) == 2
 
 
