@@ -1,4 +1,5 @@
-# Needs: Debian or Ubuntu (others: see mitsuba_ext/llvm.py), make, apt, Python >= 3.9 with venv.
+# Needs: Debian or Ubuntu, make, apt, Python >= 3.9 with venv. (On other systems, install an LLVM
+# library by hand: mitsuba_ext/llvm.py says which ones work.)
 #
 #   make demo    compares our integrator with `path` on two of our scenes, in about three minutes
 #   make test    runs the default tests, on all cores
@@ -42,7 +43,7 @@ lint: setup
 
 # The package in its environment, and an LLVM library that works (a few milliseconds to confirm).
 setup: $(VENV)/.installed
-	@$(BIN)/python -I mitsuba_ext/llvm.py --ensure
+	@$(BIN)/python -I -m mitsuba_ext.llvm_install --ensure
 
 $(VENV)/.installed: pyproject.toml setup.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 9))' || \
