@@ -20,7 +20,7 @@ from conftest import PATH
 from mitsuba_ext.cli.stopping import Stop, stopping
 from mitsuba_ext.compare import images, load_scene, read_exr, write_exr
 from mitsuba_ext.rendering import interrupts, seed_passes
-from mitsuba_ext.rendering.render import render as rendering
+from mitsuba_ext.rendering import render as rendering
 from mitsuba_ext.scene_remarks import scene_remarks
 
 
@@ -65,7 +65,7 @@ def test_first_render_says_that_it_compiles(run, make_scene, tmp_path, monkeypat
         monkeypatch.setattr(command, "kernels_compiled", lambda steps=steps: next(steps))
         code, out, err = run("render", make_scene(), "-o", tmp_path / "a.exr")
         assert code == 0 and err.startswith("compiling kernels") == before
-        assert ("kernels were compiled" in out) == after
+        assert ("compiled kernels" in out) == after
 
 
 def test_misspelt_integrator_gets_a_suggestion(run, make_scene, tmp_path):

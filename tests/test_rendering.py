@@ -10,8 +10,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.rendering.render import Stage, interrupts, time_budget
-from mitsuba_ext.rendering.render import render as rendering
+from mitsuba_ext.rendering import interrupts, time_budget
+from mitsuba_ext.rendering import render as rendering
+from mitsuba_ext.rendering.render import Stage
 from mitsuba_ext.transport.walk import PathSample
 
 pytestmark = pytest.mark.usefixtures("variant")
