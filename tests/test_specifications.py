@@ -1,4 +1,4 @@
-"""Integrators as they are named, and the depth that they take over from a scene."""
+"""Integrators made from specifications, and the depth that they inherit from a scene."""
 
 from __future__ import annotations
 
