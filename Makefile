@@ -1,14 +1,15 @@
-# Needs: Debian or Ubuntu (others: see mitsuba_ext/llvm.py), make, apt, Python >= 3.9 with venv.
+# Needs: Debian or Ubuntu, make, apt, Python >= 3.9 with venv. (On other systems, install an LLVM
+# library by hand: mitsuba_ext/llvm.py says which ones work.)
 #
 #   make demo    compares our integrator with `path` on two of our scenes, in about three minutes
 #   make test    runs the default tests, on all cores
-#   make test-slow  runs the long statistics, and what else takes long
-#   make bench   runs the benchmarks on our scenes, and on ../shared/scenes where it exists; writes a
+#   make test-slow  runs the long statistical tests, and other slow tests
+#   make bench   runs the benchmarks on our scenes, and on ../shared/scenes if it exists; writes a
 #                report, and the figures of the README
 #   make lint    checks the code's style
-#   make clean   removes what was built, `.venv` included; `out/` stays
+#   make clean   removes everything that was built, `.venv` included, but not `out/`
 #
-# The first of them sets everything up in `.venv`; later ones start at once.
+# The first of these commands sets everything up in `.venv`; later ones start at once.
 
 PYTHON ?= python3
 VENV   := .venv
@@ -18,8 +19,8 @@ DEMO_OUT := out/demo
 DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml scenes/rooms.xml path neepp \
         --sweep 4,16,64 --seeds 3 --reference-spp 1024 --out $(DEMO_OUT)
 
-# A process for each core (memory: 1 GiB each), each with one thread of Dr.Jit; what one has not begun
-# another takes over.
+# One process per core (1 GiB of memory each), each with one thread of Dr.Jit. A process that is done
+# takes over tests that others have not begun.
 PYTEST := $(BIN)/python -m pytest -q -n logical --maxprocesses 8 --dist worksteal
 
 .PHONY: demo test test-slow bench lint setup clean
@@ -40,9 +41,9 @@ bench: setup
 lint: setup
 	$(BIN)/python -m ruff check .
 
-# The package in its environment, and an LLVM library that works (a few milliseconds to confirm).
+# The package in its environment, and an LLVM library that works (to check this takes milliseconds).
 setup: $(VENV)/.installed
-	@$(BIN)/python -I mitsuba_ext/llvm.py --ensure
+	@$(BIN)/python -I -m mitsuba_ext.llvm_install --ensure
 
 $(VENV)/.installed: pyproject.toml setup.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 9))' || \

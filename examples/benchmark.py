@@ -1,8 +1,8 @@
 """Speed against error of our integrators and ``path``, on our scenes and on those of the papers.
 
 ``make bench`` runs all of it (about 20 minutes on two cores), writes one report, and puts its
-figures into the README; ``examples/benchmark.py open kitchen`` runs some scenes, and leaves the
-README alone. What ``out/benchmark`` holds already is not rendered again.
+figures into the README; ``examples/benchmark.py open kitchen`` runs some scenes, and does not
+change the README. Runs that ``out/benchmark`` holds are not rendered again.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import mitsuba as mi  # isort: skip
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "scenes"
 
-#: ``path``, the strongest selection of lights that learns nothing, learned selection with
-#: rejection, and path guiding.
+#: ``path``, the strongest light selection without learning, learned light selection, and path
+#: guiding.
 INTEGRATORS = {
     "path": "path",
     "spatial": "composed_path:next_event=spatial",
@@ -33,7 +33,7 @@ INTEGRATORS = {
 #: Our scenes, at their own size.
 OURS = ("door_ajar", "rooms", "window", "open", "cornell_box", "mirrors_and_glass", "sunny_gloss")
 
-#: Scenes of the papers → size of their stored reference.
+#: Scenes of the papers, with the size of their stored reference.
 THEIRS = {
     "veach-ajar": (320, 180),
     "kitchen": (320, 180),
@@ -45,7 +45,7 @@ THEIRS = {
     "living-room": (320, 180),
 }
 
-#: Depth of the stored references, and of everything that is compared with them.
+#: Maximum depth of the stored references, and of all integrators.
 DEPTH = {"max_depth": 6}
 
 README = ROOT / "README.md"
@@ -53,7 +53,7 @@ FIGURE = ROOT / "examples" / "figures" / "efficiency.svg"
 
 
 def _with_interval(value: float, low: float | None, high: float | None, **_: Any) -> str:
-    """There is no interval where the runs of two integrators were not made in turns."""
+    """The interval is unknown if two integrators have no times of a common session."""
     return f"{value:.2f}" if low is None else f"{value:.2f} [{low:.2f}, {high:.2f}]"
 
 

@@ -1,4 +1,4 @@
-"""Ten lines: integrators compared on a scene, as tables and as a report.
+"""Ten lines: compare integrators on a scene, with tables and a report.
 
 ``.venv/bin/python examples/compare.py`` (a minute) writes to ``out/example`` in the current folder.
 """

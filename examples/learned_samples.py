@@ -2,7 +2,7 @@
 
 ``.venv/bin/python examples/learned_samples.py scenes/door_ajar.xml 200 150`` writes
 ``learned_samples.png``: the density of the primary samples of the first bounce, and the directions
-that the surface's BSDF makes of such samples, seen from above its normal.
+that the surface's BSDF samples with them, projected along the normal.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
-#: Cells of the picture of a density, and directions that are drawn.
+#: Resolution of the plot of a density, and number of plotted directions.
 RESOLUTION, DIRECTIONS = 64, 4096
 
 
@@ -30,13 +30,13 @@ RESOLUTION, DIRECTIONS = 64, 4096
 @click.option("--spp", default=64, show_default=True, help="Samples per pixel of the render.")
 @click.option("--out", type=click.Path(path_type=Path), default="learned_samples.png")
 def main(scene: Path, x: int, y: int, regions: str, spp: int, out: Path) -> None:
-    """Renders SCENE and shows what was learned for the pixel X, Y."""
+    """Renders SCENE and plots the learned density for the pixel X, Y."""
     mi.set_variant("llvm_ad_rgb")
     loaded = mi.load_file(str(scene))
     integrator = mi.load_dict({"type": "pss_guided", "regions": regions, "max_depth": 6})
     image = mi.render(loaded, integrator=integrator, spp=spp)
     print(integrator.statistics.learned)
-    print(f"{integrator.statistics.zero_radiance:.1%} of the paths brought nothing")
+    print(f"{integrator.statistics.zero_radiance:.1%} of the paths had zero radiance")
     guide = integrator.guide
     if guide is None:
         raise click.ClickException("nothing is guided in this scene")
@@ -54,7 +54,7 @@ def main(scene: Path, x: int, y: int, regions: str, spp: int, out: Path) -> None
     u, v = dr.meshgrid(cell, cell)
     density = guide.density(si, pixel, mi.Point2f(u, v)).numpy().reshape(RESOLUTION, RESOLUTION)
 
-    # Samples with that density: uniform ones, kept with a probability
+    # Samples of that density, by rejection sampling
     random = np.random.default_rng(0)
     tried = mi.Point2f(random.random((2, 64 * DIRECTIONS), np.float32))
     probability = guide.density(si, pixel, tried).numpy() / density.max()

@@ -12,7 +12,7 @@ import mitsuba as mi  # isort: skip
 
 SCENES = Path(__file__).parents[1] / "scenes"
 
-#: Scene → samples per pixel for a clean picture.
+#: Samples per pixel for a clean picture of each scene.
 PICTURES = {
     "door_ajar": 2048,
     "rooms": 2048,
@@ -28,7 +28,7 @@ PICTURES = {
     "flint": 1024,
 }
 
-#: These need wavelengths.
+#: Scenes that need a spectral variant.
 SPECTRAL = {"flint"}
 
 

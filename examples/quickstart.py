@@ -1,11 +1,11 @@
-"""Ten lines: a scene, an integrator of ours, an image and what it cost.
+"""Ten lines: render a scene with an integrator of ours, and print the cost.
 
 ``.venv/bin/python examples/quickstart.py`` writes ``door_ajar.exr`` to the current folder.
 """
 
 from pathlib import Path
 
-import mitsuba_ext  # registers the plugins; before mitsuba, so that it can choose the LLVM library
+import mitsuba_ext  # registers the plugins; import it before mitsuba: it chooses the LLVM library
 
 import mitsuba as mi  # isort: skip
 

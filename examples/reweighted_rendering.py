@@ -1,8 +1,8 @@
-"""Patterns and weights of the samples of lights, lens, time and wavelengths, on scenes.
+"""Measures patterns and weights of light, lens, time and wavelength samples on scenes.
 
 ``examples/reweighted_rendering.py direct`` (or ``lens``, ``time``, ``wavelength``) prints, for each
 scene, the error and the time of all patterns and weights, and of the path tracer with Mitsuba's
-samplers (five minutes per scene); it plots the former to ``examples/figures``.
+samplers (five minutes per scene). It plots the gains to ``examples/figures``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FIGURES = ROOT / "examples" / "figures"
 
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
 
-#: Of each technique; those of the papers are left out where they are missing.
+#: Scenes for each technique; those of the papers are skipped if they are missing.
 SCENES: dict[str, dict[str, Path]] = {
     "direct": {
         "open": ROOT / "scenes" / "open.xml",
@@ -40,7 +40,7 @@ SCENES: dict[str, dict[str, Path]] = {
     "wavelength": {n: ROOT / "scenes" / f"{n}.xml" for n in ("prism", "flint")},
 }
 
-#: What is compared with: moving shapes and dispersion are seen by integrators of ours only.
+#: Integrators to compare with: only ours render moving shapes and dispersion.
 PATH = {"direct": "path", "lens": "path", "time": "composed_path", "wavelength": "composed_path"}
 
 _DIRECT = [("independent", "none"), ("hammersley", "none"), ("hammersley", "unbiased")]
@@ -80,8 +80,8 @@ def errors(images: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
 def direct(
     scene: mi.Scene, count: int, seeds: range
 ) -> dict[tuple[str, str], tuple[float, float]]:
-    """Pattern, weights → errors of direct light. All see the same camera rays, so that nothing but
-    the light samples differs from the reference."""
+    """The errors of direct light for each pattern and weights. All renders and the reference use
+    the same camera rays, so that only the light samples differ."""
 
     def integrator(pattern: str, weights: str, light_samples: int) -> dict[str, Any]:
         return {"type": "reweighted_direct", "max_depth": 2, "light_samples": light_samples,
@@ -104,13 +104,13 @@ def reweighted(kind: str, pattern: str, weights: str, count: int) -> dict[str, A
 def compare(
     kind: str, file: Path, count: int, seeds: range, reference: np.ndarray
 ) -> dict[str, tuple[float, float, float]]:
-    """What is rendered with → relMSE and MSE of the whole image, and the median time of one,
-    compilation excluded. They take turns."""
+    """For each integrator and sampler, relMSE and MSE of the whole image, and the median time
+    without compilation. They take turns."""
     path, is_direct = path_of(kind), kind == "direct"
     spp = 4 * count if is_direct else count
     jobs = {f"path, {name}": (load(file, name), mi.load_dict(path), spp) for name in SAMPLERS}
     scene = load(file)
-    # Of the whole image, direct light is a small part of the error, whatever its patterns
+    # A few patterns are enough for the whole image: light samples are a small part of its error
     for pattern, weights in _DIRECT if is_direct else combinations(kind):
         integrator = mi.load_dict(reweighted(kind, pattern, weights, count))
         jobs[f"{pattern}, {weights}"] = scene, integrator, 4 if is_direct else count
@@ -134,7 +134,7 @@ def path_of(kind: str) -> dict[str, Any]:
 
 
 def combinations(kind: str) -> list[tuple[str, str]]:
-    """All patterns with all weights that the technique knows."""
+    """All patterns with all weights that the technique accepts."""
     weights = [w for w in WEIGHTS if not (kind == "wavelength" and w == "unbiased")]
     return list(itertools.product(PATTERNS, weights))
 
@@ -145,7 +145,7 @@ def combinations(kind: str) -> list[tuple[str, str]]:
 @click.option("--samples", "counts", default=[16, 64, 256], multiple=True, show_default=True)
 @click.option("--seeds", default=3, show_default=True)
 def main(kind: str, names: tuple[str, ...], counts: tuple[int, ...], seeds: int) -> None:
-    """Compares patterns and weights on the scenes NAMES (all that there are, if none is given)."""
+    """Compares patterns and weights on the scenes NAMES (all, if none is given)."""
     mi.set_variant("llvm_ad_spectral" if kind == "wavelength" else "llvm_ad_rgb")
     scenes = {n: f for n, f in SCENES[kind].items() if f.exists() and (not names or n in names)}
     gains: dict[str, dict[int, dict[str, float]]] = {}
@@ -156,8 +156,8 @@ def main(kind: str, names: tuple[str, ...], counts: tuple[int, ...], seeds: int)
             table = compare(kind, file, count, range(seeds), reference)
             error_0, mse_0, seconds_0 = table["path, independent"]
             click.echo(
-                f"\n{name}, {count} samples: relMSE; gain beside path in relMSE and MSE, time, "
-                f"efficiency"
+                f"\n{name}, {count} samples: relMSE; relative to path: gain in relMSE and in MSE, "
+                f"time, efficiency"
             )
             for label, (error, mse, seconds) in table.items():
                 click.echo(
@@ -170,7 +170,7 @@ def main(kind: str, names: tuple[str, ...], counts: tuple[int, ...], seeds: int)
                 plain = alone["independent", "none"]
                 click.echo(
                     f"{name}, {count} light samples: gain over independent ones in relMSE and MSE, "
-                    f"alone"
+                    f"with the same camera rays"
                 )
                 for label, found in alone.items():
                     ratios = [p / e for p, e in zip(plain, found)]

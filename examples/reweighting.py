@@ -1,9 +1,9 @@
-"""Weighted points against their rivals on integrals whose value is known.
+"""Compares weighted points with other estimators on integrals whose value is known.
 
 The plots follow Figs. 4.2 to 4.4 of Guo's PhD thesis: its function of one variable, a picture,
 other functions, densities that are not uniform, and batches. ``examples/reweighting.py`` writes
-them to ``examples/figures``, and tables to the terminal (about three minutes); ``--bias`` instead
-measures how many standard errors those from independent points are off (half an hour).
+them to ``examples/figures``, and prints tables (about three minutes). With ``--bias``, it measures
+instead by how many standard errors the estimators from independent points are off (half an hour).
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ _PICTURE = picture()
 
 
 def picture_function(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The nearest pixel."""
+    """The value of the nearest pixel."""
     size = len(_PICTURE)
     row, column = (np.minimum((u * size).astype(int), size - 1) for u in (y, x))
     return _PICTURE[row, column]
@@ -100,7 +100,7 @@ SQUARE: dict[str, tuple[Callable, float]] = {
     "disk": (lambda x, y: (x**2 + y**2 < 0.8).astype(float), np.pi * 0.2),
 }
 
-# ---- Estimators: points, weights, and what else there is to add ----
+# ---- Estimators: points and their weights ----
 
 Sets = Iterator[tuple[str, np.ndarray, np.ndarray]]
 
@@ -144,7 +144,7 @@ def square_sets(count: int, rng: np.random.Generator) -> Sets:
 
 
 def unbiased_line_sets(count: int, rng: np.random.Generator) -> Sets:
-    """Those that weigh points and claim to have no bias."""
+    """(name, points, weights) of the weighted estimators of one variable that are unbiased."""
     x = points("independent", count, 1, rng)[:, 0]
     yield "independent, unbiased", x, unbiased_weights(x)
     torus = voronoi_weights(x)
@@ -169,7 +169,7 @@ def errors(
     counts: list[int],
     repetitions: int,
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Function → estimator → errors, of shape (counts, repetitions)."""
+    """For each function and each estimator, the errors, of shape (counts, repetitions)."""
     result: dict[str, dict[str, np.ndarray]] = {name: {} for name in functions}
     for row, count in enumerate(counts):
         rng = np.random.default_rng(count)
@@ -188,8 +188,8 @@ def errors(
 
 
 def report(title: str, tables: dict[str, dict[str, np.ndarray]], counts: list[int]) -> None:
-    """Prints, of each function, the slope of the MSE over the last three quarters of the counts,
-    and how many times fewer samples than plain Monte Carlo have the same error."""
+    """Prints, for each function and estimator, the MSE, its slope over the last three quarters of
+    the counts, and by which factor fewer samples than with plain Monte Carlo have the same MSE."""
     for name, estimators in tables.items():
         plain = np.mean(estimators["independent"] ** 2, axis=1) * counts
         click.echo(f"\n{title}, {name}: MSE at N = {counts[-1]}, slope, samples saved")
@@ -215,7 +215,7 @@ def plot(title: str, tables: dict[str, dict[str, np.ndarray]], counts: list[int]
             panel.loglog(counts, np.mean(table**2, axis=1), style, c=f"C{index % 10}",
                          lw=1 + index // 10, label=estimator)  # fmt: skip
         panel.set(title=name, xlabel="N", ylabel="MSE")
-        # Below that, it is rounding
+        # Smaller errors are rounding errors
         panel.set_ylim(bottom=max(1e-20, panel.get_ylim()[0]))
     figure.tight_layout()
     handles, labels = axes.flat[0].get_legend_handles_labels()
@@ -257,8 +257,8 @@ def densities(counts: list[int], repetitions: int) -> dict[str, dict[str, np.nda
 
 
 def batches(total: int, sizes: list[int], repetitions: int) -> dict[str, dict[str, np.ndarray]]:
-    """Fig. 4.3 (b): the same number of samples in batches of several sizes; the mean of what they
-    estimate. What is biased does not profit from many."""
+    """Fig. 4.3 (b): errors of the mean over batches, for the same number of samples in batches of
+    several sizes. With biased estimators, many small batches do not reduce the error."""
     f, integral = LINE["exp"]
     result: dict[str, np.ndarray] = {}
     for (row, size), column in itertools.product(enumerate(sizes), range(repetitions)):
@@ -274,7 +274,7 @@ def batches(total: int, sizes: list[int], repetitions: int) -> dict[str, dict[st
 
 
 def bias(repetitions: int) -> None:
-    """Prints by how many standard errors estimators that claim to be unbiased are off."""
+    """Prints by how many standard errors the means of the unbiased estimators are off."""
     parts = (("line", unbiased_line_sets, LINE), ("square", unbiased_square_sets, SQUARE))
     for title, make, functions in parts:
         worst: dict[str, float] = {}
@@ -283,7 +283,7 @@ def bias(repetitions: int) -> None:
                 for estimator, table in estimators.items():
                     e = table[0]
                     spread = e.std(ddof=1) / np.sqrt(len(e))
-                    # Without any noise there is rounding only
+                    # Without noise, the error is a rounding error
                     z = abs(e.mean()) / spread if spread > 1e-15 else 0.0
                     worst[estimator] = max(z, worst.get(estimator, 0.0))
                     click.echo(f"{title} {name:8s} N = {count:4d} {estimator:32s} {z:7.1f}")
@@ -294,7 +294,7 @@ def bias(repetitions: int) -> None:
 
 @click.command()
 @click.option("--repetitions", default=100, show_default=True)
-@click.option("--bias", "only_bias", is_flag=True, help="Measure bias: 1000 times as often.")
+@click.option("--bias", "only_bias", is_flag=True, help="Measure bias (1000 times as many runs).")
 def main(repetitions: int, only_bias: bool) -> None:
     """Compares estimators of integrals."""
     if only_bias:

@@ -14,9 +14,9 @@ class ReweightedLens(ReweightedCamera):
     Reweighted lens samples (:monosp:`reweighted_lens`)
     ---------------------------------------------------
 
-    Renders depth of field with the nested integrator, but takes the points of the aperture from
-    well distributed sets, which can be weighed by the cells of the points. Each pixel has one set
-    for all of its samples, chosen and moved at random.
+    Renders depth of field with the nested integrator, but takes the points on the aperture from
+    well distributed point sets. Each sample can be weighted by the Voronoi cell of its point. Each
+    pixel uses one set for all of its samples, chosen and shifted at random.
 
     .. pluginparameters::
 
@@ -28,33 +28,33 @@ class ReweightedLens(ReweightedCamera):
          :monosp:`mitsuba_ext.pointsets.points`. (Default: lattice)
      * - weights
        - |string|
-       - How they are weighed: :monosp:`none` (all alike), :monosp:`torus` (by the areas of periodic
-         Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points that are folded,
-         so that opposite edges need not be alike), or :monosp:`voronoi` (by cells that end at the
+       - Weights of the points: :monosp:`none` (all equal), :monosp:`torus` (areas of periodic
+         Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points mapped by 1 - |2u - 1|,
+         which removes discontinuities at the border), or :monosp:`voronoi` (cells that end at the
          border, as in the thesis: slightly biased). (Default: none)
      * - timeout
        - |float|
-       - Seconds after which to stop, 0 or less for no limit. Sets, which then have at most 64
-         points, are kept whole. (Default: -1)
+       - Seconds after which to stop, 0 or less for no limit. With a limit, sets have at most 64
+         points, and the render ends after a whole set. (Default: -1)
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
          :monosp:`path`, :monosp:`volpath` or one of ours.
 
-    **Use it when** the noise is that of defocus: bright or detailed things far from the focal
-    plane. **Not when** it is that of the light on them; samples of the lens change nothing about
-    that. Without an aperture (a :monosp:`perspective` sensor), the nested integrator goes on
-    alone, and a warning says so.
+    **Use it when** the noise comes from defocus: bright or detailed objects far from the focal
+    plane. **Not when** it comes from the lighting of these objects, which lens samples do not
+    improve. For a sensor without an aperture (such as :monosp:`perspective`), the nested integrator
+    renders as usual, with a warning.
 
-    Sets have as many points as a pixel has samples, at most 1024 (then there are several for
-    each pixel). There are 32 sets (2 of :monosp:`poisson_disk`); with :monosp:`voronoi` weights
-    they are not moved. The weights concern all channels, alpha and AOVs too. Other dimensions
-    of a sample are those of the sensor's sampler. An integrator of ours that is nested learns
-    as it does alone; its own timeout is ignored. Inside of :monosp:`moment`, nothing is
-    reweighted. Gradients are not supported (use :monosp:`prb`).
+    Sets have as many points as a pixel has samples, at most 1024 (with more samples, a pixel uses
+    several sets). There are at most 32 sets (2 of :monosp:`poisson_disk`); with :monosp:`voronoi`
+    weights they are not shifted. The weights apply to all channels, including alpha and AOVs. The
+    sensor's sampler provides the other dimensions of a sample. A nested integrator of this package
+    learns as usual; its own timeout is ignored. Inside of :monosp:`moment`, nothing is reweighted.
+    Gradients are not supported (use :monosp:`prb`).
 
-    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.3; periodic cells, and that they
-    are unbiased, are ours.
+    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.3. Periodic cells, and the fact
+    that they are unbiased, are our addition.
 
     .. tabs::
         .. code-tab:: xml

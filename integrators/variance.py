@@ -22,8 +22,8 @@ _PREFIX = "variance."
 _MOST_BATCHES = 1 << 16
 
 
-# Not a SamplingIntegrator: "aov" and "moment" draw single samples from those that they nest, and
-# refuse any other when the scene is loaded.
+# Not a SamplingIntegrator: "aov" and "moment" call sample() of nested integrators, which this one
+# lacks. So they refuse it when the scene is loaded.
 @registry.plugin
 class Variance(mi.AdjointIntegrator):
     r"""
@@ -47,40 +47,40 @@ class Variance(mi.AdjointIntegrator):
        - The integrator to render with, exactly one. It may be any that renders an image.
 
     **Use it when** you need error bars, a noise map for a denoiser, or weights for comparing
-    images, of an integrator that Mitsuba's :monosp:`moment` cannot take, such as :monosp:`ptracer`
-    or one that learns. **Not when** the nested integrator profits from one long render: learning
-    begins anew in each batch (with a sixteenth of the samples, at the defaults), and a sampler is
-    stratified in each batch only. Otherwise the cost is that of the nested integrator, plus
-    reading each batch back: choose batches of some samples per pixel.
+    images, and the integrator does not work with Mitsuba's :monosp:`moment`, such as
+    :monosp:`ptracer` or one that learns. **Not when** the nested integrator profits from one long
+    render: it learns anew in each batch (with a sixteenth of the samples, at the defaults), and a
+    structured sampler stratifies the samples of each batch only. Otherwise the cost is that of the
+    nested integrator, plus reading each batch back: choose batches of several samples per pixel.
 
-    **What the numbers say.** The variance is that of the image: of the mean of all samples, not of
-    one sample (for an independent sampler and the box filter, that is variance · spp). A variance
-    that is estimated from n batches has itself a relative standard error of about √(2 / (n - 1)):
-    37 % from 16 batches, 13 % from 128; more where the noise has heavy tails. Average it over
-    pixels before relying on it. With a reconstruction filter wider than a pixel, the errors of
-    neighbouring pixels depend on each other: the variance of a mean over pixels is then larger
-    than the sum of their variances says. Each batch divides by the filter weights of its own
-    samples. This shifts pixels at an edge, with one sample per batch by up to 1 % of its contrast,
-    with four by a quarter of that; filters with negative lobes, such as :monosp:`lanczos`, need
-    four at least; the box filter is exact.
+    **Meaning of the variance.** It is the variance of the image, which is the mean of all samples,
+    not that of one sample (for an independent sampler and the box filter, that is variance · spp).
+    A variance that is estimated from n batches has itself a relative standard error of about
+    √(2 / (n - 1)): 37 % from 16 batches, 13 % from 128; more where the noise has heavy tails.
+    Average it over pixels before relying on it. With a reconstruction filter wider than a pixel,
+    the errors of neighbouring pixels are correlated: a mean over pixels then has more variance than
+    independent pixels would give it. Each batch divides by the filter weights of its own samples.
+    This biases pixels at an edge, with one sample per batch by up to 1 % of its contrast, with four
+    by a quarter of that. Filters with negative lobes, such as :monosp:`lanczos`, need at least four
+    samples per batch; the box filter has no bias.
 
     **Samples.** Each batch takes spp / batches samples per pixel, rounded up (by stratified
-    samplers to a number that they can take), and as many batches are rendered as it takes to reach
-    spp, at least 2. So there can be fewer batches than asked for, and the excess is less than one
-    batch where there are more than two. At least 2 samples per pixel are needed. A
-    :monosp:`timeout` of the nested integrator is one for each batch.
+    samplers to a number that they support). It renders at least 2 batches, and as many as are
+    needed to reach spp. So there can be fewer batches than requested; with more than two, the
+    excess is less than one batch. At least 2 samples per pixel are needed. A :monosp:`timeout` of
+    the nested integrator applies to each batch.
 
     **Channels.** Names follow the film: for the pixel format :monosp:`luminance` and in monochrome
     variants there is only :monosp:`variance.Y`, for :monosp:`xyz` there are :monosp:`variance.X`,
-    :monosp:`variance.Y` and :monosp:`variance.Z`; alpha has none. AOVs of the nested integrator
-    are passed on before them, as means. Set the film's :monosp:`component_format` to
-    :monosp:`float32`: variances below 6e-8 do not survive the default, half precision, in a file
-    that :monosp:`film.write` makes.
+    :monosp:`variance.Y` and :monosp:`variance.Z`. Alpha has no variance channel. The means of the
+    nested integrator's AOVs come before these channels. Set the film's :monosp:`component_format`
+    to :monosp:`float32`: in files of :monosp:`film.write`, the default half precision rounds
+    variances below 6e-8 to zero.
 
     Ctrl-C, and :monosp:`cancel()` after the running batch, keep the image of the finished batches
-    (after a single one, its variance is NaN: unknown). :monosp:`progress` is called after each
-    batch; :monosp:`nested` is the integrator inside. :monosp:`statistics` adds up those of the
-    batches where the nested integrator keeps some. Gradients are not supported, nor are
+    (after a single batch, the variance is NaN: unknown). :monosp:`progress` is called after each
+    batch; :monosp:`nested` is the nested integrator. :monosp:`statistics` is the sum over the
+    batches if the nested integrator has statistics. Gradients are not supported, nor are
     :monosp:`specfilm`, and scalar and polarized variants. It cannot be nested in :monosp:`aov` or
     :monosp:`moment`; nest those in it.
 
@@ -111,7 +111,7 @@ class Variance(mi.AdjointIntegrator):
     sees_motion = True
 
     def __init__(self, props: mi.Properties) -> None:
-        # Nothing for the base class to read: what it would accept has no effect here
+        # Without properties, because those of the base class would have no effect here
         super().__init__(mi.Properties(props.plugin_name()))
         self.name = props.plugin_name()
         self.batch_count = read_parameter(
@@ -133,7 +133,7 @@ class Variance(mi.AdjointIntegrator):
             raise ValueError(
                 f'"{self.name}": exactly one integrator must be nested in it; found {found}'
             )
-        # Not by name: once another variant is selected, the module's name is that one's class
+        # type(self) and not ``Variance``, which is another class once another variant is selected
         if isinstance(children[0], type(self)):
             raise ValueError(f'"{self.name}": cannot be nested in another "{self.name}"')
         taken = {_PREFIX + color for color in "RGBXYZ"} & set(children[0].aov_names())
@@ -167,7 +167,7 @@ class Variance(mi.AdjointIntegrator):
                 if self.is_cancelled:
                     break
         finally:
-            # Also after an exception, the film holds the batches that were finished
+            # Also after an exception, the film gets the mean of the finished batches
             if batches is not None:
                 self._fill(film, batches)
             self.statistics.interrupted = batches is None or batches.count < batch_count
@@ -175,7 +175,8 @@ class Variance(mi.AdjointIntegrator):
         return develop_film(film, develop, evaluate)
 
     def aov_names(self) -> list[str]:
-        """Of the last render; before the first, of a film that takes RGB (or is monochrome)."""
+        """The names for the film of the last render; before the first, for an RGB (or monochrome)
+        film."""
         return self._aov_names
 
     def cancel(self) -> None:
@@ -209,7 +210,7 @@ class Variance(mi.AdjointIntegrator):
         return max(2, -(-spp // batch_spp)), batch_spp
 
     def _fill(self, film: mi.Film, batches: Batches) -> None:
-        """Makes the film hold mean and variance as if it had been rendered to."""
+        """Fills the film with mean and variance."""
         base = batches.image_channel_count
         names, aovs = list(batches.channels[:base]), list(batches.channels[base:])
         has_alpha = names[-1] == "A"
@@ -254,8 +255,8 @@ class Variance(mi.AdjointIntegrator):
 
 
 def _as_rgb(image: np.ndarray, colors: list[str]) -> np.ndarray:
-    """What the film has to store, so that it develops ``image``: it stores RGB, whatever it is
-    going to make of that."""
+    """The RGB values from which the film develops ``image``. A film stores RGB, and converts it to
+    its pixel format when it is developed."""
     if colors == ["R", "G", "B"]:
         return image
     if colors == ["Y"]:

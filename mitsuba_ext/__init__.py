@@ -17,7 +17,7 @@ __version__ = "0.1.0"
 
 __all__ = ["__version__"]
 
-# The folders of plugins are part of an installed package. In a source tree they are beside it.
+# An installed package contains the folders of plugins. In the source tree they are beside it.
 _folder = Path(__file__).parent
 if not (_folder / "integrators").is_dir():
     if not (_folder.parent / "integrators").is_dir():

@@ -1,6 +1,6 @@
 """What ``mitsuba-ext doctor`` prints: versions, hardware, LLVM, plugins, and tiny renders.
 
-Each part stands alone: one that fails prints why, and the others follow. The renders happen in
+Each part is independent: one that fails prints why, and the others follow. The renders run in
 another process, because an unusable backend ends its process without an exception.
 """
 
@@ -55,7 +55,7 @@ def main(variant: str | None = None) -> int:
             for line in part():
                 healthy &= not line.startswith("!")
                 print("  " + line, flush=True)
-        except Exception as error:  # the report goes on, whatever a part runs into
+        except Exception as error:  # a part may raise anything; the others follow
             healthy = False
             print(f"  ! {type(error).__name__}: {error}", flush=True)
     print("Everything works." if healthy else "Lines that start with ! need attention.")
@@ -146,7 +146,7 @@ def _plugins() -> Iterator[str]:
 
 
 def _renders(variant: str) -> Iterator[str]:
-    """One line per integrator; a new process for those that follow one which ended its process."""
+    """One line per integrator. After one that ends its process, a new process goes on."""
     from .registry import plugin_names
 
     runtime.check(variant)
@@ -172,7 +172,7 @@ def _line(result: dict) -> str:
 
 
 def _render_elsewhere(variant: str, names: list[str], timeout: float) -> list[dict]:
-    """Results for the first one or more of ``names``, in their order."""
+    """Results for ``names`` in their order, up to the first integrator that ends the process."""
     command = python_command("mitsuba_ext.doctor", variant, *names)
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
         try:
@@ -202,7 +202,7 @@ def _render_here(variant: str, names: list[str]) -> None:
     import numpy as np
 
     mi.set_variant(variant)
-    mi.set_log_level(mi.LogLevel.Error)  # "… reweights nothing", and stdout is for the results
+    mi.set_log_level(mi.LogLevel.Error)  # stdout is for the results, not for warnings
     description = mi.cornell_box()
     description["sensor"]["film"].update(width=32, height=32)
     scene = mi.load_dict(description)
@@ -228,8 +228,8 @@ def _render_here(variant: str, names: list[str]) -> None:
 
 
 def _make(name: str) -> tuple[str, mi.Integrator]:
-    """The integrator with default parameters, and what to call it. What does not work alone is
-    tried around another one."""
+    """A label and the integrator with default parameters. One that needs a nested integrator gets
+    ``composed_path``."""
     import mitsuba as mi
 
     manager = mi.PluginManager.instance()

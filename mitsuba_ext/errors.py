@@ -1,11 +1,11 @@
-"""Errors whose message is all that a user of the command line needs: one sentence, no traceback."""
+"""Errors that the command line shows as one sentence, without a traceback."""
 
 from __future__ import annotations
 
 
 class InputError(ValueError):
-    """Something that the user gave cannot be used. The message is one line: what, and where."""
+    """An input of the user cannot be used. The message is one line that names it and the fault."""
 
 
 class InstallationError(RuntimeError):
-    """Something that is installed cannot be used. The message says what to do."""
+    """Installed software cannot be used. The message says what to do."""

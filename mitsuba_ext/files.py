@@ -1,4 +1,4 @@
-"""Files and folders that are written: whether they can be, and never half of them."""
+"""Checks whether files and folders can be written, and replaces files in one step."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def check_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Makes a folder in which files can be made.
+    """Makes a folder, and checks that files can be made in it.
 
     Raises:
-        InputError: It cannot be.
+        InputError: The folder or a file in it cannot be made.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -36,7 +36,7 @@ def make_folder(folder: Path) -> None:
 
 
 def check_target(path: Path) -> None:
-    """Raises :class:`InputError` if no file ``path`` can be made: before hours of rendering."""
+    """Raises :class:`InputError` if the file ``path`` cannot be made; for use before a render."""
     if path.is_dir():
         raise InputError(f"{path}: is a folder")
     check_folder(path.parent)
@@ -44,9 +44,9 @@ def check_target(path: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a name to write to; the finished file then takes the place of ``path`` in one step.
+    """Yields a temporary path to write to; the finished file then replaces ``path`` in one step.
 
-    After an exception, what ``path`` held before is still there.
+    After an exception, ``path`` is unchanged.
     """
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:

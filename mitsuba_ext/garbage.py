@@ -1,4 +1,4 @@
-"""When Python's garbage collector must wait."""
+"""Stops Python's garbage collector while Dr.Jit traces calls of BSDFs."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def garbage_left_alone() -> Iterator[None]:
-    """Stops Python's garbage collector.
+    """Stops Python's garbage collector while active.
 
-    To trace a call of a BSDF's method, Dr.Jit goes through all living BSDFs, and while it runs the
-    methods of those that are written in Python, the collector may free others, of scenes that
-    nobody uses any more: the process would end.
+    To trace a call of a BSDF's method, Dr.Jit iterates over all living BSDFs. While it runs the
+    methods of those that are written in Python, the collector could free others, of scenes that are
+    no longer used. Dr.Jit would then access freed memory, and the process would end.
     """
     was_enabled = gc.isenabled()
     gc.disable()

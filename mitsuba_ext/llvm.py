@@ -1,17 +1,12 @@
-"""Which LLVM library Dr.Jit would load, whether that one works, and how to get one that does.
+"""Which LLVM library Dr.Jit would load, which others there are, and whether they work.
 
 Dr.Jit loads libLLVM when it is imported. A library that it cannot use ends the process at the
-first kernel instead of raising an exception, so the choice has to be made beforehand. This file
-needs the standard library only, and runs as a script before the package is installed::
-
-    python mitsuba_ext/llvm.py            # list the libraries found, with verdicts
-    python mitsuba_ext/llvm.py --ensure   # exit 0 if one works; else install one with apt
+first kernel instead of raising an exception, so the choice has to be made beforehand.
+:mod:`.llvm_install` gets a library that works.
 """
 
 from __future__ import annotations
 
-import argparse
-import ctypes
 import glob
 import json
 import os
@@ -35,10 +30,10 @@ VARIABLE = "DRJIT_LIBLLVM_PATH"
 #: ``llvm.maximum`` (llvm-project issue 53353), whether or not the CPU has AVX-512.
 OLDEST = 17 if platform.machine().lower() in ("x86_64", "amd64") else 15
 
-#: Newer libraries than this are probed before they are trusted.
+#: A library newer than this must pass :func:`probe`.
 NEWEST_TESTED = 22
 
-#: Where Dr.Jit 1.5 looks after ``libLLVM.so`` (src/llvm_api.cpp), by platform and machine.
+#: Where Dr.Jit 1.5 searches if the loader finds no ``libLLVM.so`` (src/llvm_api.cpp).
 _DRJIT_GLOBS = {
     "linux": [
         f"/usr/lib/{folder}/libLLVM*.so.*"
@@ -50,7 +45,7 @@ _DRJIT_GLOBS = {
     ],
 }
 
-#: Where usable libraries are found besides.
+#: Other places where libraries are installed.
 _OTHER_GLOBS = {
     "linux": [
         "/usr/lib/llvm-*/lib/libLLVM*.so*",
@@ -67,11 +62,8 @@ _OTHER_GLOBS = {
 
 _ELF_MACHINES = {"x86_64": 62, "aarch64": 183}
 
-#: What the wheel of Dr.Jit links to and minimal systems lack (drjit issue 484), with its package.
-_SYSTEM_LIBRARY, _SYSTEM_PACKAGE = "libatomic.so.1", "libatomic1"
-
-# A fresh literal each time: Dr.Jit would otherwise take the kernel from its disk cache, whichever
-# library compiled it.
+# The literal ``scale`` differs each time: else Dr.Jit could load the kernel from its disk cache,
+# compiled by another library.
 _PROBE = """
 import sys
 try:
@@ -93,9 +85,9 @@ class Library:
     """A file that holds LLVM.
 
     Attributes:
-        path: The file with links followed, or what the user wrote where there is no such file;
-            empty for a library in this process whose file is not known.
-        version: The version that the name tells, e.g. ``(19, 1)``; empty if it does not.
+        path: The file with links followed, or the user's text if there is no such file; empty for a
+            library in this process whose file is unknown.
+        version: The version in the file's name, e.g. ``(19, 1)``; empty if there is none.
     """
 
     path: str
@@ -126,12 +118,12 @@ def _version_in_name(path: str) -> tuple[int, ...]:
     return ()
 
 
-# ---------------------------------------------------------------- what is there
+# ---------------------------------------------------------------- Libraries on this machine
 
 
 @cache
 def _loader_cache() -> tuple[tuple[str, str], ...]:
-    """The dynamic loader's table, as pairs of name and path."""
+    """The dynamic loader's table of LLVM libraries, as pairs of name and path."""
     ldconfig = shutil.which("ldconfig", path=os.environ.get("PATH", "") + ":/sbin:/usr/sbin")
     if sys.platform != "linux" or ldconfig is None:
         return ()
@@ -161,7 +153,7 @@ def _natural_order(path: str) -> list[object]:
 
 
 def default_library() -> Library | None:
-    """The library that Dr.Jit takes if nobody interferes, or None where it finds none."""
+    """The library that Dr.Jit loads by its own search; ``None`` if it finds none."""
     wish = os.environ.get(VARIABLE)
     if wish:
         return Library.at(_find_as_loader(wish) or wish)
@@ -206,14 +198,14 @@ def cpu() -> tuple[str, frozenset[str]]:
     return entries.get("model name", platform.machine()), frozenset(flags.split())
 
 
-# ---------------------------------------------------------------- whether it will do
+# ---------------------------------------------------------------- Do they work?
 
 
 def fault(library: Library) -> str:
     """Why Dr.Jit cannot use ``library``, as the end of a sentence about it; empty if it can.
 
-    Decided by the version. Where the name tells none, or one newer than those tried, and where a
-    probe has been made before, the probe decides.
+    Old versions are refused. Else the stored result of a probe decides, if there is one. A version
+    that is unknown, or newer than :data:`NEWEST_TESTED`, is probed now.
     """
     problem = version_fault(library.version)
     if problem or not library.path:
@@ -242,7 +234,7 @@ def version_fault(version: tuple[int, ...]) -> str:
 
 
 def cpu_fault() -> str:
-    """Why no LLVM library will do on this CPU; empty if one may."""
+    """Why no LLVM library works on this CPU; empty if one may."""
     flags = cpu()[1]
     if platform.machine() == "x86_64" and flags and "fma" not in flags:
         return "this CPU lacks the FMA instructions, which Dr.Jit's LLVM backend needs"
@@ -265,15 +257,16 @@ def _why_not_loadable(path: str) -> str:
 
 
 def usable_library() -> Library | None:
-    """The newest library that Dr.Jit can use, or None."""
+    """The newest library that Dr.Jit can use; ``None`` if there is none."""
     return next((library for library in candidates() if not fault(library)), None)
 
 
 def probe(library: Library) -> str:
-    """Runs a small kernel with ``library`` in another process, and remembers the outcome.
+    """Runs a small kernel with ``library`` in another process, and stores the result in a file.
 
     Returns:
-        An empty string if the kernel gave the right numbers, else why not, as in :func:`fault`.
+        An empty string if the kernel returned the right numbers; else the reason, as in
+        :func:`fault`.
     """
     key, verdicts = _cache_key(library), _read_cache()
     if key in verdicts:
@@ -283,9 +276,10 @@ def probe(library: Library) -> str:
     try:
         run = subprocess.run(command, env=environment, cwd="/", capture_output=True, timeout=120)
     except subprocess.TimeoutExpired:
-        return "did not compile a small kernel within two minutes"  # not cached: a busy machine?
+        # Not stored, because the machine may be busy
+        return "did not compile a small kernel within two minutes"
     lines = run.stderr.decode(errors="replace").strip().splitlines() or ["no message"]
-    if run.returncode == 3:  # says nothing about the library, so it is not remembered
+    if run.returncode == 3:  # not the fault of the library, so not stored
         return f"cannot be tried, because Dr.Jit cannot be imported ({lines[-1][:160]})"
     verdict = ""
     if run.returncode < 0:
@@ -329,125 +323,4 @@ def _write_cache(verdicts: dict[str, str]) -> None:
         partial.write_text(json.dumps(verdicts, indent=1))
         partial.replace(file)
     except (OSError, RuntimeError):
-        pass  # a cache only: the probe runs again next time
-
-
-# ---------------------------------------------------------------- getting one
-
-
-def offered_packages() -> list[str]:
-    """The packages of usable LLVM libraries that apt offers, newest first."""
-    if not shutil.which("apt-cache"):
-        return []
-    command = ["apt-cache", "search", "--names-only", "^libllvm[0-9]+(t64)?$"]
-    text = subprocess.run(command, capture_output=True, text=True).stdout
-    found = {int(major): name for name, major in re.findall(r"^(libllvm(\d+)\S*)", text, re.M)}
-    majors = [major for major in found if OLDEST <= major <= NEWEST_TESTED]
-    return [found[major] for major in sorted(majors, reverse=True)]
-
-
-def lacks_system_library() -> bool:
-    """Whether a library is missing without which Dr.Jit's wheel cannot be imported."""
-    if sys.platform != "linux":
-        return False
-    try:
-        ctypes.CDLL(_SYSTEM_LIBRARY)
-    except OSError:
-        return True
-    return False
-
-
-def install_command(with_llvm: bool = True) -> str:
-    """What a user types to get what is missing, between backticks where it is a command."""
-    needed = [_SYSTEM_PACKAGE] if lacks_system_library() else []
-    if shutil.which("apt-get"):
-        if with_llvm:
-            needed.append(next(iter(offered_packages()), "libllvm19"))
-        return f"run `sudo apt install {' '.join(needed)}`"
-    if sys.platform == "darwin":
-        return "run `brew install llvm`"
-    if with_llvm:
-        needed.append(f"LLVM {OLDEST} or newer")
-    return f"install {' and '.join(needed)} with your package manager"
-
-
-def _as_root() -> list[str] | None:
-    """What to put before a command that needs root, or None where we cannot become root."""
-    if os.geteuid() == 0:
-        return []
-    if not shutil.which("sudo"):
-        return None
-    if subprocess.run(["sudo", "-n", "true"], stderr=subprocess.DEVNULL).returncode == 0:
-        return ["sudo", "-n"]
-    return ["sudo"] if sys.stdin.isatty() else None
-
-
-def ensure() -> Library | None:
-    """Finds a library that passes the probe, installing one with apt where none does.
-
-    Returns:
-        The library that ``import mitsuba_ext`` will use, or None.
-    """
-    works = _newest_that_works()
-    if works or os.environ.get(VARIABLE) or cpu_fault() or not shutil.which("apt-get"):
-        return works
-    root = _as_root()
-    if root is None:
-        return None
-    apt = [*root, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-y", "-qq"]
-    print("Installing with apt what Dr.Jit needs.", file=sys.stderr)
-    subprocess.run([*apt, "update"], stdout=sys.stderr)
-    first = [_SYSTEM_PACKAGE] if lacks_system_library() else []
-    for package in first + offered_packages():
-        subprocess.run([*apt, "install", "--no-install-recommends", package], stdout=sys.stderr)
-        _loader_cache.cache_clear()
-        works = _newest_that_works()
-        if works:
-            return works
-    return None
-
-
-def _newest_that_works() -> Library | None:
-    if lacks_system_library():
-        return None
-    wish = os.environ.get(VARIABLE)  # the user's choice is respected, not replaced
-    libraries = [Library.at(_find_as_loader(wish) or wish)] if wish else candidates()
-    usable = (library for library in libraries if not fault(library))
-    return next((library for library in usable if not probe(library)), None)
-
-
-def _advice() -> str:
-    """One sentence for a user whose machine has no usable library and where none was installed."""
-    if cpu_fault():
-        return f"Dr.Jit cannot compile for this CPU: {cpu_fault()}."
-    if os.environ.get(VARIABLE):
-        library = default_library()
-        reason = library and (fault(library) or probe(library))
-        return f"{VARIABLE} names {library}, which {reason}: unset {VARIABLE}."
-    if usable_library() and lacks_system_library():
-        command = install_command(with_llvm=False)
-        return f"Dr.Jit needs {_SYSTEM_LIBRARY}, which is missing: {command} and try again."
-    libraries = candidates()
-    reason = "there is none"
-    if libraries:
-        reason = f"{libraries[0]} {fault(libraries[0]) or probe(libraries[0])}"
-    return f"No usable LLVM library was found ({reason}): {install_command()} and try again."
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description="LLVM libraries for Dr.Jit")
-    parser.add_argument("--ensure", action="store_true", help="install one with apt if none works")
-    if parser.parse_args().ensure:
-        library = ensure()
-        if library is None:
-            print(_advice(), file=sys.stderr)
-        return 0 if library else 1
-    default = default_library()
-    for library in candidates():
-        mark = "  <- Dr.Jit's own choice" if library == default else ""
-        print(f"{library}: {fault(library) or 'usable'}{mark}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        pass  # without the cache, the probe runs again next time

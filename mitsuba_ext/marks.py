@@ -1,5 +1,5 @@
-"""Marks in the folder of a comparison, which outlive the process that sets them: what it was making
-when it died, and that the folder is in use."""
+"""Mark files in the folder of a comparison: which render is running, in which render a process
+died, and that the folder is in use. They remain when a process dies."""
 
 from __future__ import annotations
 
@@ -20,26 +20,27 @@ try:
 except ImportError:  # not on Windows: nothing is locked there
     fcntl = None
 
-#: Suffixes of the mark of an integrator whose run (or a reference) is being made, with the process
-#: that makes it inside, and after that process died, with the reason inside.
+#: Suffixes of the mark of an integrator: while one of its runs, or a reference, is being rendered
+#: (the file holds the process id), and after the process died in it (the file holds the reason).
 _RUNNING = ".running"
 _CRASHED = ".crashed"
 
 _LOCK = ".lock"
 
-#: Tells the processes of one session from others. A supervisor hands its own on to its workers.
+#: Identifies a session. A supervisor passes its identifier on to its workers.
 SESSION_VARIABLE = "MITSUBA_EXT_SESSION"
 SESSION = os.environ.get(SESSION_VARIABLE) or uuid.uuid4().hex
 
 
 def readable(label: str) -> str:
-    """The part of a file's name that is for the eye."""
+    """The readable part of a file name: the label without special characters, shortened."""
     return re.sub(r"[^\w.=-]+", "_", label)[:60].strip("_")
 
 
 def mark_of(folder: Path, label: str) -> Path:
-    """The mark of an integrator in the folder of a scene. One for all its runs: a process that died
-    in one of them would die in the others, and a run need not have the same name again."""
+    """The mark of an integrator in the folder of a scene. All its runs share it: a process that
+    died in one of them would probably die in the others, and the file name of a run can differ the
+    next time."""
     return folder / f"{readable(label)}_{zlib.crc32(label.encode()):08x}{_RUNNING}"
 
 
@@ -50,11 +51,11 @@ def has_crashed(mark: Path) -> bool:
 
 @contextlib.contextmanager
 def marked(mark: Path) -> Iterator[None]:
-    """Sets a mark while something is being rendered. One that stays tells a supervisor what the
-    process died of (:func:`blame`).
+    """Sets a mark during a render. If the process dies, the mark stays, and tells the supervisor in
+    which render that happened (:func:`blame`).
 
     Raises:
-        RuntimeError: A process died of it before.
+        RuntimeError: A process died in a render of this integrator before.
     """
     if has_crashed(mark):
         raise RuntimeError(mark.with_suffix(_CRASHED).read_text(encoding="utf-8"))
@@ -67,7 +68,7 @@ def marked(mark: Path) -> Iterator[None]:
 
 
 def running(folder: Path, process: int) -> set[Path]:
-    """The marks of what ``process`` is rendering in ``folder``."""
+    """The marks that ``process`` has set in ``folder``."""
     marks = set()
     for mark in folder.glob(f"*/*{_RUNNING}"):
         with contextlib.suppress(FileNotFoundError):  # just finished
@@ -77,8 +78,8 @@ def running(folder: Path, process: int) -> set[Path]:
 
 
 def blame(folder: Path, process: int, message: str) -> set[Path]:
-    """After the end of ``process``: notes ``message`` as the end of what it was rendering. Returns
-    the marks of that; none if it was rendering nothing."""
+    """After ``process`` has died, records ``message`` as the reason for the render that it was in.
+    Returns the marks of that render; an empty set if it was not rendering."""
     marks = running(folder, process)
     for mark in marks:
         mark.with_suffix(_CRASHED).write_text(message, encoding="utf-8")
@@ -87,7 +88,7 @@ def blame(folder: Path, process: int, message: str) -> set[Path]:
 
 
 def forgive(folder: Path) -> None:
-    """Forgets all marks: what they say is tried again."""
+    """Removes all marks, so that integrators that crashed are tried again."""
     for suffix in (_RUNNING, _CRASHED):
         for mark in folder.glob(f"*/*{suffix}"):
             mark.unlink()
@@ -95,9 +96,9 @@ def forgive(folder: Path) -> None:
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """Keeps other comparisons out of ``folder``, which is made if it is missing: they would measure
-    each other's load. The lock ends with the process, whatever ends it; marks of a process that is
-    gone are removed. In a worker, all this is up to its supervisor.
+    """Locks ``folder``, which is made if it is missing, against other comparisons: they would slow
+    each other down. The lock ends with the process, however that ends. Marks of earlier processes
+    are removed. In a worker, this does nothing, because its supervisor holds the lock.
 
     Raises:
         InputError: Another comparison is running there, or the folder cannot be made.
@@ -115,13 +116,13 @@ def in_use(folder: Path) -> Iterator[None]:
         if file is not None:
             (folder / _LOCK).unlink(missing_ok=True)
             file.close()
-        with contextlib.suppress(OSError):  # something was written
+        with contextlib.suppress(OSError):  # not empty, because something was written
             for path in missing:
                 path.rmdir()
 
 
 def _lock(folder: Path) -> TextIO | None:
-    """The locked file; ``None`` where nothing can be locked."""
+    """The locked file; ``None`` on a system without locks."""
     if fcntl is None:
         return None
     path = folder / _LOCK
@@ -131,7 +132,7 @@ def _lock(folder: Path) -> TextIO | None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.seek(0)
-            process = file.read() or "unknown"  # just being written
+            process = file.read() or "unknown"  # the other process has not written it yet
             file.close()
             raise InputError(
                 f"{folder}: another comparison is running in this folder (process {process}): wait "
@@ -143,7 +144,7 @@ def _lock(folder: Path) -> TextIO | None:
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 break
-        file.close()  # its holder has removed it since it was opened
+        file.close()  # the process that held the lock has removed the file since it was opened
     file.truncate(0)
     file.write(str(os.getpid()))
     file.flush()

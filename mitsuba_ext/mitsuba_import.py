@@ -1,8 +1,8 @@
-"""What happens around the import of Dr.Jit and Mitsuba, whoever imports them.
+"""Hooks into the import of Dr.Jit and Mitsuba, whichever module imports them.
 
-Before Dr.Jit is imported, an LLVM library that works is chosen; after Mitsuba is imported, the
-plugins are registered. ``import mitsuba_ext`` itself imports neither, because that takes most of a
-second: commands that only print, such as ``mitsuba-ext list``, do not need them.
+Before Dr.Jit is imported, a hook chooses an LLVM library that works. After Mitsuba is imported,
+another one registers the plugins. ``import mitsuba_ext`` itself imports neither, because that takes
+most of a second, and commands that only print, such as ``mitsuba-ext list``, do not need them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from . import runtime
 
 
 def prepare() -> None:
-    """Registers the plugins if Mitsuba is imported already, else as soon as it is.
+    """Registers the plugins now if Mitsuba is imported already, else when it is imported.
 
     Raises:
         InstallationError: Mitsuba is imported, and its version is not supported.
@@ -33,7 +33,7 @@ def prepare() -> None:
 def _register() -> None:
     from . import registry
 
-    mitsuba = sys.modules["mitsuba"]  # which is not the module that was executed
+    mitsuba = sys.modules["mitsuba"]  # not the module that was executed: Mitsuba replaces it
     runtime.check_version(mitsuba.__version__)
     runtime.guard(mitsuba)
     runtime.ensure_two_threads()
@@ -56,8 +56,8 @@ def _around_mitsuba() -> Iterator[None]:
 
 
 class _Finder:
-    """Finds Dr.Jit and Mitsuba as the other finders of ``sys.meta_path`` do, and adds to what
-    happens when they are executed."""
+    """Finds Dr.Jit and Mitsuba by the other finders of ``sys.meta_path``, and runs the hooks around
+    their execution."""
 
     _AROUND: dict[str, Callable[[], AbstractContextManager[None]]] = {
         "drjit": _around_drjit,
@@ -72,7 +72,7 @@ class _Finder:
             return None
         self._searching.add(name)
         try:
-            spec = importlib.util.find_spec(name)  # asks this finder too
+            spec = importlib.util.find_spec(name)  # calls this finder too, which returns None
         finally:
             self._searching.remove(name)
         if spec is None or spec.loader is None:

@@ -1,6 +1,6 @@
-"""Which integrators there are, by name, and what a misspelt name may have meant.
+"""Names of integrators, and suggestions for misspelt ones.
 
-Nothing here needs Mitsuba, which takes a second to import: a typing error is reported at once.
+This module does not import Mitsuba, which takes a second: so a misspelt name is reported at once.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ MITSUBA_INTEGRATORS = (
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """``': did you mean "neepp"?'``, or nothing where no known name is like ``name``."""
+    """``': did you mean "neepp"?'``, or nothing if no known name resembles ``name``."""
     close = difflib.get_close_matches(name.lower(), known, n=1)
     return f': did you mean "{close[0]}"?' if close else ""
 
 
 def unknown_integrator(name: str, kind: str = "integrator") -> InputError:
-    """What to raise where there is no integrator of this name; ``kind`` is what it is called."""
+    """The error for a name that no integrator has; the message calls it a ``kind``."""
     known = [*registry.plugin_names()["integrators"], *MITSUBA_INTEGRATORS]
     return InputError(
         f'unknown {kind} "{name}"{did_you_mean(name, known)} (\'mitsuba-ext list\' shows ours)'
@@ -38,10 +38,11 @@ def unknown_integrator(name: str, kind: str = "integrator") -> InputError:
 
 
 def check_integrator(specification: str) -> None:
-    """Refuses an integrator that nothing can have registered, as long as Mitsuba is not imported.
+    """Refuses an unknown integrator before Mitsuba is imported. (Afterwards, plugins of the user
+    may be registered, and this does nothing.)
 
     Args:
-        specification: What the command line names: a file, or the integrator's name and more.
+        specification: A file, or text that begins with the integrator's name.
 
     Raises:
         InputError: There is no such integrator.
@@ -57,7 +58,7 @@ def check_integrator(specification: str) -> None:
 
 
 def is_file_of_mitsuba(name: str) -> bool:
-    """Is there a plugin in C++ of this name? Where Mitsuba is not found, there may be."""
+    """Is there a plugin in C++ of this name? ``True`` also if Mitsuba is not found."""
     spec = PathFinder.find_spec("mitsuba")
     if spec is None or not spec.submodule_search_locations:
         return True

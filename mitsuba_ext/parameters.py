@@ -1,4 +1,4 @@
-"""Reading the parameters of a plugin, with errors that speak to the scene's author."""
+"""Reads the parameters of a plugin, with error messages for the author of the scene."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Samples per pixel of a render, at most: structured samplers do not count further.
+#: Largest number of samples per pixel: structured samplers cannot count further.
 MOST_SPP = 2**30
 
 
@@ -25,15 +25,15 @@ def read_parameter(
     """A parameter of the scene, checked. Its type is that of ``default``.
 
     Args:
-        plugin: What errors call the plugin.
-        props: The parameters.
+        plugin: Name of the plugin, for error messages.
+        props: The properties that the plugin got.
         key: The parameter's name.
-        default: Its value where the scene gives none.
-        minimum, maximum: The least and the greatest value that is accepted.
-        choices: The values that are accepted, if only some are.
+        default: Its value if the scene does not set it.
+        minimum, maximum: The smallest and the largest value accepted.
+        choices: The values accepted; empty if all are.
 
     Raises:
-        TypeError: The scene gives another type (an integer passes for a float).
+        TypeError: The value has another type (an integer is accepted as a float).
         ValueError: The value is out of range, or not one of ``choices``.
     """
     value = props.get(key, default)

@@ -1,4 +1,4 @@
-"""Plugins as text, as a command line can hold them: ``NAME:key=value,key=[NAME:key=value]``."""
+"""Parses plugins written as text: ``NAME:key=value,key=[NAME:key=value]``."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from .errors import InputError
 
 
 def parse_plugin(text: str) -> dict[str, Any]:
-    """What ``text`` stands for, as ``mi.load_dict`` takes it.
+    """The plugin that ``text`` describes, as a dict for ``mi.load_dict``.
 
-    - A comma begins a parameter only where ``key=`` follows. Any other belongs to the value, which
-      may be a list.
-    - A value in square brackets is a plugin that is nested: text of the same form, to any depth.
-      Its name alone says of which kind it is.
+    - A comma begins a parameter only where ``key=`` follows. Other commas belong to the value,
+      which may be a list.
+    - A value in square brackets is a nested plugin: text of the same form, to any depth. Its name
+      determines its kind.
 
     >>> parse_plugin("neepp:max_depth=6,hide_emitters=true,aovs=d:depth,a:albedo")
     {'type': 'neepp', 'max_depth': 6, 'hide_emitters': True, 'aovs': 'd:depth,a:albedo'}
@@ -48,7 +48,7 @@ def _parse(text: str) -> dict[str, Any]:
 
 
 def _split(text: str) -> Iterator[str]:
-    """The parameters: what stands between the commas that begin one, outside of brackets."""
+    """The parameters: the parts between the commas that begin one, outside of brackets."""
     depths = _depths(text)
     if min(depths, default=0) < 0:
         raise ValueError('found "]" without "["')
@@ -64,14 +64,14 @@ def _split(text: str) -> Iterator[str]:
 
 
 def _depths(text: str) -> list[int]:
-    """How many brackets are open behind each character."""
+    """The number of open brackets after each character."""
     return list(accumulate((character == "[") - (character == "]") for character in text))
 
 
 def _parse_value(text: str) -> Any:
     if text.startswith("["):
         if _depths(text).index(0) < len(text) - 1:
-            raise ValueError(f'expected nothing behind "]" but a comma and key=, found "{text}"')
+            raise ValueError(f'expected nothing after "]" but a comma and key=, found "{text}"')
         return _parse(text[1:-1])
     if text in ("true", "false"):
         return text == "true"

@@ -1,4 +1,4 @@
-"""Other processes that run this package."""
+"""Starts this package in other processes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import sys
 def python_command(module: str, *arguments: str) -> list[str]:
     """The command that runs a module in another process, with the same packages as in this one.
 
-    ``python -m`` does not do: it looks first in the current folder, where another copy of this
-    package may be.
+    It does not use ``python -m``, which searches the current folder first: another copy of this
+    package may be there.
 
     Args:
-        module: Its full name; it is executed as ``__main__``.
-        arguments: What it finds in ``sys.argv``.
+        module: Full name of the module; it is executed as ``__main__``.
+        arguments: Its command-line arguments.
     """
     paths = [os.fspath(path) for path in sys.path]  # a user may have added a Path
     code = (

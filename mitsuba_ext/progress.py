@@ -1,4 +1,4 @@
-"""What long work says meanwhile, on stderr: bars on a terminal, lines elsewhere."""
+"""Shows the progress of long work on stderr: as bars on a terminal, as lines elsewhere."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
-#: Where there is no terminal, lines are at least so many seconds apart.
+#: Without a terminal, smallest number of seconds between two lines.
 PERIOD = 30.0
 
 
 class Step(NamedTuple):
-    """Where a comparison is; what ``progress`` is called with.
+    """The progress of a comparison; the argument of the function ``progress``.
 
     Attributes:
         label: What is being done.
-        done: Seconds of work that are behind (measured ones, not the clock's).
-        left: Seconds that are estimated to be left; ``None`` while nothing is known.
+        done: Measured seconds of the finished renders.
+        left: Estimated seconds of the remaining ones; ``None`` if unknown.
     """
 
     label: str
@@ -32,8 +32,9 @@ class Step(NamedTuple):
 
 @contextlib.contextmanager
 def reporting(progress: bool | Callable[[Step], None]) -> Iterator[Callable[[Step], None]]:
-    """What to call with each step: ``progress`` itself, or for ``True`` what shows a bar with an
-    estimate of the time left (lines, where there is no terminal), for ``False`` nothing."""
+    """Yields the function to call with each step: ``progress`` itself if it is a function. For
+    ``True``, a function that shows a bar with an estimate of the time left (without a terminal:
+    lines); for ``False``, one that does nothing."""
     if callable(progress):
         yield progress
     elif not progress:
@@ -50,7 +51,8 @@ def progress_bars(*columns: ProgressColumn) -> Iterator[Progress]:
     """Progress bars on stderr, if that is a terminal.
 
     Args:
-        columns: What follows the label, the bar and the time; default: rich's estimate of the rest.
+        columns: Columns after the label, the bar and the elapsed time. Default: rich's estimate of
+            the remaining time.
     """
     from rich import progress as bars
     from rich.console import Console

@@ -6,7 +6,7 @@ decorates with :func:`plugin` is what Mitsuba instantiates. Deleting the file re
 
 Mitsuba's base classes differ from variant to variant, so a class body binds to the variant that is
 active when it runs. The plugin files are therefore executed once per variant (as Mitsuba does with
-its own Python integrators); everything else in the package is variant-agnostic.
+its own Python integrators). The rest of the package does not depend on the variant.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from . import runtime
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Folder of the plugins → Mitsuba's function that registers them.
+#: For each folder of plugins, the function of Mitsuba that registers them.
 _KINDS: dict[str, str] = {
     "integrators": "register_integrator",
     "emitters": "register_emitter",
@@ -100,7 +100,8 @@ def _execute(module: str) -> None:
 
 
 def _register_refusals(variant: str) -> None:
-    """Where our plugins cannot run, their names exist and say so."""
+    """In a variant that our plugins do not support, registers their names with constructors that
+    raise an error which says so."""
     import mitsuba as mi
 
     def refuse(name: str) -> Callable[[mi.Properties], None]:

@@ -1,7 +1,7 @@
-"""Refuses what cannot work (Mitsuba's version, the LLVM library) before it fails in a worse way.
+"""Checks Mitsuba's version and the LLVM library, so that a wrong one ends in a clear message.
 
-``mitsuba_import.py`` calls the functions that come before and after the import of Dr.Jit and
-Mitsuba, ``registry.py`` those for every variant that is selected.
+``mitsuba_import.py`` calls these functions before and after the import of Dr.Jit and Mitsuba, and
+``registry.py`` whenever a variant is selected.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ SUPPORTED_VARIANTS: tuple[str, ...] = (
     "cuda_ad_spectral",
 )
 
-#: Versions of Mitsuba that the package was written for: from the first up to, not including, the
-#: second (3.10 renames the parameters of meshes). ``pyproject.toml`` says the same.
+#: Versions of Mitsuba that the package works with: from the first up to, not including, the second
+#: (3.10 renames the parameters of meshes). ``pyproject.toml`` has the same range.
 MITSUBA_VERSIONS = ((3, 9, 1), (3, 10))
 
 
 def choose_llvm() -> None:
     """Chooses an LLVM library that works, before Dr.Jit is imported.
 
-    The choice is a value for ``DRJIT_LIBLLVM_PATH``, made only where the user has not set it and
-    what Dr.Jit would take by itself does not work. A machine without any usable library passes:
-    CUDA variants need none, and :func:`check` refuses the rest.
+    Sets ``DRJIT_LIBLLVM_PATH`` if the user has not set it and the library that Dr.Jit would load
+    does not work. A machine without a usable library is no error here: CUDA variants need none, and
+    :func:`check` refuses the others.
     """
     if sys.platform != "win32" and not os.environ.get(llvm.VARIABLE):
         default = llvm.default_library()
@@ -49,33 +49,35 @@ def choose_llvm() -> None:
 
 @contextlib.contextmanager
 def missing_library_is_named() -> Iterator[None]:
-    """Around the import of Dr.Jit: a better message where a system library is missing.
+    """Around the import of Dr.Jit: raises a clear error if a system library is missing.
 
     Raises:
-        InstallationError: What is missing, and how to get it.
+        InstallationError: The missing library, and how to install it.
     """
     try:
         yield
-    except (ImportError, NameError) as error:  # NameError: of its own, on the way to its message
-        if llvm.lacks_system_library():
+    except (ImportError, NameError) as error:  # NameError: by a fault in Dr.Jit's own message
+        from . import llvm_install
+
+        if llvm_install.lacks_system_library():
             raise InstallationError(
                 "Dr.Jit cannot be imported because libatomic.so.1 is missing. To fix this, "
-                f"{llvm.install_command(with_llvm=llvm.usable_library() is None)}."
+                f"{llvm_install.install_command(with_llvm=llvm.usable_library() is None)}."
             ) from error
         raise
 
 
 def check_installed_version() -> None:
-    """Calls :func:`check_version`, where Mitsuba is an installed package."""
-    with contextlib.suppress(metadata.PackageNotFoundError):  # built from source, or not there
+    """Calls :func:`check_version`, if Mitsuba is an installed package."""
+    with contextlib.suppress(metadata.PackageNotFoundError):  # built from source, or missing
         check_version(metadata.version("mitsuba"))
 
 
 def check_version(found: str) -> None:
-    """Refuses versions of Mitsuba that the package was not written for.
+    """Refuses versions of Mitsuba that the package does not work with.
 
     Args:
-        found: The version, e.g. ``"3.9.1"``. A pre-release counts as what it precedes.
+        found: The version, e.g. ``"3.9.1"``. A pre-release counts as the release that it precedes.
 
     Raises:
         InstallationError: Which versions work, and how to get one.
@@ -113,7 +115,7 @@ def check(variant: str) -> None:
         variant: A name such as ``"llvm_ad_rgb"``. Variants that need no LLVM pass.
 
     Raises:
-        InstallationError: The library found, why it will not do, and how to get one that does.
+        InstallationError: The library, why it does not work, and how to get one that does.
     """
     if variant.startswith("llvm_"):
         problem = llvm_problem()
@@ -122,18 +124,18 @@ def check(variant: str) -> None:
 
 
 def ensure_two_threads() -> None:
-    """Gives Dr.Jit a second thread on a machine with one core. With one, Mitsuba 3.9.1 waits for
-    ever as soon as it reads or writes an EXR file: who waits for the threads is one of them."""
+    """Gives Dr.Jit a second thread on a machine with one core. With a single thread, Mitsuba 3.9.1
+    hangs when it reads or writes an EXR file, because the thread waits for itself."""
     drjit = sys.modules["drjit"]
     if drjit.thread_count() < 2:
         drjit.set_thread_count(2)
 
 
 def guard(mitsuba: ModuleType) -> None:
-    """Where LLVM does not work, makes ``mi.set_variant`` say so as :func:`check` does.
+    """If LLVM does not work, makes ``mi.set_variant`` raise the error of :func:`check`.
 
-    Dr.Jit's own message for a library that it refuses is that there is none. Where LLVM works,
-    ``mi.set_variant`` is left alone.
+    Dr.Jit's own message about a library that it refuses is that there is none. If LLVM works,
+    ``mi.set_variant`` is not changed.
 
     Args:
         mitsuba: The imported module.
@@ -154,7 +156,7 @@ def guard(mitsuba: ModuleType) -> None:
 
 
 def llvm_problem() -> str:
-    """What is wrong with the LLVM library that Dr.Jit has loaded or will load, and what to do.
+    """What is wrong with the LLVM library that Dr.Jit has loaded or will load, and how to fix it.
 
     Returns:
         Sentences for the user; empty if the library works.
@@ -176,9 +178,8 @@ def llvm_problem() -> str:
 
 
 def loaded_library() -> llvm.Library | None:
-    """The LLVM library in this process, with its exact version where Dr.Jit knows it.
-
-    Where Dr.Jit could load none, the file that it was told to load by ``DRJIT_LIBLLVM_PATH``.
+    """The LLVM library in this process, with the exact version if Dr.Jit knows it. If Dr.Jit could
+    load none: the file that ``DRJIT_LIBLLVM_PATH`` names.
     """
     version = _loaded_version()
     try:
@@ -198,7 +199,7 @@ def loaded_library() -> llvm.Library | None:
 
 
 def _loaded_version() -> tuple[int, ...]:
-    """The version of the LLVM backend, empty where Dr.Jit could not start it."""
+    """The version of the LLVM backend; empty if Dr.Jit could not start it."""
     version = sys.modules["drjit"].detail.llvm_version()
     return tuple(version) if version[0] >= 0 else ()
 
@@ -213,5 +214,7 @@ def _remedy(library: llvm.Library | None, loaded: bool) -> str:
             f"import mitsuba_ext before mitsuba and drjit (it chooses {usable.path}), "
             f"or run `export {llvm.VARIABLE}={usable.path}`"
         )
+    from . import llvm_install
+
     unset = f" and unset {llvm.VARIABLE}" if set_by_user else ""
-    return llvm.install_command() + unset
+    return llvm_install.install_command() + unset

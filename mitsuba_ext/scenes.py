@@ -1,8 +1,8 @@
-"""Scenes as a command line or a notebook names them.
+"""Loads scenes for the command line and for notebooks.
 
-Mitsuba's ``load_file`` cannot change the size of a film, tell which files a scene is made of, or
-say how deep its integrator traces. :func:`load_scene` goes through ``mi.parser`` for these, and
-turns everything that can be wrong with a scene into an :class:`InputError` of one line.
+Mitsuba's ``load_file`` cannot change the size of a film, and gives neither the files of a scene nor
+the maximum depth of its integrator. :func:`load_scene` gets these from ``mi.parser``, and turns
+every error in a scene into an :class:`InputError` of one line.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from .rendering.aovs import check_nodes
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: What integrators must agree on to render the same image: how long paths may be, when roulette may
-#: end them, and what the camera sees of the lights.
+#: Settings that all integrators of a comparison share: the maximum depth, the depth from which on
+#: Russian roulette is played, and whether emitters are hidden from the camera.
 SETTINGS = ("max_depth", "rr_depth", "hide_emitters")
 
 _TRACEBACK = "Traceback (most recent call last):\n"
@@ -32,9 +32,9 @@ _UNLIMITED = 2**32 - 1
 
 
 def one_line(error: BaseException | str) -> str:
-    """A Mitsuba message without source positions ("[parser.cpp:12] ", "[PLYMesh] ") and line
-    breaks. Mitsuba quotes the whole traceback of an error in a plugin that is written in Python: of
-    that, only the message at the end is kept."""
+    """A message of Mitsuba without source positions ("[parser.cpp:12] ", "[PLYMesh] ") and line
+    breaks. For an error in a plugin that is written in Python, Mitsuba quotes the whole traceback:
+    this keeps only the message at its end."""
     text = str(error)
     if _TRACEBACK in text:
         before, *_, last = text.split(_TRACEBACK)
@@ -64,8 +64,8 @@ def check_source(source: object) -> None:
 
 
 def check_variant(value: object) -> None:
-    """Checks that the objects of Mitsuba in ``value``, a dict of a scene or what it holds, are of
-    the active variant: Mitsuba ignores others, or takes them for something else.
+    """Checks that the objects of Mitsuba in ``value`` (a scene's dict, or an item of one) are of
+    the active variant: Mitsuba ignores others, or misinterprets them.
 
     Raises:
         InputError: One is of another variant.
@@ -84,7 +84,7 @@ def check_variant(value: object) -> None:
 
 @dataclass
 class LoadedScene:
-    """A scene, and what its file says about it.
+    """A scene, and data about it that Mitsuba's scene object does not have.
 
     Attributes:
         scene: The ``mi.Scene``.
@@ -107,12 +107,12 @@ class LoadedScene:
 
     @property
     def source(self) -> str:
-        """What to call the scene in messages."""
+        """How messages name the scene."""
         return "the scene" if self.path is None else str(self.path)
 
 
 def scene_name(source: str | Path | Mapping[str, Any] | None) -> str:
-    """A short name: of the file, or of its folder where the file is just ``scene.xml``."""
+    """A short name: that of the file, or of its folder if the file is called ``scene.xml``."""
     if source is None or isinstance(source, Mapping):
         return "scene"
     path = Path(source)
@@ -121,7 +121,7 @@ def scene_name(source: str | Path | Mapping[str, Any] | None) -> str:
 
 
 def check_scene_file(path: Path) -> None:
-    """Raises :class:`InputError` where there is no file, before Mitsuba is imported."""
+    """Raises :class:`InputError` if there is no such file; does not import Mitsuba."""
     if not path.is_file():
         raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such scene'}")
 
@@ -135,7 +135,7 @@ def load_scene(
     """Loads a scene in the active variant.
 
     Args:
-        source: The XML file, or what ``mi.load_dict`` takes.
+        source: The XML file, or a dict as for ``mi.load_dict``.
         size: Width and height that replace those of the film.
         parameters: Values for the ``$name`` placeholders of the file.
         keep_integrator: ``False`` leaves the scene's integrator out, so that a scene whose
@@ -164,7 +164,7 @@ def load_scene(
             check_nodes(state)
             content_hash = hash_parsed_scene(state, strings, source if is_dict else None)
             integrator = _integrator_node(state)
-            # Now: a node must not be touched after a transformation (it may be freed memory)
+            # Before transform_all(): afterwards, a node may be freed memory
             integrator_name = integrator.props.plugin_name() if integrator else ""
             settings = _settings(integrator)
             if not keep_integrator:
@@ -198,9 +198,9 @@ def load_scene(
 
 
 def _with_own_bitmaps(source: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of a scene's dict and of its bitmaps: in spectral variants, Mitsuba's ``bitmap``
-    converts the pixels that it is given in place, so that the dict would be another scene when it
-    is loaded again."""
+    """A copy of a scene's dict and of its bitmaps. In spectral variants, Mitsuba's ``bitmap``
+    converts the pixels of a ``mi.Bitmap`` in place: without the copy, loading the dict again would
+    give another scene."""
     import mitsuba as mi
 
     def copy(value: Any) -> Any:
@@ -217,8 +217,8 @@ def _as_xml(value: object) -> str:
 
 @contextlib.contextmanager
 def _search_path(path: Path | None) -> Iterator[None]:
-    """Makes Mitsuba look for meshes and textures beside the file ``path``: unlike ``mi.load_file``,
-    the functions of ``mi.parser`` leave the search path alone."""
+    """Makes Mitsuba search for meshes and textures beside the file ``path``: ``mi.load_file`` adds
+    this folder to the search path, but the functions of ``mi.parser`` do not."""
     import mitsuba as mi
 
     if path is None:
@@ -234,7 +234,7 @@ def _search_path(path: Path | None) -> Iterator[None]:
 
 def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None:
     """The integrator of the scene that traces the paths: inside a wrapper such as ``aov``, the
-    first one that says how deep."""
+    first one that sets ``max_depth``."""
     import mitsuba as mi
 
     nodes = [
@@ -248,15 +248,15 @@ def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None
 
 
 def _settings(node: mi.parser.SceneNode | None) -> dict[str, int | bool]:
-    """The :data:`SETTINGS` of an integrator: what the file sets, else the default depths, which are
-    only known from how the integrator prints itself."""
+    """The :data:`SETTINGS` of an integrator: those that the file sets, else the default depths,
+    which can only be read from the integrator's ``str()``."""
     import mitsuba as mi
 
     if node is None:
         return {}
-    own = mi.Properties(node.props)  # a copy: what is read counts as known to the plugin
+    own = mi.Properties(node.props)  # a copy, because reading a property marks it as queried
     text = ""
-    with contextlib.suppress(Exception):  # a wrapper or an unknown plugin: no defaults to know
+    with contextlib.suppress(Exception):  # a wrapper or an unknown plugin: its defaults are unknown
         properties = mi.Properties(node.props.plugin_name())
         text = str(mi.PluginManager.instance().create_object(properties))
     settings: dict[str, int | bool] = {}
@@ -285,7 +285,8 @@ def _drop_integrators(state: mi.parser.ParserState) -> None:
 
 
 def _is_integrator(node: mi.parser.SceneNode, key: str) -> bool:
-    """The parser of dicts does not know the kind of a plugin that is written in Python."""
+    """Is the node an integrator? The parser of dicts does not know the kind of a plugin that is
+    written in Python, so this makes one to see."""
     import mitsuba as mi
 
     if node.type != mi.ObjectType.Unknown:

@@ -1,6 +1,6 @@
-"""Meshes from a few numbers: what `make_assets.py` builds the scenes' furniture from.
+"""Procedural meshes, from which `make_assets.py` builds the furniture of the scenes.
 
-A mesh is a list of positions and triangles; its normals are made when it is written
+A mesh is a list of positions and triangles; its normals are computed when it is written
 (`smooth` or one per face). Lengths are metres, z points up.
 """
 
@@ -18,7 +18,7 @@ Ints = NDArray[np.int64]
 
 @dataclass
 class Mesh:
-    """Triangles; `uv` is present where a scene maps a texture onto the mesh."""
+    """Triangles; `uv` is present if a scene maps a texture onto the mesh."""
 
     positions: Floats
     faces: Ints
@@ -43,7 +43,7 @@ class Mesh:
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """One mesh of many; texture coordinates survive if all of them have some."""
+    """Joins meshes into one; it has texture coordinates if all of them have some."""
     firsts = np.cumsum([0] + [len(mesh.positions) for mesh in meshes])
     faces = [mesh.faces + first for mesh, first in zip(meshes, firsts)]
     uvs = [mesh.uv for mesh in meshes if mesh.uv is not None]
@@ -116,7 +116,7 @@ def block(low: ArrayLike, high: ArrayLike) -> Mesh:
 
 
 def perforated(xs: ArrayLike, ys: ArrayLike, holes: set[tuple[int, int]]) -> Mesh:
-    """A wall in the plane z = 0 that faces +z: all cells of a grid but those that are named."""
+    """A wall in the plane z = 0 that faces +z: all cells of a grid except the given holes."""
     xs, ys = np.asarray(xs, float), np.asarray(ys, float)
     cells = [
         quad((xs[i], ys[j], 0), (xs[i + 1] - xs[i], 0, 0), (0, ys[j + 1] - ys[j], 0))
@@ -229,10 +229,10 @@ def torus_knot(
 
 
 def write_ply(path: Path, mesh: Mesh, smooth: bool = False) -> None:
-    """Binary PLY with normals: averaged over each vertex's triangles, or one per triangle.
+    """Writes a binary PLY with normals: averaged over each vertex's triangles, or one per triangle.
 
-    Coordinates are rounded to a micrometre, so that the last bits of a machine's sine do not
-    show in the file.
+    Coordinates are rounded to a micrometre, so that the file does not depend on the last bits of a
+    machine's sine.
     """
     positions, faces, uv = mesh.positions, mesh.faces, mesh.uv
     if not smooth:

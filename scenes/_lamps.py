@@ -21,8 +21,8 @@ AT_WALLS = {
 class Room:
     """The furniture and the lamps of one room, as lines of XML.
 
-    A place at a wall (0 to 3: north, west, south, east) is so many metres along it, from its left
-    corner as seen from inside, and so many out from it.
+    A place at a wall (0 to 3: north, west, south, east) has two coordinates in metres: along the
+    wall, from its left corner as seen from inside, and the distance from the wall.
     """
 
     def __init__(self, column: int, row: int, draw: np.random.Generator) -> None:
@@ -48,7 +48,7 @@ class Room:
         return self.middle + (c * x - s * y, s * x + c * y)
 
     def find_place(self, width: float, out: float) -> tuple[int, float]:
-        """A place at a wall that is not in the way of a doorway or of what stands there."""
+        """A place at a wall that is free of doorways and furniture."""
 
         def corners(wall: int, left: float, right: float, out: float) -> Floats:
             return np.sort([self.at(wall, left, 0), self.at(wall, right, out)], axis=0)

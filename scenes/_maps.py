@@ -1,4 +1,4 @@
-"""Pictures from a few numbers: the scenes' textures and skies, and how they are written."""
+"""Procedural textures and skies of the scenes, and how they are written."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ def sky(
 def sunny_sky() -> Floats:
     """The sky of sunny_gloss.xml: its sun stands 39 degrees high.
 
-    Its four texels of 1e4 make an irradiance of 4.7 on a plane that faces it; on the ground they
-    give about four times as much as all the rest.
+    Its four texels of 1e4 cause an irradiance of 4.7 on a plane that faces the sun; on the ground,
+    about four times the irradiance of the rest of the sky.
     """
     colours = ((0.5, 0.58, 0.7), (0.09, 0.18, 0.42), (0.33, 0.28, 0.23))
     sun = np.array([1.15, 1.0, 0.8]) * 1e4
@@ -84,7 +84,7 @@ def clear_sky() -> Floats:
 
 
 def write_exr(path: Path, image: Floats) -> None:
-    """Half floats, linear, rounded to a thousandth: repeatable, and smaller."""
+    """Writes linear half floats, rounded to a thousandth: repeatable, and smaller files."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"RGB": np.round(image, 3).astype(np.float16)}) as exr:
         exr.write(str(path))

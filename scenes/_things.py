@@ -1,4 +1,4 @@
-"""The things that stand around in the scenes: tableware, a plant, furniture, a door."""
+"""The objects of the scenes: tableware, a plant, furniture, a door."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def pot() -> dict[str, Mesh]:
 
 
 def tableware() -> dict[str, Mesh]:
-    """Everything else that a lathe can make."""
+    """The other surfaces of revolution."""
     vase = [(0, 0), (0.05, 0), (0.055, 0.005), (0.1, 0.1), (0.085, 0.2), (0.03, 0.26), (0.032, 0.3)]
     vase += [(0.05, 0.33), (0.045, 0.33), (0.026, 0.3), (0.024, 0.26), (0.07, 0.2), (0, 0.1)]
     bowl = [(0, 0), (0.05, 0), (0.055, 0.01), (0.11, 0.04), (0.135, 0.085), (0.13, 0.088)]
@@ -136,7 +136,7 @@ def cupboard() -> dict[str, Mesh]:
 
 
 def fittings() -> dict[str, Mesh]:
-    """What lamps of many_lamps.xml hide in: a ledge along a wall, and a bowl on a pole."""
+    """Objects that hide lamps of many_lamps.xml: a ledge along a wall, and a bowl on a pole."""
     ledge = [block((-1.7, -0.12, 0), (1.7, 0, 0.015))]
     ledge.append(block((-1.7, -0.12, 0.015), (1.7, -0.105, 0.07)))
     stand = [(0, 0), (0.14, 0), (0.14, 0.012), (0.014, 0.02), (0.014, 1.6), (0.15, 1.72)]

@@ -1,4 +1,4 @@
-"""The exact answers of the furnace scenes; the derivations stand in the scene files.
+"""The exact answers of the furnace scenes; the scene files contain the derivations.
 
     for furnace in FURNACES:
         for region in furnace.regions:
@@ -24,8 +24,8 @@ class Region:
 
     `exact(max_depth)` is the mean radiance over the region, with Mitsuba's meaning of `max_depth`
     (1: emission only, -1: no limit), or None where no exact value is known.
-    `uniform(max_depth)` says whether each pixel alone has that value, not only the mean.
-    `allowance` is what Mitsuba's own float arithmetic may be off by, on top of the noise.
+    `uniform(max_depth)` says whether each pixel has that value, not only the mean.
+    `allowance` is the largest rounding error of Mitsuba's own float arithmetic, besides the noise.
     """
 
     exact: Callable[[int], float | None]
@@ -113,7 +113,7 @@ def glass_sphere(
 
 
 def isothermal(max_depth: int) -> float | None:
-    """1 without a limit. Not known in closed form otherwise; never above 1."""
+    """1 without a depth limit. With a limit there is no closed form (the radiance is at most 1)."""
     return 1.0 if max_depth == -1 else None
 
 

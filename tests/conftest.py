@@ -22,7 +22,7 @@ import mitsuba as mi  # isort: skip
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
-# What a shell runs in the background ignores Ctrl-C, and so would all that the tests interrupt
+# Background jobs of a shell ignore SIGINT, and so would the processes that the tests interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -31,7 +31,7 @@ def share_of_the_cores() -> None:
     """Several workers share the machine."""
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    # With one thread, Mitsuba 3.9.1 waits for ever where it reads or writes an EXR file
+    # With one thread, Mitsuba 3.9.1 hangs when it reads or writes an EXR file
     dr.set_thread_count(max(2, cores // workers))
 
 
@@ -138,12 +138,11 @@ def in_subprocess(*arguments, **options) -> subprocess.CompletedProcess:
 
 @pytest.fixture(autouse=True)
 def kernels_are_cached(monkeypatch):
-    """Whether a kernel is in the cache depends on what ran before: ``render`` does not speak of
-    it."""
+    """Makes ``render`` print nothing about compiled kernels, which depend on earlier tests."""
     monkeypatch.setattr(sys.modules["mitsuba_ext.cli.render"], "kernels_compiled", lambda: 0)
 
 
 @pytest.fixture
 def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Comparisons leave the HTML report out, which takes longer than a small comparison."""
+    """Comparisons write no HTML report, which takes longer than a small comparison."""
     monkeypatch.setattr("mitsuba_ext.compare.comparison.write_report", lambda _folder: None)

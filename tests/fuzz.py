@@ -2,10 +2,10 @@
 
     python tests/fuzz.py --seconds 600 --seed 0
 
-tries scene 0, 1, 2 and so on, the kinds in turn, and prints for each failure the line that repeats
-it with the same random numbers. ``--kind``, ``--scene`` and ``--technique`` try one of each;
-``--variant`` selects another variant. At the end it says how often ``path`` could not tell what is
-right, and how often there was too much noise to say anything.
+tests scenes 0, 1, 2 and so on, the kinds in turn, and prints for each failure the command that
+repeats it with the same random numbers. ``--kind``, ``--scene`` and ``--technique`` select one of
+each; ``--variant`` selects another variant. At the end it prints how often the image of ``path``
+could not serve as a reference, and how often the noise was too large for a comparison.
 """
 
 from __future__ import annotations
@@ -31,34 +31,37 @@ from random_scenes import SPP  # isort: skip
 from statistical import regions, sidak, z_welch  # isort: skip
 from techniques import REFERENCE, TECHNIQUES  # isort: skip
 
-#: Renders of ``path`` and of each of ours, and how many times as many decide about a suspicion.
+#: Renders of each technique and of ``path``, and the factor by which there are more of them in the
+#: second test of a suspicious difference.
 _SEEDS, _REFERENCE_SEEDS, _MORE = 8, 16, 5
 
-#: Of each image of ``path`` that is put together of several scenes, and how many such images.
+#: For kinds with several strata of time, whose images of ``path`` are averages over scenes: samples
+#: per pixel of each render, and number of images.
 _STRATUM_SPP, _STRATIFIED_SEEDS = SPP // 4, 8
 
-#: Scores that are suspicious, and how many comparisons share the probability of a false alarm.
+#: z scores above which a difference is suspicious, and the number of comparisons over which the
+#: probability of a false alarm is distributed.
 _SUSPICIOUS, _COMPARISONS = 3.5, 100
 
-#: The relative standard error of means beyond which a comparison says nothing.
+#: Relative standard error of the means beyond which a comparison has too little power.
 PRECISION = 0.05
 
-#: What is tried: all techniques but those that gamble most, whose noise says nothing in a minute.
+#: Techniques that are tested: all but those with the most variance, whose means stay too uncertain.
 TRIED = [name for name in TECHNIQUES if "paper" not in name and "floor" not in name]
 
-#: What is found out about a technique in a scene: right; ``path`` cannot tell; wrong.
+#: Results of a comparison: right; ``path`` cannot be the reference; wrong.
 OK, UNTOLD, FAILED = "ok", "could not tell", "failed"
 
 
 @dataclass
 class Verdict:
-    """On a technique in a scene.
+    """The result of the comparison of a technique with ``path`` in a scene.
 
     Attributes:
         status: One of ``OK``, ``UNTOLD`` and ``FAILED``.
-        what: Why ``path`` cannot tell, or what is wrong.
-        error: Where it is ``OK``: the relative standard error of the difference of the means of the
-            two images.
+        what: Why ``path`` cannot be the reference, or what is wrong.
+        error: For ``OK``: the relative standard error of the difference of the means of the two
+            images.
     """
 
     kind: str
@@ -81,7 +84,7 @@ class Verdict:
 
 
 class CannotTellError(Exception):
-    """``path`` does not know what is right, and why."""
+    """``path`` cannot be the reference; the message says why."""
 
 
 class Trial:
@@ -96,7 +99,7 @@ class Trial:
         self._reference: dict[int, np.ndarray | CannotTellError] = {}
 
     def verdict(self, name: str) -> Verdict:
-        """What is found out about the technique of this name."""
+        """Compares the technique of this name."""
         try:
             status, what, error = self._judge(name)
         except CannotTellError as reason:
@@ -104,7 +107,7 @@ class Trial:
         return Verdict(self.kind, self.number, name, status, what, error)
 
     def _judge(self, name: str) -> tuple[str, str, float]:
-        """Status, what is wrong, and the relative standard error."""
+        """The status, the fault, and the relative standard error."""
         reference = self._path(1)
         try:
             images = self._ours(name, 1)
@@ -124,7 +127,7 @@ class Trial:
                     return FAILED, f"z = {z:.1f} and {again:.1f}, image means {means}", 0.0
         except CannotTellError:
             raise
-        except Exception as error:  # whatever it is, ``path`` has none
+        except Exception as error:  # any error is a fault, because ``path`` has none here
             return FAILED, _line(error), 0.0
         if not (_colours(images).any() or _colours(reference).any()):
             raise CannotTellError("the image is black")
@@ -175,13 +178,13 @@ class Trial:
         return self._render(None, TECHNIQUES[name].make(**self._depth), seeds)
 
     def _rng(self, name: str, times: int) -> np.random.Generator:
-        """The same for one technique as for several."""
+        """The seeds, which are the same for one technique as for several."""
         return np.random.default_rng([self.number, times, zlib.crc32(name.encode())])
 
     def _render(
         self, at: float | None, integrator: mi.Integrator, seeds: list[int], spp: int = 0
     ) -> np.ndarray:
-        # Scenes that are alive take part in the kernels of all others: let go of each
+        # Objects of living scenes are compiled into the kernels of all others: delete each scene
         scene = mi.load_dict(self._kind.make(self.number, self._folder, at), optimize=False)
         images = np.array(
             [np.array(mi.render(scene, integrator=integrator, seed=s, spp=spp)) for s in seeds],
@@ -191,12 +194,12 @@ class Trial:
 
 
 def _scattered(rng: np.random.Generator, count: int) -> list[int]:
-    """Of structured samplers, neighbouring seeds share their numbers."""
+    """Random seeds, because structured samplers draw the same numbers at neighbouring seeds."""
     return rng.choice(1 << 31, count, replace=False).tolist()
 
 
 def _colours(images: np.ndarray) -> np.ndarray:
-    """Without opacity, which may be all that is known well."""
+    """Without opacity, which may be the only channel with little noise."""
     return images[..., :3]
 
 
@@ -211,7 +214,7 @@ def _line(error: Exception) -> str:
 
 
 def verdicts(kind: str, number: int, names: list[str]) -> Iterator[Verdict]:
-    """What is found out in the scene of this kind and number."""
+    """Compares techniques in the scene of this kind and number."""
     with tempfile.TemporaryDirectory() as folder:
         trial = Trial(kind, number, Path(folder))
         for name in names:
@@ -221,7 +224,7 @@ def verdicts(kind: str, number: int, names: list[str]) -> Iterator[Verdict]:
 
 
 def some_techniques(number: int, count: int) -> list[str]:
-    """Those that are tried on the scene of this number: all have their turn."""
+    """The techniques that are tested on the scene of this number; they take turns."""
     return [TRIED[(count * number + i) % len(TRIED)] for i in range(count)]
 
 
@@ -242,13 +245,13 @@ def main() -> int:
     first = number = arguments.seed if arguments.scene is None else arguments.scene
     found: list[Verdict] = []
     while True:
-        # All kinds of one scene where it is named; else each scene has another one
+        # With --scene, all kinds of this scene; else each scene has another kind
         kinds = list(KINDS) if arguments.scene is not None else [list(KINDS)[number % len(KINDS)]]
         names = [arguments.technique] if arguments.technique else some_techniques(number, 4)
         for kind in [arguments.kind] if arguments.kind else kinds:
             for verdict in verdicts(kind, number, names):
                 found.append(verdict)
-                # Of one scene, all is told
+                # For a single scene, print all results
                 if verdict.status != OK or verdict.is_noisy or arguments.scene is not None:
                     print(verdict, flush=True)
         number += 1

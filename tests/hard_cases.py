@@ -1,7 +1,7 @@
-"""Scenes on which renderers break: tiny, huge, empty, degenerate, and everything in between.
+"""Scenes on which renderers fail: tiny, huge, empty, degenerate ones, and others.
 
-Most are changes to one small stage (a floor, a wall, a block that casts a shadow, a lamp), so that
-cases whose structure is the same share compiled kernels.
+Most are variations of one small stage (a floor, a wall, a block that casts a shadow, a lamp), so
+that cases of the same structure share compiled kernels.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ class HardCase:
         make: Makes the scene's dictionary in the active variant.
         precision: Relative standard error of the mean that the comparison must reach.
         spp: Samples per pixel of one render.
-        parameters: Of the integrators.
+        parameters: Parameters of the integrators.
         is_black: The image must be zero everywhere.
-        seeds: Renders of the integrator: two where the pixels tell the noise.
-        unit: Edge of the squares of pixels whose errors do not depend on each other.
+        seeds: Number of renders of the integrator: two are enough if the pixels are independent.
+        unit: Edge of the squares of pixels whose errors are independent of each other.
     """
 
     make: Callable[[], Scene]
@@ -96,8 +96,8 @@ def stage(
     """A floor, a wall and a block under a small lamp, transformed (but not rotated) as a whole.
 
     Parameters:
-        light: In place of the lamp; an empty dictionary for none.
-        changes: More objects; ``None`` removes one.
+        light: Replaces the lamp; an empty dictionary removes it.
+        changes: Additional objects; ``None`` removes one.
     """
     T = mi.ScalarTransform4f
     world = transform or T()
@@ -157,7 +157,7 @@ def _octahedron(radius: float, centre: tuple[float, float, float], **children: A
 
 
 def _many_lights() -> Scene:
-    """Spheres, because the methods of each rectangle are compiled anew."""
+    """Spheres, because Dr.Jit compiles the methods of each rectangle separately."""
     lights = {
         f"light_{i}": {
             "type": "sphere",

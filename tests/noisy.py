@@ -1,6 +1,6 @@
-"""Integrators whose error and time are known, and comparisons of them.
+"""Integrators with known error and time, and comparisons of them.
 
-Times come from a clock that the integrators move themselves.
+Times come from a clock that the integrators advance themselves.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Clock:
 
 
 def noisy_integrator(clock, sigma=1.0, cost=0.01, fixed=0.0, fails_in=None, mean=1.0, calls=None):
-    """Adds noise of variance σ²/spp to the truth, and takes ``fixed + cost · spp`` seconds."""
+    """Renders ``mean`` with noise of variance σ²/spp, and takes ``fixed + cost · spp`` seconds."""
 
     class Noisy(type(mi.load_dict({"type": "prb"}))):
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):

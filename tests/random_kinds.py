@@ -1,7 +1,7 @@
-"""Kinds of random scenes: what is tried, and what ``path`` renders that must have the same mean.
+"""Kinds of random scenes: the scene to test, and the scene of the same mean that ``path`` renders.
 
-All that a scene holds is made anew for each load: in spectral variants, Mitsuba converts the pixels
-of an ``mi.Bitmap`` in place (``docs/mitsuba_faults.md``).
+Each load makes all objects of a scene anew: in spectral variants, Mitsuba converts the pixels of an
+``mi.Bitmap`` in place (``docs/mitsuba_faults.md``).
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ class Kind:
     """A kind of scenes.
 
     Attributes:
-        make: The scene of a number, in a folder for its files: the one to try where the time is
-            ``None``, else the one that ``path`` sees at this time (0 to 1) of the shutter interval.
-        strata: Into how many parts the shutter interval is divided; ``path`` sees each of them at
-            a random time, so that its mean is that of the interval.
+        make: Makes the scene of a number; its files go to a folder. If the time is ``None``: the
+            scene to test; else the one that ``path`` renders for this time (0 to 1) of the shutter
+            interval.
+        strata: Number of parts of the shutter interval; ``path`` renders each at a random time, so
+            that the mean of its images is that of the interval.
         depth: Parameters of integrators that this kind prescribes.
-        allowance: By how much, relatively, the means may differ.
+        allowance: Accepted relative difference of the means.
     """
 
     make: Callable[[int, Path, float | None], Scene]
@@ -48,7 +49,7 @@ def _plain(seed: int, folder: Path, time: float | None) -> Scene:
 
 
 def _moving(seed: int, folder: Path, time: float | None) -> Scene:
-    """One or two things move: in ``moving``, or each where it is at this time."""
+    """One or two shapes move: inside of ``moving``, or placed where they are at the given time."""
     scene, maker = Maker(seed, folder).large().scene(), Maker(seed, folder, stream=13)
     opens, lasts = maker.number(0, 0.3), maker.number(0.2, 1)
     scene["sensor"] |= {"shutter_open": opens, "shutter_close": opens + lasts}
@@ -85,8 +86,8 @@ def _motion(maker: Maker) -> tuple[Scene, Pose]:
 
 
 def _constant_index(seed: int, folder: Path, time: float | None) -> Scene:
-    """Glass in a scene: our plugins with an index that does not depend on the wavelength are
-    Mitsuba's."""
+    """Glass in a scene: with an index that does not depend on the wavelength, our plugins must
+    equal Mitsuba's."""
     scene, maker = Maker(seed, folder).scene(), Maker(seed, folder, stream=17).large()
     for index in range(maker.rng.integers(1, 3)):
         glass: Scene = {"type": "dielectric", "int_ior": maker.number(1.2, 1.9)}
@@ -107,8 +108,8 @@ def _constant_index(seed: int, folder: Path, time: float | None) -> Scene:
 
 
 def _furnace(seed: int, folder: Path, time: float | None) -> Scene:
-    """Glass that disperses, where the sky is all there is: nothing is absorbed, so that glass
-    cannot be seen. ``path`` sees the sky alone."""
+    """Dispersive glass under a constant sky: glass absorbs nothing, so it is invisible. ``path``
+    renders the sky alone."""
     maker = Maker(seed, folder, stream=19).large()
     sky = {"type": "constant", "radiance": maker.colour()}
     scene = {"type": "scene", "sensor": maker.sensor(), "sky": sky}
@@ -117,7 +118,7 @@ def _furnace(seed: int, folder: Path, time: float | None) -> Scene:
     for index in range(maker.rng.integers(1, 4) if time is None else 0):
         glass = {"type": "dispersive_dielectric", **_index(maker)}
         if maker.chance(0.3):
-            # So smooth that hardly anything is scattered twice, and lost
+            # Smooth, so that little energy is lost to multiple scattering in the microsurface
             glass |= {"type": "dispersive_roughdielectric", "distribution": "ggx", "alpha": 0.002}
         scene[f"glass_{index}"] = {**_closed(maker), "bsdf": glass}
     return scene
@@ -144,6 +145,7 @@ KINDS = {
     "plain": Kind(_plain),
     "moving": Kind(_moving, strata=16),
     "constant_index": Kind(_constant_index),
-    # What ends early is lost; roulette's rare long paths would be its only noise in RGB
+    # Long paths without roulette: a small max_depth would lose energy, and in RGB roulette would be
+    # the only source of noise
     "furnace": Kind(_furnace, depth={"max_depth": -1, "rr_depth": 64}, allowance=2e-3),
 }

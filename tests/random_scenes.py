@@ -24,9 +24,9 @@ class Maker:
     merges rectangles, sky and sun leak in ``path``.
 
     Parameters:
-        seed: Another number is another scene.
+        seed: Selects the scene.
         folder: Where files of curves are written.
-        stream: Another number is other random numbers for the same seed.
+        stream: Selects another sequence of random numbers for the same seed.
     """
 
     def __init__(self, seed: int, folder: Path, stream: int = 7) -> None:
@@ -59,7 +59,7 @@ class Maker:
         return makers[self.rng.integers(len(makers))](self)
 
     def large(self) -> Maker:
-        """From now on, things are large and in the middle: what matters is seen."""
+        """From now on, objects are large and in the middle, so that the camera sees them."""
         self.spread, self.size = 0.5, (0.5, 0.9)
         return self
 

@@ -2,14 +2,14 @@
 
     python tests/regenerate_references.py [NAME …]
 
-Do so only when images are *meant* to change, and look at the difference. Each reference holds, for
-a film of 32 × 18 pixels, the mean and the variance of independent renders such as the test makes:
+Do so only after an *intended* change of images, and look at the difference. Each reference holds,
+for a film of 32 × 18 pixels, the mean and the variance of independent renders like the test's:
 
 R, G, B                     mean
 variance.R, .G, .B          variance of one render, per pixel
 tile, image                 variance of the mean of the pixel's tile, and of the whole image
-                            (the filter makes neighbours depend on each other, so these do not
-                            follow from the variances of the pixels)
+                            (the filter correlates neighbouring pixels, so these cannot be computed
+                            from the variances of the pixels)
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ CHANNELS = ["R", "G", "B", "variance.R", "variance.G", "variance.B", "tile", "im
 
 @dataclass(frozen=True)
 class Regression:
-    """An integrator on a scene that shows what it is for. ``is_slow``: not in ``make test``."""
+    """An integrator on a scene that it is made for. ``is_slow``: not in ``make test``."""
 
     integrator: str
     scene: str

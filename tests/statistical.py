@@ -1,15 +1,15 @@
 """The statistics with which tests judge images.
 
 The noise of a mean is estimated from the scatter of independent images, never from a variance that
-the algorithm under test reports about itself. Two seeds are enough where the errors of pixels do
-not depend on each other: what the two images differ by, in all pixels together, tells the noise as
-well as many seeds do. That needs a ``box`` filter, so that no sample lands in two pixels. It holds
-for integrators that learn: what was learned says nothing about which way the samples err that come
-after it. It does not hold where one sample brings light to many pixels (light paths, photons), or
-where pixels share numbers: these need many seeds (:func:`assert_same_mean`).
+the algorithm under test reports about itself. Two seeds are enough if the errors of pixels are
+independent: the difference of the two images, over all pixels, estimates the noise as well as many
+seeds do. That requires a ``box`` filter, so that no sample contributes to two pixels. It also holds
+for integrators that learn, because the errors of the samples after the learning are independent of
+what was learned. It does not hold if one sample contributes to many pixels (light paths, photons),
+or if pixels share random numbers: these need many seeds (:func:`assert_same_mean`).
 
-A Student t statistic is given as the z score of equal probability, so that one threshold serves for
-any number of seeds or pixels.
+A Student t statistic is converted to the z score of equal probability, so that one threshold is
+valid for any number of seeds or pixels.
 
 The module is not called ``statistics``: pytest puts this folder on the path, where it would hide
 the module of the standard library.
@@ -37,8 +37,8 @@ SCENES = Path(__file__).parents[1] / "scenes"
 #: Single tests accept |z| below this (p = 6e-5); several at once, its Šidák correction.
 THRESHOLD = 4.0
 
-#: Seeds of the integrators under test. Those of ``path`` are others: with equal numbers drawn, the
-#: difference of two images says nothing about their noise.
+#: Seeds of the integrators under test. ``path`` has others: with equal random numbers, the
+#: difference of two images would not show their noise.
 SEEDS = range(1, 17)
 REFERENCE_SEEDS = range(1001, 1017)
 
@@ -47,8 +47,8 @@ _ROUNDING = 2e-6
 
 
 def load(name: str, **options: Any) -> mi.Scene:
-    """One of our scenes, in the active variant. Let go of it after use: Dr.Jit compiles the methods
-    of *all* objects that exist into each kernel."""
+    """One of our scenes, in the active variant. Delete it after use: Dr.Jit compiles the methods of
+    *all* living objects into each kernel."""
     return mi.load_file(str(SCENES / f"{name}.xml"), **options)
 
 
@@ -67,15 +67,15 @@ def batches(
 def two_halves(
     scene: mi.Scene, integrator: mi.Integrator, spp: int, seeds: Iterable[int]
 ) -> np.ndarray:
-    """Two images of half of the samples each: their difference tells the noise of their mean."""
+    """Two images of half of the samples each; their difference estimates the noise of the mean."""
     first, second, *_ = seeds
     return batches(scene, integrator, spp // 2, [first, second])
 
 
 @contextlib.contextmanager
 def _one_thread_per_worker() -> Iterator[None]:
-    """Where a process for each core runs tests, its other threads would only wait for work, and
-    keep the cores busy with that."""
+    """One thread of Dr.Jit if each core runs a test process: more threads would keep the cores busy
+    while they wait for work."""
     count = dr.thread_count()
     if "PYTEST_XDIST_WORKER" in os.environ:
         dr.set_thread_count(1)
@@ -206,11 +206,11 @@ def compare_pixels(a: np.ndarray, b: np.ndarray, tile: int = 8, unit: int = 1) -
 
     Parameters:
         tile: Edge of the tiles.
-        unit: Edge of the squares whose errors are taken for independent: more than 1 for filters
-            wider than a pixel.
+        unit: Edge of the squares whose errors are assumed to be independent: more than 1 for
+            filters wider than a pixel.
     """
     height, width = a.shape[1:3]
-    # Neighbouring squares share what lands on their border: measured, for a gaussian filter
+    # Neighbouring squares share the samples at their border: measured for a gaussian filter
     caution = 1.0 if unit == 1 else 1.2
 
     def z(part: tuple[slice, slice], channels: slice = slice(None)) -> tuple[float, float]:
@@ -245,7 +245,7 @@ def z_of_means(
             variances += each.sum()
             terms += (each**2).sum() / (len(x) - 1)
     difference = means[0] - means[1]
-    # Welch–Satterthwaite: where few values make all of the noise, they are all that is known
+    # Welch–Satterthwaite: if few values make most of the noise, there are few degrees of freedom
     freedom = variances**2 / terms if terms > 0 else 1.0
     error = caution * math.sqrt(variances)
     deviation = max(0.0, abs(difference) - rounding - allowance)
@@ -269,8 +269,8 @@ def assert_same_mean(
     tile: int = 8,
     tolerance: float = 0.0,
 ) -> Comparison:
-    """Fails if the means of images of independent seeds differ, or are known so badly that the test
-    says nothing. ``tolerance`` is for colours outside of the gamut."""
+    """Fails if the means of images of independent seeds differ, or if their noise leaves the test
+    without power. ``tolerance`` is for colours outside of the gamut."""
     return _assert_agreement(a, b, compare(a, b, tile), precision, tolerance)
 
 

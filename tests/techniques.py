@@ -1,7 +1,7 @@
-"""The table of techniques: what must have the mean of ``path``, and which tests are run on it.
+"""The table of techniques, which must have the mean of ``path``, and of the tests that each gets.
 
-A new technique takes one row. ``make test`` runs what ``checks`` names; what only ``thorough``
-names is marked ``slow`` and is run by ``.ci/run`` after that.
+A new technique takes one row. ``make test`` runs the tests in ``checks``; those that are only in
+``thorough`` are marked ``slow``, and ``.ci/run`` runs them after the others.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ DEPTHS = (1, 2, 3, 6, -1)
 
 @dataclass(frozen=True)
 class Checks:
-    """What is run on a technique.
+    """The tests of a technique.
 
     Attributes:
-        scenes: Its mean is that of ``path``.
-        variants: In these variants too.
-        furnaces, depths: Furnaces with an exact answer, and at which ``max_depth``.
+        scenes: Scenes in which its mean is compared with that of ``path``.
+        variants: Additional variants for this.
+        furnaces, depths: Furnaces with an exact answer, and values of ``max_depth``.
         cases: Hard cases.
     """
 
@@ -56,12 +56,12 @@ class Technique:
 
     Attributes:
         plugin: The name of the integrator.
-        parameters: Besides ``max_depth``.
-        is_plugin: Does it stand for its plugin? Then it is also asked for seeds, errors, gradients,
-            AOVs.
-        draws_like_path: At the same seed, does it draw the numbers that ``path`` draws? Images are
-            compared then, which is sharper than means.
-        checks, thorough: What is run on it.
+        parameters: Its parameters besides ``max_depth``.
+        is_plugin: Does it represent its plugin? Then it also gets the tests of seeds, errors,
+            gradients and AOVs.
+        draws_like_path: At the same seed, does it draw the same numbers as ``path``? Then images
+            are compared, which has more power than comparing means.
+        checks, thorough: Its tests.
     """
 
     plugin: str
@@ -72,7 +72,7 @@ class Technique:
     thorough: Checks = Checks()
 
     def make(self, max_depth: int = -1, **parameters: Any) -> mi.Integrator:
-        """The integrator; it takes the place of the scene's own in ``mi.render``."""
+        """The integrator; it replaces the scene's own in ``mi.render``."""
         return mi.load_dict(
             {"type": self.plugin, "max_depth": max_depth, **self.parameters, **parameters}
         )
@@ -82,7 +82,7 @@ EVERYTHING = Checks(
     SCENES, ("llvm_ad_mono", "llvm_ad_spectral"), FURNACES, DEPTHS, tuple(HARD_CASES)
 )
 
-#: On what learners have failed: nothing to learn from, one pixel, lights of all kinds and sizes.
+#: Cases on which learners have failed: no light, one pixel, lights of all kinds and sizes.
 _LEARNERS = (
     "plain", "scaled_by_1e4", "lamp_of_radius_1e-4", "no_light", "light_that_nothing_sees",
     "delta_lights", "constant_environment", "sun_of_one_texel", "textured_two_sided_lights",
@@ -92,12 +92,12 @@ _LEARNERS = (
 
 _SEVERAL_LIGHTS = ("delta_lights", "textured_two_sided_lights", "materials", "no_light")
 
-# Settings under which more is learned or gambled: unbiased all the same. The films of the tests
-# are so small that the default pilot learns little.
+# Settings with more learning, or with more shadow rays rejected: they must be unbiased too. The
+# tests have small films, in which the default pilot learns little.
 _TRAINED = {"pilot_spp": 32, "grid": 8}
 _REJECTING = {**_TRAINED, "rejection": True}
 _MAPPED = {**_REJECTING, "light_sampling": "uniform"}
-#: Every connection is tested with the same small probability.
+#: Traces the shadow ray of every connection with the same small probability.
 _FLOOR = {"slope": 0.0, "floor": 0.1}
 
 
@@ -118,7 +118,7 @@ TECHNIQUES: dict[str, Technique] = {
         ),
         thorough=EVERYTHING,
     ),
-    # On films of a few pixels guiding gains little, and would be given up
+    # On films of a few pixels, guiding gains little, and by default would be switched off
     "pss_guided": Technique(
         "pss_guided", {"always_guide": True}, is_plugin=True,
         checks=Checks(
@@ -173,7 +173,7 @@ TECHNIQUES: dict[str, Technique] = {
     "grid_64": _neepp("window", pilot_spp=16, grid=64),
     "grid_1": _neepp("rooms", **{**_TRAINED, "grid": 1}),
     "rejecting": _neepp("rooms", **_REJECTING),
-    # The paper's law is so noisy that its mean is known well enough in one scene only
+    # The law of the paper is so noisy that its mean is precise enough in one scene only
     "rejecting_paper": _neepp("door_ajar", **{**_REJECTING, "law": "paper", "grid": 4}),
     "rejecting_floor": Technique(
         "neepp", {**_REJECTING, **_FLOOR},
@@ -198,7 +198,7 @@ TECHNIQUES: dict[str, Technique] = {
     ),
 }  # fmt: skip
 
-#: What they are compared with.
+#: The integrator to compare with.
 REFERENCE = Technique("path", draws_like_path=True)
 
 DEFAULTS = [name for name, technique in TECHNIQUES.items() if technique.is_plugin]
@@ -207,7 +207,7 @@ FOLLOWERS = [name for name, technique in TECHNIQUES.items() if technique.draws_l
 
 def pairs(*columns: str) -> list:
     """Parameters of a test: the values of ``columns`` of :class:`Checks`, and the technique's name.
-    Those that only its ``thorough`` column names are marked ``slow``."""
+    Those that are only in ``thorough`` are marked ``slow``."""
     found = []
     for name, technique in TECHNIQUES.items():
         quick = _product(technique.checks, columns)

@@ -38,7 +38,7 @@ PRECISION = {
 
 
 def _scene(name: str) -> mi.Scene:
-    """With a filter that keeps pixels independent of each other."""
+    """With a box filter, so that pixels are independent of each other."""
     return load(name, width=WIDTH, height=HEIGHT, rfilter="box")
 
 
@@ -63,8 +63,8 @@ def _check_mean(scene: str, name: str, variant: str = "llvm_ad_rgb", spp: int = 
     ("scene", "name"), [case for case in pairs("scenes") if case.values[-1] not in FOLLOWERS]
 )
 def test_mean_is_that_of_path(scene: str, name: str) -> None:
-    """Also with grids that are far too coarse and far too fine, the paper's law, rejection without
-    regard to what was learned, lights that are chosen in other ways."""
+    """Also with grids that are much too coarse or much too fine, the law of the paper, rejection
+    that ignores what was learned, and other choices of lights."""
     _check_mean(scene, name)
 
 
@@ -150,7 +150,7 @@ def test_image_is_that_of_path_in_variant(variant: str, name: str) -> None:
 
 @pytest.mark.parametrize("name", FOLLOWERS)
 def test_image_is_that_of_path_under_early_roulette(name: str) -> None:
-    """Long paths through glass: the roulette knows the indices of refraction."""
+    """Long paths through glass: Russian roulette takes the refractive indices into account."""
     scene = load("mirrors_and_glass", width=WIDTH, height=HEIGHT)
     _assert_image_of_path(name, scene, spp=64, max_depth=12, rr_depth=2)
 
@@ -234,7 +234,7 @@ def test_image_is_that_of_path_on_spectral_film(variant: str, name: str) -> None
 @pytest.mark.parametrize("light", [{"type": "constant"}, None], ids=["environment", "lamp"])
 @pytest.mark.parametrize("name", FOLLOWERS)
 def test_image_is_that_of_path_with_hidden_emitters(name: str, light: Any) -> None:
-    """Alpha included: where nothing but an emitter is, there is nothing."""
+    """Alpha included: it is 0 where the camera sees only a hidden emitter."""
     camera = sensor(film=film(pixel_format="rgba"))
     scene = mi.load_dict(stage(camera=camera, light=light, wall=None))
     image = _assert_image_of_path(name, scene, hide_emitters=True)
@@ -264,7 +264,7 @@ _GAMBLERS = [name for name in TECHNIQUES if TECHNIQUES[name].parameters.get("rej
     for name in _GAMBLERS
 ])  # fmt: skip
 def test_roulette_rejects_shadow_rays_where_most_are_blocked(name: str) -> None:
-    """Otherwise the tests of its mean would test nothing."""
+    """Otherwise the tests of the mean would have no effect."""
     scene = load("door_ajar", width=WIDTH, height=HEIGHT)
     rays = []
     for technique in (TECHNIQUES["composed_path"], TECHNIQUES[name]):

@@ -19,7 +19,7 @@ def test_bounds_hold_merged_rectangles():
                           "bsdf": diffuse()}
              for z in (0, 5)}  # fmt: skip
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 0.2}, **sides})
-    assert len(scene.shapes()) == 2  # otherwise this tests nothing
+    assert len(scene.shapes()) == 2  # Mitsuba has merged shapes
     box = scene_bounds(scene)
     np.testing.assert_allclose([list(box.min), list(box.max)], [[-9, -9, -0.2], [9, 9, 5]])
     assert not scene_bounds(mi.load_dict({"type": "scene"})).valid()

@@ -35,7 +35,7 @@ def test_compare_writes_table_results_and_images(run, make_scene, tmp_path):
     assert first["levels"][0]["ratios"]["efficiency"]["value"] == pytest.approx(1)
     assert len(second["runs"]) == 2
     assert second["runs"][1]["spp"] == 4
-    # prb is path with other roulette, which a depth of 3 does not reach: the same numbers
+    # prb has another Russian roulette than path, but begins it beyond depth 3: the same numbers
     errors = [record["levels"][0]["figures"]["relmse"]["value"] for record in (first, second)]
     assert errors[0] == pytest.approx(errors[1], rel=0.05)
     assert scene["reference"]["noise"] > 0
@@ -60,7 +60,7 @@ def test_every_budget_works(run, make_scene, tmp_path, budget, kind, levels, wit
     command = ["compare", make_scene(), "path", fragment, *budget, "--seeds", 2, "--out", out]
     code, text, err = run(*command, "--reference-spp", 20000)
     assert err == ""
-    # How many samples fit into a time, and whether the reference is good enough, is luck
+    # The number of samples that fit into a time, and the noise of the reference, vary
     assert code == 0 or kind == "time"
     results = json.loads((out / "results.json").read_text())
     assert results["budget"]["kind"] == kind
@@ -322,7 +322,7 @@ def test_integrator_that_takes_the_process_down_is_a_failed_row(
     assert err.count("going on with the others") == 1
     assert stored_runs(tmp_path) == [3, 1]
     files = set(tmp_path.rglob("out/*/*.exr"))
-    # What is there is taken up the next time
+    # The next comparison uses the finished runs
     monkeypatch.setenv("TROUBLE", "")
     assert run(*arguments)[0] == 0
     assert stored_runs(tmp_path) == [3, 3]

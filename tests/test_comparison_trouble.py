@@ -1,4 +1,4 @@
-"""Comparisons: references that do not fit, and what becomes of trouble."""
+"""Comparisons: references that do not fit, and failures."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_time_that_cannot_be_met_is_noted(clock, tmp_path):
     slow = {"slow": noisy_integrator(clock, cost=50.0)}
     record = compare_noisy(compare.equal_time(20), slow, tmp_path)["integrators"][0]
     assert record["runs"][0]["spp"] == 1
-    assert "3 of 3 runs took another time than 20 s" in record["notes"][0]
+    assert "3 of 3 runs missed the time of 20 s" in record["notes"][0]
 
 
 def test_fireflies_are_noted(clock, tmp_path):
@@ -231,7 +231,7 @@ def test_times_are_compared_within_one_session(clock, tmp_path, monkeypatch):
 
     alone = run_again("monday", 1.0, ["first"])
     images = {path: path.read_bytes() for path in tmp_path.glob("scene/*.exr")}
-    # The machine takes twice as long: so does the first integrator, whose images stay
+    # A session on a machine of half the speed: the first integrator is timed again
     scene = run_again("tuesday", 2.0, ["first", "second"])
     assert len([call for call in calls if call[1] == 64]) == 6
     assert all(path.read_bytes() == content for path, content in images.items())
@@ -265,7 +265,7 @@ def test_times_without_a_common_session_give_no_ratio(clock, tmp_path, monkeypat
     (scene,) = comparison.run()["scenes"]
     ratios = scene["integrators"][1]["levels"][0]["ratios"]
     assert ratios["seconds"] is None and ratios["efficiency"] is None and ratios["relmse"]
-    assert "second and first have no times of one session" in scene["warnings"][1]
+    assert "second and first have no times of a common session" in scene["warnings"][1]
     assert len(scene["integrators"][1]["runs"]) == 2
 
 
@@ -308,7 +308,7 @@ def small(clock):
 def test_progress_is_reported_unless_it_is_switched_off(small, capsys, monkeypatch):
     monkeypatch.setattr(progress, "PERIOD", 0.0)
     small.run()
-    assert (small.folder / "results.json").is_file()  # nobody has said where
+    assert (small.folder / "results.json").is_file()  # in a temporary folder
     captured = capsys.readouterr()
     assert "scene: reference 50%\n" in captured.err and captured.out == ""
     steps = []

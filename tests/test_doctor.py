@@ -1,4 +1,4 @@
-"""What ``mitsuba-ext doctor`` says, without its renders."""
+"""``mitsuba-ext doctor`` without its renders."""
 
 from __future__ import annotations
 

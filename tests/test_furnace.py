@@ -1,4 +1,4 @@
-"""Closed scenes with an exact answer: the sum over path lengths and all weights add up."""
+"""Closed scenes with an exact answer: path lengths and MIS weights add up."""
 
 from __future__ import annotations
 

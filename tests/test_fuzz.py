@@ -26,7 +26,7 @@ SCENES = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("variant", "kind", "scenes"), SCENES, indirect=["variant"])
 def test_random_scenes_are_those_of_path(variant: str, kind: str, scenes: tuple[int, ...]) -> None:
-    """And what is compared is known well enough to say something."""
+    """And the noise of the comparisons is small enough."""
     mi.set_log_level(mi.LogLevel.Error)
     found = [verdict for n in scenes for verdict in verdicts(kind, n, _names(n))]
     told = "\n" + "\n".join(map(str, found))
@@ -38,12 +38,12 @@ def test_random_scenes_are_those_of_path(variant: str, kind: str, scenes: tuple[
 
 
 def _names(scene: int) -> list[str]:
-    """The simplest technique, and its share of the others: all have their turn."""
+    """Each scene tests the simplest technique and some of the others, which take turns."""
     numbers = [n for *_, scenes in SCENES for n in scenes]
     return list(dict.fromkeys(["composed_path", *TRIED[numbers.index(scene) :: len(numbers)]]))
 
 
-# ---- What the fuzzer makes of images ----
+# ---- The fuzzer's verdict on images ----
 
 
 def _images(mean: float, noise: float, opacity: bool = False) -> Callable[..., np.ndarray]:

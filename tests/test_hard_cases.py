@@ -29,8 +29,8 @@ _REFERENCE_SEEDS = range(1001, 1007)
 
 
 def _scene(case: str) -> mi.Scene:
-    """Not kept: Dr.Jit compiles the methods of all objects that exist into each kernel. Not
-    optimized: where Mitsuba 3.9.1 merges rectangles, the sky leaks through them in ``path``."""
+    """Not kept, because Dr.Jit compiles the methods of all living objects into each kernel. Not
+    optimized, because the sky leaks through rectangles that Mitsuba 3.9.1 merges in ``path``."""
     return mi.load_dict(HARD_CASES[case].make(), optimize=False)
 
 
@@ -48,7 +48,7 @@ def _is_one_pixel(case: str) -> bool:
 
 @pytest.mark.parametrize(("case", "name"), pairs("cases"))
 def test_hard_case_has_sound_pixels_and_the_mean_of_path(case: str, name: str) -> None:
-    """Where the integrator draws the numbers of ``path``: the image of ``path``."""
+    """If the integrator draws the same random numbers as ``path``, it renders the same image."""
     hard, technique = HARD_CASES[case], TECHNIQUES[name]
     integrator = technique.make(hard.max_depth, **hard.parameters)
     scene = _scene(case)
@@ -105,7 +105,8 @@ def assert_same_mean_of_case(a: np.ndarray, b: np.ndarray, precision: float) -> 
 
 @EACH_DEFAULT
 def test_extreme_seeds_give_images_of_their_own(name: str) -> None:
-    """The seed as a number and as a Dr.Jit value is the same seed, and no other one's twin."""
+    """A seed gives the same image as a number and as a Dr.Jit value, and other seeds give other
+    images."""
     scene, integrator = _scene("plain"), TECHNIQUES[name].make(4)
     seeds = [0, 2**32 - 1, 1]
     images = batches(scene, integrator, 16, seeds)
@@ -168,8 +169,8 @@ def test_gradients_are_refused_with_a_hint_at_prb(name: str) -> None:
 
 
 def _mentions(error: BaseException | None, kind: type, *words: str) -> bool:
-    """Is there, in the chain of causes, an error of this kind (or a text that holds one, since
-    Mitsuba's C++ turns errors into text) that has all these words?"""
+    """Does the chain of causes contain an error of this kind with all these words? (Or a message
+    that quotes one, because Mitsuba's C++ code converts errors to text.)"""
     while error is not None:
         text = str(error)
         if (isinstance(error, kind) or kind.__name__ in text) and all(w in text for w in words):

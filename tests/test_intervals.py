@@ -1,4 +1,4 @@
-"""Confidence intervals: their formulas, and how often they hold the truth."""
+"""Confidence intervals: their formulas, and how often they contain the right value."""
 
 from __future__ import annotations
 

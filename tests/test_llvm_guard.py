@@ -1,4 +1,4 @@
-"""An LLVM library that does not work is replaced silently where possible, and named otherwise.
+"""An LLVM library that does not work is replaced silently if possible; else an error names it.
 
 The libraries here are fakes: another shared library under LLVM's name. Whatever depends on the
 moment at which Dr.Jit loads one runs in a process of its own.
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsuba_ext import llvm, runtime
+from mitsuba_ext import llvm, llvm_install, runtime
 from mitsuba_ext.errors import InstallationError
 
 ROOT = Path(__file__).parents[1]
@@ -197,14 +197,14 @@ def test_remedy_is_a_package_where_no_usable_library_exists(
     fake: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(llvm, "candidates", lambda: [llvm.Library.at(str(fake))])
-    monkeypatch.setattr(llvm, "lacks_system_library", lambda: False)
+    monkeypatch.setattr(llvm_install, "lacks_system_library", lambda: False)
     monkeypatch.setattr(shutil, "which", lambda name, path=None: "/usr/bin/" + name)
-    monkeypatch.setattr(llvm, "offered_packages", lambda: ["libllvm19"])
+    monkeypatch.setattr(llvm_install, "offered_packages", lambda: ["libllvm19"])
     assert runtime._remedy(None, loaded=True) == "run `sudo apt install libllvm19`"
 
 
 def test_missing_system_library_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(llvm, "lacks_system_library", lambda: True)
+    monkeypatch.setattr(llvm_install, "lacks_system_library", lambda: True)
     with pytest.raises(InstallationError, match=r"libatomic\.so\.1 is missing.*libatomic"):
         with runtime.missing_library_is_named():
             raise NameError("name '_drjit_ext' is not defined")  # what Dr.Jit 1.5 raises
@@ -222,10 +222,10 @@ def test_probe_that_cannot_import_drjit_says_nothing_about_the_library(
 
 
 def test_ensure_without_a_usable_library_is_one_sentence(fake: Path) -> None:
-    script = ROOT / "mitsuba_ext" / "llvm.py"
     process = subprocess.run(
-        [sys.executable, "-I", str(script), "--ensure"],
+        [sys.executable, "-m", "mitsuba_ext.llvm_install", "--ensure"],
         env={**os.environ, llvm.VARIABLE: str(fake)},
+        cwd=ROOT,
         capture_output=True,
         text=True,
     )

@@ -37,8 +37,8 @@ class Fault(NamedTuple):
     is_slow: bool
 
     def claim(self, line: int) -> tuple[float, float, float]:
-        """What is printed at that line of the page: what Mitsuba says, how exactly the page knows
-        it, and what would be right."""
+        """The claim at that line of the page: the value found in Mitsuba, its tolerance, and the
+        right value."""
         text = self.code.splitlines()[line - self.line]
         found, tolerance, right = CLAIM.fullmatch(text).groups()
         return literal_eval(found), literal_eval(tolerance or "0"), literal_eval(right)
@@ -48,19 +48,19 @@ class Fault(NamedTuple):
         return [self.claim(self.line + i) for i, text in enumerate(lines) if "print(" in text]
 
     def judge(self, line: int, value: float) -> None:
-        """Fails where the ``value`` printed at that line is not what the page says."""
+        """Fails if the ``value`` printed at that line is not the one on the page."""
         found, tolerance, right = self.claim(line)
         if abs(value - found) <= tolerance:
             return
         section = f'the section "{self.title}" of docs/{PAGE.name}'
         if abs(value - right) <= tolerance:
             files = ", and the workaround in " + ", ".join(self.files) if self.files else ""
-            pytest.fail(f"Mitsuba has mended this: remove {section}{files} ({value})")
+            pytest.fail(f"Mitsuba has fixed this: remove {section}{files} ({value})")
         pytest.fail(f"The fault has changed: {section} says {found}, and it is {value}")
 
 
 def _read() -> tuple[str, list[Fault]]:
-    """The code that all blocks begin with, and the faults."""
+    """The code that runs before each block, and the faults."""
     page = PAGE.read_text(encoding="utf-8")
     preamble = BLOCK.search(page)
     faults = []
@@ -91,10 +91,10 @@ def test_mitsuba_still_has_this_fault(fault: Fault, tmp_path: Path, monkeypatch)
     namespace = {"print": judge}
     try:
         exec(PREAMBLE, namespace)
-        # The numbers of lines are those of the page, also in tracebacks
+        # Line numbers are those of the page, also in tracebacks
         exec(compile("\n" * (fault.line - 1) + fault.code, PAGE, "exec"), namespace)
     finally:
-        # What stays alive is compiled into the kernels of other tests
+        # Objects that stay alive would be compiled into the kernels of other tests
         namespace.clear()
         gc.collect()
         mi.set_variant("llvm_ad_rgb")
@@ -110,7 +110,7 @@ def test_each_section_claims_something_wrong_and_links_to_files_that_exist() -> 
             assert (PAGE.parents[1] / file).is_file(), fault.title
 
 
-def test_failures_tell_a_mended_fault_from_another_one() -> None:
+def test_failures_distinguish_a_fixed_fault_from_a_changed_one() -> None:
     files = ["mitsuba_ext/materials/glass.py"]
     fault = Fault("Dark glass", 7, "x = 1\nprint(x)  # 0.4 ± 0.01, not 0.5\n", files, False)
     fault.judge(8, 0.405)

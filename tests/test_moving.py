@@ -170,7 +170,7 @@ def test_integrators_that_nest_ours_see_motion() -> None:
 
 
 def test_blur_is_not_what_is_seen_at_one_time() -> None:
-    """Otherwise the tests of the mean would test nothing."""
+    """Otherwise the tests of the mean would have no effect."""
     case = "turns_more_than_once"
     image = batches(resting_scene(case, 0.5), REFERENCE.make(4), 256, [1])[0]
     assert np.abs(image - reference(case).mean(axis=0)).mean() > 0.05 * image.mean()

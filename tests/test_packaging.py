@@ -1,4 +1,4 @@
-"""What the wheel holds, and that it works where the source tree is not at hand."""
+"""The content of the wheel, which works without the source tree."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_plugin_folders_are_part_of_the_package_and_keep_their_sources() -> None
 
 @pytest.fixture
 def source_tree(tmp_path: Path) -> Path:
-    """What a clone or a zip of the sources holds."""
+    """A copy of the source tree, as a clone or a zip archive has it."""
     tree = tmp_path / "tree"
     for source in SOURCES:
         shutil.copytree(source, tree / source.name)
@@ -92,7 +92,7 @@ def source_tree(tmp_path: Path) -> Path:
 
 
 def test_other_processes_run_the_package_of_their_parent(source_tree: Path, tmp_path: Path) -> None:
-    """That of an installed command, and not the one in the current folder."""
+    """It runs the package of the installed command, and not one in the current folder."""
     packages = tmp_path / "packages"
     shutil.copytree(SOURCES[0], packages / "mitsuba_ext")
     for source in SOURCES[1:]:

@@ -48,7 +48,7 @@ def test_lengths_of_known_cells() -> None:
     np.testing.assert_allclose(voronoi_weights([0.3], "torus"), [1])
     np.testing.assert_allclose(voronoi_weights([0, 0, 1], "torus"), 1 / 3)
     np.testing.assert_allclose(voronoi_weights([0.4, 0.4, 0.8, 0.4], "clip"), [0.2, 0.2, 0.4, 0.2])
-    # One is nearest to no test
+    # One point is nearest to no test point
     np.testing.assert_array_equal(nearest_neighbour_weights([0.1, 0.9], [0.0, 0.2]), [1, 0])
 
 
@@ -140,7 +140,7 @@ def test_a_heap_of_points_takes_nothing_from_the_others(size, dimension):
 
 def test_no_image_that_matters_is_left_out() -> None:
     for power, boundary in itertools.product((1, 2, 3), BOUNDARIES):
-        # With this seed, what would be left out changes the sum by 1e-6 only
+        # With this seed, the missing images would change the sum by 1e-6 only
         x = np.clip(_sets(100, 2, 1, seed=12)[0] ** power, 1e-6, 1 - 1e-6)
         exact = voronoi._cell_measures(x, voronoi._images(x, boundary, np.inf))
         np.testing.assert_allclose(voronoi_weights(x, boundary), exact, rtol=1e-6)
@@ -264,7 +264,7 @@ def test_weights_of_piecewise_constant_densities_are_unbiased() -> None:
         x = piecewise_points(u, edges, probabilities)
         sums.append(piecewise_weights(x, edges, probabilities) @ np.exp(-3 * x))
     assert abs(_z(np.array(sums), (1 - np.exp(-3)) / 3)) < 4
-    # A piece that is certain needs no correction
+    # A piece of probability 1 needs no correction
     x = np.array([0.1, 0.2, 0.7])
     np.testing.assert_allclose(piecewise_weights(x, [0, 1], [1]), unbiased_weights(x), rtol=1e-14)
     np.testing.assert_allclose(piecewise_weights([0.1], [0, 0.9, 1], [0.9, 0.1]), [1])
@@ -354,7 +354,7 @@ def test_stratified_points_have_a_cell_each(dimension, count):
 
 @pytest.mark.parametrize("count, dimension", [(31, 2), (32, 2), (34, 3)])
 def test_the_lattice_is_the_best_that_powers_make(count, dimension):
-    """By its dual: the fewest and highest frequencies alias."""
+    """By the dual lattice: only few and high frequencies alias."""
     reach = 60 if dimension == 2 else 20
     h = np.array(list(itertools.product(range(-reach, reach + 1), repeat=dimension)))
     decay = 1 / np.prod(np.maximum(1, np.abs(h)) ** 2.0, axis=1)

@@ -1,4 +1,4 @@
-"""Path guiding: unbiased whatever it guides, worth it behind a door, and quiet where it is not."""
+"""Path guiding: unbiased in all cases, more efficient behind a door, off where it gains nothing."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def guided(max_depth: int = 5, **parameters: Any) -> mi.Integrator:
 
 
 def insisting(max_depth: int = 5, **parameters: Any) -> mi.Integrator:
-    """Guides also where that does not pay, as on most films of tests."""
+    """Guides even if the estimated gain is too small, as on most films of tests."""
     return guided(max_depth, always_guide=True, **parameters)
 
 
@@ -154,7 +154,7 @@ def test_three_pilots_of_one_sample_keep_the_mean(reference: np.ndarray) -> None
 
 
 def test_later_connections_alone_have_the_mean_of_path() -> None:
-    """Lights without extent, which no direction runs into, are connected nevertheless."""
+    """Connections to delta lights remain, because BSDF samples cannot hit them."""
     point = {"type": "point", "position": [0.8, -1, 1.5], "intensity": {"type": "rgb", "value": 1}}
     for more in ({}, {"point": point}):
         scene = mi.load_dict(stage(**more))
@@ -171,7 +171,7 @@ def test_no_shadow_ray_leaves_the_first_vertex() -> None:
     assert later.statistics.rays["shadow"] == later.statistics.connections == 0
 
 
-# ---- Where there is nothing to learn, and where it is not worth while ----
+# ---- Nothing to learn, or too little gain ----
 
 
 def _mirrors() -> dict:

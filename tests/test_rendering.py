@@ -10,8 +10,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.rendering.render import Stage, interrupts, time_budget
-from mitsuba_ext.rendering.render import render as rendering
+from mitsuba_ext.rendering import interrupts, time_budget
+from mitsuba_ext.rendering import render as rendering
+from mitsuba_ext.rendering.render import Stage
 from mitsuba_ext.transport.walk import PathSample
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -98,7 +99,7 @@ def test_passes_of_large_films_keep_the_samples_of_a_pixel_together(scene, sampl
 
 
 def test_passes_of_expensive_samples_are_shorter(scene):
-    """Else nothing could stop them for minutes."""
+    """Else a pass would last minutes, in which nothing can stop it."""
     def length(**parameters):
         integrator = mi.load_dict({"type": "reweighted_direct", **parameters})
         job = rendering._Job(integrator, scene, scene.sensors()[0], 0, 1 << 20)
@@ -143,7 +144,7 @@ def test_pilots_and_passes_keep_the_sample_count(scene, sampler):
 
 
 class _Clock:
-    """A clock that only passes move: each sample per pixel takes a tenth of a second."""
+    """A clock that only passes advance: each sample per pixel takes a tenth of a second."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, compiling: int = 0) -> None:
         self.now, self.compiling = 0.0, compiling
@@ -281,7 +282,7 @@ def test_passes_share_kernels_and_memory(scene):
     assert compiled[1] == compiled[2], "a pass of a pilot had to compile"
     assert compiled[3] == compiled[8], "a pass of the last stage had to compile"
     integrator.render(scene, sensor, spp=30, seed=1)
-    # Small ones that make tables may be new, but none of those that trace
+    # Small kernels that make tables may be new, but not those that trace paths
     assert compiled[10] == compiled[11] and compiled[12] == compiled[17], "another seed compiled"
     integrator.render(scene, sensor, spp=69)
     many = integrator.statistics

@@ -1,4 +1,4 @@
-"""The report of a comparison: what its file says."""
+"""The report of a comparison: the content of its file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Document(HTMLParser):
-    """What an HTML file loads, its ids, and its text."""
+    """The resources that an HTML file loads, its ids, and its text."""
 
     def __init__(self, html: str) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Many connections of the first vertex: unbiased, and worth it in soft shadows."""
+"""Many connections of the first vertex: unbiased, and more efficient in soft shadows."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_mean_is_that_of_path(reference, pattern, weights, count):
 
 
 def test_glossy_things_and_mirrors_reflect_lights_once() -> None:
-    """The BSDF sample and the many light samples share what both can find."""
+    """MIS weights of the BSDF sample and of the many light samples add up to one."""
     scene = load("mirrors_and_glass", width=32, height=18, rfilter="box")
     reference = two_halves(scene, REFERENCE.make(3), 6144, REFERENCE_SEEDS)
     images = two_halves(scene, direct(3, light_samples=8), 1536, SEEDS)
@@ -57,7 +57,7 @@ def test_glossy_things_and_mirrors_reflect_lights_once() -> None:
     ("sobol", "none", 5), ("lattice", "none", 8),
 ])  # fmt: skip
 def test_sets_lower_the_noise_of_soft_shadows(pattern, weights, factor):
-    """Beside independent light samples, as many."""
+    """Compared with the same number of independent light samples."""
     scene = _box()
     images = {
         name: batches(scene, direct(light_samples=64, pattern=p, weights=w), 1, [7])[0]

@@ -1,4 +1,4 @@
-"""Weighted points of the aperture: unbiased, whole sets, and better where all is defocus."""
+"""Weighted points of the aperture: unbiased, whole sets, less noise from defocus."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_seeds_are_independent_and_repeatable() -> None:
     assert np.abs(a - other).mean() > 0.01 * a.mean()
 
 
-# ---- What a user meets ----
+# ---- Scene files, warnings and errors ----
 
 
 def test_without_an_aperture_the_nested_integrator_goes_on_alone() -> None:

@@ -1,4 +1,4 @@
-"""Weighted times of the shutter interval: unbiased, and better where all is motion."""
+"""Weighted times of the shutter interval: unbiased, less noise from motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Weighted wavelengths: unbiased, and better where the noise is coloured."""
+"""Weighted wavelengths: unbiased, less coloured noise."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def test_passes_of_structured_samplers_are_whole_sets(sampler):
 
 
 def test_passes_of_structured_samplers_are_short_for_large_films():
-    """Else 30 seconds, which batch systems leave, would not see the end of one."""
+    """Else a pass would last longer than the 30 seconds that batch systems wait."""
     lengths = {}
     for width, height in ((640, 360), (1920, 1080)):
         film = {"type": "hdrfilm", "width": width, "height": height}

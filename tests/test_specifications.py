@@ -1,4 +1,4 @@
-"""Integrators as they are named, and the depth that they take over from a scene."""
+"""Integrators made from specifications, and the depth that they inherit from a scene."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_brackets_hold_nested_plugins_to_any_depth():
         ("x:a=1,a=2", '"a" is given twice'), ("x:type=y", '"type" is given twice'),
         ("x:n=[y", "without"), ("x:n=y]", "without"), ("x:n=]y[", "without"),
         ("x:n=[]", "expected NAME"), ("x:n=[y:a]", 'found "a"'),
-        ("x:n=[y],z", 'behind "]"'), ("x:n=[y][z]", 'behind "]"'),
+        ("x:n=[y],z", 'after "]"'), ("x:n=[y][z]", 'after "]"'),
     ],
 )
 def test_malformed_specification_is_refused(text, words):

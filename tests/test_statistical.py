@@ -1,4 +1,4 @@
-"""The statistics of the tests find what is wrong, and let pass what is right."""
+"""The statistics of the tests detect errors, and accept right images."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_equal_means_agree(mean: np.ndarray) -> None:
     ids=["everywhere", "a block", "a small block", "scattered", "half", "a channel"],
 )
 def test_bias_is_found_wherever_it_is(mean: np.ndarray, pixels: tuple, factor: float) -> None:
-    """Also in a few pixels: their error is no noise."""
+    """Also errors of a few pixels, which are not taken for noise."""
     wrong = mean.copy()
     wrong[pixels] *= factor
     with pytest.raises(AssertionError, match="z up to"):

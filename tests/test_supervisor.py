@@ -13,9 +13,9 @@ import pytest
 from mitsuba_ext import marks
 from mitsuba_ext.cli import supervisor
 from mitsuba_ext.compare import InputError
-from mitsuba_ext.rendering.render import interrupts
+from mitsuba_ext.rendering import interrupts
 
-#: What the lines of a worker can use. It is started anew with the same lines.
+#: Code before the lines of each worker. A restarted worker runs the same lines.
 WORKER = """
 import json, os, signal, sys, time
 from pathlib import Path
@@ -27,7 +27,7 @@ def begin(mark=mark):
 def log(text):
     with open(folder / "log", "a") as file:
         file.write(text + "\\n")
-def wait(number, then=None):  # for the signal number, with which something is done
+def wait(number, then=None):  # for a signal, after asking the supervisor for it
     signal.signal(number, then or (lambda *_: sys.exit(130)))
     os.kill(parent, SIGNAL)
     time.sleep(8)
@@ -53,7 +53,7 @@ def supervise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize("code", [0, 1, 2, 130])
 def test_worker_that_ends_in_order_ends_all(supervise, tmp_path, capfd, code):
-    # The mark of another process: nobody is blamed for it
+    # The mark of another process: no integrator is blamed
     lines = f"mark.parent.mkdir(); mark.write_text('1'); sys.exit({code})"
     assert supervise(lines) == (code, ["measure"])
     assert capfd.readouterr().err == ""

@@ -1,4 +1,4 @@
-"""Building trees of primary samples: what is learned and expected, and what teaches nothing."""
+"""Building trees of primary samples: learned and expected densities, and samples to ignore."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_the_first_bit_of_a_code_is_the_side_of_the_first_split(u, code):
     assert int(cell_code(mi.Point2f(*u))[0]) == code
 
 
-# ---- What teaches nothing ----
+# ---- Samples without information ----
 
 
 @pytest.mark.parametrize("count, value", [

@@ -83,7 +83,7 @@ def test_variance_is_that_of_the_mean_of_all_samples(lattice, batches):
     assert abs(z_exact(variance, exact)[0]) < THRESHOLD
     assert z_exact(variance, exact)[1] < 0.07
     assert abs(z_exact((mean - p) ** 2, exact)[0]) < THRESHOLD
-    # What a user does: the errors against the truth are those that were announced
+    # As a user would: the errors against the exact image have the variance in the channels
     assert abs(z_exact((mean - p) ** 2 - variance, 0.0)[0]) < THRESHOLD
 
 
@@ -93,7 +93,7 @@ def test_variance_is_that_of_the_mean_of_all_samples(lattice, batches):
 )
 def test_variance_announces_the_differences_of_independent_renders(nested, sampler, batches):
     """E[(a − b)²] = Var a + Var b, for a wide filter too."""
-    # Below the lamp: its edge would decide everything
+    # Below the lamp, because its edge would dominate the variance
     view = lookat([0, -4, 1.2], [0, 0, -0.2], [0, 0, 1])
     wide = film(12, 12, rfilter={"type": "gaussian"})
     scene = mi.load_dict(stage(camera=sensor(to_world=view, film=wide, sampler=sampler)))
@@ -111,7 +111,7 @@ def test_variance_announces_the_differences_of_independent_renders(nested, sampl
 
 
 def test_update_keeps_small_variances_of_large_means():
-    """Where a difference of sums of squares would have no digit left."""
+    """For values whose sums of squares would cancel completely."""
     random = np.random.default_rng(1)
     images = 1e9 + random.normal(size=(50, 4, 4, 1))
     batches = Batches(["Y"], 1)

@@ -1,4 +1,5 @@
-"""The random walk: its decisions can be replaced, and what a scene lacks is not in the kernel."""
+"""The random walk: its decisions can be replaced, and kernels hold no code that a scene does not
+need."""
 
 from __future__ import annotations
 
@@ -72,7 +73,7 @@ class _RecordingShadowTest(ShadowTest):
 
 
 class _RecordingQuery(SceneQuery):
-    """Has no state: what it is asked must differ from bounce to bounce."""
+    """A decision without state: only its arguments can differ from bounce to bounce."""
 
     def __init__(self, recorder: _Recorder, occluded: _Recorder) -> None:
         self.recorder, self.shadow = recorder, occluded
@@ -162,7 +163,7 @@ def test_a_rejected_connection_traces_no_shadow_ray_and_survivors_weigh_more(box
 
 
 def test_weights_of_guided_samples_do_not_end_paths(box):
-    """Where these are dense, throughput is low because paths matter."""
+    """A high density of guided samples makes the throughput low, although the path is important."""
 
     class Weighted(DirectionSamples):
         def draw(self, *arguments):
@@ -209,7 +210,7 @@ print(size(always), size(always, point), size(always, area), size(always, area, 
 
 
 def test_what_the_scene_lacks_is_not_in_the_kernel():
-    """In a process of its own: Dr.Jit's calls reach the objects of all living scenes."""
+    """In its own process, because Dr.Jit compiles methods of the objects of all living scenes."""
     output = subprocess.run(
         [sys.executable, "-c", KERNEL_SIZE], capture_output=True, text=True, check=True
     ).stdout
@@ -220,8 +221,8 @@ def test_what_the_scene_lacks_is_not_in_the_kernel():
 
 
 def test_no_scene_is_freed_while_calls_are_traced(box):
-    """Dr.Jit calls the methods of all living BSDFs. It ends the process if a BSDF in Python dies
-    between two of them, as part of garbage that the collector finds."""
+    """Dr.Jit calls the methods of all living BSDFs. The process crashes if the garbage collector
+    deletes a BSDF in Python between two of these calls."""
     found = []
 
     class Asking(DirectionSamples):

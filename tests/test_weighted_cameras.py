@@ -1,4 +1,4 @@
-"""Weighted lens points, times and wavelengths together, in each other and around what learns."""
+"""Weighted lens points, times and wavelengths combined, and around integrators that learn."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ def nest(names: tuple[str, ...], innermost: dict = PATH, **parameters: Any) -> d
 @IN_SPECTRAL
 @pytest.mark.parametrize("order", [("lens", "time", "wavelength"), ("wavelength", "lens", "time")])
 def test_weights_of_all_purposes_are_multiplied(variant, order):
-    """A pixel's product of weights has the variance of a product, not that of its last factor."""
+    """All weights of a sample are multiplied: the sum over a pixel varies as products do, not as
+    the last factor does."""
     scene = white(pixel_format="rgba")
 
     def spread(names: tuple[str, ...]) -> float:
@@ -101,7 +102,7 @@ def test_purposes_pixels_and_sets_draw_numbers_of_their_own(variant):
     numbers = np.array([np.array(n) for n in numbers])
     assert len(numbers) == 8
     circle = np.exp(2j * np.pi * numbers)
-    # Neither a number nor a difference (or sum) of two prefers a place
+    # Each number, and the difference and sum of two numbers (modulo 1), are uniform
     for a, b in itertools.combinations(circle, 2):
         for product in (a, a * b, a * b.conj()):
             assert abs(product.mean()) < 4.5 / np.sqrt(len(pixel))

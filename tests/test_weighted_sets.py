@@ -1,4 +1,4 @@
-"""Weighted sets on the device: what kernels draw from them."""
+"""Weighted sets in device memory, and the numbers that kernels draw from them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _drawn(sets: WeightedSets, users: int, seed: int = 0) -> tuple[np.ndarray, n
     u, weight = sets.draw(number, shift, index, mi.Bool(True))
     dimension = 2 if isinstance(u, mi.Point2f) else 1
     u = np.asarray(u.numpy()).reshape(dimension, users, sets.count)
-    weight = dr.full(mi.Float, 1.0, users * sets.count) * weight  # there may be none
+    weight = dr.full(mi.Float, 1.0, users * sets.count) * weight  # it may be the number 1.0
     return np.moveaxis(u, 0, -1), weight.numpy().reshape(users, sets.count)
 
 
@@ -49,7 +49,7 @@ def test_each_point_is_uniform_whatever_its_weight(weights):
     for index in (0, 8):
         for axis in range(2):
             assert stats.kstest(u[:, index, axis], "uniform").pvalue > 6e-5
-    # The weight says nothing about the place
+    # The mean weight does not depend on the position
     for region in (u < 0.1).all(axis=-1), (np.abs(u - 0.5) < 0.2).all(axis=-1):
         sums = (weight * region).mean(axis=1) - region.mean()
         expected = (0.1**2, 0.4**2)[int(region.mean() > 0.05)]
@@ -90,7 +90,7 @@ def test_only_voronoi_points_stay_where_they_are() -> None:
 
 
 def test_the_order_of_points_is_random() -> None:
-    """That of a sampler, or of sets for another purpose, must not agree with it."""
+    """The order of the points must not be correlated with that of samplers or of other sets."""
     u, _ = _drawn(WeightedSets("lattice", "voronoi", 64, 1, seed=1), 50)
     first = u[:, :8, 0].mean(axis=1)
     assert abs(first.mean() - 0.5) < 0.1 and first.std() > 0.05
@@ -102,7 +102,7 @@ def test_a_second_weight_is_that_of_places_modulo_a_period() -> None:
     u, weight, folded = sets.draw(zero, mi.Point2f(0.3), index, mi.Bool(True))
     np.testing.assert_allclose(weight, 12 * voronoi_weights(u.numpy()), rtol=1e-4)
     np.testing.assert_allclose(folded, 12 * voronoi_weights(u.numpy() * 4 % 1), rtol=1e-3)
-    # Equidistant points come in fours that are the same: none of them weighs nothing
+    # Groups of four equidistant points coincide modulo 1/4: none of them has the weight zero
     sets = WeightedSets("lattice", "torus", 64, 1, seed=3, periods=4)
     index, zero = dr.arange(mi.UInt32, 64), dr.zeros(mi.UInt32, 64)
     _u, _weight, folded = sets.draw(zero, mi.Point2f(0.3), index, mi.Bool(True))

@@ -44,7 +44,7 @@ for command in (render, compare, diff, list_plugins, doctor):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command and returns its exit code."""
     try:
-        # Called by the shell, and not from Python: the process is ours to divide
+        # Only if started from a shell, and not from Python, do comparisons run in worker processes
         obj = SUPERVISED if arguments is None else None
         code = cli.main(arguments, prog_name="mitsuba-ext", standalone_mode=False, obj=obj)
     except click.Abort:
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except click.ClickException as error:
         if not list(sys.argv[1:] if arguments is None else arguments):
-            error.show()  # the help: nothing was asked for
+            error.show()  # the help, because no subcommand was given
         else:
             _complain(error.format_message())
         return 2
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except BrokenPipeError:
         return 1
-    except OSError as error:  # a full disk, a folder that went away
+    except OSError as error:  # a full disk, a deleted folder
         _complain(str(error))
         return 2
     return code if isinstance(code, int) else 0

@@ -1,4 +1,4 @@
-"""What the commands share: kinds of options, the variant, the terminal."""
+"""What the commands share: types of options, selection of the variant, output to the terminal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ INTERRUPTED = 130
 
 MAX_SEED = 2**32 - 1
 
-#: Width of tables that go to a file or a pipe, where there is no terminal to ask.
+#: Width of tables that are written to a file or a pipe.
 _PIPE_WIDTH = 160
 
 
@@ -44,7 +44,7 @@ class Numbers(click.ParamType):
 
 
 class FilledPath(click.Path):
-    """A path; an empty one is not taken for the current folder."""
+    """A path that is not empty. (``Path("")`` would be the current folder.)"""
 
     def __init__(self) -> None:
         super().__init__(path_type=Path)
@@ -66,7 +66,7 @@ class Definition(click.ParamType):
 
 
 def scene_options(command: Callable) -> Callable:
-    """What ``render`` and ``compare`` share."""
+    """Adds the options that ``render`` and ``compare`` share."""
     for decorator in (
         click.option(
             "--size", type=Size(), metavar="WxH",
@@ -103,7 +103,7 @@ def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
     except (ImportError, RuntimeError) as error:
         raise InputError(f'the variant "{variant}" does not start: {one_line(error)}') from error
     if plugins:
-        sys.path.insert(0, "")  # as python -m does: modules beside the user
+        sys.path.insert(0, "")  # modules in the current folder, as with python -m
     for name in plugins:
         try:
             _import_module(name)
@@ -130,8 +130,8 @@ def kernels_compiled() -> int:
 
 
 def say(text: str, err: bool = True) -> None:
-    """Prints a line, on stderr or stdout. A terminal that is gone is no reason to lose an image or
-    to end with another exit code."""
+    """Prints a line, on stderr or stdout. A terminal that was closed is ignored, so that the image
+    is still written and the exit code stays the same."""
     with contextlib.suppress(OSError):
         click.echo(text, err=err)
 

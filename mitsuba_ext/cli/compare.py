@@ -37,7 +37,7 @@ from .common import (
 )
 @click.option(
     "--until", type=click.FloatRange(min=0, min_open=True), metavar="RELMSE",
-    help="Double the samples until the mean relMSE is reached: what does it cost?",
+    help="Double the samples until the mean relMSE is at most RELMSE, and report the cost.",
 )
 @click.option(
     "--seeds", type=click.IntRange(min=1), default=3, show_default=True, metavar="K",
@@ -49,17 +49,17 @@ from .common import (
 )
 @click.option(
     "--reference-spp", type=click.IntRange(min=8), metavar="N",
-    help="Render the reference with N samples; it is kept in DIR for the next time. "
+    help="Render the reference with N samples per pixel, and store it in DIR for later. "
     "[default: 16 times the longest run]",
 )
 @click.option(
     "--reference-integrator", default="path", show_default=True, metavar="INTEGRATOR",
-    help="What renders the reference.",
+    help="Integrator that renders the reference.",
 )
 @click.option(
     "--out", type=FilledPath(), default="out/compare", show_default=True, metavar="DIR",
-    help="Folder for report.html, results.json, the images, and rendered references. What is there "
-    "already is kept, and only timed again beside new runs.",
+    help="Folder for report.html, results.json, the images, and rendered references. Runs that it "
+    "holds are used again; they are only timed again where new runs are compared with them.",
 )
 @click.option("--worker", type=click.Choice(supervisor.JOBS), hidden=True)
 @scene_options
@@ -150,7 +150,7 @@ def compare(
 
 
 def _has_trouble(scene: Mapping[str, Any]) -> bool:
-    """Did something fail, or is an error not known?"""
+    """Did the scene or an integrator fail, or was the reference too noisy for an error?"""
     return bool(scene["error"]) or any(
         item["error"] or any(level["refused"] for level in item["levels"])
         for item in scene["integrators"]

@@ -39,13 +39,13 @@ def diff(a: Path, b: Path, as_json: bool, output: Path | None) -> int:
     """Measure how far the image A is from the reference B.
 
     Both can be EXR (R/G/B or mean, with or without variance; Y; one layer), PNG, JPEG, HDR, PFM, or
-    NumPy arrays; all are compared as linear RGB. Where B has a variance, what it contributes to
-    relMSE, MSE and rMSE is subtracted; σ/μ and FLIP contain it. Relative errors are relative to B.
-    "trimmed" leaves out the 0.1 % of the pixels with the largest errors.
+    NumPy arrays; all are compared as linear RGB. If B has a variance, it is subtracted from relMSE,
+    MSE and rMSE, but not from σ/μ and FLIP. Relative errors are relative to B. "trimmed" leaves out
+    the 0.1 % of the pixels with the largest errors.
 
-    Where both have a variance, z is the difference of the means of the images in standard
-    deviations: beyond ±4, one of them is probably biased. It takes pixels for independent, which a
-    reconstruction filter wider than a pixel violates: z is then too large.
+    If both have a variance, z is the difference of the means of the images in standard deviations:
+    beyond ±4, one of them is probably biased. z assumes that pixels are independent. With a
+    reconstruction filter wider than a pixel they are not, and z is too large.
     """
     from ..compare import images, machine
 
@@ -122,7 +122,7 @@ def _compare(image: _Image, reference: _Image) -> _Difference:
     differing = int(signed.any(axis=2).sum())
     y, x, channel = np.unravel_index(np.argmax(np.abs(signed)), signed.shape)
     if differing == 0:
-        # Even where both are black. The variance says nothing about an image and itself.
+        # Also if both are black. Between an image and itself, no variance is to be subtracted.
         errors = metrics.Errors(**dict.fromkeys(_FIGURES, 0.0))
     else:
         try:
@@ -141,7 +141,7 @@ def _compare(image: _Image, reference: _Image) -> _Difference:
 def _z_scores(
     image: _Image, reference: _Image, signed: np.ndarray
 ) -> list[float | None] | None:
-    """Difference of the means by its standard deviation, per channel."""
+    """The difference of the means divided by its standard deviation, per channel."""
     if image.variance is None or reference.variance is None:
         return None
     mean = signed.mean(axis=(0, 1))
@@ -218,8 +218,7 @@ def _print(image: _Image, reference: _Image, difference: _Difference) -> None:
         f"{' instead of '.join(map(_short, pair))} ({difference.largest:+#.4g}).")
     noise = _noise(reference, difference)
     if noise is not None:
-        say(f"B has a relMSE of {noise:.2g} of its own: it is subtracted, from MSE and rMSE "
-            "likewise.")
+        say(f"The noise of B, relMSE {noise:.2g}, is subtracted (also from MSE and rMSE).")
     if math.isnan(difference.errors.flip):
         say("FLIP is not known: B has no positive pixel, or flip-evaluator is not installed.")
 

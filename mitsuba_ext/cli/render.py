@@ -27,8 +27,8 @@ from .stopping import stopping
 )
 @click.option(
     "--integrator", "specification", metavar="INTEGRATOR",
-    help="Use this one instead of the scene's: NAME[:key=value,…], or an XML or JSON file. It "
-    "takes over max_depth and rr_depth from there unless it sets them.",
+    help="Integrator to use instead of the scene's: NAME[:key=value,…], or an XML or JSON file. It "
+    "inherits max_depth and rr_depth of the scene's integrator unless it sets them.",
 )
 @click.option(
     "--spp", type=click.IntRange(1, MOST_SPP), metavar="N",
@@ -36,9 +36,9 @@ from .stopping import stopping
 )
 @click.option(
     "--time", "seconds", type=click.FloatRange(min=0, min_open=True), metavar="S",
-    help="As many samples as fit into S seconds of rendering. Their number follows from the first "
-    "ones; with our integrators and structured samplers, from a few short renders that come on "
-    "top.",
+    help="Take as many samples as fit into S seconds of rendering. The first samples tell the "
+    "speed; with our integrators and with structured samplers, a few short renders do, which take "
+    "additional time.",
 )
 @click.option(
     "--seed", type=click.IntRange(0, MAX_SEED), default=0, metavar="N",
@@ -65,13 +65,12 @@ def render(
 ) -> int:
     """Render SCENE (an XML file) to an image.
 
-    Ctrl-C, SIGTERM and SIGHUP end it after the running pass and keep the image so far: in FILE, or
-    in NAME.partial.EXT where FILE exists already. A second one, half a second later or more, ends
-    it at once, unless the image is being written.
+    Ctrl-C, SIGTERM and SIGHUP end the render after the running pass and keep the image so far: in
+    FILE, or in NAME.partial.EXT if FILE exists already. A second signal, half a second later or
+    more, ends the process at once, unless the image is being written.
 
-    Mitsuba's own integrators are rendered in passes of whole sets of samples: a structured sampler
-    stratifies each pass (64 samples per pixel or more, 16 for large images) and not the whole
-    render.
+    Mitsuba's own integrators render in passes. A structured sampler stratifies the samples of a
+    pass (64 per pixel or more, 16 for large images), not those of the whole render.
     """
     if specification and not plugins:
         check_integrator(specification)
@@ -97,17 +96,17 @@ def render(
             for remark in job.remarks(is_sensor_chosen=sensor_index is not None):
                 warn(remark)
             if is_new:
-                # Those of the render will take longer, and nothing can be printed meanwhile
+                # The render's kernels take longer to compile, and nothing can be printed meanwhile
                 say("compiling kernels (later renders like this one find them in a cache)")
             job.run(spp, seconds)
         except (KeyboardInterrupt, OSError) as error:
-            # A terminal that has been closed cannot show progress any more
+            # After SIGHUP, showing progress on the closed terminal raises an OSError
             if isinstance(error, OSError) and not stop.is_asked:
                 raise
             if job is None or not job.has_image():
                 say("interrupted before there was an image: nothing written")
                 return stop.exit_code
-            # In the last pass, it came too late
+            # After a signal in the last pass, the image may be complete
             job.is_interrupted = not job.is_complete()
 
         stop.wait()
@@ -130,11 +129,11 @@ def render(
         if bad:
             warn(f"{bad} of {pixel_count} pixels of {target} are NaN or infinite")
         if job.is_interrupted:
-            older = "" if target == output else f" ({output} is an older image, and still there)"
+            older = "" if target == output else f" ({output} is an older image, and was kept)"
             say(f"interrupted {job.how_far()}: {target}{older}")
             return stop.exit_code
-    is_slow = kernels_compiled() > compiled and not is_new  # else it has been said
-    remark = " (kernels were compiled: next time that is faster)" if is_slow else ""
+    is_slow = kernels_compiled() > compiled and not is_new  # else it was printed above
+    remark = " (compiled kernels: the next such render starts faster)" if is_slow else ""
     say(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}", err=False)
     return 1 if bad else 0
 

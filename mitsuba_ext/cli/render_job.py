@@ -1,4 +1,5 @@
-"""One render of a scene file, with whichever integrator: Mitsuba's in passes, ours as they are."""
+"""One render of a scene file: with Mitsuba's integrators in passes, with ours by their own
+``render()``."""
 
 from __future__ import annotations
 
@@ -22,11 +23,11 @@ from ..specifications import make_named
 
 
 class RenderJob:
-    """A scene, an integrator, and how far it got.
+    """The render of a scene by an integrator, and its progress.
 
     Attributes:
-        integrator, name, parameters: Of the integrator.
-        film: Where the image is.
+        integrator, name, parameters: The integrator, its name and its parameters.
+        film: The film that holds the image.
         is_interrupted: Did a signal end the render before all samples were taken?
         seconds: Wall clock of the render.
     """
@@ -71,7 +72,7 @@ class RenderJob:
         return cls(loaded, *parts, sensor_index or 0, seed)
 
     def remarks(self, is_sensor_chosen: bool) -> list[str]:
-        """What the image will not show."""
+        """Warnings about what the image will not show."""
         remarks = scene_remarks(self._loaded.scene, self._sensor, self.integrator, self.name)
         count = len(self._loaded.scene.sensors())
         if count > 1 and not is_sensor_chosen:
@@ -79,13 +80,14 @@ class RenderJob:
         return remarks
 
     def run(self, spp: int | None, seconds: float | None) -> None:
-        """Renders ``spp`` samples per pixel (else as many as the sampler says), or as many as fit
-        into ``seconds``. Ctrl-C ends it: :attr:`is_interrupted` tells, or an exception.
+        """Renders ``spp`` samples per pixel (by default, the number of the sampler), or as many as
+        fit into ``seconds``. After Ctrl-C, passes end with :attr:`is_interrupted` set; integrators
+        that do not handle it raise ``KeyboardInterrupt``.
 
         Raises:
             InputError: The integrator cannot render this scene.
-            KeyboardInterrupt: Ctrl-C; :meth:`has_image` tells whether the film holds something,
-                :meth:`is_complete` whether it holds all samples.
+            KeyboardInterrupt: Ctrl-C. :meth:`has_image` says whether the film holds samples,
+                :meth:`is_complete` whether it holds all of them.
         """
         begin = time.perf_counter()
         try:
@@ -137,23 +139,23 @@ class RenderJob:
 
     @property
     def spp(self) -> int | None:
-        """Samples per pixel in the image. What others' integrators took before an interruption only
-        they know."""
+        """Samples per pixel in the image. ``None`` after an interruption of an integrator that does
+        not report them (neither Mitsuba's nor ours)."""
         report = self._passes or timing.own_statistics(self.integrator)
         if report is not None:
             return report.spp
         return None if self.is_interrupted else sample_count(self._sensor, self._wanted or 0)
 
     def how_far(self) -> str:
-        """For a message about an interruption."""
+        """The progress, for a message about an interruption."""
         if self.spp is None:
             return "during the render"
         wanted = f" of {self._wanted}" if self._wanted else ""
         return f"after {self.spp}{wanted} spp"
 
     def is_complete(self) -> bool:
-        """Does the film hold all samples, as after a signal in the last pass? What others'
-        integrators leave after one is taken for incomplete."""
+        """Does the film hold all samples, as after a signal in the last pass? ``False`` for
+        integrators that do not report it (neither Mitsuba's nor ours)."""
         report = self._passes or timing.own_statistics(self.integrator)
         return report is not None and report.passes > 0 and not report.interrupted
 

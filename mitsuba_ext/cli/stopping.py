@@ -1,4 +1,4 @@
-"""What ends a render: Ctrl-C, and the signals by which batch systems and closed terminals ask."""
+"""Ends a render on Ctrl-C, and on the signals that batch systems and closed terminals send."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from .common import INTERRUPTED, say
 
 
 class Stop(interrupts.InterruptHandler):
-    """The handler of the signals, and what has asked for the end so far. Only the first signal
-    does something here; what comes later is the business of :func:`_watching`, which knows when a
-    signal came. (Handlers in Python learn of it after the native code that is running.)"""
+    """Handles the first signal, and remembers it. Later signals are handled by the thread of
+    :func:`_watching`, which sees them at once. (Python calls this handler only after the native
+    code that is running.)"""
 
     is_writing = False
 
@@ -32,20 +32,20 @@ class Stop(interrupts.InterruptHandler):
 
     @property
     def exit_code(self) -> int:
-        """That of a process which the signal ended."""
+        """The exit code of a process that the signal ended."""
         return INTERRUPTED if self.number is None else 128 + self.number
 
     def wait(self) -> None:
-        """From now on, signals do nothing: the image is being written."""
+        """From now on, signals are ignored, because the image is being written."""
         self.is_writing = True
 
 
 @contextlib.contextmanager
 def stopping() -> Iterator[Stop]:
-    """While active, the first signal raises ``KeyboardInterrupt`` (where passes are rendered, after
-    the running one); a second signal ends the process at once, whatever code is running, but not
-    after :meth:`Stop.wait`. Signals that come together count as one; those that are ignored, as
-    SIGHUP is under ``nohup``, stay so."""
+    """While active, the first signal raises ``KeyboardInterrupt`` (during passes: after the running
+    one). A second signal ends the process at once, whatever code is running, but not after
+    :meth:`Stop.wait`. Signals within half a second count as one. Signals that were ignored before,
+    such as SIGHUP under ``nohup``, stay ignored."""
     stop = Stop()
     if threading.current_thread() is not threading.main_thread():
         yield stop
@@ -56,13 +56,14 @@ def stopping() -> Iterator[Stop]:
 
 @contextlib.contextmanager
 def _watching(stop: Stop) -> Iterator[None]:
-    """A thread that learns of signals while native code runs, when no handler in Python does."""
+    """Runs a thread that receives signals at once, even while native code runs and Python calls no
+    handler."""
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
 
     def watch() -> None:
         first = None
-        while number := receiver.recv(1):  # nothing once the sender is closed
+        while number := receiver.recv(1):  # empty once the sender is closed
             if number[0] not in interrupts.SIGNALS:
                 continue
             now = time.monotonic()

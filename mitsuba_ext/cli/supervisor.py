@@ -1,13 +1,13 @@
-"""A comparison runs in a process of its own, which an integrator may take down with it.
+"""Runs a comparison in a worker process, because an integrator can crash its process.
 
-Out of memory, a fault in native code, an abort of LLVM: none of these can be caught in Python. The
-supervisor notes at which integrator the process died, and starts another; that one finds the
-finished runs in the folder, gives the guilty integrator a failed row, and goes on with the others.
+Python cannot catch a lack of memory, a fault in native code, or an abort of LLVM. The supervisor
+records which integrator was rendering when the worker died, and starts another worker. This one
+finds the finished runs in the folder, reports that integrator as failed, and goes on with the rest.
 
-Mitsuba's own integrators cannot be interrupted: after Ctrl-C, the process ends when the running
-render does. A second Ctrl-C kills it, and another process writes the report of what is finished.
-SIGTERM and SIGHUP, which batch systems send before they kill, end it alike, but the running render
-has no more than :data:`GRACE` seconds. Signals that come together count as one.
+Mitsuba's own integrators cannot be interrupted: after Ctrl-C, the worker ends when the running
+render does. A second Ctrl-C kills it, and another worker writes the report of the finished runs.
+SIGTERM and SIGHUP, which batch systems send before they kill, act like Ctrl-C, but the running
+render has at most :data:`GRACE` seconds. Signals within half a second count as one.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from ..processes import python_command
 from ..rendering import interrupts
 from .common import INTERRUPTED, say
 
-#: What the context's ``obj`` is in a process that was started from a shell.
+#: Value of the click context's ``obj`` in a process that was started from a shell.
 SUPERVISED = "supervised"
 
-#: Jobs of a worker: measure, or report what is there.
+#: Jobs of a worker: measure, or write the report of the stored runs.
 MEASURE, STORED = JOBS = ("measure", "stored")
 
-#: Seconds that a running render has after SIGTERM or SIGHUP. Batch systems kill after 10 to 30, and
-#: the report takes a few.
+#: Seconds in which a running render may finish after SIGTERM or SIGHUP. Batch systems kill after 10
+#: to 30 seconds, and the report takes a few.
 GRACE = 3.0
 
-#: Exit codes of a worker that came to its end: finished, with trouble, bad input, interrupted.
+#: Exit codes of a worker that did not crash: finished, with failures, bad input, interrupted.
 _IN_ORDER = (0, 1, 2, INTERRUPTED)
 
-#: Seconds after which is looked for signals that have come.
+#: Seconds between two checks for received signals.
 _POLL = 0.1
 
 _PR_SET_PDEATHSIG = 1
@@ -79,13 +79,13 @@ def supervise(arguments: Sequence[str], folder: Path) -> int:
 
 
 def without_job(arguments: Sequence[str]) -> list[str]:
-    """The arguments as the user gave them."""
+    """The arguments that the user gave, without the option ``--worker``."""
     return [text for text in arguments if not text.startswith("--worker=")]
 
 
 def become_worker() -> None:
-    """Makes this process end when its supervisor is killed (on Linux), and interrupts it once,
-    whatever signal says so: the report that it then writes is not interrupted again."""
+    """Makes this process end when its supervisor is killed (on Linux). The first signal of any kind
+    raises ``KeyboardInterrupt``; later ones are ignored, because the report is being written."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     signals = [n for n in interrupts.SIGNALS if signal.getsignal(n) is not signal.SIG_IGN]
@@ -103,7 +103,7 @@ class _End(NamedTuple):
     """How a worker ended.
 
     Attributes:
-        process: Its number.
+        process: Its process id.
         code: Its exit code; negative if a signal ended it.
         signal: The signal that asked it to end; 0 if none did.
     """
@@ -118,8 +118,8 @@ def _command(arguments: Sequence[str], job: str) -> list[str]:
 
 
 def _work(arguments: Sequence[str], folder: Path, job: str, received: list[int]) -> _End:
-    """Runs a worker to its end; the first signal asks it to end, another one kills it."""
-    # In a session of its own, it gets signals from here alone: each of them once
+    """Runs a worker to its end. The first signal interrupts it, a second one kills it."""
+    # In its own session, it does not get signals of the terminal, only those sent below
     worker = subprocess.Popen(
         _command(arguments, job),
         start_new_session=True,
@@ -150,9 +150,8 @@ def _work(arguments: Sequence[str], folder: Path, job: str, received: list[int])
 
 @contextlib.contextmanager
 def _collected_signals() -> Iterator[list[int]]:
-    """The numbers of the signals that ask this process to end, as they come; of those that come
-    together, the first. (Exceptions in their place could come at any time, also while the last one
-    is being dealt with.)"""
+    """Collects the numbers of received signals in a list; of signals within half a second, only the
+    first. (An exception instead could be raised at any time, even while another one is handled.)"""
     received: list[int] = []
     first = -math.inf
 
@@ -165,7 +164,7 @@ def _collected_signals() -> Iterator[list[int]]:
 
     is_deaf = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     if is_deaf:
-        # Workers would inherit that, and must hear the SIGINT that is sent from here
+        # Workers would inherit that SIGINT is ignored, but _work() interrupts them with it
         signal.signal(signal.SIGINT, lambda *_: None)
     numbers = [n for n in interrupts.SIGNALS if not (is_deaf and n == signal.SIGINT)]
     try:

@@ -1,4 +1,4 @@
-"""What every integrator of a comparison is given: samples, seconds, or an error to reach."""
+"""The budget of each run of a comparison: samples, seconds, or an error to reach."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numbers import Real
 
 from ..scenes import InputError
 
-#: First number of samples on the way to an error: with fewer, a learner has none to learn from.
+#: Samples per pixel that ``until`` starts with. With fewer, an integrator may have no pilot pass.
 _FIRST_SPP = 8
 
 
@@ -35,7 +35,7 @@ class Budget:
         return self.values[0] if self.kind == "until" else None
 
     def level(self, index: int) -> float:
-        """The ``index``-th level; those of ``until`` double without end."""
+        """The ``index``-th level; the levels of ``until`` double each time, without a last one."""
         return _FIRST_SPP << index if self.kind == "until" else self.values[index]
 
     def __str__(self) -> str:

@@ -1,5 +1,5 @@
 """Several scenes with several integrators: references, runs, ``results.json`` and report in one
-folder, in which a second run continues what a first one left."""
+folder. A comparison that is started again in its folder renders only what is missing."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from .report import write_report
 
 SceneSource = Union[str, Path, Mapping[str, Any]]
 
-#: How much longer than the longest run a reference is.
+#: Samples of a reference, as a multiple of those of the longest run.
 _REFERENCE_FACTOR = 16
 
 
@@ -41,7 +41,7 @@ class SceneSetup:
         source: An XML file, or a dict as ``mi.load_dict`` takes it. Its integrator is replaced.
         size: Width and height that replace those of the film.
         parameters: Values for the ``$name`` placeholders of the file.
-        reference: A file to measure against. Default: one is rendered.
+        reference: A file to measure against. Default: render a reference.
     """
 
     source: SceneSource
@@ -57,20 +57,22 @@ class Comparison:
         scenes: XML files, dicts, or :class:`SceneSetup` of them.
         integrators: Specifications (:func:`mitsuba_ext.specifications.make_named`), or a mapping
             of labels to them. Ratios are given relative to the first.
-        budget: What each run gets: see :mod:`.budgets`.
+        budget: Samples, seconds or error of each run: see :mod:`.budgets`.
         seeds: Runs of each integrator at each level.
-        folder: For ``results.json``, ``report.html``, images and references; made if missing. A
-            comparison in the same folder takes up what is there. Default: a temporary one, which
-            goes when the object does.
+        folder: For ``results.json``, ``report.html``, images and references; made if missing. Runs
+            and references that it holds are used again. Default: a temporary folder, which is
+            deleted with the object.
         reference_spp: Samples per pixel of rendered references. Default: 16 times those of the
-            longest run (of as many seconds, for a time; enough for the error, for ``until``).
-        reference_integrator: What renders them.
+            longest run. With a time budget: as many as take 16 times that long. With ``until``:
+            enough for a relMSE of 1/16 of the target.
+        reference_integrator: The integrator that renders references.
         command: The command line, for the report.
-        only_stored: Render nothing: figures and report of what is in the folder.
+        only_stored: Render nothing; make figures and report from the runs in the folder.
 
     Raises:
-        InputError: No scene was given, an integrator cannot be made, the budget is none, or the
-            folder has no name.
+        InputError: No scene was given, an integrator cannot be made, ``budget`` is no
+            :class:`Budget`, ``seeds`` is below 1, the variant is a scalar one, or the name of the
+            folder is empty.
     """
 
     def __init__(
@@ -99,7 +101,7 @@ class Comparison:
                 f"the budget must be made by equal_samples(64), equal_time(10), sweep([4, 16, 64]) "
                 f"or until(0.01) of mitsuba_ext.compare, found {budget!r}"
             )
-        make_all(integrators)  # an unknown name must not wait for the end of a reference
+        make_all(integrators)  # reports an unknown name before a reference is rendered
         if not all(setup.reference for setup in self.scenes):
             make_named(reference_integrator)
         self.integrators = integrators
@@ -122,17 +124,17 @@ class Comparison:
     def run(self, progress: bool | Callable[[Step], None] = True) -> dict[str, object]:
         """Measures everything, writes ``results.json`` and ``report.html``, returns the results.
 
-        After Ctrl-C both are written with what is finished before the exception goes on.
+        After Ctrl-C, it writes both files from the finished runs, then raises the exception again.
 
         Args:
-            progress: What to say meanwhile: ``True`` for a bar on a terminal, and for a line every
-                half minute on stderr elsewhere; ``False`` for nothing; or what to call before each
-                piece of work.
+            progress: ``True`` shows a bar on a terminal, and elsewhere writes a line to stderr
+                every half minute; ``False`` shows nothing; a function is called before each piece
+                of work.
 
         Raises:
-            InputError: The only scene cannot be used, or its reference cannot. (Of several, one
-                that cannot is an entry of the results.) Or another comparison is running in the
-                folder, or the folder cannot be made.
+            InputError: The only scene, or its reference, cannot be used. (With several scenes, the
+                results record the error instead.) Or another comparison is running in the folder,
+                or the folder cannot be made.
         """
         self._records, self.is_finished = [], False
         with in_use(self.folder), reporting(progress) as report_step:
@@ -159,7 +161,7 @@ class Comparison:
                 self.write()
 
     def results(self) -> dict[str, object]:
-        """What ``results.json`` holds; see :mod:`.results`."""
+        """The content of ``results.json``; see :mod:`.results`."""
         content = {
             "schema": results.SCHEMA,
             "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
@@ -205,7 +207,7 @@ class Comparison:
         self._keep_record()
 
     def _keep_record(self) -> None:
-        """The figures of the running scene; the scene itself is let go."""
+        """Adds the figures of the running scene to the results, and releases the scene."""
         name, experiment = self._running
         self._running = None
         record = {"name": name, **results.scene_record(experiment, self.folder)}
@@ -228,7 +230,7 @@ class Comparison:
             folder,
             self._reference_integrator,
             lambda done: progress(Step(f"reference {done:.0%}", 0.0, None)),
-            # What was measured comes out differently each time: half of it will do
+            # A derived number varies with the measurement: a stored reference with half will do
             enough=asked or spp // 2,
         )
 

@@ -1,15 +1,14 @@
 """Speed against error: one scene with several integrators, under equal conditions.
 
 - Every integrator gets the settings of the scene's own (``max_depth``, ``rr_depth``,
-  ``hide_emitters``) unless its specification says otherwise: they solve the same problem.
-- Kernels are compiled beforehand, by a small render. A measured run that had to compile after all
-  (a size of pass that the small one did not have) is thrown away and repeated.
-- The integrators take turns (A B C A B C …), round by round: a machine that becomes slower becomes
-  so for all of them. Each round and each level has a seed of its own, which the integrators share.
-- Times are compared within one session only: a run that was kept from an earlier one is timed again
-  (its image stays) when the run that it is compared with is of this session.
-- The clock runs around the whole of ``render()``, what it learns included, and stops when the
-  image is there.
+  ``hide_emitters``) unless its specification sets them, so that all solve the same problem.
+- Small renders compile the kernels beforehand. A measured run that compiled a kernel after all
+  (for a size of pass that the small renders did not have) is discarded and repeated.
+- The integrators take turns (A B C A B C …), round by round: a machine that slows down slows all of
+  them down. Each round and each level has its own seed, which the integrators share.
+- Times are compared within one session only. A stored run of an earlier session is timed again (its
+  image is kept) when a run of this session is compared with it.
+- The measured time covers the whole of ``render()``, learning included, until the image is there.
 """
 
 from __future__ import annotations
@@ -31,11 +30,12 @@ from .references import Reference
 from .runs import Run, RunFolder
 from .zero_radiance import zero_radiance_share
 
-#: How far the time of a run may be from what was asked for before it is repeated, and how often.
+#: With a time budget, a run that misses its time by more than this fraction is repeated with a
+#: corrected number of samples, up to so many attempts in all.
 TIME_TOLERANCE = 0.05
 _TIME_ATTEMPTS = 3
 
-#: ``until`` goes no further than this where the reference does not say how many samples it has.
+#: Most samples per pixel of ``until`` where the file of the reference does not give its own number.
 _MAX_UNTIL_SPP = 1 << 16
 
 
@@ -46,7 +46,7 @@ class Contender:
     Attributes:
         named: The integrator, its label, name and parameters.
         runs: In the order in which they were measured.
-        compile_seconds: What the kernels cost to compile or to load, without tracing.
+        compile_seconds: Time to compile or to load the kernels, without tracing.
         error: Why there are no (more) runs; empty if all went well.
         traceback: Where the error came from, for those who write the integrator.
         notes: What a reader of the figures should know.
@@ -82,10 +82,10 @@ class Experiment:
         scene: The scene; its own integrator matters only for the settings that others take over.
         integrators: Specifications (:func:`mitsuba_ext.specifications.make_named`), or a mapping
             of labels to them. Figures are given relative to the first.
-        budget: What each gets.
+        budget: Samples, seconds or error of each run.
         rounds: Runs of each integrator at each level.
-        folder: Keeps the images; runs that it holds already are not repeated.
-        only_stored: Take those, and render nothing.
+        folder: Stores the runs; those that it already holds are not rendered again.
+        only_stored: Use the stored runs only, and render nothing.
 
     Raises:
         InputError: An integrator is unknown, rejects a parameter, or is given twice.
@@ -142,7 +142,7 @@ class Experiment:
     def _schedule_levels(self) -> Iterator[tuple[Contender, int, int]]:
         indices = range(len(self.budget.values))
         for contender in self.contenders:
-            # All speeds are known before the first long run: the time that is left can be told
+            # Measure all speeds before the first long run, to estimate the time that is left
             paths = (self._path(contender, i, r) for i in indices for r in range(self.rounds))
             is_complete = all(self._folder.load(path) for path in paths)
             if not (is_complete or has_crashed(self._mark(contender)) or self.only_stored):
@@ -167,19 +167,19 @@ class Experiment:
         for contender in going:
             runs = contender.at(self.budget.level(index - 1))
             contender.notes.append(
-                f"not reached: relMSE {_mean_error(runs):.3g} with {runs[0].spp} spp, no more than "
-                f"the reference has"
+                f"error not reached: relMSE {_mean_error(runs):.3g} with {runs[0].spp} spp; "
+                f"more samples than the reference has are not tried"
             )
 
     def _is_done(self, contender: Contender, index: int) -> bool:
-        """Has the error been reached? (Or there are no runs: only what is stored is asked for.)"""
+        """Is the error reached? Also true without runs, which happens with ``only_stored``."""
         runs = contender.at(self.budget.level(index))
         return not runs or _mean_error(runs) <= self.budget.target
 
     # ---- One run ----
 
     def _attempt(self, contender: Contender, action: Callable[[], object]) -> None:
-        """One integrator that fails must not take the others' results with it."""
+        """Calls ``action`` and records an error of the integrator; the others go on."""
         try:
             action()
         except (Exception, SystemExit) as error:  # an integrator may raise anything
@@ -187,7 +187,7 @@ class Experiment:
             contender.traceback = traceback.format_exc()
 
     def _take(self, contender: Contender, index: int, round: int) -> None:
-        """Measures a run, or takes it from the folder."""
+        """Measures a run, or loads it from the folder."""
         path = self._path(contender, index, round)
         run = self._folder.load(path)
         if run is None:
@@ -206,7 +206,8 @@ class Experiment:
             self._share_session(contender, run)
 
     def _share_session(self, contender: Contender, run: Run) -> None:
-        """Sees to it that a run and that of the first integrator have times of one session."""
+        """Times a run, and the first integrator's run of that round, again in this session where
+        they have no time of a common session."""
         first = self.contenders[0]
         partner = next((r for r in first.at(run.level) if r.round == run.round), run)
         if partner.times.keys() & run.times.keys():
@@ -216,7 +217,7 @@ class Experiment:
                 self._attempt(other, lambda c=other, r=stored: self._time_again(c, r))
 
     def _time_again(self, contender: Contender, run: Run) -> None:
-        """Repeats a run of an earlier session for its time in this one."""
+        """Renders a run of an earlier session again to measure its time in this session."""
         self._prepare(contender)
         label = f"{contender.label}: timing again"
         self._progress(Step(label, self._done, self._seconds_left()))
@@ -254,7 +255,8 @@ class Experiment:
         return self._folder.save(run, pixels, path, metadata)
 
     def _render(self, contender: Contender, level: float, seed: int) -> timing.Timed:
-        """A render that compiled nothing and, where a time is to be filled, filled it."""
+        """Renders without compiling. With a time budget, adjusts the number of samples in a few
+        attempts and returns the one whose time is closest."""
         spp = self._samples(contender, level)
         attempts: list[timing.Timed] = []
         while len(attempts) < _TIME_ATTEMPTS:
@@ -273,7 +275,7 @@ class Experiment:
         return self._timed(contender, spp, seed) if timed.compiled else timed
 
     def _prepare(self, contender: Contender) -> None:
-        """Compiles what the runs will need, and finds out how fast they will be."""
+        """Compiles the kernels of the runs and measures the speed of the integrator."""
         if contender._is_prepared:
             return
         with marked(self._mark(contender)):
@@ -284,8 +286,8 @@ class Experiment:
         self._progress(Step(f"{contender.label}: compiling", self._done, None))
         integrator = contender.named.integrator
         counts = () if self.budget.is_time else self._counts()
-        # The kernel for one sample per pixel differs from that for many, and that for a power of
-        # two from that for other counts (Mitsuba divides the index of a sample by the count).
+        # One sample per pixel, powers of two and other counts have different kernels (Mitsuba
+        # divides the index of a sample by the count): compile those that occur.
         for spp in sorted({1 if n == 1 else 2 if n & (n - 1) == 0 else 3 for n in counts}):
             self._timed(contender, spp, seed=0)
         if self.budget.is_time:
@@ -306,7 +308,7 @@ class Experiment:
     # ---- Numbers ----
 
     def _counts(self) -> list[int]:
-        """Samples of the levels that are known beforehand."""
+        """Samples per pixel of the levels that are known beforehand."""
         if self.budget.kind == "until":
             return [int(self.budget.level(0))]
         return [int(value) for value in self.budget.values]
@@ -315,7 +317,7 @@ class Experiment:
         return max(1, round(level / contender._pace)) if self.budget.is_time else int(level)
 
     def _seconds_left(self) -> float | None:
-        """What the runs that are missing will take; unknown for ``until``."""
+        """Estimated seconds of the missing runs; ``None`` for ``until``."""
         if self.budget.kind == "until":
             return None
         left = 0.0
@@ -342,8 +344,9 @@ class Experiment:
 
 
 def run_seed(index: int, round: int) -> int:
-    """The seed of a run of the ``index``-th level. Scattered, since Mitsuba's stratified samplers
-    repeat themselves, a pixel aside, at seeds that are ``spp`` apart; 31 bits fit into an EXR."""
+    """The seed of a run of the ``index``-th level. It is a hash, because Mitsuba's stratified
+    samplers at seed s + ``spp`` give a pixel the strata that its neighbour has at seed s. It has
+    31 bits, so that it fits into an integer attribute of an EXR."""
     return zlib.crc32(f"level {index}, round {round}".encode()) >> 1
 
 
@@ -354,7 +357,8 @@ def make_all(
     """Makes the integrators of a comparison.
 
     Raises:
-        InputError: There are none, one cannot be made, a label is empty, or two are the same.
+        InputError: No integrator was given, one cannot be made, a label is empty, or two labels are
+            the same.
     """
     if isinstance(integrators, Mapping) and "type" not in integrators:
         pairs = list(integrators.items())
@@ -371,7 +375,7 @@ def make_all(
     for label in labels:
         if labels.count(label) > 1:
             raise InputError(
-                f'the integrator "{label}" is given twice: more runs of it need more --seeds'
+                f'the integrator "{label}" is given twice; for more runs of it, increase --seeds'
             )
     return made
 

@@ -1,10 +1,10 @@
 """FLIP: how different two images look when one flips between them, from 0 (equal) to 1.
 
 HDR-FLIP [1] is the largest LDR-FLIP [2] over a range of exposures. NVIDIA's ``flip-evaluator``
-computes it, but ends the process when an exposure comes out infinite (an image that is black or
-very dim) and knows no reference that is black for the most part. So the exposures are computed
-here, by its rule, in units of the brightest pixel of the reference: FLIP does not depend on the
-scale of the radiance, nor do the exposures depend on the image that is compared.
+computes it, but ends the process when an exposure is infinite (an image that is black or very dim),
+and does not support references that are mostly black. Therefore, the exposures are computed here,
+by its rule, after both images are divided by the brightest pixel of the reference: FLIP does not
+depend on the scale of the radiance, and the exposures depend on the reference only.
 
 [1] Andersson, Nilsson, Shirley, Akenine-Möller. Visualizing Errors in Rendered High Dynamic Range
 Images. Eurographics Short Papers 2021.
@@ -20,16 +20,16 @@ from types import ModuleType
 
 import numpy as np
 
-#: Luminance that the tone curve (ACES) maps to 0.85. The exposures go from the one that brings the
-#: brightest pixel there to the one that does so with the median [1].
+#: Luminance that the tone curve (ACES) maps to 0.85. The exposures range from the one that maps the
+#: brightest pixel to it to the one that maps the median to it [1].
 _EXPOSED = 2**1.0832972
 
 #: Luminance relative to the brightest pixel below which the median counts as black: there are never
 #: more than 23 exposures.
 _BLACK = 2**-23
 
-#: Multiple of the brightest pixel that is white at every exposure: more makes no difference, but
-#: could overflow.
+#: Images are clipped at this multiple of the brightest pixel, which is white at every exposure:
+#: larger values would not change FLIP, but could overflow.
 _WHITE = 100
 
 _WAIT_POLICY = "OMP_WAIT_POLICY"
@@ -47,7 +47,7 @@ def mean_flip(image: np.ndarray, reference: np.ndarray) -> float:
 
     Args:
         image: Finite linear RGB, (height, width, 3).
-        reference: The same for the truth. The order matters: it sets the exposures.
+        reference: The reference, same shape. It sets the exposures, so the order matters.
 
     Returns:
         A number from 0 to 1; NaN if ``flip-evaluator`` is not installed (it has no wheels for
@@ -72,7 +72,7 @@ def mean_flip(image: np.ndarray, reference: np.ndarray) -> float:
         "stopExposure": stop,
         "numExposures": max(2, math.ceil(stop - start)),
     }
-    # Its own mean is summed in single precision, which is off by 0.02 % at 1920x1080
+    # The mean of flip-evaluator is summed in single precision: 0.02 % off at 1920x1080
     error_map, _, _ = evaluator.evaluate(
         *pixels, "HDR", applyMagma=False, computeMeanError=False, parameters=exposures
     )
@@ -80,13 +80,13 @@ def mean_flip(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def _evaluator() -> ModuleType | None:
-    """The package, with threads that sleep when they wait.
+    """The package, with OpenMP threads that sleep when they wait.
 
-    By default, those of its OpenMP spin: 8 ms into whatever is measured after a call, and on a busy
-    machine in each other's way (twice the time at 320x180, fifty times for tiny images).
+    By default they spin: for 8 ms after a call, they slow down whatever is measured next, and on a
+    busy machine they slow each other down (twice the time at 320x180, fifty times for tiny images).
     """
     policy = os.environ.get(_WAIT_POLICY)
-    os.environ.setdefault(_WAIT_POLICY, "PASSIVE")  # it looks once, when it is imported
+    os.environ.setdefault(_WAIT_POLICY, "PASSIVE")  # read once, at the import
     try:
         import flip_evaluator
     except ImportError:

@@ -1,7 +1,8 @@
-"""Reading and writing images: never half a file, always with what made them.
+"""Reads and writes images. A file is replaced as a whole, never left half written, and an EXR holds
+metadata about its render.
 
-EXRs go through ``mi.Bitmap``, not the OpenEXR package: that one prints warnings of its own to the
-terminal when a file is damaged, and returns an empty image.
+EXRs go through ``mi.Bitmap``, not the OpenEXR package: for a damaged file, the latter prints
+warnings to the terminal and returns an empty image.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from ..scenes import InputError, one_line
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: What ``write_film`` can write.
+#: Extensions that ``write_film`` can write.
 EXTENSIONS = (".exr", ".png", ".jpg", ".jpeg", ".hdr", ".pfm")
 
 
 def check_target(path: Path) -> None:
-    """Raises :class:`InputError` where no image could be written to ``path``, before hours of
-    rendering."""
+    """Raises :class:`InputError` if no image can be written to ``path``; for use before a render
+    that may take hours."""
     files.check_target(path)
     if path.suffix.lower() not in EXTENSIONS:
         found = f'the extension "{path.suffix}"' if path.suffix else "a name without extension"
@@ -91,8 +92,8 @@ def check_file(path: Path) -> None:
 
 
 def check_film(path: Path, film: mi.Film, aovs: Sequence[str]) -> None:
-    """Raises :class:`InputError` where what ``film`` will hold could not be written to ``path``:
-    finds out by writing a black image beside it."""
+    """Raises :class:`InputError` if the image of ``film`` cannot be written to ``path``. Tries it
+    with a black image in the same folder."""
     import mitsuba as mi
 
     is_special = mi.has_flag(film.flags(), mi.FilmFlags.Special)
@@ -109,15 +110,16 @@ def check_film(path: Path, film: mi.Film, aovs: Sequence[str]) -> None:
 
 
 def count_non_finite(film: mi.Film) -> tuple[int, int]:
-    """How many pixels of the image that a film holds (AOVs apart) are NaN or infinite, and how many
-    there are."""
+    """The number of pixels of a film's image (without AOVs) that are NaN or infinite, and the
+    number of all pixels."""
     image = np.array(film.develop())[..., : film.base_channels_count()]
     bad = ~np.isfinite(image).all(axis=2)
     return int(np.count_nonzero(bad)), bad.size
 
 
 def write_film(path: Path, film: mi.Film, metadata: Mapping[str, object]) -> None:
-    """Writes what a film holds: an EXR as it is, HDR and PFM as RGB, the others as 8-bit sRGB."""
+    """Writes the image of a film: all channels to an EXR, RGB to HDR and PFM, 8-bit sRGB to the
+    other formats."""
     import mitsuba as mi
 
     bitmap = film.bitmap()
@@ -135,7 +137,8 @@ def write_film(path: Path, film: mi.Film, metadata: Mapping[str, object]) -> Non
 
 
 def to_rgb(image: object, channels: Sequence[str]) -> np.ndarray:
-    """A rendered tensor as an array (height, width, 3): alpha and AOVs go, grey is repeated.
+    """A rendered tensor as an array (height, width, 3): alpha and AOVs are dropped, grey is
+    repeated.
 
     Args:
         image: The tensor; its first channels are those of the film's image.
@@ -161,7 +164,7 @@ def check_comparable(film: mi.Film) -> None:
 
 
 def film_channels(film: mi.Film) -> list[str]:
-    """The names of the channels that a film holds, once it has been rendered to."""
+    """The names of the channels of a film that has been rendered to (or prepared)."""
     return [field.name for field in film.bitmap().struct_()]
 
 

@@ -1,8 +1,8 @@
 """Estimates with their 95 % confidence intervals over independent runs.
 
-Errors and times are positive and vary by factors, not by differences: their intervals are those of
-the mean of the logarithms (Student's t), laid around the estimate as a factor. With three runs such
-an interval is wide, and rightly so: t is 4.3.
+Errors and times are positive and vary by factors. So their interval is that of the mean of the
+logarithms (Student's t), applied as a factor around the estimate. With three runs t is 4.3, and the
+interval is wide.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ CONFIDENCE = 0.95
 
 
 class Estimate(NamedTuple):
-    """A value and its confidence interval; the bounds are ``None`` where one run cannot tell."""
+    """A value and its confidence interval; the bounds are ``None`` where they are unknown, as for a
+    single run."""
 
     value: float
     low: float | None = None
@@ -43,7 +44,7 @@ def ratio(
     Args:
         numerator, denominator: The estimates whose values are divided.
         pairs: One (numerator, denominator) for each round in which both ran. The interval comes
-            from their ratios: what two runs of a round share (the machine's mood, the seed)
+            from their ratios: what two runs of a round share (the load of the machine, the seed)
             cancels.
     """
     if numerator is None or denominator is None or not denominator.value > 0:
@@ -65,8 +66,8 @@ def slope(x: Sequence[float], y: Sequence[float]) -> Estimate | None:
 
 def cost_of(target: float, x: Sequence[float], y: Sequence[float]) -> Estimate | None:
     """The ``x`` at which the line through log y against log x reaches ``target`` (inverse
-    prediction, by the delta method); ``None`` if y does not fall, and without an interval where it
-    may not."""
+    prediction, by the delta method). ``None`` if the slope is not negative; without an interval if
+    the slope may be positive within its own interval."""
     fit = _log_fit(x, y)
     if fit is None or not fit.slope < 0:
         return None
@@ -83,8 +84,8 @@ def cost_of(target: float, x: Sequence[float], y: Sequence[float]) -> Estimate |
 
 
 def follow(at: Estimate | None, x: Sequence[float], y: Sequence[float]) -> Estimate | None:
-    """The y of an estimated x, by the line through log y against log x. The interval is that of x:
-    y is taken for known where x is."""
+    """The y at an estimated x, by the line through log y against log x. The line maps the interval
+    of x to that of y; the uncertainty of the line itself is ignored."""
     fit = _log_fit(x, y)
     if at is None or fit is None:
         return None
@@ -124,7 +125,8 @@ def _around(center, values: Sequence[float]) -> Estimate | None:
         return None
     value = float(center(values))
     if min(values) <= 0:
-        # No logarithm: differences instead (shares, counts, errors after a subtraction)
+        # A value has no logarithm (a share, a count, an error after a subtraction): take the
+        # interval of the values themselves
         half = _half_width(values)
         return Estimate(value) if half is None else Estimate(value, value - half, value + half)
     return _with_factor(value, values)

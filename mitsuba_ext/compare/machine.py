@@ -1,4 +1,4 @@
-"""What a measurement depends on besides the scene: versions of software, and the machine."""
+"""Versions of the software, and the machine, which a measurement depends on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> dict[str, object]:
-    """The computer, as far as timings depend on it."""
+    """System, processor and number of cores."""
     return {
         "system": platform.platform(),
         "processor": _processor(),

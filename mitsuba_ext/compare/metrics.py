@@ -1,12 +1,12 @@
 """How far an image is from a reference.
 
 All functions take linear RGB of shape (height, width, 3) and compute in double precision. Where the
-variance of the reference's own mean is known, its expected contribution is subtracted from the
-squared errors, so that a noisy reference does not put a floor under them. A subtracted error can
-come out zero or negative: then the image is closer to the truth than this reference can tell.
+variance of the reference's mean is known, it is subtracted from the squared errors: its noise would
+otherwise add to every error. The difference can be zero or negative: then the error of the image is
+too small to be measured with this reference.
 
-σ/μ and FLIP keep the noise of the reference, because they are built of absolute values: what to
-subtract depends on how the noise of the channels is correlated, which no reference records. A
+σ/μ and FLIP keep the noise of the reference. They take absolute values, so what to subtract would
+depend on the correlation of the noise between channels, which references do not record. A
 reference by the same method with K times the samples of the image raises σ/μ by a factor of
 √(1 + 1/K), 3 % at K = 16.
 """
@@ -36,8 +36,8 @@ class Errors:
 
     Attributes:
         relmse: (I−R)² / (R² + ε), with ε = 10⁻² · mean(R)².
-        relmse_trimmed: The same without the 0.1 % of the pixels that have the largest errors. Much
-            smaller than ``relmse`` where a few fireflies decide.
+        relmse_trimmed: The same without the 0.1 % of the pixels that have the largest errors. It is
+            much smaller than ``relmse`` where a few fireflies make up most of the error.
         mse: (I−R)².
         rmse: √mse; NaN where the subtraction left no positive ``mse``.
         sigma_mu: σ/μ, the coefficient of variation: the root of the mean squared colour difference,
@@ -64,11 +64,11 @@ def errors(
     """All figures of ``image``, see :class:`Errors`.
 
     Args:
-        image: What is measured.
-        reference: What counts as the truth.
+        image: The image to measure.
+        reference: The reference.
         reference_variance: Variance of ``reference``, ``None`` if unknown.
-        flip: ``False`` leaves FLIP out, which takes more than 20 times as
-            long as the others together (on two cores 0.3 s at 320x180, 10 s at 1920x1080).
+        flip: ``False`` skips FLIP, which takes more than 20 times as long as the others together
+            (on two cores 0.3 s at 320x180, 10 s at 1920x1080).
 
     Raises:
         ValueError: The shapes differ, the reference is black, or a value is not finite.
@@ -76,7 +76,7 @@ def errors(
     squared, weight = _squared_and_weight(image, reference, reference_variance)
     mse = float(squared.mean())
     relative = squared * weight
-    # Which pixels to drop is decided by what is seen, before the expected variance is subtracted
+    # The trimmed pixels are those with the largest errors before the variance is subtracted
     seen = (np.asarray(image, np.float64) - reference) ** 2 * weight
     return Errors(
         relmse=float(relative.mean()),
@@ -96,7 +96,7 @@ def relative_mse(
 
 
 def reference_noise(reference: np.ndarray, reference_variance: np.ndarray) -> float:
-    """The relMSE that the reference itself has: what is subtracted from every ``relmse``."""
+    """The relMSE of the reference itself, which is subtracted from every ``relmse``."""
     return float((np.asarray(reference_variance, np.float64) * _weight(reference)).mean())
 
 

@@ -21,23 +21,23 @@ def read_image(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, dict[st
     ``.npy``, ``.npz``    Linear floating point, (height, width) or (height, width, 1, 3 or 4). An
                           ``.npz`` holds one array, or ``mean`` and perhaps ``variance``.
     EXR                   ``mean.R/G/B`` (a reference), else ``R/G/B``, both with ``variance.R/G/B``
-                          where it is there (the integrator ``variance`` leaves it), else ``Y``,
-                          else the only layer that has ``R/G/B`` (Blender's ``Combined`` where
-                          there are several). Of several parts, only the first.
+                          if present (the integrator ``variance`` adds it), else ``Y``, else the
+                          only layer that has ``R/G/B`` (Blender's ``Combined`` if there are
+                          several). Of several parts, only the first is read.
     PNG, JPEG, BMP, TGA   8 or 16 bits per channel, sRGB: made linear, 1 is white.
     HDR (RGBE), PFM       Linear.
     ====================  ======================================================================
 
-    Grey is repeated, alpha is dropped. Except for NumPy's, the content of a file decides, not its
-    extension.
+    Grey is repeated, alpha is dropped. The format is recognised by the content of the file, not by
+    its extension, except for NumPy's.
 
     Returns:
         The image (height, width, 3) and its variance of the same shape (``None`` if unknown), in
-        single precision, and what the file says about itself. The entry ``channels`` of the latter
-        names what was read, for example ``"ViewLayer.Combined.R/G/B"``.
+        single precision, and the metadata of the file. The entry ``channels`` of the metadata names
+        the channels that were read, for example ``"ViewLayer.Combined.R/G/B"``.
 
     Raises:
-        InputError: The file cannot be read, or it is not clear where in it the image is.
+        InputError: The file cannot be read, holds no image, or holds several that could be meant.
     """
     path = Path(path)
     if path.suffix.lower() in (".npy", ".npz"):
@@ -126,9 +126,9 @@ def _read_arrays(path: Path) -> tuple[np.ndarray, np.ndarray | None, dict[str, o
     images.check_file(path)
     try:
         content = np.load(path, allow_pickle=False)
-        # An .npz is read only when an array of it is asked for
+        # np.load reads an array of an .npz only when it is accessed: dict() reads all
         arrays = {"": content} if isinstance(content, np.ndarray) else dict(content)
-    except Exception as error:  # a damaged file: zipfile, zlib and numpy raise what they like
+    except Exception as error:  # a damaged file: zipfile, zlib and numpy raise many kinds of errors
         reason = str(error).partition("\n")[0].partition(". ")[0] or type(error).__name__
         raise InputError(f"{path}: unreadable ({reason})") from error
     name = "mean" if "mean" in arrays else next(iter(arrays), "")
@@ -151,6 +151,6 @@ def _as_rgb(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.size == 0:
         shape = "x".join(map(str, array.shape))
         raise InputError(f"{label}an array {shape} is no image (height, width[, 1, 3 or 4])")
-    with np.errstate(over="ignore"):  # becomes infinite, which is reported where it matters
+    with np.errstate(over="ignore"):  # overflow becomes infinity, which the metrics report
         array = array.astype(np.float32)
     return np.repeat(array, 3, axis=2) if array.shape[2] == 1 else array[:, :, :3]

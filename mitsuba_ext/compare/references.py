@@ -1,9 +1,9 @@
-"""What errors are measured against: images from files, or rendered once and kept.
+"""References, which errors are measured against: read from files, or rendered once and stored.
 
-A reference is the mean of independent batches, so that the variance of that mean is known too. On
-disk it is an EXR with the channels ``mean.R/G/B`` and ``variance.R/G/B`` (variance of the mean);
-an EXR with plain ``R/G/B`` is accepted too, with ``variance.R/G/B`` (as the integrator ``variance``
-leaves it) or without.
+A rendered reference is the mean of independent batches, so that the variance of this mean is known.
+On disk it is an EXR with the channels ``mean.R/G/B`` and ``variance.R/G/B`` (variance of the mean).
+An EXR with plain ``R/G/B`` is accepted too, with ``variance.R/G/B`` (which the integrator
+``variance`` writes) or without.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from ..specifications import NamedIntegrator, Specification, make_named
 from . import images, metrics
 from .machine import versions
 
-#: Batches of a rendered reference. Their spread gives the variance.
+#: Number of batches of a rendered reference, from whose spread its variance is estimated.
 BATCH_COUNT = 16
 MIN_BATCH_COUNT = 8
 
-#: Seed of references, from which those of the batches follow: not one that a run has.
+#: Seed of references; ``batch_seeds`` derives the seeds of the batches from it.
 FIRST_SEED = 7_000_000
 
-#: Samples from which the noise of a longer reference is foretold.
+#: Samples per pixel of the pilot from which the noise of a longer reference is extrapolated.
 _PILOT_SPP = 64
 
 _RGB = ("R", "G", "B")
@@ -45,13 +45,13 @@ _RGB = ("R", "G", "B")
 
 @dataclass
 class Reference:
-    """An image that is taken for the truth.
+    """An image that stands for the exact solution.
 
     Attributes:
         mean: Array (height, width, 3).
         variance: Variance of ``mean``, same shape; ``None`` if unknown.
         path: The file that holds it.
-        metadata: What the file says about itself.
+        metadata: The metadata of that file.
     """
 
     mean: np.ndarray
@@ -66,7 +66,7 @@ class Reference:
 
     @property
     def spp(self) -> int | None:
-        """Samples per pixel, if the file says."""
+        """Samples per pixel, ``None`` if the metadata does not give them."""
         spp = self.metadata.get("spp")
         return int(spp) if isinstance(spp, (int, float)) else None
 
@@ -80,7 +80,7 @@ def load_reference(path: str | Path, size: tuple[int, int] | None = None) -> Ref
 
     Raises:
         InputError: The file is unreadable, lacks the channels, holds NaN or infinity, is black, or
-            is not of the ``size`` that was asked for.
+            does not have the requested ``size``.
     """
     path = Path(path)
     channels, metadata = images.read_exr(path)
@@ -113,18 +113,18 @@ def render_reference(
     progress: Callable[[float], None] | None = None,
     enough: int | None = None,
 ) -> Reference:
-    """Renders a reference at the depth of the scene, or takes it from ``folder``.
+    """Renders a reference with the settings of the scene's integrator, or loads it from ``folder``.
 
-    One that is there is taken if it was rendered from the same files, at the same size, by the same
-    integrator and versions, with enough samples. One that was interrupted goes on where it was.
+    A stored reference is used if it was rendered from the same files, at the same size, by the same
+    integrator and versions, with enough samples. An interrupted one is continued.
 
     Args:
         scene: The scene.
         spp: Samples per pixel of all batches together; rounded up to a multiple of the batches.
-        folder: Where references are kept. It must exist.
-        integrator: What renders it; it must converge to the right image.
+        folder: Where references are stored. It must exist.
+        integrator: The integrator that renders it; it must be unbiased.
         progress: Called after each batch with the fraction that is done.
-        enough: A reference in ``folder`` with at least so many samples will do. Default: ``spp``.
+        enough: A stored reference with at least so many samples is used. Default: ``spp``.
 
     Raises:
         InputError: ``spp`` is below 8, the integrator fails, or the image is black or holds NaN or
@@ -148,7 +148,7 @@ def render_reference(
 def stored_reference(
     scene: LoadedScene, folder: Path, integrator: Specification = "path"
 ) -> Reference | None:
-    """The reference with the most samples that ``folder`` holds for the scene."""
+    """The reference with the most samples that ``folder`` holds for the scene, if any."""
     return _best_cached(folder, _identity(scene, make_named(integrator, scene.settings)))
 
 
@@ -193,7 +193,7 @@ def _render(
 
 
 def _identity(scene: LoadedScene, named: NamedIntegrator) -> dict[str, object]:
-    """What a reference is of, with a hash of all that as ``key``, and a file name."""
+    """Everything that a reference depends on, its hash as ``key``, and a file name as ``stem``."""
     identity = {
         "scene": scene.source,
         "content_hash": scene.content_hash,
@@ -210,10 +210,10 @@ def _identity(scene: LoadedScene, named: NamedIntegrator) -> dict[str, object]:
 
 def samples_for_noise(scene: LoadedScene, noise: float, integrator: Specification = "path") -> int:
     """Samples per pixel (a power of two) after which a reference has at most the relMSE ``noise``,
-    judged from a few batches.
+    extrapolated from a short pilot reference.
 
     Raises:
-        InputError: The few batches are black.
+        InputError: The pilot cannot be rendered, or is black.
     """
     with tempfile.TemporaryDirectory() as folder:
         pilot = render_reference(scene, _PILOT_SPP, Path(folder), integrator)
@@ -222,7 +222,7 @@ def samples_for_noise(scene: LoadedScene, noise: float, integrator: Specificatio
 
 
 def _unfinished(path: Path) -> Batches | None:
-    """The batches of a reference that was interrupted; what is damaged is begun anew."""
+    """The stored batches of an interrupted reference; ``None`` if there are none, or damaged."""
     try:
         return Batches.load(path)
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):
@@ -230,7 +230,7 @@ def _unfinished(path: Path) -> Batches | None:
 
 
 def _best_cached(folder: Path, identity: Mapping[str, object]) -> Reference | None:
-    """The reference with the most samples that is there; damaged ones do not count."""
+    """The stored reference with the most samples; damaged files are ignored."""
     found = []
     for path in folder.glob(f"{glob.escape(str(identity['stem']))}_*spp.exr"):
         with contextlib.suppress(InputError):

@@ -1,4 +1,4 @@
-"""What a reader of the figures must know: where they cannot be given, or are not what they seem."""
+"""Remarks for the reader of the figures: which could not be measured, and which may mislead."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from .experiment import TIME_TOLERANCE, Contender, Experiment
 from .references import Reference
 from .runs import Run
 
-#: A reference whose own relMSE is more than this share of an error is too noisy to measure it.
+#: A reference is too noisy to measure an error if its own relMSE is more than this share of it.
 _NOISE_LIMIT = 0.5
 
-#: Where relMSE is so many times the trimmed relMSE, a thousandth of the pixels decides it.
+#: Where relMSE is more than so many times the trimmed relMSE, a note names fireflies as the cause.
 _FIREFLIES = 1.5
 
 
 def warnings(experiment: Experiment) -> list[str]:
-    """About a scene and its reference."""
+    """Remarks about a scene and its reference."""
     return list(_warnings(experiment))
 
 
 def notes(experiment: Experiment, contender: Contender) -> list[str]:
-    """About the runs of one integrator."""
+    """Remarks about the runs of one integrator."""
     return [*contender.notes, *_notes(experiment, contender)]
 
 
 def refusal(reference: Reference | None, runs: Sequence[Run]) -> str:
-    """Why the errors of a level cannot be told with this reference; empty if they can."""
+    """Why this reference cannot measure the errors of a level; empty if it can."""
     noise = reference.noise if reference else None
     if noise is None or not runs:
         return ""
@@ -38,7 +38,7 @@ def refusal(reference: Reference | None, runs: Sequence[Run]) -> str:
     text = f"the reference is too noisy: its own relMSE is {noise:.2g}, "
     text += f"the error {error:.2g}" if error > 0 else "the error less than that"
     if reference.spp:
-        # Sixteen times less noise than error; an error that is not known is at most the noise
+        # So many that the noise is 1/16 of the error, but at most 256 times as many as now
         needed = reference.spp * 16 * noise / max(error, noise / 16)
         text += f"; needs --reference-spp {1 << math.ceil(math.log2(needed))}"
     return text
@@ -56,7 +56,10 @@ def _warnings(experiment: Experiment) -> Iterator[str]:
     metadata = reference.metadata
     rendered = metadata.get("content_hash")
     if rendered is not None and rendered != scene.content_hash:
-        yield f"the reference is of another scene, or state of the scene: {metadata.get('scene')}"
+        yield (
+            f"the reference was rendered from another scene, or from another version of this one: "
+            f"{metadata.get('scene')}"
+        )
     claimed = {**_parsed(metadata.get("parameters")), **metadata}.get("max_depth")
     actual = scene.settings.get("max_depth")
     if isinstance(claimed, int) and actual is not None and claimed != actual:
@@ -65,15 +68,15 @@ def _warnings(experiment: Experiment) -> Iterator[str]:
 
 
 def _sessions(experiment: Experiment) -> Iterator[str]:
-    """About runs between which the machine may have changed."""
+    """Warnings about runs of different sessions."""
     first, *others = experiment.contenders
     all_runs = [run for contender in experiment.contenders for run in contender.runs]
     if len({run.session for run in all_runs}) < 2:
         return
     repeated = [c.label for c in experiment.contenders if any(run.timed_again for run in c.runs)]
     yield (
-        "runs of different sessions, between which the machine may have become faster or slower: "
-        "ratios of times and efficiencies compare times of one session"
+        "the runs are of different sessions, between which the speed of the machine may have "
+        "changed: ratios of times and of efficiencies use times of one session"
         + (f" (timed again for that: {', '.join(repeated)})" if repeated else "")
         + "; seconds are those of each run's own session"
     )
@@ -82,8 +85,8 @@ def _sessions(experiment: Experiment) -> Iterator[str]:
         pairs = [(run, partners.get((run.level, run.round))) for run in contender.runs]
         if any(other and not run.times.keys() & other.times.keys() for run, other in pairs):
             yield (
-                f"{contender.label} and {first.label} have no times of one session in some rounds, "
-                f"which are left out of the ratios: the same command adds them"
+                f"{contender.label} and {first.label} have no times of a common session in some "
+                f"rounds: the ratios leave these rounds out; running the same command adds them"
             )
 
 
@@ -94,8 +97,8 @@ def _notes(experiment: Experiment, contender: Contender) -> Iterator[str]:
         missed = [r for r in contender.runs if abs(r.seconds / wanted - 1) > TIME_TOLERANCE]
         if missed:
             yield (
-                f"{len(missed)} of {len(contender.runs)} runs took another time than {wanted:g} s "
-                f"by more than {TIME_TOLERANCE:.0%}"
+                f"{len(missed)} of {len(contender.runs)} runs missed the time of {wanted:g} s by "
+                f"more than {TIME_TOLERANCE:.0%}"
             )
     for level in contender.levels()[-1:]:
         errors = [run.errors for run in contender.at(level)]
@@ -104,11 +107,11 @@ def _notes(experiment: Experiment, contender: Contender) -> Iterator[str]:
         if relmse > _FIREFLIES * trimmed > 0:
             yield (
                 f"at {level:g} {'s' if budget.is_time else 'spp'}, 0.1 % of the pixels make up "
-                f"{1 - trimmed / relmse:.0%} of relMSE: its interval is too narrow, and trimmed "
-                f"relMSE says more"
+                f"{1 - trimmed / relmse:.0%} of relMSE: its interval is too narrow; trimmed relMSE "
+                f"is more reliable"
             )
     if budget.target and len(contender.levels()) == 1 and not contender.error:
-        yield "reached with the first number of samples: the cost is at most that"
+        yield "reached the error at the first level: the cost shown is an upper bound"
 
 
 def _parsed(parameters: object) -> dict[str, object]:

@@ -22,8 +22,8 @@ bounds are null for a single one), or null where there is none. Other unknown nu
             error            why it failed; empty if it did not
             traceback        where in Python
             notes            a list
-            compile_seconds  of this session: little where a kernel was compiled before, for
-                             another integrator or an earlier session
+            compile_seconds  of this session: small where the kernels were compiled before, for
+                             another integrator or in an earlier session
             runs             a list: level (samples, or seconds), round, seed, spp, seconds,
                              relmse, relmse_trimmed, mse, rmse, sigma_mu, flip,
                              rays {camera, scatter, shadow}, connections, zero_radiance,
@@ -34,7 +34,7 @@ bounds are null for a single one), or null where there is none. Other unknown nu
                 refused      why the errors are not given: the reference is too noisy for them
                 figures      F of spp, seconds (median), relmse, relmse_trimmed, mse, rmse,
                              sigma_mu, flip, rays, rays_camera, rays_scatter, rays_shadow,
-                             shadow_share (of those that path traces),
+                             shadow_share (shadow rays traced / those that path would trace),
                              zero_radiance, memory, launches,
                              efficiency (1 / (mean relMSE · median seconds))
                 ratios       F of seconds, relmse, relmse_trimmed, efficiency, to the first
@@ -42,8 +42,8 @@ bounds are null for a single one), or null where there is none. Other unknown nu
                              have a time of one session
             slopes           F of log relMSE against log spp ("spp") and log seconds ("seconds")
             target           F of the spp and seconds that the relMSE of "until" costs; else null.
-                             (It stops at the first level whose mean is small enough, which luck
-                             makes a little too early.)
+                             (The runs stop at the first level whose mean relMSE is small enough.
+                             Noise can make that a little too early.)
     versions   mitsuba_ext, mitsuba, drjit, variant, numpy, python
     machine    system, processor, cores
 
@@ -65,7 +65,7 @@ from .runs import Run
 
 SCHEMA = 2
 
-#: Levels, from the last one back, that tell what an error costs.
+#: Number of levels, the last ones, from which the cost of the error of ``until`` is estimated.
 _FITTED_LEVELS = 4
 
 _ERRORS = ("relmse", "relmse_trimmed", "mse", "rmse", "sigma_mu", "flip")
@@ -94,7 +94,7 @@ def scene_record(experiment: Experiment, folder: Path) -> dict[str, object]:
 
 
 def clean(value: object) -> object:
-    """``value`` as JSON can hold it, which knows neither NaN nor infinity."""
+    """``value`` in types that JSON has; NaN and infinity, which it has not, become ``None``."""
     if isinstance(value, Estimate):
         return clean(value._asdict())
     if isinstance(value, dict):
@@ -137,7 +137,7 @@ def _contender_record(
         "runs": [_run_record(run, folder) for run in contender.runs],
         "levels": levels,
         "slopes": {
-            # Runs of equal time differ in their samples by chance only: there is no slope in that
+            # Within one level, samples and times differ by chance only: they have no slope
             name: intervals.slope(values, errors) if len(levels) > 1 else None
             for name, values in efforts.items()
         },
@@ -148,7 +148,7 @@ def _contender_record(
 def _target_record(
     experiment: Experiment, trusted: Sequence[Run], levels: Sequence[Mapping[str, Any]]
 ) -> dict[str, Estimate | None] | None:
-    """What the error costs that was to be reached; ``None`` if it was not."""
+    """What reaching the error of ``until`` costs; ``None`` if it was not reached."""
     target = experiment.budget.target
     errors = [level["figures"]["relmse"] for level in levels]
     if not target or not any(error and error.value <= target for error in errors):
@@ -156,13 +156,13 @@ def _target_record(
     if len(levels) == 1:
         figures = levels[0]["figures"]
         return {name: figures[name] and Estimate(figures[name].value) for name in _EFFORTS}
-    # The line through the last levels: near the target it need not bend
+    # Fit the last levels only: convergence over all levels need not be a straight line
     last = trusted[-_FITTED_LEVELS * experiment.rounds :]
     spp = [run.spp for run in last]
     cost = intervals.cost_of(target, spp, [run.errors.relmse for run in last])
     return {
         "spp": cost,
-        # Through the samples, and not from the noise of the times
+        # From the samples: a line of error against time would add the noise of the times
         "seconds": intervals.follow(cost, spp, [run.seconds for run in last]),
     }
 
@@ -230,8 +230,7 @@ def _timed_ratios(
 
 
 def _common_times(own: Run, other: Run) -> tuple[float, float]:
-    """The seconds of two runs in one session: that in which the first of them was measured, if the
-    other was timed then."""
+    """The seconds of two runs in one session: the first one of ``own`` in which both were timed."""
     session = next(session for session in own.times if session in other.times)
     return own.times[session], other.times[session]
 

@@ -1,9 +1,9 @@
 """Measured renders, and the folder that keeps them.
 
-Every run is one EXR: its image, and in its header what it cost. The name holds a hash of all that
-the run depends on, so that a comparison that is started again takes up the runs that are there, and
-never one of another scene, integrator, version or machine. A run that was timed again, in another
-session, has a JSON file with these times beside it.
+Every run is one EXR: its image, and a header with its cost. The file name holds a hash of all that
+the run depends on: a comparison that is started again uses the stored runs, but never those of
+another scene, integrator, version or machine. A run that was timed again in another session has a
+JSON file with these times beside it.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Run:
     """One measured render.
 
     Attributes:
-        level: What was asked for: samples per pixel, or seconds.
-        round: Which of the repetitions it is, from 0 on.
+        level: The budget: samples per pixel, or seconds.
+        round: Index of the repetition, from 0 on.
         seed: Its seed.
         spp: Samples per pixel that were taken.
         seconds: Wall clock of the render, learning included, compilation excluded.
@@ -42,7 +42,7 @@ class Run:
         zero_radiance: Share of the camera samples without radiance, ``None`` if not known.
         memory: Peak of the memory that Dr.Jit held, in bytes.
         launches: Kernels launched.
-        session: In which it was measured: runs of different ones did not take turns.
+        session: The session in which it was measured. Integrators take turns within a session only.
         timed_again: Seconds that the same render took in later sessions, by session.
         path: The EXR that holds the image.
         errors: Against the reference of the experiment.
@@ -84,7 +84,7 @@ class Run:
 
     @property
     def is_timed_now(self) -> bool:
-        """Is there a time of this session?"""
+        """Was it timed in this session?"""
         return marks.SESSION in self.times
 
     def record(self) -> dict[str, object]:
@@ -109,8 +109,8 @@ class RunFolder:
         """The file of a run.
 
         Args:
-            label: The integrator's label, for the eye.
-            integrator: All that its images depend on.
+            label: The integrator's label, which makes the name readable.
+            integrator: The integrator's identity: all that its images depend on.
             level: The level with its unit (``64spp``, ``10s``).
             round, seed: Of the run.
         """
@@ -135,7 +135,7 @@ class RunFolder:
     def save(
         self, run: Run, image: np.ndarray, path: Path, metadata: Mapping[str, object]
     ) -> Run:
-        """Writes a run; what it returns knows its file."""
+        """Writes a run, and returns it with its path."""
         header = {**metadata, "spp": run.spp, "seed": run.seed, "seconds": run.seconds,
                   "run": json.dumps(run.record())}
         images.write_exr(path, image, "RGB", header)
@@ -149,7 +149,7 @@ class RunFolder:
 
 
 def _read_times(path: Path) -> dict[str, float]:
-    """Times of other sessions; none where the file is missing or damaged."""
+    """Times of other sessions; empty if the file is missing or damaged."""
     try:
         times = json.loads(path.read_text(encoding="utf-8"))
         return {str(session): float(seconds) for session, seconds in times.items()}

@@ -18,22 +18,22 @@ _ERRORS = (
 )
 
 _LEGEND = (
-    "Means over the rounds (seconds: median), with 95 % confidence intervals over them (as a "
-    "factor: +50 % upwards is −33 % downwards); compilation excluded, learning included. "
-    "eff. = 1 / (relMSE · seconds), relative to the first; shadow = shadow rays traced, of those "
-    "that 'path' would trace."
+    "Means over the rounds (seconds: medians) with 95 % confidence intervals, given as factors: "
+    "+50 % upwards is −33 % downwards. Times include learning, not compilation. "
+    "eff. = 1 / (relMSE · seconds), relative to the first integrator; shadow = share of the shadow "
+    "rays of 'path' that are traced."
 )
 
-#: Width of what goes to a file or a pipe, where there is no terminal to ask.
+#: Width of the output to a file or a pipe.
 _PIPE_WIDTH = 160
 
-#: Labels get no less than this; what does not fit beside them goes to a further table.
+#: Smallest width of the labels; columns that do not fit beside them go to a further table.
 _LABEL_WIDTH = 16
 
 
 def show(results: Mapping[str, Any]) -> None:
-    """Prints a table for each scene, with what a reader has to know to trust it. Where the terminal
-    is too narrow for all columns, several tables follow each other.
+    """Prints a table for each scene, with its reference, warnings and notes. If the terminal is too
+    narrow for all columns, a scene has several tables.
 
     Args:
         results: The content of ``results.json``.
@@ -46,7 +46,7 @@ def show(results: Mapping[str, Any]) -> None:
 
 
 def tables(results: Mapping[str, Any], width: int = _PIPE_WIDTH) -> Iterator[Table | Text]:
-    """What :func:`show` prints, for ``width`` characters."""
+    """The parts that :func:`show` prints, laid out for ``width`` characters."""
     for scene in results["scenes"]:
         if scene["error"]:
             yield Text(f"{scene['name']}: {scene['error']}\n", style="red")
@@ -70,7 +70,7 @@ class _Column(NamedTuple):
 
     @property
     def width(self) -> int:
-        """With the two spaces before it."""
+        """Including the two spaces before the column."""
         return 2 + max(cell_len(text) for text in (self.heading, *self.cells))
 
 
@@ -104,7 +104,8 @@ def _columns(scene: Mapping[str, Any], budget: Mapping[str, Any]) -> list[_Colum
 def _in_groups(
     columns: Sequence[_Column], labels: Sequence[str], width: int
 ) -> Iterator[list[_Column]]:
-    """All columns if they fit beside the labels; else errors and costs apart, or even less."""
+    """The columns of each table: all if they fit beside the labels; else errors and costs in
+    separate tables, split further where needed."""
     room = width - min(_LABEL_WIDTH, max(map(cell_len, labels), default=0))
     if sum(column.width for column in columns) <= room:
         yield list(columns)
@@ -157,7 +158,7 @@ def _notes(scene: Mapping[str, Any]) -> Iterator[str]:
     reference = scene["reference"]
     if reference:
         noise = reference["noise"]
-        note = "" if noise is None else f", relMSE of its own {noise:.2g}, subtracted"
+        note = "" if noise is None else f" (its own relMSE, {noise:.2g}, is subtracted)"
         yield f"Reference: {reference['path']}{note}."
     for warning in scene["warnings"]:
         yield f"Warning: {warning}."

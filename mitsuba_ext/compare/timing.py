@@ -1,4 +1,4 @@
-"""The clock around a render, and how many samples a time allows."""
+"""Times renders, and finds the number of samples that a time allows."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ if TYPE_CHECKING:
 
     from ..rendering.render import RenderStatistics
 
-#: More would not fit into the 2^32 samples of a wavefront even for a film of 16x16 pixels.
+#: Limit of ``samples_for``: with more, even a film of 16x16 pixels exceeds the 2^32 samples of a
+#: wavefront.
 _MAX_SPP = 2**24
 
-#: Below this many seconds, a hiccup of the machine can double the time of a render.
+#: A render shorter than this (in seconds) is timed twice: a short disturbance can double its time.
 _SHORT = 0.5
 
 
@@ -26,9 +27,9 @@ class Timed(NamedTuple):
 
     Attributes:
         seconds: Wall clock of the whole render, learning and compilation included.
-        compiled: Did a kernel have to be compiled, or loaded from the disk?
-        compile_seconds: How long that took (without tracing).
-        launches: Kernels that were launched.
+        compiled: Was a kernel compiled, or loaded from the disk?
+        compile_seconds: Time for that, without tracing.
+        launches: Number of kernel launches.
         spp: Samples per pixel that were taken.
         memory: Peak of the memory that Dr.Jit held, the scene included, in bytes.
         image: The developed image.
@@ -46,20 +47,20 @@ class Timed(NamedTuple):
 def timed_render(
     integrator: mi.Integrator, scene: mi.Scene, seed: int, spp: int, sensor: int = 0
 ) -> Timed:
-    """Renders (``spp`` 0: as many samples as the scene's sampler says) and waits for the image.
+    """Renders and waits for the image. ``spp`` 0 stands for the number of the scene's sampler.
 
     Raises:
-        NotImplementedError: Something moves, and the integrator does not see it.
+        NotImplementedError: The scene has moving shapes, and the integrator does not support them.
     """
     import drjit as dr
     import mitsuba as mi
 
     check_motion_is_seen(integrator, scene)
 
-    # What is garbage now must not be found while Dr.Jit traces calls (see garbage.py)
+    # Free garbage now: the collector must not free it while Dr.Jit traces calls (see garbage.py)
     gc.collect()
     dr.detail.malloc_clear_statistics()
-    # The history costs nothing that could be measured
+    # Recording the kernel history has no measurable cost
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         start = time.perf_counter()
@@ -86,7 +87,7 @@ def timed_render(
 
 
 def own_statistics(integrator: mi.Integrator) -> RenderStatistics | None:
-    """What an integrator of ours says about its last render; Mitsuba's say nothing."""
+    """Statistics of the last render, if the integrator is one of ours; else ``None``."""
     from ..rendering.render import RenderStatistics
 
     report = getattr(integrator, "statistics", None)
@@ -98,10 +99,10 @@ def samples_for(
 ) -> int:
     """How many samples per pixel take ``budget`` seconds.
 
-    Mitsuba's own integrators ignore a ``timeout`` outside of the scalar variants, and those that
-    learn plan their pilot passes by the number of samples: so the speed is measured, and the number
-    follows from it. The renders become longer until one takes an eighth of the budget (or four
-    seconds); the last two tell the cost of a sample from that of a render.
+    Mitsuba's own integrators ignore ``timeout`` outside of the scalar variants, and integrators
+    that learn plan their pilot passes by the number of samples. So this function measures the speed
+    and computes the number. It doubles the samples until a render takes an eighth of the budget (or
+    four seconds). The last two renders give the cost of a sample and the fixed cost of a render.
     """
 
     def seconds_of(spp: int) -> float:
@@ -110,7 +111,7 @@ def samples_for(
             seconds = min(seconds, timed_render(integrator, scene, seed, spp, sensor).seconds)
         return seconds
 
-    # From 8 on: with fewer, an integrator may have none to learn from
+    # Start with 8: with fewer, an integrator may have no pilot pass
     spp = 8
     shorter = seconds_of(spp)
     if shorter > min(budget / 2, 4):
@@ -121,7 +122,7 @@ def samples_for(
         if seconds >= min(budget / 8, 4) or spp >= _MAX_SPP:
             break
         shorter = seconds
-    # At least half the average: short renders are noisy, and a tiny slope would promise anything
+    # At least half the average: the difference of two noisy times can be close to zero
     per_sample = max((seconds - shorter) / (spp / 2), seconds / spp / 2)
     fixed = max(0.0, seconds - per_sample * spp)
     return min(_MAX_SPP, max(1, int((budget - fixed) / per_sample)))

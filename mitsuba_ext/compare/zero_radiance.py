@@ -1,4 +1,4 @@
-"""The share of samples that bring nothing back, of integrators that do not count it themselves."""
+"""The share of camera samples with zero radiance, for integrators that do not count them."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: About so many samples tell the share to a tenth of a percent.
+#: Number of samples, about. The standard error of the share is then at most 0.1 %.
 _SAMPLES = 1 << 18
 
 
 def zero_radiance_share(integrator: mi.Integrator, scene: mi.Scene, seed: int) -> float | None:
-    """The share of camera samples whose radiance is zero; ``None`` if the integrator cannot be
-    asked for single samples (a light tracer, or one that needs gradients)."""
+    """The share of camera samples whose radiance is zero; ``None`` if the integrator cannot trace
+    single camera samples (a light tracer, or one for gradients)."""
     import drjit as dr
     import mitsuba as mi
 

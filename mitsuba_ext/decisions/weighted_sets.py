@@ -1,7 +1,7 @@
-"""Weighted point sets on the device, and how a kernel draws from them.
+"""Weighted point sets in device memory, from which kernels draw.
 
-Source: Guo, PhD thesis, section 4.5.2; that a random shift around the torus makes weights that add
-up to one unbiased in every dimension is ours.
+Source: Guo, PhD thesis, section 4.5.2. Our addition: after a random shift around the torus, weights
+that add up to one are unbiased in every dimension.
 """
 
 from __future__ import annotations
@@ -14,29 +14,32 @@ import numpy as np
 
 from ..pointsets import points, voronoi_weights
 
-#: How the points of a set are weighed.
+#: Values of the parameter ``weights``.
 WEIGHTS = ("none", "voronoi", "torus", "unbiased")
 
-#: Points of all sets together, and sets at most. With few sets, pixels share the luck of one.
+#: Number of points of all sets together, and the largest number of sets. With few sets, many pixels
+#: use the same set, and their errors are correlated.
 _POINTS, _MOST_SETS = 1 << 13, 32
 
-#: A pattern whose points are slow to find; more of them than this take ten seconds.
+#: The pattern that is slow to generate, its number of sets, and the number of points per set beyond
+#: which it takes ten seconds or more.
 SLOW_PATTERN, _FEW_SETS, MOST_SLOW_POINTS = "poisson_disk", 2, 1024
 
 
 class WeightedSets:
-    """Some point sets of one kind. Each user of a set (a pixel, a vertex of a path) chooses one at
-    random and, but for ``voronoi``, shifts it around the torus at random.
+    """Several point sets of one kind. Each pixel, or each vertex of a path, chooses a set at random
+    and, except with ``voronoi``, shifts it around the torus at random.
 
     Parameters:
         pattern: See :func:`mitsuba_ext.pointsets.points`.
         weights: ``none`` (1/N); ``voronoi`` (cells that end at the border: biased); ``torus``
-            (periodic cells); ``unbiased`` (the same, and the points are folded: no seam).
+            (periodic cells); ``unbiased`` (periodic cells, and points mapped by
+            :func:`mitsuba_ext.pointsets.tent`, which removes the discontinuity at the border).
         count: Points of a set, N.
         dimension: 1 or 2.
-        seed: Another seed (an integer, or several) gives other sets.
-        periods: With more than 1, in one dimension: points get a second weight, for integrands that
-            repeat themselves so often in [0, 1). Their place counts modulo 1 / periods.
+        seed: One or several integers.
+        periods: If larger than 1 (in one dimension only), points have a second weight, for
+            integrands of the period 1 / periods: it is computed from positions modulo this period.
     """
 
     def __init__(
@@ -53,12 +56,12 @@ class WeightedSets:
         most = _FEW_SETS if pattern == SLOW_PATTERN else _MOST_SETS
         self._set_count = min(max(2, _POINTS // count), most)
         rng = np.random.default_rng(seed)
-        # Rows of two or four numbers are read at once
+        # Rows have two or four numbers, so that one gather reads them
         columns = dimension + self._weight_count
         table = np.ones((self._set_count, count, columns + columns % 2), np.float32)
         for rows in table:
             x = points(pattern, count, dimension, rng)
-            # Their order must not be that of another sampler
+            # Without the shuffle, their order could be correlated with that of the film's sampler
             rng.shuffle(x)
             rows[:, :dimension] = x
             if weights != "none":
@@ -72,7 +75,7 @@ class WeightedSets:
         dr.eval(self._table)
 
     def choose(self, sample: mi.Float) -> mi.UInt32:
-        """One of the sets, for a number in [0, 1)."""
+        """The index of a set, chosen by a uniform number in [0, 1)."""
         sets = self._opaque_sets
         return dr.minimum(mi.UInt32(sample * mi.Float(sets)), sets - 1)
 
@@ -80,12 +83,12 @@ class WeightedSets:
         self, number: mi.UInt32, shift: mi.Point2f, index: mi.UInt32, active: mi.Bool
     ) -> tuple[Any, ...]:
         """The point ``index`` of a set, its weight times N, and with ``periods`` its second weight
-        times N. The weights are 1.0 where there are none.
+        times N. With ``none``, the weights are 1.0.
 
         Parameters:
-            number: Which set.
-            shift: In [0, 1)ᴰ.
-            index: Below N.
+            number: Index of the set.
+            shift: Shift around the torus, in [0, 1)ᴰ; ignored with ``voronoi``.
+            index: Index of the point, below N.
         """
         row = number * self._opaque_count + index
         columns = self._dimension + self._weight_count
@@ -99,15 +102,15 @@ class WeightedSets:
             u -= dr.floor(u)
         if self._kind == "unbiased":
             u = 1 - dr.abs(2 * u - 1)
-        # Rounding must not reach the upper end
+        # Points stay below 1 despite rounding
         u = dr.minimum(u, dr.one_minus_epsilon(mi.Float))
         weights = [entry[self._dimension + i] for i in range(self._weight_count)]
         return (u, *([1.0] * len(weights) if self._kind == "none" else weights))
 
 
 def _periodic_weights(x: np.ndarray, periods: int) -> np.ndarray:
-    # Points that differ by rounding only must share their cell. None weighs nothing: weights of
-    # both kinds are divided by each other
+    # Points that differ by rounding only share a cell. No weight is zero, because the two weights
+    # of a point are divided by each other
     place = np.round(x.ravel() * periods % 1, 9) % 1
     return np.maximum(len(x) * voronoi_weights(place), 1e-6)
 

@@ -1,13 +1,12 @@
-"""Point sets in the unit cube, and weights by which their values are summed: for Monte Carlo
-integration with or without a scene.
+"""Point sets in the unit cube, and weights for Monte Carlo sums over them. Neither needs a scene.
 
 >>> from mitsuba_ext.pointsets import points, voronoi_weights
 >>> x = points("independent", 1024, dimension=2, seed=1)
 >>> w = voronoi_weights(x, boundary="torus")
 >>> estimate = (w * f(x[:, 0], x[:, 1])).sum()
 
-Source: Guo, PhD thesis, chapter 4 and appendix A. Which weights are unbiased is summed up in
-:func:`voronoi_weights`.
+Source: Guo, PhD thesis, chapter 4 and appendix A. :func:`voronoi_weights` says which weights are
+unbiased.
 """
 
 from .line import correction, nearest_neighbour_weights, trapezoid_weights, unbiased_weights

@@ -1,7 +1,8 @@
-"""Weights of points of an interval.
+"""Weights of points in an interval.
 
-Source: Guo, PhD thesis, section 4.4 (Eqs. 4.4 to 4.8); Yakowitz, Krimmel and Szidarovszky,
-Weighted Monte Carlo integration, SIAM J. Numer. Anal. 15(6), 1978 (the rivals).
+Source: Guo, PhD thesis, section 4.4 (Eqs. 4.4 to 4.8); for trapezoid and nearest-neighbour weights,
+Yakowitz, Krimmel and Szidarovszky, Weighted Monte Carlo integration, SIAM J. Numer. Anal. 15(6),
+1978.
 """
 
 from __future__ import annotations
@@ -17,32 +18,31 @@ def checked_points(function: str, x: npt.ArrayLike, most_axes: int = 1) -> Float
     """The points as an array of shape (N,), or with two axes also (N, D).
 
     Raises:
-        ValueError: They have another shape, are missing, or outside of the unit cube.
+        ValueError: The shape is another, there are no points, or some are outside of the unit cube.
     """
     x = np.asarray(x, float)
     if not 1 <= x.ndim <= most_axes or x.size == 0:
         shapes = "(N,) or (N, D)" if most_axes == 2 else "(N,)"
         raise ValueError(f"{function}: points of shape {shapes} expected, not {x.shape}")
-    # Also NaN is not inside
+    # This form of the condition also rejects NaN
     if not (x.min() >= 0 and x.max() <= 1):
         raise ValueError(f"{function}: there are points outside of the unit cube, or NaN")
     return x
 
 
 def cell_lengths(x: npt.ArrayLike, boundary: str) -> FloatArray:
-    """Of each point of [0, 1], the length of the cell in which none is nearer. Equal points share
-    their cell.
+    """The length of each point's Voronoi cell in [0, 1]. Equal points share a cell equally.
 
     Parameters:
         x: Points, of shape (N,), in any order.
-        boundary: ``"clip"`` (the cells end at 0 and 1) or ``"torus"`` (0 follows on 1).
+        boundary: ``"clip"`` (the cells end at 0 and 1) or ``"torus"`` (0 and 1 are joined).
     """
     x, which, counts = np.unique(np.asarray(x, float), return_inverse=True, return_counts=True)
     middle = (x[1:] + x[:-1]) / 2
     if boundary == "clip":
         ends = [0.0], [1.0]
     else:
-        # Seen from the first point, the last one lies one to the left
+        # On the torus, the left neighbour of the first point is the last one, moved by −1
         seam = (x[0] + x[-1] - 1) / 2
         ends = [seam], [seam + 1]
     edges = np.concatenate([ends[0], middle, ends[1]])
@@ -50,18 +50,19 @@ def cell_lengths(x: npt.ArrayLike, boundary: str) -> FloatArray:
 
 
 def correction(x: npt.ArrayLike, count: int) -> FloatArray:
-    """g(x): what the clipped cell of an independent uniform point at ``x`` measures on average,
-    relative to 1 / ``count`` (Guo, Eq. 4.7). Near the ends it falls to 1/2."""
+    """g(x): the expected length of the clipped cell of a point at ``x`` among ``count`` independent
+    uniform points, relative to 1 / ``count`` (Guo, Eq. 4.7). At both ends it is 1/2."""
     x = np.asarray(x, float)
     y = 1 - x
     right, left = x ** (count - 1), y ** (count - 1)
-    # N − (N + 1) x would lose digits near 1
+    # With y = 1 − x, because N − (N + 1) x would lose digits near x = 1
     return (((count + 1) * y - 1) * right + ((count + 1) * x - 1) * left + 2) / 2
 
 
 def unbiased_weights(x: npt.ArrayLike) -> FloatArray:
-    """Clipped cells, corrected such that sums are unbiased for independent uniform points
-    (Guo, Eq. 4.8). The weights do not add up to one: also a constant has variance."""
+    """Lengths of the clipped cells divided by :func:`correction`, which makes sums unbiased for
+    independent uniform points (Guo, Eq. 4.8). The weights do not add up to one, so even the
+    estimate of a constant has variance."""
     x = checked_points("unbiased_weights", x)
     return cell_lengths(x, "clip") / correction(x, len(x))
 
@@ -82,8 +83,8 @@ def trapezoid_weights(x: npt.ArrayLike) -> tuple[FloatArray, float, float]:
 
 
 def nearest_neighbour_weights(x: npt.ArrayLike, tests: npt.ArrayLike) -> FloatArray:
-    """The share of test points that are nearest to each point (Yakowitz et al.): an estimate of the
-    clipped cells that needs no diagram, in any dimension.
+    """For each point, the share of the test points that are nearest to it (Yakowitz et al.). This
+    estimates the measure of its clipped cell in any dimension, without a Voronoi diagram.
 
     Parameters:
         x, tests: Points of shape (N,) or (N, D), and (M,) or (M, D).

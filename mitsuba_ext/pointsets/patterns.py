@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from .line import FloatArray
 
-#: What :func:`points` can make.
+#: The patterns of :func:`points`.
 PATTERNS = (
     "independent", "stratified", "latin_hypercube", "halton", "hammersley", "sobol", "lattice",
     "poisson_disk",
@@ -20,27 +20,27 @@ PATTERNS = (
 #: Candidates for each further point of a Poisson disk pattern.
 _CANDIDATES = 32
 
-#: Products that are evaluated to choose a lattice.
+#: Limit of the work of choosing a lattice: number of products that are evaluated.
 _LATTICE_WORK = 1 << 22
 
 
 def points(
     pattern: str, count: int, dimension: int = 2, seed: int | np.random.Generator = 0
 ) -> FloatArray:
-    """Points in [0, 1)ᴰ. A point of them that is chosen at random is uniform: plain means are
-    unbiased. ``hammersley`` and ``lattice`` are fixed sets up to a random shift around the torus
-    and the order (``lattice``: also the direction) of their axes.
+    """Points in [0, 1)ᴰ. In each pattern, a point chosen at random is uniformly distributed, so
+    unweighted means are unbiased. ``hammersley`` and ``lattice`` are fixed sets, randomised by a
+    shift around the torus and by the order of the axes (``lattice``: also by their signs).
 
     - ``independent``: i.i.d. uniform numbers.
-    - ``stratified``: one in each cell of a grid (jittered). Where the count is no power, the grid
-      has the next smaller number of cells along each axis but the last, which is divided such that
-      each cell has one point: some columns, chosen at random, have one more than others.
-    - ``latin_hypercube``: one in each of N slices along each axis.
+    - ``stratified``: one point in each cell of a grid (jittered). Along each axis but the last, the
+      grid has ⌊N^(1/D)⌋ cells. Along the last axis, the columns are divided such that each cell has
+      one point: if N is no D-th power, some columns, chosen at random, have one cell more.
+    - ``latin_hypercube``: one point in each of N slices along each axis.
     - ``halton``: scrambled.
     - ``hammersley``: (i / N, Halton), shifted.
-    - ``sobol``: scrambled (Owen's scrambling, in the form of random matrices and a digital shift);
-      its first two dimensions are a (0, 2)-sequence. Powers of two serve it best.
-    - ``lattice``: of rank one, with the best of many generators, shifted.
+    - ``sobol``: scrambled (random linear matrices and a digital shift); its first two dimensions
+      are a (0, 2)-sequence. It is best for powers of two.
+    - ``lattice``: a lattice of rank one with the best of many generators, shifted.
     - ``poisson_disk``: each point is the candidate farthest from all others on the torus (Mitchell;
       Cline, PhD dissertation, section 4.5.3). Slow: its time grows with the square of the count.
 
@@ -63,20 +63,20 @@ def points(
             raise ValueError(f"points: {name} is {value}, not an integer of at least 1")
     rng = np.random.default_rng(seed)
     x = _MAKERS[pattern](count, dimension, rng)
-    # Rounding must not reach the upper end, also not in single precision
+    # Points stay below 1, also when they are rounded to single precision
     return np.minimum(x, 1 - 2.0**-24)
 
 
 def shifted(points: npt.ArrayLike, shift: npt.ArrayLike) -> FloatArray:
-    """Points moved around the torus."""
+    """The points plus ``shift``, modulo 1."""
     x = (np.asarray(points, float) + shift) % 1
-    # Next to 0 on its left, the remainder is rounded to 1
+    # The remainder of a tiny negative number is rounded to 1
     return np.where(x == 1, 0.0, x)
 
 
 def tent(points: npt.ArrayLike) -> FloatArray:
-    """1 − |2u − 1|: uniform points remain uniform, and a function of the result is the same at
-    opposite ends of the cube."""
+    """1 − |2u − 1|: uniform points remain uniform, and f(tent(u)) has equal values at opposite ends
+    of the cube."""
     return 1 - np.abs(2 * np.asarray(points, float) - 1)
 
 
@@ -86,7 +86,7 @@ def tent(points: npt.ArrayLike) -> FloatArray:
 def _stratified(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
     edge = _root(count, dimension)
     columns = edge ** (dimension - 1)
-    # The last axis: as many cells in each column as points remain for it
+    # Along the last axis, a column has as many cells as points; ``size`` is their number
     size = count // columns + (rng.permutation(columns) < count % columns)
     column = np.repeat(np.arange(columns), size)
     rank = np.arange(count) - (np.cumsum(size) - size)[column]
@@ -98,7 +98,7 @@ def _stratified(count: int, dimension: int, rng: np.random.Generator) -> FloatAr
 
 
 def _root(count: int, dimension: int) -> int:
-    """The largest integer whose power is at most ``count``."""
+    """The largest integer whose ``dimension``-th power is at most ``count``."""
     edge = round(count ** (1 / dimension))
     return edge if edge**dimension <= count else edge - 1
 
@@ -120,32 +120,32 @@ def _hammersley(count: int, dimension: int, rng: np.random.Generator) -> FloatAr
 
 def _sobol(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
     with warnings.catch_warnings():
-        # It warns of counts that are no power of two
+        # SciPy warns of counts that are no power of two
         warnings.simplefilter("ignore", UserWarning)
         return _qmc().Sobol(dimension, scramble=True, seed=rng).random(count)
 
 
 def _lattice(count: int, dimension: int, rng: np.random.Generator) -> FloatArray:
     index = np.arange(count, dtype=np.int64)[:, None]
-    # No direction is preferred: a lattice can suit an integrand, and its mirror image not
+    # Random order and signs of the axes: an integrand may suit a lattice but not its mirror image
     generator = rng.permutation(_generator(count, dimension)) * rng.choice([-1, 1], dimension)
     return shifted(index * generator % count / count, rng.random(dimension))
 
 
 def _generator(count: int, dimension: int) -> npt.NDArray[np.int64]:
-    """The powers of a number (Korobov) for which periodic functions of a Sobolev space are
-    integrated best: the mean of Π(1 + 2π² B₂({i zₐ / N})) is smallest."""
+    """The generator z of a Korobov lattice (powers of a number) with the smallest worst-case error
+    for periodic functions of a Sobolev space: the smallest mean of Π(1 + 2π² B₂({i zₐ / N}))."""
     if count < 3 or dimension == 1:
         return np.ones(dimension, np.int64)
     most = max(1, _LATTICE_WORK // (count * dimension))
     candidates = np.array([a for a in range(1, count // 2 + 1) if math.gcd(a, count) == 1])
     if len(candidates) > most:
-        # Golden ones are good where not all can be tried
+        # If there are too many to try, those near the golden section are good
         golden = count * (math.sqrt(5) - 1) / 2
         near = np.abs(np.minimum(golden, count - golden) - candidates)
         candidates = candidates[np.argsort(near, kind="stable")[:most]]
     i = np.arange(count, dtype=np.int64)
-    # Of all residues i / N
+    # The factor of every residue i / N
     kernel = 1 + 2 * math.pi**2 * ((i / count) ** 2 - i / count + 1 / 6)
     best = None
     for a in candidates.tolist():
@@ -171,7 +171,7 @@ def _poisson_disk(count: int, dimension: int, rng: np.random.Generator) -> Float
 
 
 def _qmc():
-    # Imported where it is needed: it takes longer to load than all of this package
+    # Imported here, because it takes longer to load than the rest of this package
     from scipy.stats import qmc
 
     return qmc

@@ -12,23 +12,23 @@ import numpy.typing as npt
 
 from .line import FloatArray, checked_points, unbiased_weights
 
-#: What makes weights of points in [0, 1].
+#: A function that computes weights of points in [0, 1].
 Weigher = Callable[[FloatArray], FloatArray]
 
 
 def stratum_weights(
     x: npt.ArrayLike, edges: npt.ArrayLike, weigher: Weigher = unbiased_weights
 ) -> FloatArray:
-    """Weights of points that are weighed stratum by stratum, as if each were all there is.
+    """Weights that are computed in each stratum separately, and scaled by its length.
 
     Parameters:
         x: Points in [0, 1], of shape (N,).
-        edges: Limits of the strata, ascending from 0 to 1; each of them has one point or more.
+        edges: Limits of the strata, ascending from 0 to 1; each stratum has one point or more.
         weigher: Weights of points of a single stratum, scaled to [0, 1].
 
     Raises:
-        ValueError: A stratum has no point: its part of the integral would be lost. Points are
-            outside, or edges not as they should be.
+        ValueError: A stratum has no point, so that its part of the integral would be lost; a point
+            is outside of [0, 1]; or the edges do not ascend from 0 to 1.
     """
     x, edges = checked_points("stratum_weights", x), _checked_edges("stratum_weights", edges)
     weights, counts = _within(x, edges, weigher)
@@ -48,7 +48,7 @@ def piecewise_points(
         probabilities: Of the pieces, of shape (K,), with sum 1.
 
     Raises:
-        ValueError: These are not as they should be.
+        ValueError: Points, edges or probabilities are not as described.
     """
     u = checked_points("piecewise_points", u)
     edges, probabilities = _checked_pieces("piecewise_points", edges, probabilities)
@@ -61,9 +61,9 @@ def piecewise_weights(
     probabilities: npt.ArrayLike,
     weigher: Weigher = unbiased_weights,
 ) -> FloatArray:
-    """Weights of independent points of a piecewise constant density: they are weighed piece by
-    piece. How many a piece has is chance; that it may have none is made up for by those times when
-    it has one, so that sums remain unbiased if they are so with ``weigher``.
+    """Weights of independent points of a piecewise constant density, computed in each piece
+    separately. By chance, a piece may have no point. So its weights are divided by the probability
+    that it has one: sums are unbiased if those with ``weigher`` are.
 
     Parameters:
         x: Points in [0, 1], of shape (N,).
@@ -71,7 +71,7 @@ def piecewise_weights(
         weigher: Weights of points of a single piece, scaled to [0, 1].
 
     Raises:
-        ValueError: These are not as they should be.
+        ValueError: Points, edges or probabilities are not as described.
     """
     x = checked_points("piecewise_weights", x)
     edges, probabilities = _checked_pieces("piecewise_weights", edges, probabilities)
@@ -100,7 +100,7 @@ def _checked_pieces(
 def _within(
     x: FloatArray, edges: FloatArray, weigher: Weigher
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Weights of the points, and how many there are in each stratum."""
+    """Weights of the points, and the number of points in each stratum."""
     stratum, weights = _stratum(x, edges), np.empty(len(x))
     order = np.argsort(stratum, kind="stable")
     counts = np.bincount(stratum, minlength=len(edges) - 1)
@@ -112,5 +112,5 @@ def _within(
 
 
 def _stratum(x: FloatArray, edges: FloatArray) -> npt.NDArray[np.int64]:
-    # 1 belongs to the last one
+    # The point 1 belongs to the last stratum
     return np.minimum(np.searchsorted(edges, x, side="right") - 1, len(edges) - 2)

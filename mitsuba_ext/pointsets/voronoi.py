@@ -1,6 +1,6 @@
 """Weights of points: the measures of their Voronoi cells.
 
-Source: Guo, PhD thesis, section 4.4.1 (Eq. 4.4); that periodic cells are unbiased is ours.
+Source: Guo, PhD thesis, section 4.4.1 (Eq. 4.4). That periodic cells are unbiased is our addition.
 """
 
 from __future__ import annotations
@@ -17,30 +17,32 @@ from .line import FloatArray, cell_lengths, checked_points
 
 BOUNDARIES = ("clip", "torus")
 
-#: Points that are nearer to the border of a clipped domain count as being so far from it: from
-#: their mirror images they have to be told apart.
+#: With ``clip``, points are moved to at least this distance from the border: Qhull must distinguish
+#: them from their mirror images.
 _BORDER = 1e-7
 
-#: Points that are nearer to each other coincide, by dimension: Qhull could not tell them apart.
+#: Points closer than this, by dimension, are treated as equal: Qhull cannot distinguish them.
 _SPACING = {2: 1e-10, 3: 1e-7}
 
-#: The sum of all cells may be off by so much through rounding; and if no image is left out, by so
-#: much where points are close.
+#: Accepted errors of the sum of all cells. The first holds with the images near the domain only (a
+#: missing image causes a larger error), the second with all images (close points cause rounding).
 _TOLERANCE, _MOST = 1e-9, 1e-5
 
 
 def voronoi_weights(points: npt.ArrayLike, boundary: str = "torus") -> FloatArray:
     """Measures of the Voronoi cells of points in [0, 1]ᴰ; they add up to one. Points that coincide
-    share their cell.
+    share a cell equally.
 
     Sums Σ wᵢ f(xᵢ) with these weights are
 
-    - with ``"clip"``: consistent, but biased by what happens at the border. In one dimension,
-      :func:`~mitsuba_ext.pointsets.unbiased_weights` mends this for independent uniform points.
+    - with ``"clip"``: consistent, but biased, because cells are cut off at the border. In one
+      dimension, :func:`~mitsuba_ext.pointsets.unbiased_weights` corrects this for independent
+      uniform points.
     - with ``"torus"``: unbiased in every dimension for independent uniform points, and for *any*
-      points that a uniform random shift has moved around the torus
-      (:func:`~mitsuba_ext.pointsets.shifted`): no place is special. Where f differs at opposite
-      ends, evaluate it at ``tent(points)`` instead: still unbiased, and free of the seam.
+      points after a uniform random shift around the torus
+      (:func:`~mitsuba_ext.pointsets.shifted`), because all positions are then equally likely. If f
+      differs at opposite ends, evaluate it at ``tent(points)`` instead: still unbiased, and without
+      the discontinuity at the border.
 
     Parameters:
         points: Of shape (N,) or (N, D), with D = 1, 2 or 3.
@@ -50,8 +52,8 @@ def voronoi_weights(points: npt.ArrayLike, boundary: str = "torus") -> FloatArra
         Array of shape (N,).
 
     Raises:
-        ValueError: Points are missing or outside of the domain; D is too large; there is no such
-            boundary; the cells that were found do not fill the domain.
+        ValueError: There are no points, or some are outside of the domain; D is too large; the
+            boundary is unknown; the cells do not fill the domain, because of rounding.
     """
     x = checked_points("voronoi_weights", points, 2)
     if boundary not in BOUNDARIES:
@@ -70,7 +72,7 @@ def voronoi_weights(points: npt.ArrayLike, boundary: str = "torus") -> FloatArra
 
 
 def _places(x: FloatArray, boundary: str) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """The places where there are points, and which of them is that of each point."""
+    """The distinct positions of the points, and for each point the index of its position."""
     places, which = np.unique(x, axis=0, return_inverse=True)
     tree = cKDTree(places, boxsize=1.0 if boundary == "torus" else None)
     pairs = tree.query_pairs(_SPACING[x.shape[1]], output_type="ndarray")
@@ -86,12 +88,12 @@ def _measures(x: FloatArray, boundary: str) -> FloatArray:
         try:
             measures = _cell_measures(x, _images(x, boundary, margin))
         except QhullError:
-            # Points on a line, say, whose images beside it are farther away
+            # For example, all points are on a line, and images off the line are beyond the margin
             continue
-        # Without an image that matters, cells are too large, and so is their sum
+        # If a needed image is missing, cells are too large, and so is their sum
         if abs(measures.sum() - 1) < tolerance:
             return measures / measures.sum()
-    raise ValueError("voronoi_weights: no cells that fill the domain; are points very close?")
+    raise ValueError("voronoi_weights: the cells do not fill the domain; are points very close?")
 
 
 def _images(x: FloatArray, boundary: str, margin: float) -> FloatArray:
@@ -99,7 +101,7 @@ def _images(x: FloatArray, boundary: str, margin: float) -> FloatArray:
     each face, or shifted by whole periods."""
     dimension = x.shape[1]
     if boundary == "clip":
-        # A cell ends where the mirror image of its own point is as near
+        # A face is equally far from a point and its mirror image, so the point's cell ends there
         unit = np.eye(dimension)
         copies = [2 * side * e + x * (1 - 2 * e) for e in unit for side in (0, 1)]
     else:
@@ -109,8 +111,8 @@ def _images(x: FloatArray, boundary: str, margin: float) -> FloatArray:
 
 
 def _cell_measures(x: FloatArray, images: FloatArray) -> FloatArray:
-    """Areas or volumes of the cells of ``x`` among ``images``: infinite for those without bounds,
-    and 0 for points that Qhull takes for one of their neighbours."""
+    """Areas or volumes of the cells of ``x`` among ``images``: infinite for unbounded cells, 0 for
+    points that Qhull merges with a neighbour."""
     count, dimension = x.shape
     diagram = Voronoi(np.concatenate([x, images]))
     pair = diagram.ridge_points

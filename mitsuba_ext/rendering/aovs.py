@@ -1,5 +1,5 @@
-"""Lists of arbitrary output variables, checked before Mitsuba's ``aov`` reads them: an item without
-a type ends the process there (a segmentation fault in 3.9.1)."""
+"""Checks lists of arbitrary output variables before Mitsuba's ``aov`` reads them: there, an item
+without a type ends the process (a segmentation fault in 3.9.1)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: What Mitsuba 3.9.1's ``aov`` accepts as types.
+#: The types that ``aov`` of Mitsuba 3.9.1 accepts.
 AOV_TYPES = (
     "albedo", "depth", "position", "uv", "geo_normal", "sh_normal", "dp_du", "dp_dv", "duv_dx",
     "duv_dy", "prim_index", "shape_index",
@@ -39,7 +39,7 @@ def check_nodes(state: mi.parser.ParserState) -> None:
     """Checks the lists of every ``aov`` of Mitsuba in a parsed scene or integrator.
 
     Raises:
-        ValueError: One is not well-formed.
+        ValueError: A list is not well-formed.
     """
     for node in state.nodes:
         if node.props.plugin_name() == "aov" and isinstance(node.props.get("aovs"), str):

@@ -1,7 +1,7 @@
 """Mean and variance of an image from independent batches: the same render at several seeds.
 
-This works for any integrator, also for those that do not go through ``sample()`` (light tracing,
-Metropolis) or whose samples depend on each other (learning), since it looks at whole images only.
+This works for any integrator, because it uses whole images only: also for those that do not go
+through ``sample()`` (light tracing, Metropolis) or whose samples depend on each other (learning).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from .camera import find_sensor
 
 
 class Batches:
-    """Mean and variance of the batches so far. Neither memory nor cost per batch grow with their
-    number.
+    """Running mean and variance of batches. Its memory and its cost per batch do not grow with
+    their number.
 
     Attributes:
         channels: Names of the channels: those of the film's image, then the integrator's AOVs.
-        image_channel_count: How many of them are the image, alpha included.
+        image_channel_count: Number of channels of the image, alpha included.
         spp: Samples per pixel of all batches together.
     """
 
@@ -37,19 +37,19 @@ class Batches:
         self._state = (0, np.float64(0), np.float64(0))
 
     def add(self, image: np.ndarray, spp: int) -> None:
-        """Takes the image of a batch in."""
-        # Welford's update, in double precision: a difference of large sums is never taken
+        """Adds the image of a batch."""
+        # Welford's update in double precision, which avoids the difference of large sums
         count, mean, squares = self._state
         with np.errstate(invalid="ignore", over="ignore"):  # pixels may be infinite
             deviation = image.astype(np.float64) - mean
             mean = mean + deviation / (count + 1)
             squares = squares + deviation * (image - mean)
-        # At once: Ctrl-C may come at any time
+        # In one assignment, because Ctrl-C may interrupt at any time
         self._state = (count + 1, mean, squares)
         self.spp += spp
 
     def save(self, path: Path) -> None:
-        """Writes everything to a file, from which :meth:`load` makes an equal object."""
+        """Writes the batches to a file that :meth:`load` reads."""
         count, mean, squares = self._state
         with open(path, "wb") as file:
             np.savez(
@@ -76,8 +76,8 @@ class Batches:
 
     @property
     def mean(self) -> np.ndarray:
-        """Array (height, width, channels), double precision. NaN or infinity in any batch is still
-        there."""
+        """Array (height, width, channels), double precision. A pixel that is NaN or infinite in any
+        batch is not finite."""
         return self._state[1]
 
     @property
@@ -97,23 +97,23 @@ def each_batch(
     seeds: Iterable[int],
     batches: Batches | None = None,
 ) -> Iterator[Batches]:
-    """Renders one batch per seed, in steps: yields, after each batch, one and the same object. The
+    """Renders one batch per seed, and yields the same :class:`Batches` object after each. The
     caller may stop at any time, and keeps the finished batches after an exception.
 
     Args:
         integrator, scene, sensor: What to render; a sensor may be given by its index.
         batch_spp: Samples per pixel of each batch; stratified samplers round up.
-        seeds: Of the batches. All different, and such that the integrator's own use of a seed does
-            not make images depend on each other: :func:`batch_seeds`.
-        batches: Earlier ones, to go on from.
+        seeds: Seeds of the batches, by :func:`batch_seeds`. With others, images could be correlated
+            by the way in which integrators and samplers use their seed.
+        batches: Earlier batches to continue.
 
     Raises:
-        NotImplementedError: Something moves, and the integrator does not see it.
+        NotImplementedError: The scene has moving shapes, and the integrator does not support them.
     """
     check_motion_is_seen(integrator, scene)
     sensor = find_sensor(scene, sensor)
     batch_spp = sample_count(sensor, batch_spp)
-    # Whatever AOVs an earlier render left there
+    # Removes the AOVs of an earlier render
     sensor.film().prepare([])
     for seed in seeds:
         image = _render(integrator, scene, sensor, batch_spp, seed)
@@ -126,10 +126,10 @@ def each_batch(
 def batch_seeds(seed: int | mi.UInt32, count: int) -> list[int]:
     """Seeds of ``count`` batches of a render with the given seed.
 
-    Scattered over all 32 bits: neighbouring seeds would share batches if they were consecutive, and
-    Mitsuba's stratified samplers give pixel p at seed s + spp the numbers of pixel p + 1 at seed s.
-    The second output of TEA, since our integrators take the first for the seeds of their passes:
-    with that, pass k of one batch would repeat batch k.
+    They are hashes of 32 bits. With consecutive seeds, renders with neighbouring seeds would share
+    batches, and Mitsuba's stratified samplers give pixel p at seed s + spp the numbers of pixel
+    p + 1 at seed s. They are the second output of TEA, because our integrators take the first for
+    the seeds of their passes: else pass k of one batch would repeat batch k.
     """
     if isinstance(seed, mi.UInt32):
         seed = seed[0]
@@ -138,8 +138,8 @@ def batch_seeds(seed: int | mi.UInt32, count: int) -> list[int]:
 
 
 def sample_count(sensor: mi.Sensor, spp: int) -> int:
-    """The samples per pixel of a render that asks for ``spp`` (0: as many as the sampler says):
-    stratified samplers round up."""
+    """The samples per pixel that a render with ``spp`` takes, since stratified samplers round up. 0
+    stands for the sampler's own number."""
     sampler = sensor.sampler()
     before = sampler.sample_count()
     if spp:
@@ -156,7 +156,7 @@ def _render(
     before = sampler.sample_count()
     try:
         with dr.suspend_grad(), garbage_left_alone():
-            # Developed: "prb" refuses to do without
+            # "prb" refuses develop=False
             return integrator.render(
                 scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=True
             ).numpy()
@@ -165,15 +165,15 @@ def _render(
 
 
 def _no_batches(film: mi.Film) -> Batches:
-    """For images with the channels of a film that has just been rendered to."""
+    """An empty object for images with the channels of a film that has just been rendered to."""
     return Batches([field.name for field in film.bitmap().struct_()], film.base_channels_count())
 
 
 def _complete(image: np.ndarray, film: mi.Film, channel_count: int) -> np.ndarray:
-    """An image with the channels that the film has.
+    """The image with the channels of the film.
 
-    "aov" returns others than it leaves in the film. Its image is the nested integrator's; of the
-    rest, only the film's channels have names.
+    The image that "aov" returns lacks channels that it leaves in the film. So this takes the image
+    itself from ``image``, and the other channels, which have names, from the film.
     """
     if image.shape[2] == channel_count:
         return image

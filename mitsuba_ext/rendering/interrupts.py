@@ -1,6 +1,6 @@
-"""The signals that ask a process to end, and Ctrl-C between two passes of a render.
+"""Handles the signals that ask a process to end, and defers Ctrl-C to the end of a pass.
 
-Nothing here imports Mitsuba: the command line installs handlers before it does.
+This module does not import Mitsuba at the top: the command line installs its handlers before that.
 """
 
 from __future__ import annotations
@@ -12,23 +12,24 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
 
-#: Ctrl-C; what batch systems send some seconds before they kill; what a closed terminal sends.
+#: Signals of Ctrl-C, of batch systems some seconds before they kill, and of a closed terminal.
 SIGNALS = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 ]
 
-#: Signals that come within so many seconds of the first one count as one: a terminal that is closed
-#: may send several, and some launchers pass on a Ctrl-C that the terminal sends to both processes.
+#: Signals within so many seconds of the first one count as one. A terminal that is closed may send
+#: several, and some launchers forward a Ctrl-C that the terminal also sends to this process.
 TOGETHER = 0.5
 
 
 class InterruptHandler:
-    """A handler for some of :data:`SIGNALS`. The first signal raises ``KeyboardInterrupt``, or only
-    sets an event if there is one; a second one raises ``KeyboardInterrupt``.
+    """A handler for some of :data:`SIGNALS`. The first signal sets :attr:`event`, or raises
+    ``KeyboardInterrupt`` if there is none; a second one raises ``KeyboardInterrupt``.
 
     Attributes:
-        number: The first signal; ``None`` if none came yet.
-        event: What the first signal sets, as long as a pass must not be interrupted.
+        number: The first signal; ``None`` if none was received yet.
+        event: During a pass, the event that the first signal sets instead of interrupting the pass;
+            else ``None``.
     """
 
     def __init__(self) -> None:
@@ -47,14 +48,14 @@ class InterruptHandler:
         self.event.set()
         import mitsuba as mi
 
-        mi.Log(mi.LogLevel.Warn, "Interrupted: the running pass is being finished.")
+        mi.Log(mi.LogLevel.Warn, "Interrupted: finishing the running pass.")
 
 
 @contextlib.contextmanager
 def deferred_interrupt() -> Iterator[threading.Event]:
     """While active, the first Ctrl-C only sets the event, so that the running pass can finish; a
-    second one interrupts at once (or as soon as Mitsuba returns to Python). Where an
-    :class:`InterruptHandler` is active already, its signals do the same."""
+    second one interrupts at once (or as soon as Mitsuba returns to Python). If an
+    :class:`InterruptHandler` is active already, all of its signals act like Ctrl-C."""
     event = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield event
@@ -78,8 +79,8 @@ def deferred_interrupt() -> Iterator[threading.Event]:
 def handling(
     numbers: Sequence[int], handler: Callable[[int, FrameType | None], None]
 ) -> Iterator[None]:
-    """While active, ``handler`` is called for each of the signals, except for those that are
-    ignored: by ``nohup``, or SIGINT by a shell that runs a script's job in the background."""
+    """While active, ``handler`` is called for each of the signals, except for those that were
+    ignored before (``nohup`` ignores SIGHUP, and a script's shell SIGINT in background jobs)."""
     previous = {number: signal.getsignal(number) for number in numbers}
     handled = [number for number in numbers if previous[number] is not signal.SIG_IGN]
     for number in handled:

@@ -1,9 +1,9 @@
-"""Rendering with Mitsuba's own integrators so that it can be stopped.
+"""Renders with Mitsuba's own integrators in passes, so that the render can be stopped.
 
 Their ``render()`` takes all samples at once, however long that lasts, and ignores Ctrl-C meanwhile.
-Here, it is called for some samples at a time, each time with another seed. A film holds, for each
-pixel, the weighted sum of its samples and the sum of their weights: what these renders leave there
-adds up to what a single one of all samples would leave, for every reconstruction filter.
+Here, each pass calls it for some of the samples, with a seed of its own. A film holds, for each
+pixel, the weighted sum of its samples and the sum of their weights. These sums are added over the
+passes, which gives the film of a single render of all samples, for every reconstruction filter.
 """
 
 from __future__ import annotations
@@ -24,29 +24,31 @@ from .camera import film_extent
 from .interrupts import deferred_interrupt
 from .render import check_extent, kernel_cache_misses
 
-#: Samples of a pass, about: one or two seconds on two CPU cores. Their number must not depend on
-#: the speed: the same seed gives the same image.
+#: Approximate number of samples of a pass: one or two seconds on two CPU cores. It must not depend
+#: on the speed, so that the same seed gives the same image.
 _PASS_SAMPLES = {dr.JitBackend.LLVM: 1 << 20, dr.JitBackend.CUDA: 1 << 24}
 
-#: Samples per pixel and pass, at least. Rays of one pixel stay together, and so are faster than
-#: those of different pixels. The samples of a structured sampler are stratified in a pass only:
-#: with fewer, more would be lost than a shorter wait for Ctrl-C is worth.
+#: Fewest samples per pixel in a pass, with independent and with structured samplers. Rays of one
+#: pixel are more coherent, and faster, than rays of different pixels. Structured samplers stratify
+#: the samples of one pass only, so shorter passes would cost efficiency.
 _PASS_SPP, _STRUCTURED_PASS_SPP = 4, 64
 
-#: Where passes of so many samples would be longer than this many lanes (minutes on two CPU cores),
-#: they are shorter: batch systems kill 10 to 30 seconds after they ask.
+#: If passes with a structured sampler have more samples than this (minutes on two CPU cores), they
+#: get only so many per pixel: batch systems kill 10 to 30 seconds after the first signal.
 _LONG_PASS, _LARGE_FILM_PASS_SPP = 1 << 25, 16
 
-#: With a time to fill, passes are shorter by this factor: they are what it is filled with.
+#: With a time budget, passes are shorter by this factor, so that a whole number of them comes
+#: closer to the time.
 _TIMED_PASS_DIVISOR = 4
 
-#: The first of the numbers by which passes get their seeds. Batches count from 0.
+#: Offset of the stream numbers from which passes derive their seeds. Those of batches start at 0.
 _STREAM = 1 << 31
 
 
 def can_render(integrator: mi.Integrator) -> bool:
-    """Is it one of Mitsuba's own, with only such in it? Others may learn, which passes would make
-    them repeat. In scalar variants, Mitsuba's can be stopped as they are."""
+    """Is the integrator, with all that are nested in it, one of Mitsuba's own, in a JIT variant?
+    Others may learn, and would learn again in each pass. In scalar variants, Mitsuba's integrators
+    can be stopped without passes."""
     modules = {type(each).__module__.split(".")[0] for each in with_nested(integrator)}
     return dr.is_jit_v(mi.Float) and modules == {"mitsuba"}
 
@@ -62,12 +64,12 @@ def pass_length(sensor: mi.Sensor, is_timed: bool = False) -> int:
         limit = max(limit // _TIMED_PASS_DIVISOR, 1)
     else:
         limit = max(limit, _PASS_SPP)
-    # Mitsuba finds the pixels of other numbers than powers of two by another kernel
+    # A power of two: for other counts, Mitsuba computes the pixel of a sample by another kernel
     return sample_count(sensor, 1 << (limit.bit_length() - 1))
 
 
 def is_independent(sensor: mi.Sensor) -> bool:
-    """Do its samples depend on no other sample of the pixel?"""
+    """Does the sensor's sampler draw each sample independently of the pixel's other samples?"""
     return sensor.sampler().class_name() == "IndependentSampler"
 
 
@@ -83,7 +85,7 @@ class SeedPasses:
         interrupted: Did Ctrl-C or an error end the render before all samples were taken?
 
     Raises:
-        NotImplementedError: Something moves, which such integrators do not see.
+        NotImplementedError: The scene has moving shapes, which such integrators do not support.
         ValueError: The film has more pixels than a wavefront can hold.
     """
 
@@ -105,19 +107,21 @@ class SeedPasses:
         seconds: float | None = None,
         progress: Callable[[float], None] = lambda done: None,
     ) -> None:
-        """Renders, and leaves the image in the film: also after Ctrl-C, which ends it after a pass,
-        and after an exception. A render of one pass is that of ``integrator.render``.
+        """Renders, and leaves the image of the finished passes in the film, also after an exception
+        and after Ctrl-C, which ends the render after the running pass. With a single pass, the
+        image is that of ``integrator.render``.
 
         Args:
             spp: Samples per pixel, which structured samplers may round up.
-            seconds: Instead of ``spp``, with independent samples: as many passes as fit. Their
-                number follows from the time of the first one that compiles nothing, and not from
-                the clock: an image that ends when the clock says so prefers samples that are fast.
+            seconds: Instead of ``spp``, with independent samples: take as many passes as fit. Their
+                number is computed from the time of the first pass that compiles nothing. It does
+                not depend on the times of later passes: stopping by the clock would be biased
+                towards samples that are fast.
             progress: Called after each pass with the fraction done.
         """
         length = pass_length(self._sensor, seconds is not None)
         pass_count = -(-spp // length) if seconds is None else math.inf
-        self.interrupted = True  # until all passes are there
+        self.interrupted = True  # until all passes are finished
         asked = self._sensor.sampler().sample_count()
         try:
             with deferred_interrupt() as interrupt:
@@ -134,16 +138,16 @@ class SeedPasses:
                 self._fill_film()
 
     def _run_pass(self, spp: int) -> tuple[float, bool]:
-        """Adds a pass; how many seconds did it take, and did it compile a kernel?"""
+        """Adds a pass; returns its seconds, and whether it compiled a kernel."""
         spp = sample_count(self._sensor, spp)
         begin, misses = time.perf_counter(), kernel_cache_misses()
         seed = self._seed if self.passes == 0 else self._scattered_seed()
-        # Developed: "prb" refuses to do without
+        # render() develops the film, because "prb" refuses develop=False
         with garbage_left_alone():
             self._integrator.render(self._scene, self._sensor, seed, spp)
         contents = np.array(self._film.develop(raw=True), dtype=np.float64)
         elapsed, compiled = time.perf_counter() - begin, kernel_cache_misses() > misses
-        # Light tracing leaves an image, and no weights
+        # A light tracer leaves an image, but no weights
         self._has_weights = bool(contents[..., self._weight_channel()].any())
         self._sum += contents if self._has_weights else contents * spp
         self.passes += 1
@@ -151,14 +155,14 @@ class SeedPasses:
         return elapsed, compiled
 
     def _fill_film(self) -> None:
-        """Hands the sum to the film, which holds the last pass."""
+        """Replaces the content of the film, the last pass, by the sum of all passes."""
         contents = self._sum if self._has_weights else self._sum / self.spp
         self._film.prepare(self._integrator.aov_names())
         tensor = mi.TensorXf(contents.astype(np.float32))
         self._film.put_block(mi.ImageBlock(tensor, offset=self._film.crop_offset()))
 
     def _scattered_seed(self) -> int:
-        # Far from each other, and none of those that batches have (batch_seeds)
+        # A hash, and different from the seeds of batches (see batch_seeds)
         stream = mi.UInt32(self.passes + _STREAM)
         return mi.sample_tea_32(mi.UInt32(self._seed), stream)[1][0]
 

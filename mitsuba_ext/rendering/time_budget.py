@@ -1,24 +1,24 @@
-"""How many samples fit into the time that a render has.
+"""Computes how many samples fit into the time of a render.
 
-The number of samples of a stage is fixed by the times of its first passes, before the others are
-rendered. The clock never ends a stage: an image that ends when the clock says so prefers samples
-that are fast. Each stage begins with a short pass, which is repeated until one has compiled
-nothing: it tells the speed.
+The number of samples of a stage is computed from the times of its first passes, before the others
+are rendered. The clock never ends a stage: stopping by the clock would be biased towards samples
+that are fast. Each stage begins with a short pass that measures the speed; it is repeated until one
+compiles nothing.
 """
 
 from __future__ import annotations
 
 import time
 
-#: Samples of a short pass, about: fewer would take as long.
+#: Approximate number of samples of a short pass; fewer would take as long.
 _SHORT_PASS = 1 << 16
 
-#: Share of all samples that pilots may take. They are the least useful ones, and learning from them
-#: takes time besides.
+#: Largest share of all samples for pilot passes. Their samples have the most variance, and learning
+#: from them takes additional time.
 _PILOT_SHARE = 0.25
 
-#: Share of the time left that the second pass of the last stage takes: it tells the speed better
-#: than the short one does.
+#: Share of the time left that the second pass of the last stage takes. It measures the speed more
+#: precisely than the short pass.
 _SECOND_SHARE = 0.25
 
 
@@ -27,15 +27,16 @@ class TimeBudget:
 
     Parameters:
         timeout: Seconds; 0 or less for no limit.
-        start: When they began, by ``time.perf_counter``.
-        pixel_count: Of the film.
-        pilot_spp: Samples per pixel that all pilots would take without a limit.
+        start: Start of the render, by ``time.perf_counter``.
+        pixel_count: Number of pixels of the film.
+        pilot_spp: Samples per pixel of all pilot passes without a limit.
 
     Attributes:
         is_limited: Is there a limit?
-        end: When it is reached, by the same clock.
+        end: End of the render, by ``time.perf_counter``.
         short: Samples per pixel of a short pass.
-        pilot_factor: By how much pilots are cut short; ``None`` until the speed is known.
+        pilot_factor: Fraction of the pilots' samples that are taken; ``None`` until the speed is
+            known.
     """
 
     def __init__(self, timeout: float, start: float, pixel_count: int, pilot_spp: int) -> None:
@@ -46,8 +47,13 @@ class TimeBudget:
         self.pilot_factor: float | None = None
 
     def stage(self, samples: int, taken: int, is_last: bool) -> StageBudget:
-        """That of a stage which would take ``samples`` samples per pixel without a limit, after
-        ``taken`` ones of earlier stages."""
+        """The budget of a stage.
+
+        Parameters:
+            samples: Samples per pixel of the stage without a limit.
+            taken: Samples per pixel of the stages before.
+            is_last: Is it the last stage? The others are pilots.
+        """
         if not self.is_limited:
             return StageBudget(samples, samples)
         if is_last:
@@ -59,8 +65,8 @@ class StageBudget:
     """The samples of a stage, without a limit.
 
     Attributes:
-        samples: Samples per pixel to take, as far as it is known.
-        longest: Length of the next pass, at most.
+        samples: Samples per pixel to take, as far as known.
+        longest: Largest number of samples per pixel in the next pass.
         is_open: Can the number of samples still change?
     """
 
@@ -70,12 +76,12 @@ class StageBudget:
         self.samples, self.longest = samples, longest
 
     def passed(self, spp: int, done: int, seconds: float) -> None:
-        """A pass of ``spp`` samples, which compiled nothing, took so long; the stage has ``done``
-        samples by now."""
+        """Records that a pass of ``spp`` samples per pixel, which compiled nothing, took
+        ``seconds``; the stage has taken ``done`` samples per pixel so far."""
 
 
 class _PilotBudget(StageBudget):
-    """All pilots together are cut short when the speed of the first pass is known."""
+    """The samples of a pilot. The speed of the first pass decides the fraction of all pilots."""
 
     def __init__(self, whole: TimeBudget, samples: int, taken: int) -> None:
         super().__init__(samples, whole.short)
@@ -98,7 +104,8 @@ class _PilotBudget(StageBudget):
 
 
 class _LastStageBudget(StageBudget):
-    """A short pass, one of a quarter of the time left, and the rest."""
+    """The samples of the last stage: a short pass, a pass of a quarter of the time left, and the
+    rest."""
 
     is_open = True
 

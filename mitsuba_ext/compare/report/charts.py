@@ -41,8 +41,8 @@ class Chart:
 def make_charts(
     scene: Record, anchor: str, series_of: Mapping[str, int], target: float | None
 ) -> list[Chart]:
-    """Error against samples and against seconds where there are several levels; else against
-    seconds only."""
+    """Plots error against samples and against seconds; with a single level, against seconds
+    only."""
     found = levels(scene)
     axes = [("seconds", "seconds", ())]
     if len(found) > 1:
@@ -119,7 +119,7 @@ def _notes(
     if key == "seconds":
         lines.append(f"Dotted: as efficient as {first} (error · time is constant).")
     else:
-        lines.append("Dotted: slope −1, as of independent samples.")
+        lines.append("Dotted: slope −1, that of independent samples.")
     if target is not None:
         lines.append(f"Dashed: the error asked for, {formats.short(target)}.")
     below = sum(
@@ -128,7 +128,7 @@ def _notes(
     )
     if below:
         runs = f"{below} runs" if below > 1 else "one run"
-        lines.append(f"Not drawn: {runs} whose error is lost in the noise of the reference.")
+        lines.append(f"Not drawn: {runs} whose error is smaller than the reference's noise.")
     if any(level["refused"] for one in integrators for level in one["levels"]):
         lines.append("Not drawn: levels whose errors were refused.")
     return lines

@@ -1,4 +1,4 @@
-"""Where to look closely: the windows in which the methods differ most."""
+"""Chooses the windows of the images in which the methods differ most."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-#: More than three would be looked at by nobody.
+#: Number of windows.
 COUNT = 3
 
 #: Side of a window: an eighth of the image's width, but large enough to show something and small
@@ -27,21 +27,21 @@ class Window(NamedTuple):
         return pixels[self.y : self.y + self.side, self.x : self.x + self.side]
 
     def distance(self, other: Window) -> int:
-        """Of the corners, along the axis on which it is larger; from ``side`` on, windows do not
-        overlap."""
+        """Distance of the corners, along the axis where it is larger. Windows at least ``side``
+        apart do not overlap."""
         return max(abs(self.x - other.x), abs(self.y - other.y))
 
 
 def choose_windows(errors: Sequence[np.ndarray], floor: float) -> list[Window]:
-    """Windows that do not overlap, those first in which the integrators' errors differ most.
+    """Windows that do not overlap, ordered by how much the errors of the integrators differ.
 
-    In every window the logarithm of the error is averaged, so that a firefly is one pixel among
-    many; what counts is the variance of that average over the integrators. Of a single integrator,
-    the windows with the largest errors are taken.
+    The score of a window is the variance, over the integrators, of the mean logarithm of the error
+    in it. (In the mean of the logarithms, a firefly weighs little.) With a single integrator, the
+    score is that mean itself.
 
     Args:
         errors: The error maps of the integrators, all of one shape.
-        floor: Errors below are as good as none (they would have no logarithm).
+        floor: Smaller errors are raised to this value, because zero has no logarithm.
     """
     if not errors:
         return []
@@ -62,7 +62,7 @@ def choose_windows(errors: Sequence[np.ndarray], floor: float) -> list[Window]:
         for index in order.tolist()
     ]
     chosen: list[Window] = []
-    # First with room between them: three windows on one edge show one thing three times
+    # Prefer windows that are apart: three windows along one edge would all show the same
     for distance in (2 * side, side):
         for window in candidates:
             if len(chosen) < COUNT and all(window.distance(one) >= distance for one in chosen):
@@ -79,5 +79,5 @@ def _window_means(
     top, left = rows[:, None], columns[None, :]
     bottom, right = top + side, left + side
     total = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    # The table's cancellation error would decide between equal windows
+    # Rounded: else the table's cancellation error would decide between equal windows
     return np.round(total / side**2, 9)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-#: Splits a quantity into what it is divided by, and the unit that then follows.
+#: Maps a value to the factor it is divided by and the unit printed after it.
 Unit = Callable[[float], "tuple[float, str]"]
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -15,13 +15,13 @@ _NARROW_SPACE = "\u202f"
 
 
 class Text(NamedTuple):
-    """A figure as text. ``interval`` is empty where none is known."""
+    """A figure as text. ``interval`` is empty if it is unknown."""
 
     value: str
     interval: str = ""
 
 
-#: What stands where nothing is known.
+#: Text of an unknown figure.
 UNKNOWN = Text("–")
 
 
@@ -52,7 +52,7 @@ def figure(estimate: Mapping[str, float | None] | None, unit: Unit) -> Text:
     ends = number(low / factor), number(high / factor)
     if ends[0] == ends[1]:
         return Text(value)  # a count that is the same in all runs, or nearly
-    # A dash next to a minus sign would be hard to read
+    # "to" for negative bounds: a dash next to a minus sign would be hard to read
     dash = "–" if low >= 0 else " to "
     return Text(value, dash.join(ends))
 
@@ -106,8 +106,8 @@ def count(value: float) -> tuple[float, str]:
 
 
 def _prefixed(value: float, *units: tuple[float, str]) -> tuple[float, str]:
-    """The first, that is the largest, of the units in which ``value`` is at least 1 (0.1 for those
-    after which only smaller ones come)."""
+    """The largest unit in which ``value`` is at least 1. For the unit without prefix, 0.1 is
+    enough."""
     for factor, unit in units:
         if abs(value) >= factor * (0.1 if factor == 1 else 1):
             return factor, _NARROW_SPACE + unit

@@ -1,4 +1,4 @@
-"""What the template is filled with."""
+"""Fills the template of the report."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def render_page(results: Record, folder: Path) -> str:
         color_stops=_color_stops(),
         style=Markup((_FOLDER / "report.css").read_text(encoding="utf-8")),
         script=Markup(script),
-        # Nothing but this one script may run, and nothing may be loaded: what a label or a message
-        # contains is text, whatever it looks like
+        # For the page's policy: only this script may run, and nothing may be loaded, even if a
+        # label or a message contains HTML
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
 
@@ -185,7 +185,7 @@ def _scene_facts(scene: Record) -> list[tuple[str, str]]:
             formats.quantity(reference["seconds"], formats.seconds)
             if reference["seconds"] else None,
             "its noise is unknown, and part of all errors" if noise is None
-            else f"relMSE {formats.number(noise)} of its own, subtracted",
+            else f"its own relMSE, {formats.number(noise)}, is subtracted",
         ]
         facts.append(("Reference", ", ".join(filter(None, parts))))
     return facts
@@ -217,7 +217,7 @@ def _color_stops() -> str:
 
 def _color_ticks(limits: tuple[float, float] | None) -> list[tuple[str, float]]:
     """Text and position (in percent) of the colour bar's ticks: both ends, and the powers of ten
-    that leave room for them."""
+    that are far enough from them."""
     if limits is None:
         return []
     low, high = np.log10(limits)

@@ -1,7 +1,7 @@
 """The images of a scene for the screen: one exposure for all, and error maps in one colour scale.
 
-Everything is an 8-bit PNG of the size of the film, as ``data:`` URI: nothing is scaled down, and
-nothing is compressed with a loss that could be taken for the integrator's.
+Every image is an 8-bit PNG of the size of the film, as ``data:`` URI. It is neither scaled down nor
+compressed with losses, which could be mistaken for errors of the integrator.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from ...scenes import InputError
 from .. import metrics, reading
 from .records import Record, pictured_runs
 
-#: The brightest 5 % of the reference may be lost in white …
+#: The exposure maps this percentile of the reference's luminance …
 EXPOSURE_PERCENTILE = 95
-#: … what lies at that percentile gets this much of white (linear).
+#: … to this fraction of white (linear).
 EXPOSURE_TARGET = 0.8
 
 #: Perceptually uniform, and black where there is no error.
@@ -39,7 +39,7 @@ class Picture:
     Attributes:
         name: ``reference``, or the label of an integrator.
         integrator: The integrator's record; ``None`` for the reference.
-        run: The run that the image is of; ``None`` for the reference.
+        run: The run whose image it is; ``None`` for the reference.
         pixels: 8-bit sRGB, (height, width, 3).
         image: ``pixels`` as URI.
         error: Mean relative squared error of every pixel over ``run_count`` runs, (height, width);
@@ -62,9 +62,9 @@ class Pictures:
     """The images of a scene.
 
     Attributes:
-        pictures: The reference, if it is there, then the integrators in their order.
+        pictures: The reference, if there is one, then the integrators in their order.
         size: Width and height in pixels.
-        exposure: What the linear values were multiplied by.
+        exposure: The factor that the linear values were multiplied by.
         limits: Errors at the ends of the colour scale; ``None`` without error maps.
         faults: Sentences about the files that could not be read.
     """
@@ -77,7 +77,7 @@ class Pictures:
 
 
 def load_pictures(scene: Record, level: float | None, folder: Path) -> Pictures:
-    """Reads what the scene's runs at ``level`` have rendered; the images are of the first round."""
+    """Reads the images of the scene's runs at ``level``; those of the first round are shown."""
     result = Pictures()
     reference = None
     if scene["reference"]:
@@ -87,8 +87,8 @@ def load_pictures(scene: Record, level: float | None, folder: Path) -> Pictures:
             result.faults.append(f"the reference is missing here: {error}")
     shape = None if reference is None else reference.shape
 
-    # Images wait for the exposure that the first of them decides; errors are summed run by run, so
-    # that no more than one image per integrator is in memory.
+    # One image per integrator stays in memory until the exposure is known, which the first image
+    # decides. Errors are summed run by run.
     waiting: list[tuple[Record, Record, np.ndarray, np.ndarray | None, int]] = []
     for integrator in scene["integrators"]:
         first, total, count = None, None, 0
@@ -136,7 +136,7 @@ def exposure(pixels: np.ndarray) -> float:
 
 
 def tone_map(pixels: np.ndarray, factor: float) -> np.ndarray:
-    """Linear values as 8-bit sRGB; what is brighter than white is white."""
+    """Linear values as 8-bit sRGB; values above 1 are clipped."""
     linear = np.clip(pixels * factor, 0, 1)
     encoded = np.where(
         linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
@@ -156,8 +156,9 @@ def relative_error(pixels: np.ndarray, reference: np.ndarray) -> np.ndarray | No
 
 
 def color_limits(errors: Sequence[np.ndarray]) -> tuple[float, float] | None:
-    """Limits of one logarithmic scale for several error maps: all but the smallest 2 % and the
-    largest 0.2 % of the pixels lie inside; rounded outwards to 1, 2 or 5 times a power of ten."""
+    """Limits of one logarithmic scale for several error maps. All but the smallest 2 % and the
+    largest 0.2 % of the pixels lie inside. The limits are rounded outwards to 1, 2 or 5 times a
+    power of ten."""
     if not errors:
         return None
     values = np.concatenate([error[error > 0] for error in errors])

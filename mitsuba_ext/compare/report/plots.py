@@ -1,8 +1,8 @@
 """Error against cost on logarithmic axes, as SVG that takes its colours from the page.
 
-matplotlib draws in place holders, which become the style sheet's variables: the same plot is right
-on a light and on a dark page, and an integrator has one colour everywhere. The legend is part of
-the page, where it can wrap.
+matplotlib draws in placeholder colours, which are then replaced by variables of the style sheet: so
+the plot fits a light and a dark page, and an integrator has the same colour everywhere. The legend
+is part of the page, where it can wrap.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from markupsafe import Markup
 
 from . import formats
 
-#: Shapes of the marks, for matplotlib and for text: colour is not the only thing that tells.
+#: Marks of the integrators, for matplotlib and as text, so that colour is not needed to tell them
+#: apart.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 GLYPHS = ("●", "■", "▲", "◆", "▼", "✚", "✖", "★")
 
 _INK, _GRID = "#010203", "#010204"
 _WIDTH, _HEIGHT = 5.6, 3.7  # inches; the page scales it
 
-#: An interval may stretch an axis by this factor beyond the points, no more.
+#: Largest factor by which intervals may extend an axis beyond the points.
 _INTERVAL_ROOM = 2.0
 
-#: An axis covers at least this factor: else noise would fill the plot.
+#: Smallest ratio of an axis's ends: else tiny differences would fill the plot.
 _LEAST_SPAN = 2.0
 
 
@@ -45,7 +46,7 @@ class Series:
     """An integrator.
 
     Attributes:
-        index: Which colour and mark it has on the page.
+        index: Index of its colour and mark on the page.
         runs: Cost and error of every run.
         points: Means per level.
         slope: Of the fitted line in the logarithms; ``None`` draws none.
@@ -73,8 +74,8 @@ def plot(
         x_ticks: Where the x axis has its ticks; by default, chosen by the range.
         target: The error that was asked for, drawn as a line across.
     """
-    # Here, and without pyplot: a comparison that makes no report should not pay for it, and nobody
-    # else's figures and backend should notice
+    # Imported here, so that comparisons without a report do not wait for it, and without pyplot,
+    # which would change the user's figures and backend
     import matplotlib
     from matplotlib.figure import Figure
 
@@ -85,7 +86,7 @@ def plot(
     if target is not None:
         ys.append(target)
     with matplotlib.rc_context():
-        matplotlib.rcdefaults()  # the user's matplotlibrc is for the user's figures
+        matplotlib.rcdefaults()  # ignore the user's matplotlibrc
         matplotlib.rcParams.update(_STYLE)
         matplotlib.rcParams["svg.hashsalt"] = name  # ids that are the same every time
         figure = Figure(figsize=(_WIDTH, _HEIGHT), layout="constrained")
@@ -121,7 +122,7 @@ def _draw(axes, series: Series) -> None:
     points = [point for point in series.points if point.x[0] > 0 and point.y[0] > 0]
     for point in points:
         (x, left, right), (y, bottom, top) = point.x, point.y
-        # What reaches below zero reaches to the end of the axis
+        # An interval that reaches zero or below is drawn to the end of the axis
         axes.plot([max(left or x, low_x), min(right or x, high_x)], [y, y], color=color, lw=1.2)
         axes.plot([x, x], [max(bottom or y, low_y), min(top or y, high_y)], color=color, lw=1.2)
     axes.plot(
@@ -129,7 +130,7 @@ def _draw(axes, series: Series) -> None:
         marker=marker, markersize=6.5, color=color, markeredgewidth=0,
     )
     if series.slope is not None and len(runs) > 1:
-        # Through the centre of the runs, as every least-squares line is
+        # A least-squares line passes through the centre of the runs
         x, y = np.log(runs).T
         line = np.array([x.min(), x.max()])
         axes.plot(
@@ -138,8 +139,8 @@ def _draw(axes, series: Series) -> None:
 
 
 def _draw_slope_of_minus_one(axes, series: Series) -> None:
-    """What Monte Carlo converges with, through the centre of the first integrator's points: against
-    seconds, also the line of equal efficiency."""
+    """The slope −1 of Monte Carlo, drawn through the centre of the first integrator's points.
+    Against seconds, it is also the line of equal efficiency."""
     points = [point for point in series.points if point.x[0] > 0 and point.y[0] > 0]
     if points:
         product = math.exp(sum(math.log(p.x[0] * p.y[0]) for p in points) / len(points))
@@ -157,7 +158,7 @@ def _ends(estimate: tuple[float, float | None, float | None]) -> list[float]:
 
 
 def _limits(values: Sequence[float], ends: Sequence[list[float]]) -> tuple[float, float]:
-    """An axis on which all values lie, and the intervals as far as there is room."""
+    """The ends of an axis that holds all values, and the intervals up to a limit."""
     low, high = min(values), max(values)
     for end in (end for pair in ends for end in pair):
         if low / _INTERVAL_ROOM <= end <= high * _INTERVAL_ROOM:
@@ -167,7 +168,7 @@ def _limits(values: Sequence[float], ends: Sequence[list[float]]) -> tuple[float
 
 
 def _set_ticks(axis, limits: tuple[float, float], wanted: Sequence[float] = ()) -> None:
-    """Round numbers, written out: matplotlib's own choice leaves short axes without any."""
+    """Ticks at round numbers: matplotlib's own choice leaves short axes without labels."""
     from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
 
     ticks = [tick for tick in wanted or _round_numbers(*limits) if limits[0] <= tick <= limits[1]]
@@ -193,10 +194,10 @@ def _placeholder(index: int) -> str:
 
 
 def _for_the_page(svg: str, name: str) -> str:
-    """An ``<svg>`` that can stand next to others in one HTML page."""
+    """Makes an ``<svg>`` that can share an HTML page with others."""
     svg = svg[svg.index("<svg") :]  # without the XML declaration and the DTD's address
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    # This style would hold for the whole page; report.css says the same of the plots
+    # This style would apply to the whole page; report.css has it for the plots only
     svg = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")
     # matplotlib counts its ids from 1 in every figure

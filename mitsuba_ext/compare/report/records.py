@@ -13,7 +13,7 @@ from typing import Any
 
 from ...scenes import InputError
 
-#: The form of ``results.json`` that this report can read.
+#: The schema of ``results.json`` that this report can read.
 SCHEMA = 2
 
 Record = Mapping[str, Any]
@@ -57,7 +57,7 @@ def main_level(scene: Record) -> float | None:
 
 
 def at_level(integrator: Record, level: float | None) -> Record | None:
-    """What ``levels`` says about one level; ``None`` if the integrator was not measured there."""
+    """The record of one level; ``None`` if the integrator was not measured there."""
     return next((one for one in integrator["levels"] if one["level"] == level), None)
 
 
@@ -68,8 +68,8 @@ def runs_at(integrator: Record, level: float | None) -> list[Record]:
 
 
 def pictured_runs(integrator: Record, level: float | None) -> list[Record]:
-    """The runs whose images are shown: those of ``level``; of the largest level that there is, if
-    the integrator was stopped before ``level``."""
+    """The runs whose images are shown: those of ``level``, or of the largest measured level if the
+    integrator was stopped before ``level``."""
     runs = runs_at(integrator, level)
     if not runs and integrator["runs"]:
         runs = runs_at(integrator, max(run["level"] for run in integrator["runs"]))
@@ -77,8 +77,8 @@ def pictured_runs(integrator: Record, level: float | None) -> list[Record]:
 
 
 def problems(scene: Record) -> Iterator[tuple[str, str]]:
-    """What a reader has to know before the figures: pairs of ``"error"`` or ``"warning"`` and a
-    sentence, each once."""
+    """Errors, warnings and notes of a scene: pairs of ``"error"`` or ``"warning"`` and a sentence,
+    without repetitions."""
     seen = set()
     for kind, text in _problems(scene):
         if text not in seen:
@@ -99,7 +99,7 @@ def _problems(scene: Record) -> Iterator[tuple[str, str]]:
         for note in integrator["notes"]:
             yield "warning", f"{label}: {note}"
         for level in integrator["levels"]:
-            # A note may have said it already, about the same level or about all of them
+            # A note may contain the same text already
             if level["refused"] and not any(level["refused"] in n for n in integrator["notes"]):
                 yield "warning", f"{label}: no errors at level {level['level']:g}: " + (
                     level["refused"]

@@ -3,7 +3,7 @@
 (() => {
   const STEP = 1.25; // of the zoom
   const NUDGE = 0.02; // of the divider, per key press
-  const CALM = 400; // ms after which a wheel that began outside may zoom
+  const CALM = 400; // ms without scrolling of the page after which the wheel may zoom
 
   let active = null; // the viewer that keys go to: below the pointer, or with the focus
   let scrolled = -Infinity; // when the wheel last scrolled the page
@@ -214,8 +214,8 @@
         this.stage.addEventListener(type, () => { last = null; });
       }
       this.stage.addEventListener("wheel", (event) => {
-        // A page that scrolls under the pointer goes on scrolling, and so does one that wants to
-        // leave the whole image
+        // The wheel scrolls the page, instead of zooming, shortly after it has scrolled the page, and
+        // when it would zoom out beyond the whole image
         const outwards = event.deltaY > 0;
         if (event.timeStamp - scrolled < CALM || (outwards && this.zoom === 1)) return;
         event.preventDefault();
@@ -231,10 +231,10 @@
       this.split = clamp(this.split + nudge, 0, 1);
       this.render();
       event.preventDefault();
-      event.stopPropagation(); // the arrows are not for the flip-book here
+      event.stopPropagation(); // else the arrows would also switch images
     }
 
-    // Did the key mean anything?
+    // Handles a key; returns whether it had a meaning
     key(name) {
       const count = this.sources.length;
       if (name >= "1" && name <= "9") {

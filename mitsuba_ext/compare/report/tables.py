@@ -1,4 +1,4 @@
-"""The figures of one level as a table: what the columns are, and which are worth showing."""
+"""The figures of one level as a table; columns without figures are left out."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Column:
     """A column of the table.
 
     Attributes:
-        heading: What it is called.
+        heading: Its heading.
         unit: How its values are printed.
-        estimate: Takes it from an integrator and its level, ``None`` if it is not known.
+        estimate: Function of an integrator and its level that returns the figure, or ``None``.
         explanation: A tooltip.
-        group: The heading that it shares with its neighbours.
+        group: The common heading of this column and its neighbours.
     """
 
     heading: str
@@ -39,7 +39,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """Columns in groups, a row of cells per integrator, and what nobody has recorded.
+    """Columns in groups, a row of cells per integrator, and the columns that were left out.
 
     Attributes:
         groups: Heading and number of columns.
@@ -55,7 +55,7 @@ class Table:
 
 
 def make_table(scene: Record, level: float | None, target: float | None = None) -> Table:
-    """The table of one level. ``target`` is the relMSE that was asked for, if one was."""
+    """The table of one level. ``target`` is the relMSE of ``until``; ``None`` for other budgets."""
     integrators = scene["integrators"]
     rows = [(integrator, at_level(integrator, level)) for integrator in integrators]
     columns = [*_ratios(integrators), *_target(target), *_RUN, *_ERRORS, *_WORK]
@@ -161,7 +161,7 @@ _ERRORS = [
 
 _WORK = [
     _figure("rays", formats.count, "rays", "Camera, scatter and shadow rays of one run", "work"),
-    _figure("scatter", formats.count, "rays_scatter", "Rays found by sampling a BSDF", "work"),
+    _figure("scatter", formats.count, "rays_scatter", "Rays sampled by a BSDF", "work"),
     _figure("shadow", formats.count, "rays_shadow", "Shadow rays that were traced", "work"),
     _figure(
         "shadow share", formats.percent, "shadow_share",
