@@ -17,27 +17,18 @@ class ReweightedWavelength(ReweightedCamera):
     --------------------------------------------------------
 
     Renders in spectral variants with the nested integrator, but takes the numbers that choose the
-    wavelengths from well distributed sets, which can be weighed by the cells of the numbers. Each
-    pixel has one set for all of its samples, chosen and moved at random.
+    wavelengths from :monosp:`weighted_numbers`: well distributed sets, which can be weighted by the
+    cells of the numbers. Each pixel has one set for all of its samples, chosen and moved at random.
 
     .. pluginparameters::
 
-     * - pattern
-       - |string|
-       - How the points of a set are distributed: :monosp:`independent`, :monosp:`stratified`,
-         :monosp:`latin_hypercube`, :monosp:`halton`, :monosp:`hammersley`, :monosp:`sobol`,
-         :monosp:`lattice` or :monosp:`poisson_disk`; see
-         :monosp:`mitsuba_ext.pointsets.points`. (Default: lattice)
      * - weights
        - |string|
-       - How they are weighed: :monosp:`none` (all alike), :monosp:`torus` (by the lengths of
-         periodic Voronoi cells: unbiased; both ends of the spectrum are dark, so that there is no
-         seam), or :monosp:`voronoi` (by cells that end at the border, as in the thesis: slightly
-         biased). (Default: none)
-     * - timeout
-       - |float|
-       - Seconds after which to stop, 0 or less for no limit. Sets, which then have at most 64
-         points, are kept whole. (Default: -1)
+       - How the points are weighted, see :monosp:`weighted_numbers`: :monosp:`none`,
+         :monosp:`torus` or :monosp:`voronoi` (slightly biased). (Default: none)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`ReweightedCamera`: pattern, timeout.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
@@ -48,15 +39,8 @@ class ReweightedWavelength(ReweightedCamera):
     **Not when** it is that of light on things, or of reflection and refraction in glass. In RGB
     variants there are no wavelengths: an error says so.
 
-    A number u chooses four wavelengths, u + k/4. Where all four survive, light repeats itself after
-    1/4, and the cells are those of the numbers modulo 1/4; where a path has been refracted by
-    dispersive glass, one is left, and the cells are those of the whole circle. Both are used in one
-    image.
-
-    Sets have as many numbers as a pixel has samples, at most 1024 (then there are several for each
-    pixel). There are 32 sets (2 of :monosp:`poisson_disk`); with :monosp:`voronoi` weights they are
-    not moved. The weights concern all channels, alpha and AOVs too. Other dimensions of a sample
-    are those of the sensor's sampler, or of a :monosp:`reweighted_lens` or
+    The page of :monosp:`weighted_numbers` says more about sets and weights. Other dimensions of a
+    sample are those of the sensor's sampler, or of a :monosp:`reweighted_lens` or
     :monosp:`reweighted_time` that is nested. An integrator of ours that is nested learns as it does
     alone; its own timeout is ignored. Inside of :monosp:`moment`, nothing is reweighted. Gradients
     are not supported (use :monosp:`prb`).
