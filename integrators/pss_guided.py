@@ -6,6 +6,7 @@ import mitsuba as mi
 
 from mitsuba_ext import registry
 from mitsuba_ext.composition.connections import Connections
+from mitsuba_ext.composition.decision_parameters import ParameterReader
 from mitsuba_ext.composition.directions import Guided
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.decisions.directions.guide_learner import GuideLearner
@@ -90,11 +91,11 @@ class PSSGuided(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         connects_first = self.parameter(props, "nee_first_bounce", True)
-        read = self.reader(props, count=0)
+        none = None if connects_first else ParameterReader.of_defaults(self.name, count=0)
         self.fill(
             props,
-            directions=Guided(read),
-            connections=None if connects_first else Connections(read),
+            directions=Guided(self.reader(props)),
+            connections=Connections(none) if none else None,
         )
 
     @property

@@ -32,7 +32,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Page:
-    """What a plugin says about itself; ``text`` is its docstring without title and parameters."""
+    """The page of a plugin; ``text`` is its docstring without title and parameters."""
 
     name: str
     title: str
@@ -46,7 +46,7 @@ class Page:
 
 
 def read_page(file: Path) -> Page:
-    """The page of the plugin that ``file`` holds, which is named after it."""
+    """The page of the plugin in ``file``, which has the name of the file."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
     classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
     # One plugin class per file; a helper class does not have a parameter list

@@ -1,4 +1,4 @@
-"""Integrators as a command line, a notebook or a file names them."""
+"""Makes integrators from text, files and dicts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 from .content_hash import hash_code, hash_value
 from .errors import InputError
-from .names import is_file_of_mitsuba, unknown_integrator
+from .names import is_file_of_mitsuba, unknown_parameter, unknown_plugin
 from .plugin_text import parse_plugin
 from .registry import plugin_names
 from .rendering.aovs import check_aovs, check_nodes
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 
 Value = Union[bool, int, float, str]
 
-#: How an integrator can be named; see :func:`make_named`.
+#: How an integrator can be specified; see :func:`make_named`.
 Specification = Union[str, Path, Mapping[str, Any], "mi.Integrator"]
 
 
 @dataclass
 class NamedIntegrator:
-    """An integrator, and how it was asked for.
+    """An integrator, its name and its parameters.
 
     Attributes:
-        label: What tells it from others in tables.
+        label: Its name in tables.
         name: Its plugin's name.
-        parameters: What it was made with, as far as that is known; a dict for what is nested in it.
+        parameters: Its parameters, as far as they are known; a dict for a nested plugin.
         integrator: The integrator.
         identity: Text that changes whenever the integrator could render other images or take other
-            time: its plugins, its parameters, and the code of those that are written in Python.
-            Where these cannot be known (an integrator that exists already, code without a file), it
-            is never the same again.
+            time. It covers the plugins, their parameters, and the code of those that are written in
+            Python. If these cannot be known (an integrator that exists already, code without a
+            file), the identity is random, so that stored runs are never used.
     """
 
     label: str
@@ -60,11 +60,11 @@ def make_named(
     Args:
         specification: ``name`` or ``name:key=value,key=value``
             (:func:`mitsuba_ext.plugin_text.parse_plugin`); the path of an XML file whose root is an
-            ``<integrator>``, or of a JSON file with what ``mi.load_dict`` takes; such a dict; or an
-            integrator that exists already (nothing is inherited then).
-        inherited: Parameters (a :attr:`LoadedScene.settings`) that apply to each integrator, nested
-            ones included, that knows them and does not set them.
-        label: Instead of one made from the specification.
+            ``<integrator>``, or of a JSON file with a dict for ``mi.load_dict``; such a dict; or an
+            integrator that exists already (which inherits nothing).
+        inherited: Parameters (a :attr:`LoadedScene.settings`) for each integrator, nested ones
+            included, that knows them and does not set them.
+        label: The label. Default: made from the specification.
 
     Raises:
         InputError: There is no such file or plugin, it is no integrator, it rejects a parameter, or
@@ -104,8 +104,8 @@ def make_named(
 
 @dataclass
 class _Made:
-    """An integrator, its parameters, and the classes of all plugins that it is made of (``None``
-    for one that is not known)."""
+    """An integrator, its parameters, and the classes of its own plugin and of all nested ones
+    (``None`` for a class that is unknown)."""
 
     name: str
     parameters: dict[str, Any]
@@ -114,9 +114,9 @@ class _Made:
 
 
 def _identity(made: _Made, content: str | dict[str, Any]) -> str:
-    """Of an integrator that was made from its parameters, or from the ``content`` of a file."""
+    """The identity of an integrator that was made from its parameters, or from ``content``."""
     try:
-        # Parameters that were left out may have other defaults; addresses are never the same
+        # str() shows the defaults of parameters that are not set; addresses differ each time
         state = re.sub("0x[0-9a-f]+", "", str(made.integrator))
     except Exception:  # to_string() is optional for a class in Python
         state = ""
@@ -128,11 +128,12 @@ def _identity(made: _Made, content: str | dict[str, Any]) -> str:
 
 
 def _never_again() -> str:
+    """An identity that no other integrator has, and this one only in this process."""
     return uuid.uuid4().hex
 
 
 def _is_alive(specification: object) -> bool:
-    """Is it, or does it hold, an object whose state can change?"""
+    """Is it an object of Mitsuba, or a dict that contains one? Its state can change."""
     import mitsuba as mi
 
     if isinstance(specification, Mapping):
@@ -141,7 +142,7 @@ def _is_alive(specification: object) -> bool:
 
 
 def is_fragment(path: Path) -> bool:
-    """Is the file an integrator, and not a scene? What cannot be read is not."""
+    """Is the file an integrator, and not a scene? ``False`` for a file that cannot be read."""
     if path.suffix.lower() == ".json":
         return True
     try:
@@ -155,10 +156,10 @@ def is_fragment(path: Path) -> bool:
 def _make(
     plugin: Mapping[str, Any], inherited: Mapping[str, Value], kind: str = "integrator"
 ) -> _Made:
-    """Makes an integrator, and before it what is nested in it (``kind``: "nested plugin").
+    """Makes an integrator after the plugins nested in it (whose ``kind`` is "nested plugin").
 
     Raises:
-        InputError: There is no such plugin, or it rejects or does not know a parameter.
+        InputError: The plugin is unknown, or it rejects or does not know a parameter.
     """
     import mitsuba as mi
 
@@ -170,7 +171,7 @@ def _make(
     }
     objects = {key: made.integrator for key, made in nested.items()}
     if any(isinstance(item, mi.Integrator) for item in objects.values()):
-        inherited = {}  # the paths are those of the nested integrator
+        inherited = {}  # they apply to the nested integrator, which traces the paths
     name, given = plugin["type"], {**inherited, **own, **objects}
     properties = mi.Properties(name)
     for key, value in given.items():
@@ -181,15 +182,19 @@ def _make(
         made = mi.PluginManager.instance().create_object(properties)
     except Exception as error:  # a plugin's constructor may raise anything
         if "not found!" in str(error) and f'Plugin "{name}"' in str(error):
-            raise unknown_integrator(name, kind) from error
-        raise InputError(f'{kind} "{name}": {one_line(error)}') from error
+            raise unknown_plugin(name, kind != "integrator") from error
+        message = one_line(error)
+        own_prefix = f'"{name}": '
+        if message.startswith(own_prefix):  # our plugins name themselves
+            message = message[len(own_prefix) :]
+        raise InputError(f'{kind} "{name}": {message}') from error
     if kind == "integrator" and not isinstance(made, mi.Integrator):
         raise InputError(f'"{name}" is a plugin of Mitsuba, but not an integrator')
     made = (made.expand() or [made])[0]  # "volpathmis" is made in two steps
     unknown = set(properties.unqueried())
     for key in own:
         if key in unknown:
-            raise InputError(f'{kind} "{name}" has no parameter "{key}"')
+            raise unknown_parameter(kind, name, key)
     parameters = {
         key: {"type": nested[key].name, **nested[key].parameters} if key in nested else value
         for key, value in given.items()
@@ -200,7 +205,7 @@ def _make(
 
 
 def _read_fragment(path: Path) -> str | dict[str, Any]:
-    """XML text with the version that Mitsuba insists on, or a dict."""
+    """XML text, with the version attribute that Mitsuba requires, or a dict."""
     if not path.is_file():
         raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
     try:
@@ -237,7 +242,7 @@ def _from_parser(
             for key, value in (inherited or {}).items():
                 if key not in node.props and _knows(node.props.plugin_name(), key, value):
                     node.props[key] = value
-        root = mi.Properties(state.root.props)  # a copy: what is read counts as known to the plugin
+        root = mi.Properties(state.root.props)  # a copy: reading a property marks it as queried
         name = root.plugin_name()
         parameters = {
             key: root[key] for key in root.keys() if isinstance(root[key], (bool, int, float, str))
@@ -258,15 +263,16 @@ def _class_of(name: str) -> type | None:
 
     try:
         return type(mi.PluginManager.instance().create_object(mi.Properties(name)))
-    except Exception:  # one that cannot be made alone, as a wrapper
+    except Exception:  # a plugin that needs parameters, such as a wrapper
         pass
     if any(name in names for names in plugin_names().values()):
-        return _Made  # any class of this package stands for all of its files
+        return _Made  # the hash of any class of this package covers all of its files
     return mi.Object if is_file_of_mitsuba(name) else None
 
 
 def _knows(name: str, key: str, value: Value) -> bool:
-    """Does a plugin query the parameter? (One that cannot be made alone, as a wrapper: no.)"""
+    """Does a plugin query the parameter? ``False`` for a plugin that cannot be made without others,
+    such as a wrapper."""
     import mitsuba as mi
 
     properties = mi.Properties(name)
@@ -282,10 +288,12 @@ def _label_of_dict(specification: Mapping[str, Any]) -> str:
     values = [
         f"{key}={_as_text(value)}"
         for key, value in specification.items()
-        if key != "type" and isinstance(value, (bool, int, float, str))
+        if key != "type" and isinstance(value, (bool, int, float, str, Mapping))
     ]
     return str(specification.get("type", "integrator")) + (":" if values else "") + ",".join(values)
 
 
-def _as_text(value: Value) -> str:
+def _as_text(value: Value | Mapping[str, Any]) -> str:
+    if isinstance(value, Mapping):
+        return f"[{_label_of_dict(value)}]"
     return str(value).lower() if isinstance(value, bool) else str(value)
