@@ -89,7 +89,6 @@ class ComposedPath(WalkIntegrator):
         .. code-tab:: xml
 
             <integrator type="composed_path">
-                <integer name="max_depth" value="8"/>
                 <sampler name="directions" type="guided_directions">
                     <integer name="bounces" value="4"/>
                 </sampler>
@@ -99,7 +98,6 @@ class ComposedPath(WalkIntegrator):
         .. code-tab:: python
 
             'type': 'composed_path',
-            'max_depth': 8,
             'directions': {
                 'type': 'guided_directions',
                 'bounces': 4

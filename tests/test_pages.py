@@ -17,6 +17,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 FOLDERS = registry.plugin_names()
 FILES = {file.stem: file for folder in FOLDERS for file in registry.plugin_files(folder)}
+README = Path(__file__).parents[1] / "README.md"
 DECISIONS = FOLDERS["samplers"]
 #: The integrators that nest no other one.
 WALKS = ["composed_path", "neepp", "pss_guided", "reweighted_direct"]
@@ -137,9 +138,8 @@ def test_str_of_an_integrator_calls_decisions_as_a_scene_does():
     assert "spatial_lights[grid = 8," in str(spatial)
 
 
-@pytest.mark.parametrize("name", DECISIONS)
-def test_examples_of_decisions_load(name):
-    """As XML, as a dict, and on the command line, with the same result."""
+@pytest.mark.parametrize("name", ["composed_path", *DECISIONS])
+def test_examples_are_the_same_as_xml_as_a_dict_and_on_the_command_line(name):
     text = pages.read_page(FILES[name]).text
     (xml,) = re.findall(r"<integrator.*</integrator>", text, re.DOTALL)
     (values,) = re.findall(r"^ *('type'.*?\n *\}.*?)\n\n", text, re.DOTALL | re.MULTILINE)
@@ -147,7 +147,15 @@ def test_examples_of_decisions_load(name):
     scene = mi.load_string(f'<scene version="3.0.0">{xml}</scene>')
     shown = {str(scene.integrator()), str(mi.load_dict(eval(f"{{{values}}}")))}
     assert {*shown, str(make_named(line).integrator)} == shown and len(shown) == 1
-    assert Path(FILES[name]).stem in shown.pop()
+    assert name in shown.pop()
+
+
+def test_example_of_the_readme_loads():
+    (xml,) = re.findall(r"```xml\n(.*?)```", README.read_text(), re.DOTALL)
+    assert "bounces = 4" in str(mi.load_string(f'<scene version="3.0.0">{xml}</scene>'))
+    for name in re.findall(r"\]\((?:integrators|samplers)/(\w+)\.py\)", README.read_text()):
+        assert name in FILES
+    assert all(f"/{name}.py" in README.read_text() for name in FILES)
 
 
 def test_a_decision_cannot_be_the_sampler_of_a_sensor():
