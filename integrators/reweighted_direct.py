@@ -20,8 +20,8 @@ class ReweightedDirect(WalkIntegrator):
     ------------------------------------------------------
 
     A path tracer that connects the first vertex of each path to many points of the lights. They
-    come from well distributed sets, which can be weighted by the cells of the points. Later
-    vertices of a path are connected to one point each, as by :monosp:`path`. It is
+    come from well distributed point sets. Each connection can be weighted by the Voronoi cell of
+    its point. Later vertices of a path are connected to one point each, as by :monosp:`path`. It is
     :monosp:`composed_path` with :monosp:`weighted_connections`, whose page says more.
 
     .. pluginparameters::
@@ -41,7 +41,7 @@ class ReweightedDirect(WalkIntegrator):
          :monosp:`lattice` or :monosp:`poisson_disk`. (Default: hammersley)
      * - weights
        - |string|
-       - How the points are weighted: :monosp:`none`, :monosp:`torus`, :monosp:`unbiased` or
+       - Weights of the points: :monosp:`none`, :monosp:`torus`, :monosp:`unbiased` or
          :monosp:`voronoi` (slightly biased). (Default: none)
      * - camera_samples
        - |int|
@@ -52,16 +52,16 @@ class ReweightedDirect(WalkIntegrator):
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
 
-    **Use it when** the noise is that of soft shadows and large lights, and edges, defocus or
-    materials do not ask for many camera samples. **Not when** most light is indirect (then more
-    camera samples serve better), or with many lights (use :monosp:`neepp`). Compare it with
+    **Use it when** the noise comes from soft shadows and large lights, and edges, defocus or
+    materials do not need many camera samples. **Not when** most light is indirect (more camera
+    samples reduce its noise more), or with many lights (use :monosp:`neepp`). Compare it with
     :monosp:`path` and a :monosp:`multijitter` sampler, which is hard to beat.
 
     Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants.
 
-    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4; periodic cells, and that they
-    are unbiased, are ours.
+    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4. Periodic cells, and the fact
+    that they are unbiased, are our addition.
 
     .. tabs::
         .. code-tab:: xml

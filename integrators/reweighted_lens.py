@@ -14,9 +14,9 @@ class ReweightedLens(ReweightedCamera):
     Reweighted lens samples (:monosp:`reweighted_lens`)
     ---------------------------------------------------
 
-    Renders depth of field with the nested integrator, but takes the points of the aperture from
-    :monosp:`weighted_numbers`: well distributed sets, which can be weighted by the cells of the
-    points. Each pixel has one set for all of its samples, chosen and moved at random.
+    Renders depth of field with the nested integrator, but takes the points on the aperture from
+    :monosp:`weighted_numbers`: well distributed point sets, with which each sample can be weighted
+    by the Voronoi cell of its point. Each pixel uses one set for all of its samples.
 
     .. pluginparameters::
 
@@ -24,18 +24,18 @@ class ReweightedLens(ReweightedCamera):
        - |several|
        - Those of :class:`ReweightedCamera`: pattern, weights, timeout, and the nested integrator.
 
-    **Use it when** the noise is that of defocus: bright or detailed things far from the focal
-    plane. **Not when** it is that of the light on them; samples of the lens change nothing about
-    that. Without an aperture (a :monosp:`perspective` sensor), the nested integrator goes on alone,
-    and a warning says so.
+    **Use it when** the noise comes from defocus: bright or detailed objects far from the focal
+    plane. **Not when** it comes from the lighting of these objects, which lens samples do not
+    improve. For a sensor without an aperture (such as :monosp:`perspective`), the nested integrator
+    renders as usual, with a warning.
 
-    The page of :monosp:`weighted_numbers` says more about sets and weights. Other dimensions of a
-    sample are those of the sensor's sampler. An integrator of ours that is nested learns as it does
-    alone; its own timeout is ignored. Inside of :monosp:`moment`, nothing is reweighted. Gradients
-    are not supported (use :monosp:`prb`).
+    The page of :monosp:`weighted_numbers` says more about sets and weights. The sensor's sampler
+    provides the other dimensions of a sample. A nested integrator of this package learns as usual;
+    its own timeout is ignored. Inside of :monosp:`moment`, nothing is reweighted. Gradients are not
+    supported (use :monosp:`prb`).
 
-    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.3; periodic cells, and that they
-    are unbiased, are ours.
+    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.3. Periodic cells, and the fact
+    that they are unbiased, are our addition.
 
     .. tabs::
         .. code-tab:: xml

@@ -14,9 +14,9 @@ class ReweightedTime(ReweightedCamera):
     Reweighted times (:monosp:`reweighted_time`)
     --------------------------------------------
 
-    Renders motion blur with the nested integrator, but takes the times of the shutter interval from
-    :monosp:`weighted_numbers`: well distributed sets, which can be weighted by the cells of the
-    times. Each pixel has one set for all of its samples, chosen and moved at random.
+    Renders motion blur with the nested integrator, but takes the times in the shutter interval from
+    :monosp:`weighted_numbers`: well distributed point sets, with which each sample can be weighted
+    by the Voronoi cell of its time. Each pixel uses one set for all of its samples.
 
     .. pluginparameters::
 
@@ -26,26 +26,26 @@ class ReweightedTime(ReweightedCamera):
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
-         :monosp:`composed_path`. To see :monosp:`moving` shapes, it has to be one of ours.
+         :monosp:`composed_path`. Only integrators of this package render :monosp:`moving` shapes.
 
-    **Use it when** the sensor's sampler is :monosp:`independent` and the noise is that of motion:
-    fast shapes (:monosp:`moving`), long streaks, hard edges. **Not when** it is that of the light
-    on them; other times change nothing about that. A :monosp:`multijitter` sampler distributes
-    times, and all else, as well. With a sensor whose shutter does not stay open
-    (:monosp:`shutter_open`, :monosp:`shutter_close`), the nested integrator goes on alone, and a
-    warning says so.
+    **Use it when** the sensor's sampler is :monosp:`independent` and the noise comes from motion:
+    fast shapes (:monosp:`moving`), long streaks, hard edges. **Not when** it comes from the
+    lighting of the shapes, which other times do not improve. A :monosp:`multijitter` sampler
+    distributes times, and all other dimensions, equally well. For a sensor whose shutter interval
+    is empty (:monosp:`shutter_open`, :monosp:`shutter_close`), the nested integrator renders as
+    usual, with a warning.
 
-    A :monosp:`box` filter of the film suits it best. A wider filter gives samples random weights,
-    and these keep part of the noise, however well times are distributed.
+    Use a :monosp:`box` filter for the film. A wider filter gives samples random weights, whose
+    noise remains however well the times are distributed.
 
-    The page of :monosp:`weighted_numbers` says more about sets and weights. Other dimensions of a
-    sample are those of the sensor's sampler, or of a :monosp:`reweighted_lens` or
-    :monosp:`reweighted_wavelength` that is nested. An integrator of ours that is nested learns as
-    it does alone; its own timeout is ignored. Inside of :monosp:`moment`, nothing is reweighted.
-    Gradients are not supported (use :monosp:`prb`).
+    The page of :monosp:`weighted_numbers` says more about sets and weights. The other dimensions of
+    a sample come from the sensor's sampler, or from a nested :monosp:`reweighted_lens` or
+    :monosp:`reweighted_wavelength`. A nested integrator of this package learns as usual; its own
+    timeout is ignored. Inside of :monosp:`moment`, nothing is reweighted. Gradients are not
+    supported (use :monosp:`prb`).
 
-    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.1; periodic cells, and that they
-    are unbiased, are ours.
+    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.1. Periodic cells, and the fact
+    that they are unbiased, are our addition.
 
     .. tabs::
         .. code-tab:: xml

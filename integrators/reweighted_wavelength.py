@@ -17,36 +17,37 @@ class ReweightedWavelength(ReweightedCamera):
     --------------------------------------------------------
 
     Renders in spectral variants with the nested integrator, but takes the numbers that choose the
-    wavelengths from :monosp:`weighted_numbers`: well distributed sets, which can be weighted by the
-    cells of the numbers. Each pixel has one set for all of its samples, chosen and moved at random.
+    wavelengths from :monosp:`weighted_numbers`: well distributed point sets, with which each sample
+    can be weighted by the Voronoi cell of its number. Each pixel uses one set for all of its
+    samples.
 
     .. pluginparameters::
 
      * - weights
        - |string|
-       - How the points are weighted, see :monosp:`weighted_numbers`: :monosp:`none`,
-         :monosp:`torus` or :monosp:`voronoi` (slightly biased). (Default: none)
+       - Weights of the points, see :monosp:`weighted_numbers`: :monosp:`none`, :monosp:`torus` or
+         :monosp:`voronoi` (slightly biased). (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`ReweightedCamera`: pattern, timeout.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
-         :monosp:`path`, :monosp:`volpath` or one of ours. To see dispersion
-         (:monosp:`dispersive_dielectric`), it has to be one of ours.
+         :monosp:`path`, :monosp:`volpath` or one of ours. Only integrators of this package render
+         dispersion (:monosp:`dispersive_dielectric`).
 
     **Use it when** the noise is coloured: dispersive glass, lamps and filters with narrow spectra.
-    **Not when** it is that of light on things, or of reflection and refraction in glass. In RGB
-    variants there are no wavelengths: an error says so.
+    **Not when** it comes from lighting, or from the choice between reflection and refraction in
+    glass. RGB and monochrome variants have no wavelengths, and raise an error.
 
-    The page of :monosp:`weighted_numbers` says more about sets and weights. Other dimensions of a
-    sample are those of the sensor's sampler, or of a :monosp:`reweighted_lens` or
-    :monosp:`reweighted_time` that is nested. An integrator of ours that is nested learns as it does
-    alone; its own timeout is ignored. Inside of :monosp:`moment`, nothing is reweighted. Gradients
-    are not supported (use :monosp:`prb`).
+    The page of :monosp:`weighted_numbers` says more about sets and weights. The other dimensions of
+    a sample come from the sensor's sampler, or from a nested :monosp:`reweighted_lens` or
+    :monosp:`reweighted_time`. A nested integrator of this package learns as usual; its own timeout
+    is ignored. Inside of :monosp:`moment`, nothing is reweighted. Gradients are not supported (use
+    :monosp:`prb`).
 
-    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.2; periodic cells, that they are
-    unbiased, and cells modulo 1/4 are ours.
+    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.2. Periodic cells, the fact that
+    they are unbiased, and cells modulo 1/4 are our addition.
 
     .. tabs::
         .. code-tab:: xml

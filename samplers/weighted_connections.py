@@ -16,9 +16,9 @@ class WeightedConnectionsPlugin(DecisionPlugin):
     -----------------------------------------------------
 
     A decision for the slot :monosp:`connections` of :monosp:`composed_path`. It connects a vertex
-    to many points of lights. Their random numbers come from well distributed sets, which can be
-    weighted by the cells of the points. :monosp:`reweighted_direct` is a path tracer with this
-    decision.
+    to many points of lights. Their random numbers come from well distributed point sets. Each
+    connection can be weighted by the Voronoi cell of its point. :monosp:`reweighted_direct` is a
+    path tracer with this decision.
 
     .. pluginparameters::
 
@@ -39,25 +39,25 @@ class WeightedConnectionsPlugin(DecisionPlugin):
          (Default: hammersley)
      * - weights
        - |string|
-       - How the points are weighted: :monosp:`none` (all alike), :monosp:`torus` (by the areas of
-         periodic Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points that are
-         folded, so that opposite edges need not be alike), or :monosp:`voronoi` (by cells that end
-         at the border, as in the thesis: slightly biased). (Default: none)
+       - Weights of the points: :monosp:`none` (all equal), :monosp:`torus` (areas of periodic
+         Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points mapped by 1 - |2u - 1|,
+         which removes discontinuities at the border), or :monosp:`voronoi` (cells that end at the
+         border, as in the thesis: slightly biased). (Default: none)
 
-    **Use it when** the noise is that of soft shadows and large lights, and edges, defocus or
-    materials do not ask for many camera samples. **Not when** most light is indirect, or edges make
-    the noise: more camera samples serve better then. Compare it with a :monosp:`multijitter`
+    **Use it when** the noise comes from soft shadows and large lights, and edges, defocus or
+    materials do not need many camera samples. **Not when** most light is indirect, or the noise
+    comes from edges: more camera samples reduce it more. Compare it with a :monosp:`multijitter`
     sampler of the sensor, which is hard to beat.
 
-    Each vertex moves its set around the torus at random (with :monosp:`voronoi` weights it does
-    not), so that errors of neighbouring pixels do not depend on each other. The BSDF sample of the
-    vertex has its share in direct light by multiple importance sampling, as one sample beside so
-    many. It goes with every :monosp:`next_event`: where that chooses lights by numbers of its own,
-    these come from a lattice, and the set chooses points on the lights. 16 connections take about
-    as long as a path.
+    Each vertex shifts its set around the torus at random (not with :monosp:`voronoi` weights), so
+    that errors of neighbouring pixels are independent. The BSDF sample of the vertex has its share
+    in direct light by multiple importance sampling, as one sample beside so many. It can be
+    combined with every :monosp:`next_event`: if that chooses the light by numbers of its own, these
+    come from a lattice, and the set chooses points on the lights. 16 connections take about as long
+    as a path.
 
-    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4; periodic cells, and that they
-    are unbiased, are ours.
+    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4. Periodic cells, and the fact
+    that they are unbiased, are our addition.
 
     .. tabs::
         .. code-tab:: xml

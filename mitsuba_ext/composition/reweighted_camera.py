@@ -36,13 +36,13 @@ class ReweightedCamera(StagedIntegrator):
          (Default: lattice)
      * - weights
        - |string|
-       - How the points are weighted, see :monosp:`weighted_numbers`: :monosp:`none`,
-         :monosp:`torus`, :monosp:`unbiased` or :monosp:`voronoi` (slightly biased).
-         (Default: none)
+       - Weights of the points, see :monosp:`weighted_numbers`: :monosp:`none`, :monosp:`torus`,
+         :monosp:`unbiased` or :monosp:`voronoi` (slightly biased). (Default: none)
      * - timeout
        - |float|
        - Seconds after which to stop, 0 or less for no limit; kept as by :monosp:`composed_path`.
-         Sets, which then have at most 64 points, are kept whole. (Default: -1)
+         With a limit, sets have at most 64 points, and the render ends after a whole set.
+         (Default: -1)
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
