@@ -84,7 +84,7 @@ class ParameterReader:
         return self._names.get(key, key) in self._props
 
     def refuse_without_effect(self, conditions: Mapping[str, str]) -> None:
-        """Refuses parameters that nothing has read until now.
+        """Refuses parameters that nobody has read until now.
 
         Parameters:
             conditions: By name, what a parameter needs to have an effect.
@@ -92,9 +92,8 @@ class ParameterReader:
         Raises:
             ValueError: The scene gives such a parameter.
         """
-        unread = set(self._props.unqueried())
         for key, condition in conditions.items():
-            if key in unread:
+            if key in self._props and not self._props.was_queried(key):
                 raise ValueError(
                     f'"{self.plugin}": the parameter "{key}" needs {condition}; leave it out'
                 )
