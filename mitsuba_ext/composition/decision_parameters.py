@@ -66,18 +66,18 @@ class ParameterReader:
         self.plugin, self._props = plugin, props
         self._names, self._defaults = names or {}, defaults
 
+    def __call__(self, key: str, default: Any, **accepted: Any) -> Any:
+        """A parameter, checked: see :func:`mitsuba_ext.parameters.read_parameter`."""
+        name = self._names.get(key, key)
+        default = self._defaults.get(key, default)
+        return read_parameter(self.plugin, self._props, name, default, **accepted)
+
     @classmethod
     def of_defaults(
         cls, plugin: str, names: Mapping[str, str] | None = None, **defaults: Any
     ) -> ParameterReader:
         """One for which the scene gives no parameters."""
         return cls(plugin, mi.Properties(plugin), names, **defaults)
-
-    def __call__(self, key: str, default: Any, **accepted: Any) -> Any:
-        """A parameter, checked: see :func:`mitsuba_ext.parameters.read_parameter`."""
-        name = self._names.get(key, key)
-        default = self._defaults.get(key, default)
-        return read_parameter(self.plugin, self._props, name, default, **accepted)
 
     def is_given(self, key: str) -> bool:
         """Does the scene say anything?"""
