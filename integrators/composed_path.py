@@ -19,7 +19,8 @@ class ComposedPath(WalkIntegrator):
     Composed path tracer (:monosp:`composed_path`)
     ----------------------------------------------
 
-    A path tracer whose decisions are chosen in the scene. With all defaults it is Mitsuba's
+    A path tracer whose decisions are chosen in the scene. Each of its slots holds one decision: a
+    word, or a nested plugin that has parameters of its own. With all defaults it is Mitsuba's
     :monosp:`path` (with the same random numbers and the same image, while one pass of two million
     samples is enough), but traces no shadow ray for connections that cannot contribute. Where
     Mitsuba 3.9.1 misjudges the bounds of a scene (rectangles of one material, which it merges), sky
@@ -27,63 +28,86 @@ class ComposedPath(WalkIntegrator):
 
     .. pluginparameters::
 
+     * - directions
+       - |string| or |decision|
+       - Which random numbers choose the direction in which a path goes on: :monosp:`uniform` ones,
+         :monosp:`guided` ones, or a nested :monosp:`guided_directions`. (Default: uniform)
      * - next_event
-       - |string|
-       - How a light is chosen at each vertex: :monosp:`uniform` (as :monosp:`path` does),
-         :monosp:`power`, :monosp:`spatial`, :monosp:`linear`, :monosp:`visibility` or
-         :monosp:`contribution`; see the parameter light_sampling of :monosp:`neepp`.
-         (Default: uniform)
+       - |string| or |decision|
+       - Which light a vertex is connected to, and which point of it. Not learned: :monosp:`uniform`
+         (as :monosp:`path` chooses), :monosp:`power` (in proportion to the lights' power),
+         :monosp:`spatial` (by unoccluded contributions, per voxel) or a nested
+         :monosp:`spatial_lights`, :monosp:`linear` (by an estimate for each light at each vertex;
+         its cost grows with their number). Learned: :monosp:`contribution`, :monosp:`visibility`,
+         or a nested :monosp:`learned_lights`. (Default: uniform)
+     * - connections
+       - |string|, |int| or |decision|
+       - To how many points of lights the first vertex of a path is connected: :monosp:`one`, a
+         number (of points of a :monosp:`hammersley` set), or a nested
+         :monosp:`weighted_connections`. (Default: one)
      * - shadow_test
-       - |string|
-       - Whether the shadow ray of a connection is traced: :monosp:`always`, or
-         :monosp:`visibility_roulette` (by learned visibility, see :monosp:`neepp`).
-         (Default: always)
-     * - grid, max_memory, pilot_spp, law, slope, floor, refine, save_map, load_map
+       - |string| or |decision|
+       - Whether the shadow ray of a connection is traced: :monosp:`always`, by
+         :monosp:`visibility_roulette` (learned), or by a nested :monosp:`visibility_roulette` with
+         parameters. (Default: always)
+     * - aperture, time, wavelength
+       - |string| or |decision|
+       - Which numbers choose the point on the aperture, the time, and the wavelengths of a camera
+         ray: those of the sensor's :monosp:`sampler`, those of sets of a pattern (:monosp:`sobol`,
+         :monosp:`lattice`, …), or those of a nested :monosp:`weighted_numbers`. wavelength needs a
+         spectral variant. (Default: sampler)
+     * - pilot_spp
+       - |int|
+       - Samples per pixel from which is learned, at most a quarter of all. They count towards the
+         image. Known only where something learns; with 0 nothing is learned. A sampler that is
+         stratified over all samples may need longer pilots. (Default: 32 with guided directions,
+         otherwise 16)
+     * - (Common parameters)
        - |several|
-       - Those of :monosp:`neepp`; known only where next_event or shadow_test is not the default.
-     * - max_depth
-       - |int|
-       - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 adds direct
-         illumination, and so on. (Default: -1)
-     * - rr_depth
-       - |int|
-       - Path depth at which Russian roulette on the throughput begins. (Default: 5)
-     * - hide_emitters
-       - |bool|
-       - Hide directly visible emitters. (Default: false)
-     * - timeout
-       - |float|
-       - Seconds after which to stop, compilation included; 0 or less for no limit. The number of
-         samples follows from the speed of the first passes (short ones, until one compiles nothing,
-         and then one of a quarter of the time left), and not from the clock, so that stopping does
-         not prefer fast samples. The time is kept as well as the speed is steady; a short pass is
-         always taken. (Default: -1)
-     * - aovs
-       - |string|
-       - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
-         :monosp:`depth:depth,nn:sh_normal`. (Default: none)
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
 
     **Use it when** you want :monosp:`path` with passes of bounded memory, a time budget, statistics
     or progress, or to combine techniques. **Not when** you need gradients (use :monosp:`prb`),
     participating media (use :monosp:`volpath`; they are ignored here, as by :monosp:`path`), or a
     scalar or polarized variant.
 
+    A scene nests a decision as a :monosp:`sampler`, which is what Mitsuba takes it for, under the
+    name of the slot. Every decision goes with every decision of the other slots, and the image
+    stays unbiased (but for :monosp:`voronoi` weights). All that learn share the same pilots: three
+    where directions are guided, two where lights are learned, one where only
+    :monosp:`visibility_roulette` learns. Beside learned lights, :monosp:`visibility_roulette` uses
+    their map, and knows no parameters of a map of its own. :monosp:`neepp`, :monosp:`pss_guided`
+    and :monosp:`reweighted_direct` are path tracers with some of these decisions, under one name
+    each.
+
     Source: the algorithm is that of Mitsuba's :monosp:`path`; J. T. Kajiya, *The Rendering
-    Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple importance sampling).
+    Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple importance sampling); P.
+    Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH 2003 course 44, section 3.4
+    (:monosp:`linear`). The pages of the decisions name theirs.
 
     .. tabs::
         .. code-tab:: xml
 
             <integrator type="composed_path">
-                <integer name="max_depth" value="8"/>
-                <string name="shadow_test" value="visibility_roulette"/>
+                <sampler name="directions" type="guided_directions">
+                    <integer name="bounces" value="4"/>
+                </sampler>
+                <string name="next_event" value="contribution"/>
             </integrator>
 
         .. code-tab:: python
 
             'type': 'composed_path',
-            'max_depth': 8,
-            'shadow_test': 'visibility_roulette'
+            'directions': {
+                'type': 'guided_directions',
+                'bounces': 4
+            },
+            'next_event': 'contribution'
+
+        .. code-tab:: bash
+
+            mitsuba-ext compare scene.xml --time 10 path \
+                "composed_path:directions=[guided_directions:bounces=4],next_event=contribution"
     """
 
     def __init__(self, props: mi.Properties) -> None:

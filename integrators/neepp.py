@@ -36,18 +36,17 @@ class NEEPlusPlus(WalkIntegrator):
 
     A path tracer that learns from its first samples which lights reach which surfaces. It chooses
     lights accordingly, also parts of large lights and directions of the sky, and can reject most of
-    the shadow rays that would be blocked. Both are unbiased.
+    the shadow rays that would be blocked. Both are unbiased. It is :monosp:`composed_path` with
+    :monosp:`learned_lights`, and with :monosp:`visibility_roulette` if asked for; their pages say
+    more.
 
     .. pluginparameters::
 
      * - light_sampling
        - |string|
-       - How a light is chosen at each vertex. Learned, for the voxel and the side of the surface:
-         :monosp:`contribution` (by what arrived from it), :monosp:`visibility` (by how often it was
-         visible, times what it would contribute unoccluded). Not learned: :monosp:`uniform` (as
-         :monosp:`path` chooses), :monosp:`power`, :monosp:`spatial` (unoccluded contributions, per
-         voxel, as in pbrt-v3), :monosp:`linear` (an estimate for each light at each vertex; its
-         cost grows with their number). (Default: contribution)
+       - How a light is chosen at each vertex, as :monosp:`next_event` of :monosp:`composed_path`.
+         Learned: :monosp:`contribution`, :monosp:`visibility`. Not learned: :monosp:`uniform`,
+         :monosp:`power`, :monosp:`spatial`, :monosp:`linear`. (Default: contribution)
      * - rejection
        - |bool|
        - Reject shadow rays by learned visibility. It saves time where lights are not chosen by what
@@ -56,62 +55,32 @@ class NEEPlusPlus(WalkIntegrator):
      * - grid
        - |int|
        - Voxels along each axis of the region in which paths scatter (of the scene's bounding box,
-         where :monosp:`light_sampling` is not learned). (Default: 16, or fewer where the pilot has
-         few samples for the voxels that it sees and the lights; 16 for rejection without learned
-         light sampling; 32, or what fits into the memory, for :monosp:`spatial`)
+         where :monosp:`light_sampling` is not learned). (Default: as of :monosp:`learned_lights`,
+         :monosp:`spatial_lights` or :monosp:`visibility_roulette`)
      * - max_memory
        - |float|
-       - Memory for what is learned, and for the table of :monosp:`spatial`, in MiB. Where
-         :monosp:`grid` needs more, a coarser grid is used, with a warning. (Default: 512)
+       - Memory for what is learned, and for the table of :monosp:`spatial`, in MiB. (Default: 512)
      * - pilot_spp
        - |int|
        - Samples per pixel from which is learned, at most a quarter of all. They count towards the
          image. With 0 nothing is learned: lights are chosen as by :monosp:`path`, and every shadow
          ray is traced. A sampler that is stratified over all samples may need longer pilots.
          (Default: 16)
-     * - law
-       - |string|
-       - With :monosp:`rejection` only, as the next two: how the probability of tracing a shadow
-         ray follows from the learned visibility V:
-         :monosp:`affine` for min(1, slope · V + floor), :monosp:`paper` for max(V, 1e-4), as
-         printed: it traces fewer rays and is much noisier. (Default: affine)
-     * - slope
-       - |float|
-       - Slope of the affine law; unknown to the other. (Default: 10)
-     * - floor
-       - |float|
-       - Least probability of the affine law, 1e-6 to 1; unknown to the other. (Default: 0.1)
+     * - law, slope, floor
+       - |several|
+       - With :monosp:`rejection`: the law of :monosp:`visibility_roulette`. (Default: affine, 10,
+         0.1)
      * - refine
        - |int|
        - With :monosp:`rejection`, and only where light sampling is not learned: random visibility
-         tests added to each entry of the map in which the pilot saw a success, for the voxels with
-         a light. (Default: 16)
-     * - save_map
+         tests of :monosp:`visibility_roulette`. (Default: 16)
+     * - save_map, load_map
        - |string|
-       - File to which the learned map is written; its folder must be there. (Default: none)
-     * - load_map
-       - |string|
-       - File of a map to begin with, from this view of the scene or another one; the pilot adds to
-         it. A map of another scene is refused. (Default: none)
-     * - max_depth
-       - |int|
-       - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 adds direct
-         illumination, and so on. (Default: -1)
-     * - rr_depth
-       - |int|
-       - Path depth at which Russian roulette on the throughput begins. (Default: 5)
-     * - hide_emitters
-       - |bool|
-       - Hide directly visible emitters. (Default: false)
-     * - timeout
-       - |float|
-       - Seconds after which to stop, learning and compilation included; 0 or less for no limit. It
-         is kept as by :monosp:`composed_path`. Pilots then get at most a quarter of the samples
-         that fit. A short pass of each pilot, and one of the rest, are always taken. (Default: -1)
-     * - aovs
-       - |string|
-       - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
-         :monosp:`depth:depth,nn:sh_normal`. (Default: none)
+       - Where light sampling is learned: files of a map to write, and of one to begin with.
+         (Default: none)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
 
     **Use it when** there are many lights, when most of them are hidden from most places (rooms, a
     sky seen through windows, lamps behind walls), or when large lights are partly covered. **Not
@@ -119,23 +88,16 @@ class NEEPlusPlus(WalkIntegrator):
     or glossy light: it then costs the pilots' bookkeeping.
 
     A first sample per pixel, which is none of the image's, finds the region and the surfaces. Two
-    pilots follow, the second of which chooses its lights by what the first has learned; all samples
-    weigh the same, and none teaches a stage that it is part of, so that the image is unbiased. A
-    tenth of the choices does not depend on what was learned. Where the first pilot finds that
-    choosing as :monosp:`path` does is nearly as good (less than 7 % of the variance to gain),
-    learning ends there, unless :monosp:`grid`, :monosp:`rejection` or a file of a map is given.
-    Where light sampling is not learned, rejection knows lights in the scene's bounding box only;
-    those outside of it and at infinity are then always tested.
+    pilots follow, the second of which chooses its lights by what the first has learned. Where
+    little is to gain, learning ends there, unless :monosp:`grid`, :monosp:`rejection` or a file of
+    a map is given.
 
-    Lights on meshes with interpolated normals are sampled by the area of their triangles;
-    :monosp:`path` and :monosp:`uniform` are biased there, by a fault in Mitsuba. Participating
-    media are ignored, as by :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor
-    are scalar and polarized variants. Nested in :monosp:`moment` there is no pilot.
+    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
+    pilot.
 
-    Sources: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
-    Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, sections 3 to 4.2;
-    P. Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH 2003 course 44, section
-    3.4 (:monosp:`linear`).
+    Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
+    Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, sections 3 to 4.2.
 
     .. tabs::
         .. code-tab:: xml
@@ -161,5 +123,5 @@ class NEEPlusPlus(WalkIntegrator):
         lights = make_lights(read) if make_lights else None
         learns = isinstance(lights, LearnedLights)
         rejection = RejectedShadowRays(read, has_own_map=not learns) if rejects else None
-        read.refuse_without_effect(_CONDITIONS)
         self.fill(props, next_event=lights, shadow_test=rejection)
+        read.refuse_without_effect(_CONDITIONS)

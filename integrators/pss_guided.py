@@ -6,6 +6,7 @@ import mitsuba as mi
 
 from mitsuba_ext import registry
 from mitsuba_ext.composition.connections import Connections
+from mitsuba_ext.composition.decision_parameters import ParameterReader
 from mitsuba_ext.composition.directions import Guided
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.decisions.directions.guide_learner import GuideLearner
@@ -22,28 +23,27 @@ class PSSGuided(WalkIntegrator):
 
     A path tracer that learns from its first samples which random numbers choose directions from
     which light comes, and draws these more often. It is unbiased, knows nothing of materials or of
-    lights, and guides all BSDFs alike.
+    lights, and guides all BSDFs alike. It is :monosp:`composed_path` with
+    :monosp:`guided_directions`, whose page says how it learns.
 
     .. pluginparameters::
 
      * - regions
        - |string|
-       - What has a tree of samples: :monosp:`surfaces` (voxels, and the sides of the surfaces in
-         them; all bounces use the trees of the places where they happen), or :monosp:`tiles` (of
-         the film, as in the thesis; the samples of a path's first bounce decide about the tree of
-         the second, and so on). (Default: surfaces)
+       - What has a tree of samples: :monosp:`surfaces`, or :monosp:`tiles` of the film, as in the
+         thesis. (Default: surfaces)
      * - tile
        - |int|
        - Edge of a tile in pixels; known only with :monosp:`tiles`. (Default: 16)
      * - bounces
        - |int|
-       - How many directions of a path are guided, at most; those that do not pay are left out. At
-         most 5 with tiles. (Default: 6; 2 with tiles)
+       - How many directions of a path are guided, at most; those that do not pay are left out.
+         (Default: 6; 2 with tiles)
      * - nee_first_bounce
        - |bool|
        - Connect the first vertex of a path to lights? False is the setting in which the thesis
-         measures, for comparisons; lights without extent are connected to all the same.
-         (Default: true)
+         measures, for comparisons; lights without extent are connected to all the same. (Default:
+         true)
      * - pilot_spp
        - |int|
        - Samples per pixel from which is learned, at most a quarter of all. They count towards the
@@ -51,51 +51,26 @@ class PSSGuided(WalkIntegrator):
          stratified over all samples may need longer pilots. (Default: 32)
      * - always_guide
        - |bool|
-       - Guide all :monosp:`bounces`, also where the pilots show that it does not pay? Then
-         images of different seeds, or the frames of an animation, are all made in the same way and
-         by the same kernels. (Default: false)
+       - Guide all :monosp:`bounces`, also where the pilots show that it does not pay? (Default:
+         false)
      * - max_memory
        - |float|
-       - Memory for what is recorded and learned, in MiB. Where the pilots need more, they record
-         a part of their paths. Trees of tiles of a few pixels come on top. (Default: 512)
-     * - max_depth
-       - |int|
-       - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 adds direct
-         illumination, and so on. (Default: -1)
-     * - rr_depth
-       - |int|
-       - Path depth at which Russian roulette on the throughput begins. What guiding adds to the
-         throughput does not count: paths to bright places are not ended sooner. (Default: 5)
-     * - hide_emitters
-       - |bool|
-       - Hide directly visible emitters. (Default: false)
-     * - timeout
-       - |float|
-       - Seconds after which to stop, 0 or less for no limit. It is kept as by :monosp:`neepp`.
-         (Default: -1)
-     * - aovs
-       - |string|
-       - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
-         :monosp:`depth:depth,nn:sh_normal`. (Default: none)
+       - Memory for what is recorded and learned, in MiB. (Default: 512)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
 
     **Use it when** light comes by way of other surfaces: through doors, windows and gaps, from lit
-    corners, along mirrors and glossy things. **Not when** most light is direct (use
-    :monosp:`neepp` to choose among many lights), when an image has fewer than 16 samples per pixel,
-    or for caustics of small lights seen through glass, which paths from the camera do not find.
+    corners, along mirrors and glossy things. **Not when** most light is direct (use :monosp:`neepp`
+    to choose among many lights), when an image has fewer than 16 samples per pixel, or for caustics
+    of small lights seen through glass, which paths from the camera do not find.
 
-    Each tree is a k-d tree over the two numbers by which a BSDF chooses a direction. Its density is
-    what paths brought on average from there on, drawn to what was found in larger surroundings
-    where there are few samples, and mixed with uniform numbers. The second of three pilots shows
-    what the trees of the first are worth. From that follows how much of the samples trees decide
-    (40, 60 or 80 %) and how many bounces are worth the time of guiding them; if none is, learning
-    ends there, and the rest is rendered as by :monosp:`path`. After a render,
-    :monosp:`integrator.statistics.learned` tells, and :monosp:`integrator.guide` holds what was
-    learned (see examples/learned_samples.py).
+    After a render, :monosp:`integrator.statistics.learned` tells what was found, and
+    :monosp:`integrator.guide` holds it (see examples/learned_samples.py).
 
-    The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass
-    (with tiles they are, in vain). Participating media are ignored, as by :monosp:`path`. Gradients
-    are not supported (use :monosp:`prb`), nor are scalar and polarized variants. Nested in
-    :monosp:`moment` there is no pilot.
+    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
+    pilot.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of
     film tiles. Regions of surfaces, the estimates, and the measurement of the gain are ours.
@@ -116,11 +91,11 @@ class PSSGuided(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         connects_first = self.parameter(props, "nee_first_bounce", True)
-        read = self.reader(props, count=0)
+        none = None if connects_first else ParameterReader.of_defaults(self.name, count=0)
         self.fill(
             props,
-            directions=Guided(read),
-            connections=None if connects_first else Connections(read),
+            directions=Guided(self.reader(props)),
+            connections=Connections(none) if none else None,
         )
 
     @property

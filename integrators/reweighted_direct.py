@@ -19,66 +19,49 @@ class ReweightedDirect(WalkIntegrator):
     Reweighted light samples (:monosp:`reweighted_direct`)
     ------------------------------------------------------
 
-    A path tracer that connects the first thing it sees to many points of the lights. They come from
-    well distributed sets, which can be weighed by the cells of the points. Later vertices of a path
-    are connected to one point each, as by :monosp:`path`.
+    A path tracer that connects the first vertex of each path to many points of the lights. They
+    come from well distributed point sets. Each connection can be weighted by the Voronoi cell of
+    its point. Later vertices of a path are connected to one point each, as by :monosp:`path`. It is
+    :monosp:`composed_path` with :monosp:`weighted_connections`, whose page says more.
 
     .. pluginparameters::
 
+     * - light_samples
+       - |int|
+       - Points of a set: connections of the first vertex, at most 4096 (1024 with
+         :monosp:`poisson_disk`): beyond that, the time serves more camera samples better. With 0,
+         the first vertex finds light by BSDF samples only. (Default: 256)
+     * - vertices
+       - |string|
+       - Which vertices have so many: the :monosp:`first`, or :monosp:`all`. (Default: first)
      * - pattern
        - |string|
        - How the points of a set are distributed: :monosp:`independent`, :monosp:`stratified`,
          :monosp:`latin_hypercube`, :monosp:`halton`, :monosp:`hammersley`, :monosp:`sobol`,
-         :monosp:`lattice` or :monosp:`poisson_disk`; see
-         :monosp:`mitsuba_ext.pointsets.points`. (Default: hammersley)
+         :monosp:`lattice` or :monosp:`poisson_disk`. (Default: hammersley)
      * - weights
        - |string|
-       - How they are weighed: :monosp:`none` (all alike), :monosp:`torus` (by the areas of periodic
-         Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points that are folded,
-         so that opposite edges need not be alike), or :monosp:`voronoi` (by cells that end at the
-         border, as in the thesis: slightly biased). (Default: none)
-     * - light_samples
-       - |int|
-       - Points of a set: connections of the first vertex, at most 4096 (1024 with
-         :monosp:`poisson_disk`): beyond that, the time serves more camera samples better.
-         (Default: 256)
+       - Weights of the points: :monosp:`none`, :monosp:`torus`, :monosp:`unbiased` or
+         :monosp:`voronoi` (slightly biased). (Default: none)
      * - camera_samples
        - |int|
        - Samples per pixel, where :monosp:`render` is not told how many; 0 for as many as the
          sensor's sampler takes, which are 4 if it does not say either. Not where it is nested in
          another integrator. (Default: 0)
-     * - max_depth
-       - |int|
-       - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 is direct
-         illumination, and so on. (Default: -1)
-     * - rr_depth
-       - |int|
-       - Path depth at which Russian roulette on the throughput begins. (Default: 5)
-     * - hide_emitters
-       - |bool|
-       - Hide directly visible emitters. (Default: false)
-     * - timeout
-       - |float|
-       - Seconds after which to stop, 0 or less for no limit. It is kept as by
-         :monosp:`composed_path`. (Default: -1)
-     * - aovs
-       - |string|
-       - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
-         :monosp:`depth:depth,nn:sh_normal`. (Default: none)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
 
-    **Use it when** the noise is that of soft shadows and large lights, and edges, defocus or
-    materials do not ask for many camera samples. **Not when** most light is indirect (then more
-    camera samples serve better), or with many lights (use :monosp:`neepp`). Compare it with
+    **Use it when** the noise comes from soft shadows and large lights, and edges, defocus or
+    materials do not need many camera samples. **Not when** most light is indirect (more camera
+    samples reduce its noise more), or with many lights (use :monosp:`neepp`). Compare it with
     :monosp:`path` and a :monosp:`multijitter` sampler, which is hard to beat.
 
-    Each vertex moves its set around the torus at random, so that errors of neighbouring pixels do
-    not depend on each other. The BSDF sample of the first vertex, which goes on as the path, has
-    its share in direct light by multiple importance sampling, as one sample among so many.
     Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants.
 
-    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4; periodic cells, and that they
-    are unbiased, are ours.
+    Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4. Periodic cells, and the fact
+    that they are unbiased, are our addition.
 
     .. tabs::
         .. code-tab:: xml

@@ -15,27 +15,14 @@ class ReweightedTime(ReweightedCamera):
     --------------------------------------------
 
     Renders motion blur with the nested integrator, but takes the times in the shutter interval from
-    well distributed point sets. Each sample can be weighted by the Voronoi cell of its time. Each
-    pixel uses one set for all of its samples, chosen and shifted at random.
+    :monosp:`weighted_numbers`: well distributed point sets, with which each sample can be weighted
+    by the Voronoi cell of its time. Each pixel uses one set for all of its samples.
 
     .. pluginparameters::
 
-     * - pattern
-       - |string|
-       - How the points of a set are distributed: :monosp:`independent`, :monosp:`stratified`,
-         :monosp:`latin_hypercube`, :monosp:`halton`, :monosp:`hammersley`, :monosp:`sobol`,
-         :monosp:`lattice` or :monosp:`poisson_disk`; see
-         :monosp:`mitsuba_ext.pointsets.points`. (Default: lattice)
-     * - weights
-       - |string|
-       - Weights of the points: :monosp:`none` (all equal), :monosp:`torus` (lengths of periodic
-         Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points mapped by 1 - |2u - 1|,
-         which removes the discontinuity between both ends), or :monosp:`voronoi` (cells that end at
-         the border, as in the thesis: slightly biased). (Default: none)
-     * - timeout
-       - |float|
-       - Seconds after which to stop, 0 or less for no limit. With a limit, sets have at most 64
-         points, and the render ends after a whole set. (Default: -1)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`ReweightedCamera`: pattern, weights, timeout.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
@@ -51,13 +38,11 @@ class ReweightedTime(ReweightedCamera):
     Use a :monosp:`box` filter for the film. A wider filter gives samples random weights, whose
     noise remains however well the times are distributed.
 
-    Sets have as many times as a pixel has samples, at most 1024 (with more samples, a pixel uses
-    several sets). There are at most 32 sets (2 of :monosp:`poisson_disk`); with :monosp:`voronoi`
-    weights they are not shifted. The weights apply to all channels, including alpha and AOVs. The
-    other dimensions of a sample come from the sensor's sampler, or from a nested
-    :monosp:`reweighted_lens` or :monosp:`reweighted_wavelength`. A nested integrator of this
-    package learns as usual; its own timeout is ignored. Inside of :monosp:`moment`, nothing is
-    reweighted. Gradients are not supported (use :monosp:`prb`).
+    The page of :monosp:`weighted_numbers` says more about sets and weights. The other dimensions of
+    a sample come from the sensor's sampler, or from a nested :monosp:`reweighted_lens` or
+    :monosp:`reweighted_wavelength`. A nested integrator of this package learns as usual; its own
+    timeout is ignored. Inside of :monosp:`moment`, nothing is reweighted. Gradients are not
+    supported (use :monosp:`prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.1. Periodic cells, and the fact
     that they are unbiased, are our addition.

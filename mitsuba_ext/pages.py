@@ -1,7 +1,9 @@
 """The page of a plugin, read from its docstring without running its file.
 
 Docstrings have Mitsuba's form: a title underlined with dashes, a ``.. pluginparameters::`` list of
-name, type and description (which ends in ``(Default: …)``), and prose.
+name, type and description (which ends in ``(Default: …)``), and prose. A row named ``(Common
+parameters)`` stands for the list in the docstring of the base class, but for those parameters that
+the plugin describes itself.
 """
 
 from __future__ import annotations
@@ -9,8 +11,13 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+#: The row that stands for the parameters of the base class.
+_COMMON = "(Common parameters)"
+
+_LIST = ".. pluginparameters::"
 
 
 @dataclass(frozen=True)
@@ -41,14 +48,10 @@ class Page:
 def read_page(file: Path) -> Page:
     """The page of the plugin in ``file``, which has the name of the file."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
-    docstrings = [
-        ast.get_docstring(node, clean=False) or ""
-        for node in tree.body
-        if isinstance(node, ast.ClassDef)
-    ]
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
     # One plugin class per file; a helper class does not have a parameter list
-    docstrings.sort(key=lambda text: ".. pluginparameters::" not in text)
-    return parse_page(file.stem, docstrings[0] if docstrings else "")
+    classes.sort(key=lambda node: _LIST not in _docstring(node))
+    return _class_page(file, tree, classes[0]) if classes else parse_page(file.stem, "")
 
 
 def parse_page(name: str, docstring: str) -> Page:
@@ -61,7 +64,7 @@ def parse_page(name: str, docstring: str) -> Page:
             title = _plain(lines[index - 1].strip())
             lines = lines[: index - 1] + lines[index + 1 :]
             break
-    start = next((i for i, line in enumerate(lines) if ".. pluginparameters::" in line), None)
+    start = next((i for i, line in enumerate(lines) if _LIST in line), None)
     parameters: tuple[Parameter, ...] = ()
     if start is not None:
         end = start + 1
@@ -72,6 +75,46 @@ def parse_page(name: str, docstring: str) -> Page:
     text = re.sub(r"^ *\.\. (?:tabs::|code-tab:: \w+) *\n", "", "\n".join(lines), flags=re.M)
     text = re.sub(r"\n{3,}", "\n\n", _plain(text)).strip()
     return Page(name, title, parameters, text)
+
+
+def _class_page(file: Path, tree: ast.Module, cls: ast.ClassDef) -> Page:
+    """The page of a class, with the parameters that it has from its base class."""
+    page = parse_page(file.stem, _docstring(cls))
+    own = {parameter.name for parameter in page.parameters}
+    rows: list[Parameter] = []
+    for parameter in page.parameters:
+        if parameter.name == _COMMON:
+            common = _class_page(*_base_class(file, tree, cls)).parameters
+            rows += [row for row in common if row.name not in own]
+        else:
+            rows.append(parameter)
+    return replace(page, parameters=tuple(rows))
+
+
+def _base_class(
+    file: Path, tree: ast.Module, cls: ast.ClassDef
+) -> tuple[Path, ast.Module, ast.ClassDef]:
+    """Where the base class is defined that ``file`` imports from this package, and its definition.
+
+    Raises:
+        ValueError: There is none.
+    """
+    bases = {base.id for base in cls.bases if isinstance(base, ast.Name)}
+    for node in tree.body:
+        names = {alias.name for alias in node.names} if isinstance(node, ast.ImportFrom) else set()
+        if bases & names:
+            module = node.module or ""
+            folder = file.parents[node.level - 1] if node.level else Path(__file__).parents[1]
+            base_file = folder.joinpath(*module.split(".")).with_suffix(".py")
+            base_tree = ast.parse(base_file.read_text(encoding="utf-8"))
+            for definition in base_tree.body:
+                if isinstance(definition, ast.ClassDef) and definition.name in bases:
+                    return base_file, base_tree, definition
+    raise ValueError(f"{file}: {cls.name} has no base class with {_COMMON}")
+
+
+def _docstring(cls: ast.ClassDef) -> str:
+    return ast.get_docstring(cls, clean=False) or ""
 
 
 def _parameters(lines: list[str]) -> list[Parameter]:

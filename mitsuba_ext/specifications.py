@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 from .content_hash import hash_code, hash_value
 from .errors import InputError
-from .names import is_file_of_mitsuba, unknown_integrator
+from .names import is_file_of_mitsuba, unknown_parameter, unknown_plugin
 from .plugin_text import parse_plugin
 from .registry import plugin_names
 from .rendering.aovs import check_aovs, check_nodes
@@ -182,15 +182,19 @@ def _make(
         made = mi.PluginManager.instance().create_object(properties)
     except Exception as error:  # a plugin's constructor may raise anything
         if "not found!" in str(error) and f'Plugin "{name}"' in str(error):
-            raise unknown_integrator(name, kind) from error
-        raise InputError(f'{kind} "{name}": {one_line(error)}') from error
+            raise unknown_plugin(name, kind != "integrator") from error
+        message = one_line(error)
+        own_prefix = f'"{name}": '
+        if message.startswith(own_prefix):  # our plugins name themselves
+            message = message[len(own_prefix) :]
+        raise InputError(f'{kind} "{name}": {message}') from error
     if kind == "integrator" and not isinstance(made, mi.Integrator):
         raise InputError(f'"{name}" is a plugin of Mitsuba, but not an integrator')
     made = (made.expand() or [made])[0]  # "volpathmis" is made in two steps
     unknown = set(properties.unqueried())
     for key in own:
         if key in unknown:
-            raise InputError(f'{kind} "{name}" has no parameter "{key}"')
+            raise unknown_parameter(kind, name, key)
     parameters = {
         key: {"type": nested[key].name, **nested[key].parameters} if key in nested else value
         for key, value in given.items()
@@ -284,10 +288,12 @@ def _label_of_dict(specification: Mapping[str, Any]) -> str:
     values = [
         f"{key}={_as_text(value)}"
         for key, value in specification.items()
-        if key != "type" and isinstance(value, (bool, int, float, str))
+        if key != "type" and isinstance(value, (bool, int, float, str, Mapping))
     ]
     return str(specification.get("type", "integrator")) + (":" if values else "") + ",".join(values)
 
 
-def _as_text(value: Value) -> str:
+def _as_text(value: Value | Mapping[str, Any]) -> str:
+    if isinstance(value, Mapping):
+        return f"[{_label_of_dict(value)}]"
     return str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,4 +1,4 @@
-"""TODO"""
+"""Shadow rays that are rejected by learned visibility."""
 
 from __future__ import annotations
 
@@ -9,6 +9,80 @@ from mitsuba_ext.composition.shadow_test import RejectedShadowRays
 
 @registry.plugin
 class VisibilityRoulettePlugin(DecisionPlugin):
-    r"""TODO"""
+    r"""
+    .. _sampler-visibility_roulette:
+
+    Visibility roulette (:monosp:`visibility_roulette`)
+    ---------------------------------------------------
+
+    A decision for the slot :monosp:`shadow_test` of :monosp:`composed_path`. It learns from the
+    first samples how often places see the lights, and rejects most of the shadow rays that would be
+    blocked. The connections that are tested are weighted by the inverse of the probability, so that
+    the image is unbiased.
+
+    .. pluginparameters::
+
+     * - law
+       - |string|
+       - How the probability of tracing a shadow ray follows from the learned visibility V:
+         :monosp:`affine` for min(1, slope · V + floor), :monosp:`paper` for max(V, 1e-4), as
+         printed: it traces fewer rays and is much noisier. (Default: affine)
+     * - slope
+       - |float|
+       - Slope of the affine law; unknown to the other. (Default: 10)
+     * - floor
+       - |float|
+       - Least probability of the affine law, 1e-6 to 1; unknown to the other. (Default: 0.1)
+     * - grid
+       - |int|
+       - Voxels along each axis of the scene's bounding box, 1 to 1024. Not beside
+         :monosp:`learned_lights`, as the next two. (Default: 16)
+     * - max_memory
+       - |float|
+       - Memory for what is learned, in MiB. Where :monosp:`grid` needs more, a coarser grid is
+         used, with a warning. (Default: 512)
+     * - refine
+       - |int|
+       - Random visibility tests added to each entry of the map in which the pilots saw a success,
+         for the voxels with a light; at most 1024. (Default: 16)
+
+    **Use it when** most shadow rays are blocked, tracing them takes much of the time, and lights
+    are not learned. **Not when** they are: lights that are hidden are hardly chosen any more, and
+    rejection costs more error than it saves time.
+
+    Beside :monosp:`learned_lights`, the visibility is that of the light map, which also knows
+    lights at infinity. Otherwise a map of pairs of voxels is learned: connections to lights outside
+    of the scene's bounding box or at infinity are then always tested. Where fewer than 5 % of the
+    shadow rays would be rejected, all are traced. Nested in :monosp:`moment` there is no pilot, and
+    all are traced.
+
+    Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
+    Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, sections 3 to 4.1
+    (Eq. 2 is the law :monosp:`paper`).
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="composed_path">
+                <string name="next_event" value="spatial"/>
+                <sampler name="shadow_test" type="visibility_roulette">
+                    <float name="floor" value="0.2"/>
+                </sampler>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'composed_path',
+            'next_event': 'spatial',
+            'shadow_test': {
+                'type': 'visibility_roulette',
+                'floor': 0.2
+            }
+
+        .. code-tab:: bash
+
+            mitsuba-ext render scene.xml -o image.exr --integrator \
+                "composed_path:next_event=spatial,shadow_test=[visibility_roulette:floor=0.2]"
+    """
 
     kind = RejectedShadowRays

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -158,6 +159,7 @@ def test_what_only_prints_starts_without_mitsuba(make_scene, tmp_path):
         ["--help"], ["--version"], ["render", "--help"], ["list"], ["list", "neepp"],
         ["list", "path"], ["list", "neeep"], [*render, "neeep"], ["render", "none.xml", "-o", "a"],
         ["compare", render[1], "path", "neeep", "--spp=1"],
+        [*render, "composed_path:directions=[guided_direction]"], [*render, "learned_lights"],
     ]  # fmt: skip
     code = f"""
 import sys
@@ -172,6 +174,8 @@ assert "rich" in sys.modules
     assert result.returncode == 0, result.stderr
     assert result.stdout.count("Usage:") == 2
     assert result.stderr.count('unknown integrator "neeep": did you mean "neepp"?') == 2
+    assert 'nested plugin "guided_direction": did you mean "guided_directions"?' in result.stderr
+    assert '"learned_lights" is no integrator, but a decision to be nested in' in result.stderr
 
 
 def test_list_says_whose_plugin_a_name_is_or_what_it_may_have_meant(run):
@@ -210,6 +214,8 @@ def test_list_shows_every_plugin(run):
 
     code, out, _ = run("list")
     assert code == 0
+    assert re.search(r"neepp +│ integrator +│", out)
+    assert re.search(r"guided_directions +│ decision +│", out)
     for names in registry.plugin_names().values():
         for name in names:
             assert name in out

@@ -21,7 +21,8 @@ from mitsuba_ext import runtime
 
 ROOT = Path(__file__).parents[1]
 PYPROJECT = (ROOT / "pyproject.toml").read_text()
-SOURCES = [ROOT / name for name in ("mitsuba_ext", "integrators", "emitters", "bsdfs", "shapes")]
+KINDS = ("integrators", "emitters", "bsdfs", "samplers", "shapes")
+SOURCES = [ROOT / name for name in ("mitsuba_ext", *KINDS)]
 
 
 def test_every_folder_with_modules_is_a_package() -> None:
@@ -75,7 +76,7 @@ def test_type_hints_are_announced() -> None:
 
 
 def test_plugin_folders_are_part_of_the_package_and_keep_their_sources() -> None:
-    for kind in ("integrators", "emitters", "bsdfs", "shapes"):
+    for kind in KINDS:
         module = importlib.util.find_spec(f"mitsuba_ext.{kind}")
         assert module is not None
         assert module.origin is not None

@@ -78,6 +78,10 @@ def test_nested_integrators_take_over_the_settings_and_are_checked(variant):
     assert lens.parameters["in"] == {"type": "composed_path", **settings}
     for text in ("aov:aovs=d:depth,n:uv,image=[path]", "variance:a=[moment:b=[volpathmis]]"):
         assert "max_depth = 3" in str(make_named(text, DEPTH).integrator)
+    decision = make_named("composed_path:directions=[guided_directions:bounces=3]", DEPTH)
+    nested = {"type": "guided_directions", "bounces": 3}
+    assert decision.parameters == {**DEPTH, "directions": nested}
+    assert "bounces = 3" in str(decision.integrator)
     for text, message in (
         ("variance:nested=[none]", 'unknown nested plugin "none"'),
         ("variance:nested=[path:x=1]", 'nested plugin "path" has no parameter "x"'),
@@ -85,6 +89,25 @@ def test_nested_integrators_take_over_the_settings_and_are_checked(variant):
         ("path:nested=[path]", 'integrator "path" has no parameter "nested"'),
         ("variance:nested=[independent]", "exactly one integrator must be nested in it"),
         ("independent", "not an integrator"),
+        ("composed_path:directions=[guided_direction]", 'did you mean "guided_directions"?'),
+        ("composed_path:direction=guided", 'no parameter "direction": did you mean "directions"?'),
+        ("composed_path:directions=[guided_directions:bonces=3]", 'did you mean "bounces"?'),
+        (
+            "composed_path:next_event=[guided_directions]",
+            'integrator "composed_path": the parameter "next_event" cannot be "guided_directions", '
+            "which is for directions",
+        ),
+        (
+            "composed_path:next_event=learned_lights",
+            "'learned_lights'; it must be one of uniform, power, spatial, linear, visibility, "
+            'contribution, or a nested plugin: "learned_lights" or "spatial_lights"',
+        ),
+        ("composed_path:connections=-3", 'the parameter "connections" is -3; it must be at least'),
+        ("composed_path:time=latice", "one of sampler, independent, stratified,"),
+        ("composed_path:next_event=[independent]", "is IndependentSampler; it must be one of"),
+        ("composed_path:pilot_spp=4", 'nothing here uses the parameter "pilot_spp"'),
+        ("pss_guided:nee_first_bounce=false,count=3", 'has no parameter "count"'),
+        ("composed_path:wavelength=lattice", 'does not work in the variant "llvm_ad_rgb"'),
     ):
         with pytest.raises(InputError) as error:
             make_named(text, DEPTH)
@@ -120,6 +143,10 @@ def test_depth_is_inherited_where_the_integrator_knows_it(make_scene):
 
 DEPTH = {"max_depth": 3, "rr_depth": 7}
 
+DECISIONS = """<integrator type="composed_path">
+  <sampler name="next_event" type="{}"><integer name="grid" value="8"/></sampler>
+</integrator>"""
+
 AOV = """<integrator type="aov">
   <string name="aovs" value="d:depth"/>
   <integrator type="neepp"><integer name="rr_depth" value="9"/></integrator>
@@ -137,9 +164,23 @@ def test_fragments_inherit_the_depth_at_every_node_that_knows_it(variant, tmp_pa
         assert "max_depth = 3" in str(named.integrator) and "rr_depth = 9" in str(named.integrator)
 
 
+def test_fragments_can_nest_decisions(variant, tmp_path):
+    file = tmp_path / "composed.xml"
+    file.write_text(DECISIONS.format("learned_lights"))
+    named = make_named(str(file), DEPTH)
+    assert "max_depth = 3" in str(named.integrator)
+    assert "learned_lights[target = contribution, grid = 8" in str(named.integrator)
+    assert make_named(str(file), DEPTH).identity == named.identity
+    file.write_text(DECISIONS.format("learned_light"))
+    with pytest.raises(InputError, match='Plugin "learned_light" not found'):
+        make_named(str(file))
+
+
 def test_dicts_and_integrators_are_accepted(variant):
     named = make_named({"type": "neepp", "grid": 8, "max_depth": 4}, DEPTH)
     assert named.label == "neepp:grid=8,max_depth=4"
+    nested = {"type": "composed_path", "next_event": {"type": "learned_lights", "grid": 8}}
+    assert make_named(nested).label == "composed_path:next_event=[learned_lights:grid=8]"
     assert named.parameters == {"grid": 8, "max_depth": 4, "rr_depth": 7}
     made = mi.load_dict({"type": "path", "max_depth": 2})
     named = make_named(made, DEPTH, label="mine")

@@ -48,6 +48,7 @@ class WeightedNumbers(DecisionParameters):
         TypeError, ValueError: A parameter has a wrong type or value.
     """
 
+    name = "weighted_numbers"
     slots = tuple(PURPOSES)
 
     def __init__(self, read: ParameterReader, accepted: tuple[str, ...] = WEIGHTS) -> None:

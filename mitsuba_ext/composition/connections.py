@@ -24,6 +24,7 @@ class Connections(DecisionParameters):
         TypeError, ValueError: A parameter has a wrong type or value.
     """
 
+    name = "weighted_connections"
     slots = ("connections",)
 
     def __init__(self, read: ParameterReader) -> None:

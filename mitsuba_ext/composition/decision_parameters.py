@@ -65,21 +65,26 @@ class ParameterReader:
     ) -> None:
         self.plugin, self._props = plugin, props
         self._names, self._defaults = names or {}, defaults
-        self._read: set[str] = set()
 
     def __call__(self, key: str, default: Any, **accepted: Any) -> Any:
         """A parameter, checked: see :func:`mitsuba_ext.parameters.read_parameter`."""
         name = self._names.get(key, key)
-        self._read.add(name)
         default = self._defaults.get(key, default)
         return read_parameter(self.plugin, self._props, name, default, **accepted)
+
+    @classmethod
+    def of_defaults(
+        cls, plugin: str, names: Mapping[str, str] | None = None, **defaults: Any
+    ) -> ParameterReader:
+        """One for which the scene gives no parameters."""
+        return cls(plugin, mi.Properties(plugin), names, **defaults)
 
     def is_given(self, key: str) -> bool:
         """Does the scene say anything?"""
         return self._names.get(key, key) in self._props
 
     def refuse_without_effect(self, conditions: Mapping[str, str]) -> None:
-        """Refuses parameters that nobody has read.
+        """Refuses parameters that nobody has read until now.
 
         Parameters:
             conditions: By name, what a parameter needs to have an effect.
@@ -88,7 +93,7 @@ class ParameterReader:
             ValueError: The scene gives such a parameter.
         """
         for key, condition in conditions.items():
-            if key in self._props and key not in self._read:
+            if key in self._props and not self._props.was_queried(key):
                 raise ValueError(
                     f'"{self.plugin}": the parameter "{key}" needs {condition}; leave it out'
                 )
@@ -99,12 +104,14 @@ class DecisionParameters:
     it holds nothing that belongs to one.
 
     Attributes:
+        name: What a scene calls it: a plugin, or a word.
         slots: The slots of an integrator that it can fill.
         pilot_spp: Samples per pixel from which it would learn, by default; 0 if it does not learn.
         tries: Does what it learns in a first pilot make the next ones better?
         sample_cost: The time of a sample in units of that of a path, about.
     """
 
+    name = ""
     slots: tuple[str, ...] = ()
     pilot_spp = 0
     tries = False
@@ -117,8 +124,8 @@ class DecisionParameters:
         """
         if slot not in self.slots:
             raise ValueError(
-                f'"{plugin}": the parameter "{slot}" cannot be this decision, which is for '
-                f'{" or ".join(self.slots)}: {self}'
+                f'"{plugin}": the parameter "{slot}" cannot be "{self.name}", which is for '
+                f"{', '.join(self.slots)}"
             )
 
     def check_together(self, plugin: str, slots: Mapping[str, DecisionParameters]) -> None:
@@ -140,9 +147,10 @@ class DecisionParameters:
         return None
 
     def parameters(self) -> dict[str, Any]:
-        """Names and values of all parameters, for ``str()``."""
-        return {key: value for key, value in vars(self).items() if not key.startswith("_")}
+        """Names and values for ``str()``: of all parameters but those that are empty."""
+        own = {key: value for key, value in vars(self).items() if not key.startswith("_")}
+        return {key: value for key, value in own.items() if value != ""}
 
     def __str__(self) -> str:
         values = ", ".join(f"{key} = {value}" for key, value in self.parameters().items())
-        return f"{type(self).__name__}[{values}]"
+        return f"{self.name}[{values}]" if values else self.name

@@ -25,6 +25,7 @@ class Guided(DecisionParameters):
         TypeError, ValueError: A parameter has a wrong type or value.
     """
 
+    name = "guided_directions"
     slots = ("directions",)
     pilot_spp, tries = 32, True
 

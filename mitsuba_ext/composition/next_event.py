@@ -27,6 +27,7 @@ _SPATIAL_GRID = 32
 class PowerLights(DecisionParameters):
     """Lights by their power."""
 
+    name = "power"
     slots = ("next_event",)
 
     def decision(self, setting: Setting) -> Any | None:
@@ -39,6 +40,7 @@ class PowerLights(DecisionParameters):
 class LinearLights(DecisionParameters):
     """Lights by an estimate of what each contributes to the vertex."""
 
+    name = "linear"
     slots = ("next_event",)
 
     def decision(self, setting: Setting) -> Any | None:
@@ -49,6 +51,7 @@ class SpatialLights(DecisionParameters):
     """Lights by what they contribute to a voxel if nothing is in between. The attributes are the
     parameters of the plugin ``spatial_lights``; see there."""
 
+    name = "spatial_lights"
     slots = ("next_event",)
 
     def __init__(self, read: ParameterReader) -> None:
@@ -77,6 +80,9 @@ class SpatialLights(DecisionParameters):
             )
         return rows
 
+    def parameters(self) -> dict[str, Any]:
+        return {**super().parameters(), "grid": self.grid or "automatic"}
+
 
 class LearnedLights(DecisionParameters):
     """Lights by what pilots saw of them. The attributes are the parameters of the plugin
@@ -86,6 +92,7 @@ class LearnedLights(DecisionParameters):
         TypeError, ValueError: A parameter has a wrong type or value.
     """
 
+    name = "learned_lights"
     slots = ("next_event",)
     pilot_spp, tries = 16, True
 
@@ -127,6 +134,9 @@ class LearnedLights(DecisionParameters):
             Path(self.save_map) if self.save_map else None,
             self._plugin,
         )
+
+    def parameters(self) -> dict[str, Any]:
+        return {**super().parameters(), "grid": self.grid or "automatic"}
 
 
 #: What lights can be learned for, the default first.

@@ -21,11 +21,32 @@ from .decision_parameters import ParameterReader, Setting
 
 class ReweightedCamera(StagedIntegrator):
     """Renders with a nested integrator, for camera rays of which one number (or two) comes from
-    weighted sets. Common parameters are ``pattern``, ``weights``, ``timeout`` and the nested
-    integrator.
+    weighted sets.
 
     A subclass says what the numbers are for. Nested in each other, subclasses do their work
     together.
+
+    .. pluginparameters::
+
+     * - pattern
+       - |string|
+       - How the points of a set are distributed, see :monosp:`weighted_numbers`:
+         :monosp:`independent`, :monosp:`stratified`, :monosp:`latin_hypercube`, :monosp:`halton`,
+         :monosp:`hammersley`, :monosp:`sobol`, :monosp:`lattice` or :monosp:`poisson_disk`.
+         (Default: lattice)
+     * - weights
+       - |string|
+       - Weights of the points, see :monosp:`weighted_numbers`: :monosp:`none`, :monosp:`torus`,
+         :monosp:`unbiased` or :monosp:`voronoi` (slightly biased). (Default: none)
+     * - timeout
+       - |float|
+       - Seconds after which to stop, 0 or less for no limit; kept as by :monosp:`composed_path`.
+         With a limit, sets have at most 64 points, and the render ends after a whole set.
+         (Default: -1)
+     * - (Nested plugin)
+       - |integrator|
+       - The integrator to render with, exactly one: any that samples camera rays, such as
+         :monosp:`path`, :monosp:`volpath` or one of ours.
 
     Attributes:
         purpose: The attribute of :class:`CameraSamples` that is taken over.

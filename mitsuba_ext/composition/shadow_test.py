@@ -31,6 +31,7 @@ class RejectedShadowRays(DecisionParameters):
         TypeError, ValueError: A parameter has a wrong type or value.
     """
 
+    name = "visibility_roulette"
     slots = ("shadow_test",)
     pilot_spp = 16
 

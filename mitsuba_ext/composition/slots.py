@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import mitsuba as mi
 
+from ..pointsets import PATTERNS
 from .camera_numbers import PURPOSES, WeightedNumbers
 from .connections import Connections
 from .decision_parameters import DecisionParameters, ParameterReader
 from .directions import Guided
-from .next_event import METHODS
+from .next_event import METHODS, LearnedLights, SpatialLights
 from .shadow_test import RejectedShadowRays
 
 _Maker = Callable[[ParameterReader], DecisionParameters]
@@ -26,6 +26,11 @@ SLOTS: dict[str, dict[str, _Maker | None]] = {
     "shadow_test": {"always": None, "visibility_roulette": RejectedShadowRays},
     **{slot: {"sampler": None} for slot in PURPOSES},
 }
+
+#: What can be nested into a slot, of this package.
+_PLUGINS: tuple[type[DecisionParameters], ...] = (
+    Guided, LearnedLights, SpatialLights, Connections, RejectedShadowRays, WeightedNumbers,
+)  # fmt: skip
 
 
 def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameters | None:
@@ -42,20 +47,21 @@ def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameter
         parameters.check_slot(plugin, slot)
         return parameters
     if slot == "connections" and type(value) is int:
-        return Connections(_defaults(plugin, count=value))
-    if slot in PURPOSES and isinstance(value, str) and value not in words:
-        parameters = WeightedNumbers(_defaults(plugin, pattern=value))
+        return Connections(ParameterReader.of_defaults(plugin, {"count": slot}, count=value))
+    if slot in PURPOSES and isinstance(value, str) and value in PATTERNS:
+        parameters = WeightedNumbers(ParameterReader.of_defaults(plugin, pattern=value))
         parameters.check_slot(plugin, slot)
         return parameters
     if not isinstance(value, str) or value not in words:
-        kind = value.class_name() if isinstance(value, mi.Object) else repr(value)
-        raise ValueError(
-            f'"{plugin}": the parameter "{slot}" is {kind}; it must be one of {", ".join(words)}, '
-            f"or a nested plugin that makes such decisions"
-        )
+        raise ValueError(f'"{plugin}": the parameter "{slot}" is {_accepted(slot, value)}')
     maker = words[value]
-    return None if maker is None else maker(_defaults(plugin))
+    return None if maker is None else maker(ParameterReader.of_defaults(plugin))
 
 
-def _defaults(plugin: str, **values: Any) -> ParameterReader:
-    return ParameterReader(plugin, mi.Properties(plugin), **values)
+def _accepted(slot: str, value: object) -> str:
+    """What to say of a value that a slot does not take."""
+    found = value.class_name() if isinstance(value, mi.Object) else repr(value)
+    words = [*SLOTS[slot], *(PATTERNS if slot in PURPOSES else ())]
+    number = "a number, " if slot == "connections" else ""
+    nested = " or ".join(f'"{kind.name}"' for kind in _PLUGINS if slot in kind.slots)
+    return f"{found}; it must be one of {', '.join(words)}, {number}or a nested plugin: {nested}"

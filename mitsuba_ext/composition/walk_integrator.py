@@ -28,16 +28,27 @@ class WalkIntegrator(StagedIntegrator):
     """An integrator whose samples are random walks.
 
     A subclass reads its own parameters and says with :meth:`fill` which decisions of the walk it
-    takes over. Common parameters:
+    takes over.
 
-    Parameters:
-        max_depth (int): Longest path in the image, −1 for no limit, 1 for visible emitters only.
-            Default: −1.
-        rr_depth (int): Depth at which Russian roulette begins. Default: 5.
-        hide_emitters (bool): Hide directly visible emitters. Default: false.
-        timeout (float): Seconds after which to stop; 0 or less for no limit. Default: −1.
-        aovs (str): Arbitrary output variables, as in Mitsuba's ``aov`` integrator
-            (``"depth:depth,nn:sh_normal"``). Default: none.
+    .. pluginparameters::
+
+     * - max_depth
+       - |int|
+       - Longest path in the image, -1 for no limit. 1 shows visible emitters only, 2 adds direct
+         illumination, and so on. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Path depth at which Russian roulette on the throughput begins. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: false)
+     * - (Common parameters)
+       - |float|
+       - Those of :class:`StagedIntegrator`: timeout.
+     * - aovs
+       - |string|
+       - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
+         :monosp:`depth:depth,nn:sh_normal`. (Default: none)
 
     Attributes:
         slots (dict[str, DecisionParameters]): What fills the slots of the walk.

@@ -20,12 +20,18 @@ NO_LIMIT = 0xFFFFFFFF
 
 
 class StagedIntegrator(mi.SamplingIntegrator):
-    """An integrator that renders in stages and passes (``rendering.py``).
+    """An integrator that renders in stages and passes (``render.py``).
 
-    Common parameters:
+    .. pluginparameters::
 
-    Parameters:
-        timeout (float): Seconds after which to stop; 0 or less for no limit. Default: −1.
+     * - timeout
+       - |float|
+       - Seconds after which to stop, learning and compilation included; 0 or less for no limit. The
+         number of samples follows from the speed of the first passes (short ones, until one
+         compiles nothing, and then one of a quarter of the time left), and not from the clock, so
+         that stopping does not prefer fast samples. Pilots get at most a quarter of the samples
+         that fit. The time is kept as well as the speed is steady; a short pass of each pilot, and
+         one of the rest, are always taken. (Default: -1)
 
     Attributes:
         sees_motion: It renders ``moving`` shapes.

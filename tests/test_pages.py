@@ -1,0 +1,164 @@
+"""The pages of plugins: what they say is true, and nothing is described twice."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from mitsuba_ext import pages, registry
+from mitsuba_ext.composition.slots import SLOTS
+from mitsuba_ext.specifications import make_named
+
+import mitsuba as mi  # isort: skip
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+FOLDERS = registry.plugin_names()
+FILES = {file.stem: file for folder in FOLDERS for file in registry.plugin_files(folder)}
+README = Path(__file__).parents[1] / "README.md"
+DECISIONS = FOLDERS["samplers"]
+#: The integrators that nest no other one.
+WALKS = ["composed_path", "neepp", "pss_guided", "reweighted_direct"]
+
+#: A value that each parameter accepts, besides the words that its row begins with.
+VALUES = {
+    **dict.fromkeys(["max_depth", "rr_depth", "grid", "pilot_spp", "refine", "tile", "bounces"], 3),
+    **dict.fromkeys(["connections", "count", "light_samples", "camera_samples"], 3),
+    **dict.fromkeys(["hide_emitters", "rejection", "always_guide", "nee_first_bounce"], True),
+    **dict.fromkeys(["timeout", "max_memory", "slope"], 8.0), "floor": 0.5,
+    "aovs": "d:depth", "save_map": "map.npz", "load_map": "map.npz", "regions": "surfaces",
+    "directions": "guided", "next_event": "power", "shadow_test": "visibility_roulette",
+    "aperture": "sobol", "time": "sobol", "wavelength": "sampler", "pattern": "sobol",
+    "weights": "torus", "vertices": "all", "law": "affine", "target": "visibility",
+    "light_sampling": "visibility",
+}  # fmt: skip
+
+#: What makes a parameter known that is not always.
+CONDITIONS = {
+    ("composed_path", "pilot_spp"): {"next_event": "contribution"},
+    ("pss_guided", "tile"): {"regions": "tiles"},
+    ("guided_directions", "tile"): {"regions": "tiles"},
+    **{("neepp", key): {"rejection": True} for key in ("law", "slope", "floor")},
+    ("neepp", "refine"): {"rejection": True, "light_sampling": "uniform"},
+}
+
+
+def make(name: str, **values: object) -> tuple[mi.Object, list[str]]:
+    """A plugin, and those of its parameters that it does not know."""
+    properties = mi.Properties(name)
+    for key, value in values.items():
+        properties[key] = value
+    return mi.PluginManager.instance().create_object(properties), properties.unqueried()
+
+
+def described(name: str) -> dict[str, str]:
+    """The parameters on a page and their defaults."""
+    rows = pages.read_page(FILES[name]).parameters
+    return {key: row.default for row in rows for key in row.name.split(", ")}
+
+
+def test_row_of_common_parameters_stands_for_the_table_of_the_base_class(tmp_path):
+    row = "     * - {0}\n       - |int|\n       - {1}. (Default: 1)\n"
+    table = "\n    .. pluginparameters::\n\n"
+    common = "     * - (Common parameters)\n       - |several|\n       - Those of the base.\n"
+    (tmp_path / "deeper").mkdir()
+    (tmp_path / "root.py").write_text(
+        f'class Root:\n    """Root.\n{table}{row.format("e", "Root e")}    """\n'
+    )
+    (tmp_path / "deeper" / "base.py").write_text(
+        f'from ..root import Root\n\nclass Other:\n    pass\n\nclass Base(Root):\n    """Base.\n'
+        f'{table}{row.format("b", "Base b")}{common}{row.format("c", "Base c")}    """\n'
+    )
+    plugin = tmp_path / "plugin.py"
+    plugin.write_text(
+        f'from .deeper.base import Base\nfrom x import y\nraise SystemExit\n\n@y\nclass P(Base):\n'
+        f'    """P.\n{table}{row.format("a", "Own a")}{common}{row.format("c", "Own c")}    """\n'
+    )
+    parameters = pages.read_page(plugin).parameters
+    assert [(row.name, row.description) for row in parameters] == [
+        ("a", "Own a."), ("b", "Base b."), ("e", "Root e."), ("c", "Own c."),
+    ]
+    plugin.write_text(f'class P(Base):\n    """P.\n{table}{common}    """\n')
+    with pytest.raises(ValueError, match="P has no base class with"):
+        pages.read_page(plugin)
+
+
+@pytest.mark.parametrize("name", WALKS)
+def test_integrators_describe_the_common_parameters_by_reference(name):
+    own = {row.name: row for row in pages.read_page(FILES[name]).parameters}
+    shared = {row.name: row for row in pages.read_page(FILES["composed_path"]).parameters}
+    for key in ("max_depth", "rr_depth", "hide_emitters", "timeout", "aovs"):
+        assert own[key] == shared[key]
+        assert f"* - {key}\n" not in FILES[name].read_text()
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_pages_have_what_their_readers_look_for(name):
+    page, text = pages.read_page(FILES[name]), FILES[name].read_text()
+    prose = " ".join(page.text.split())
+    assert page.title.endswith(f"({name})") and f"-{name}:\n" in text and page.parameters
+    for words in ("**Use it when**", "**Not when**", "Source", "'type': '", ' type="'):
+        assert words in prose
+    for row in page.parameters:
+        assert row.type and len(row.description) > 10, row
+    if name in DECISIONS:
+        assert "composed_path" in page.summary and "--integrator" in page.text
+
+
+@pytest.mark.parametrize("name", [*WALKS, *DECISIONS])
+def test_every_parameter_of_a_page_is_known(name):
+    for key in described(name):
+        _, unknown = make(name, **{key: VALUES[key], **CONDITIONS.get((name, key), {})})
+        assert not unknown
+
+
+@pytest.mark.parametrize("name", [*WALKS, *DECISIONS])
+def test_what_str_shows_is_on_the_page_with_the_same_default(name):
+    text = str(make(name)[0])
+    assert text.startswith(f"{name}[\n")
+    on_page = described(name)
+    for key, value in re.findall(r"^  (\w+) = (.*?),?$", text, re.MULTILINE):
+        if key in SLOTS and name != "composed_path":  # of a preset: with several parameters
+            continue
+        default = on_page[key].partition(";")[0].partition(" ")[0]
+        if value != "automatic":
+            assert {value.lower(), value.removesuffix(".0")} & {default, default.rstrip(",")}
+
+
+def test_str_of_an_integrator_calls_decisions_as_a_scene_does():
+    text = str(make_named("composed_path:directions=guided,next_event=contribution").integrator)
+    assert "directions = guided_directions[regions = surfaces, bounces = 6," in text
+    # Parameters without a value are left out, and those that the scene leaves to us say so
+    assert "next_event = learned_lights[target = contribution, grid = automatic," in text
+    assert "map" not in text and "learned_lights[grid = 0" not in text
+    assert "next_event = power\n" in str(make_named("neepp:light_sampling=power").integrator)
+    spatial = make_named("composed_path:next_event=[spatial_lights:grid=8]").integrator
+    assert "spatial_lights[grid = 8," in str(spatial)
+
+
+@pytest.mark.parametrize("name", ["composed_path", *DECISIONS])
+def test_examples_are_the_same_as_xml_as_a_dict_and_on_the_command_line(name):
+    text = pages.read_page(FILES[name]).text
+    (xml,) = re.findall(r"<integrator.*</integrator>", text, re.DOTALL)
+    (values,) = re.findall(r"^ *('type'.*?\n *\}.*?)\n\n", text, re.DOTALL | re.MULTILINE)
+    (line,) = re.findall(r'"(composed_path:.*)"', text)
+    scene = mi.load_string(f'<scene version="3.0.0">{xml}</scene>')
+    shown = {str(scene.integrator()), str(mi.load_dict(eval(f"{{{values}}}")))}
+    assert {*shown, str(make_named(line).integrator)} == shown and len(shown) == 1
+    assert name in shown.pop()
+
+
+def test_example_of_the_readme_loads():
+    (xml,) = re.findall(r"```xml\n(.*?)```", README.read_text(), re.DOTALL)
+    assert "bounces = 4" in str(mi.load_string(f'<scene version="3.0.0">{xml}</scene>'))
+    for name in re.findall(r"\]\((?:integrators|samplers)/(\w+)\.py\)", README.read_text()):
+        assert name in FILES
+    assert all(f"/{name}.py" in README.read_text() for name in FILES)
+
+
+def test_a_decision_cannot_be_the_sampler_of_a_sensor():
+    sampler = mi.load_dict({"type": "guided_directions"})
+    with pytest.raises(RuntimeError, match='nest it in a "composed_path", as "directions"'):
+        sampler.next_1d()
