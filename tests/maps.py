@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -49,6 +51,11 @@ def surface(p, n=(0, 0, 1), width: int = 1) -> mi.SurfaceInteraction3f:
     return si
 
 
+def vertex_at(depth: int, si: mi.SurfaceInteraction3f | None = None) -> SimpleNamespace:
+    """What decisions about directions ask of a vertex."""
+    return SimpleNamespace(si=si, depth=mi.UInt32(depth))
+
+
 def observe(light_map: LightMap, cell: int, visible: int, blocked: int, value: float) -> None:
     si = surface((0.1, 0.1, 0), width=visible + blocked)
     row = light_map.rows.row(si, mi.Bool(True))
@@ -65,7 +72,7 @@ def row_of(light_map: LightMap, values: mi.Float) -> np.ndarray:
 
 
 def learner_of(scene: mi.Scene, **parameters) -> LightLearner:
-    defaults = {"target": "contribution", "rejection": None, "grid": 0, "max_memory": 2**26,
+    defaults = {"target": "contribution", "grid": 0, "max_memory": 2**26,
                 "pilot_samples": 100_000}
     learner = LightLearner(**{**defaults, **parameters})
     learner.start(scene, *vertices())

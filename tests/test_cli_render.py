@@ -19,8 +19,8 @@ from conftest import PATH
 
 from mitsuba_ext.cli.stopping import Stop, stopping
 from mitsuba_ext.compare import images, load_scene, read_exr, write_exr
-from mitsuba_ext.rendering.render import interrupts, seed_passes
-from mitsuba_ext.rendering.render import render as rendering
+from mitsuba_ext.rendering import interrupts, seed_passes
+from mitsuba_ext.rendering import render as rendering
 from mitsuba_ext.scene_remarks import scene_remarks
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from batched import film_channels, small_scene
 
+from mitsuba_ext.rendering import seed_passes
 from mitsuba_ext.rendering.batches import batch_seeds
-from mitsuba_ext.rendering.render import seed_passes
 from mitsuba_ext.rendering.seed_passes import SeedPasses
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -13,7 +13,7 @@ import pytest
 from mitsuba_ext import marks
 from mitsuba_ext.cli import supervisor
 from mitsuba_ext.compare import InputError
-from mitsuba_ext.rendering.render import interrupts
+from mitsuba_ext.rendering import interrupts
 
 #: What the lines of a worker can use. It is started anew with the same lines.
 WORKER = """
