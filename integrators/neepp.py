@@ -161,5 +161,5 @@ class NEEPlusPlus(WalkIntegrator):
         lights = make_lights(read) if make_lights else None
         learns = isinstance(lights, LearnedLights)
         rejection = RejectedShadowRays(read, has_own_map=not learns) if rejects else None
-        read.refuse_without_effect(_CONDITIONS)
         self.fill(props, next_event=lights, shadow_test=rejection)
+        read.refuse_without_effect(_CONDITIONS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,6 +15,7 @@ from mitsuba_ext.decisions.next_event.light_table import Choice
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.regions.surface_rows import SurfaceRows, voxel_edges
 from mitsuba_ext.regions.surface_sides import region
+from mitsuba_ext.transport.path_decisions import EmitterSampling, LightNumbers
 
 
 def lamp(*position: float, radiance: float = 1.0, size: float = 0.1, **more) -> dict:
@@ -49,6 +51,23 @@ def surface(p, n=(0, 0, 1), width: int = 1) -> mi.SurfaceInteraction3f:
     si.sh_frame = mi.Frame3f(si.n)
     si.wi = mi.Vector3f(0, 0, 1)
     return si
+
+
+def connect(
+    selection: EmitterSampling,
+    scene: mi.Scene | None,
+    sampler: mi.Sampler,
+    si: mi.SurfaceInteraction3f,
+) -> tuple[mi.DirectionSample3f, mi.Spectrum, Any, Any]:
+    """A connection of each lane from ``si``, as the first of its path: the direction sample, its
+    weight, the choice, and the state of ``selection`` when it leaves."""
+    state, active = selection.begin(sampler, mi.Ray3f()), mi.Bool(True)
+    place = selection.visit(state, scene, si, active)
+    choices = {0: lambda: None, 1: sampler.next_1d, 2: sampler.next_2d}
+    choice = choices[selection.choice_dimension]()
+    numbers = LightNumbers(sampler.next_2d(), choice)
+    ds, weight, chosen = selection.sample(place, scene, numbers, si, active)
+    return ds, weight, chosen, selection.remember(place)
 
 
 def vertex_at(depth: int, si: mi.SurfaceInteraction3f | None = None) -> SimpleNamespace:

@@ -65,12 +65,10 @@ class ParameterReader:
     ) -> None:
         self.plugin, self._props = plugin, props
         self._names, self._defaults = names or {}, defaults
-        self._read: set[str] = set()
 
     def __call__(self, key: str, default: Any, **accepted: Any) -> Any:
         """A parameter, checked: see :func:`mitsuba_ext.parameters.read_parameter`."""
         name = self._names.get(key, key)
-        self._read.add(name)
         default = self._defaults.get(key, default)
         return read_parameter(self.plugin, self._props, name, default, **accepted)
 
@@ -79,7 +77,7 @@ class ParameterReader:
         return self._names.get(key, key) in self._props
 
     def refuse_without_effect(self, conditions: Mapping[str, str]) -> None:
-        """Refuses parameters that nobody has read.
+        """Refuses parameters that nobody has read until now.
 
         Parameters:
             conditions: By name, what a parameter needs to have an effect.
@@ -88,7 +86,7 @@ class ParameterReader:
             ValueError: The scene gives such a parameter.
         """
         for key, condition in conditions.items():
-            if key in self._props and key not in self._read:
+            if key in self._props and not self._props.was_queried(key):
                 raise ValueError(
                     f'"{self.plugin}": the parameter "{key}" needs {condition}; leave it out'
                 )
