@@ -22,7 +22,8 @@ from ..nesting import with_nested
 from .batches import sample_count
 from .camera import film_extent
 from .interrupts import deferred_interrupt
-from .render import check_extent, kernel_cache_misses
+from .plan import check_extent
+from .render import kernel_cache_misses
 
 #: Samples of a pass, about: one or two seconds on two CPU cores. Their number must not depend on
 #: the speed: the same seed gives the same image.
