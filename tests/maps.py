@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -12,6 +15,7 @@ from mitsuba_ext.decisions.next_event.light_table import Choice
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.regions.surface_rows import SurfaceRows, voxel_edges
 from mitsuba_ext.regions.surface_sides import region
+from mitsuba_ext.transport.path_decisions import EmitterSampling, LightNumbers
 
 
 def lamp(*position: float, radiance: float = 1.0, size: float = 0.1, **more) -> dict:
@@ -49,6 +53,28 @@ def surface(p, n=(0, 0, 1), width: int = 1) -> mi.SurfaceInteraction3f:
     return si
 
 
+def connect(
+    selection: EmitterSampling,
+    scene: mi.Scene | None,
+    sampler: mi.Sampler,
+    si: mi.SurfaceInteraction3f,
+) -> tuple[mi.DirectionSample3f, mi.Spectrum, Any, Any]:
+    """A connection of each lane from ``si``, as the first of its path: the direction sample, its
+    weight, the choice, and the state of ``selection`` when it leaves."""
+    state, active = selection.begin(sampler, mi.Ray3f()), mi.Bool(True)
+    place = selection.visit(state, scene, si, active)
+    choices = {0: lambda: None, 1: sampler.next_1d, 2: sampler.next_2d}
+    choice = choices[selection.choice_dimension]()
+    numbers = LightNumbers(sampler.next_2d(), choice)
+    ds, weight, chosen = selection.sample(place, scene, numbers, si, active)
+    return ds, weight, chosen, selection.remember(place)
+
+
+def vertex_at(depth: int, si: mi.SurfaceInteraction3f | None = None) -> SimpleNamespace:
+    """What decisions about directions ask of a vertex."""
+    return SimpleNamespace(si=si, depth=mi.UInt32(depth))
+
+
 def observe(light_map: LightMap, cell: int, visible: int, blocked: int, value: float) -> None:
     si = surface((0.1, 0.1, 0), width=visible + blocked)
     row = light_map.rows.row(si, mi.Bool(True))
@@ -65,7 +91,7 @@ def row_of(light_map: LightMap, values: mi.Float) -> np.ndarray:
 
 
 def learner_of(scene: mi.Scene, **parameters) -> LightLearner:
-    defaults = {"target": "contribution", "rejection": None, "grid": 0, "max_memory": 2**26,
+    defaults = {"target": "contribution", "grid": 0, "max_memory": 2**26,
                 "pilot_samples": 100_000}
     learner = LightLearner(**{**defaults, **parameters})
     learner.start(scene, *vertices())

@@ -73,16 +73,23 @@ def two_halves(
 
 
 @contextlib.contextmanager
-def _one_thread_per_worker() -> Iterator[None]:
-    """One thread of Dr.Jit if each core runs a test process: more threads would keep the cores busy
-    while they wait for work."""
+def one_thread() -> Iterator[None]:
+    """With one thread of Dr.Jit, floats are added in the same order: the same seed gives bitwise
+    the same image. No EXR file may be read or written meanwhile: Mitsuba 3.9.1 would wait for
+    ever."""
     count = dr.thread_count()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        dr.set_thread_count(1)
+    dr.set_thread_count(1)
     try:
         yield
     finally:
+        dr.sync_thread()
         dr.set_thread_count(count)
+
+
+def _one_thread_per_worker() -> contextlib.AbstractContextManager[None]:
+    """Where a process for each core runs tests, its other threads would only wait for work, and
+    keep the cores busy with that."""
+    return one_thread() if "PYTEST_XDIST_WORKER" in os.environ else contextlib.nullcontext()
 
 
 def assert_images_are_sound(images: np.ndarray, tolerance: float = 0.0) -> None:

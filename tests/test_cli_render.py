@@ -19,7 +19,7 @@ from conftest import PATH
 
 from mitsuba_ext.cli.stopping import Stop, stopping
 from mitsuba_ext.compare import images, load_scene, read_exr, write_exr
-from mitsuba_ext.rendering import interrupts, seed_passes
+from mitsuba_ext.rendering import interrupts, plan, seed_passes
 from mitsuba_ext.rendering import render as rendering
 from mitsuba_ext.scene_remarks import scene_remarks
 
@@ -156,13 +156,14 @@ def test_render_interrupted_before_its_first_pass_leaves_an_older_file_alone(
 
 @pytest.fixture(params=["path", "composed_path"])
 def third_pass_gets(request, monkeypatch):
-    """Sends signals, 10 ms apart, in every third pass of 4 samples; returns the integrator."""
-    module, job = {"path": (seed_passes, "SeedPasses"), "composed_path": (rendering, "_Job")}[
-        request.param
-    ]
-    monkeypatch.setattr(module, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 4 * 8 * 6})
-    monkeypatch.setattr(module, "_PASS_SPP", 1)
-    run_pass, passes = getattr(module, job)._run_pass, []
+    """What makes every third pass of 4 samples get signals, 10 ms from each other; returns the
+    integrator."""
+    job, lengths = {
+        "path": (seed_passes.SeedPasses, seed_passes), "composed_path": (rendering._Job, plan),
+    }[request.param]  # fmt: skip
+    monkeypatch.setattr(lengths, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 4 * 8 * 6})
+    monkeypatch.setattr(lengths, "_PASS_SPP", 1)
+    run_pass, passes = job._run_pass, []
 
     def set_signals(*names: str) -> str:
         def interrupted(self, *arguments):
@@ -172,7 +173,7 @@ def third_pass_gets(request, monkeypatch):
                 time.sleep(0.01)
             return run_pass(self, *arguments)
 
-        monkeypatch.setattr(getattr(module, job), "_run_pass", interrupted)
+        monkeypatch.setattr(job, "_run_pass", interrupted)
         return request.param
 
     return set_signals

@@ -19,6 +19,7 @@ from techniques import TECHNIQUES
 
 from mitsuba_ext.garbage import garbage_left_alone
 from mitsuba_ext.materials.glass import GLASSES
+from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.heroes import DISPERSES, Heroes, disperses, warn_of_sampler
 from mitsuba_ext.transport.walk import Walk
 
@@ -107,7 +108,7 @@ def test_one_wavelength_is_that_of_path_with_its_index(variant: str, glass, wrap
     def with_walk(sampler):
         ray = rays(sampler)
         ray.wavelengths = mi.Spectrum(λ)
-        return [dr.mean(Walk(8, 5)(scene, sampler, ray, mi.Bool(True)).L)]
+        return [dr.mean(Walk(8, 5)(scene, sampler, CameraRays(ray), mi.Bool(True)).L)]
 
     def with_path(sampler):
         ray = mi.RayDifferential3f(rays(sampler))
@@ -131,7 +132,7 @@ def test_bands_of_wavelengths_have_their_light(variant: str, glass: str, wrapper
             ray = rays(sampler)
             λ, weight = wavelengths(sampler, spread)
             ray.wavelengths = λ
-            L = Walk(8, 5)(scene, sampler, ray, mi.Bool(True)).L * weight
+            L = Walk(8, 5)(scene, sampler, CameraRays(ray), mi.Bool(True)).L * weight
             limits = zip(map(float, BANDS), map(float, BANDS[1:]))
             return [dr.mean(dr.select((λ >= a) & (λ < b), L, 0)) for a, b in limits]
 
@@ -148,7 +149,7 @@ def test_connections_and_scattering_agree(variant: str, glass: str) -> None:
         ray = rays(sampler)
         λ, weight = wavelengths(sampler)
         ray.wavelengths = λ
-        L = Walk(6, 6)(scene, sampler, ray, mi.Bool(True)).L * weight
+        L = Walk(6, 6)(scene, sampler, CameraRays(ray), mi.Bool(True)).L * weight
         return [dr.mean(dr.select(λ < 530.0, L, 0)), dr.mean(dr.select(λ < 530.0, 0, L))]
 
     scene = stage(GLASS[glass])
@@ -272,7 +273,8 @@ def test_refraction_leaves_one_wavelength_and_reflection_four(variant: str) -> N
         sampler.seed(1, 1000)
         ray = mi.Ray3f(mi.Point3f(0, 0, -4), dr.normalize(mi.Vector3f(sampler.next_1d(), 0, 4)))
         ray.wavelengths = mi.Spectrum(400, 500, 600, 700)
-        L = Walk(100, 100)(scene, sampler, ray, mi.Bool(True), None, hero_weight).L
+        rays = CameraRays(ray, hero_weight=hero_weight)
+        L = Walk(100, 100)(scene, sampler, rays, mi.Bool(True)).L
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wavelengths = ray.wavelengths
         return np.array(L / scene.environment().eval(si))

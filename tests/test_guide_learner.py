@@ -9,13 +9,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import area, diffuse, film, lookat, rectangle, sensor
+from maps import vertex_at
 
-from mitsuba_ext.decisions import DirectionSamples
+from mitsuba_ext.composition.decision_parameters import Setting
 from mitsuba_ext.decisions.directions.guide_learner import GuideLearner, most_efficient
 from mitsuba_ext.decisions.directions.guided_directions import GuidedDirections
 from mitsuba_ext.decisions.directions.path_records import BYTES_PER_RECORD, PathRecords
 from mitsuba_ext.decisions.directions.surface_regions import SurfaceRegions
 from mitsuba_ext.decisions.directions.tile_regions import TileRegions
+from mitsuba_ext.transport.path_decisions import DirectionSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -54,11 +56,10 @@ def _pilot(
     state = learner.guide and learner.guide.begin(None, None, pixel)
     L, β, active = mi.Float(0), mi.Float(1), mi.Bool(scatters)
     for depth in range(2):
-        sample, weight = numbers.next_2d(), mi.Float(1)
+        sample, weight, vertex = numbers.next_2d(), mi.Float(1), vertex_at(depth)
         if learner.guide:
-            depths = mi.UInt32(depth)
-            _, sample, weight, state = learner.guide.draw(state, numbers, None, depths, active)
-        learner.direction(None, mi.UInt32(depth), sample, weight, mi.Color3f(L), active)
+            _, sample, weight, state = learner.guide.draw(state, numbers, vertex, active)
+        learner.direction(vertex, sample, weight, mi.Color3f(L), active)
         β *= weight
     L += β * brought(pixel, sample)
     learner.end(mi.Color3f(L))
@@ -92,7 +93,7 @@ def test_gain_of_each_share_is_that_of_its_density() -> None:
         learner.learn(None, is_last=pilot == 1)
         pixel, u = _pixels(), _Numbers(10).next_2d()
         state = guide.begin(None, None, pixel)
-        first = guide.draw(state, _Numbers(11), None, mi.UInt32(0), mi.Bool(True))
+        first = guide.draw(state, _Numbers(11), vertex_at(0), mi.Bool(True))
         tree = guide.regions.tree(first[3], None, mi.Bool(True))
         mixed = guide.trees.density(tree, u, mi.Bool(True))[0].numpy()
         density = (mixed - (1 - share)) / share
@@ -129,9 +130,9 @@ def test_a_guide_that_does_not_pay_is_given_up_unless_told_otherwise(always: boo
     learner = _learner(_Measured, always=always)
     for seed in range(2):
         _pilot(learner, seed)
-        decisions = learner.learn(None, is_last=False)
+        decision = learner.learn(None, is_last=False)
     assert (learner.guide is not None) == always
-    assert (type(decisions["directions"]) is DirectionSamples) == (not always)
+    assert (type(decision) is DirectionSamples) == (not always)
     assert learner.guidance.gain == 0 and str(learner).startswith("no guide: ") == (not always)
 
 
@@ -173,11 +174,11 @@ def test_later_directions_are_not_guided() -> None:
     learner.learn(None, is_last=True)
     guide = GuidedDirections(learner.guide.trees, learner.guide.regions, bounces=1)
     state, active = guide.begin(None, None, _pixels()), mi.Bool(True)
-    state = guide.draw(state, _Numbers(2), None, mi.UInt32(0), active)[3]
-    _, sample, weight, after = guide.draw(state, _Numbers(3), None, mi.UInt32(1), active)
+    state = guide.draw(state, _Numbers(2), vertex_at(0), active)[3]
+    _, sample, weight, after = guide.draw(state, _Numbers(3), vertex_at(1), active)
     assert (sample == _Numbers(3).next_2d()).numpy().all() and (weight == 1).numpy().all()
     assert (after == state).numpy().all()
-    guided = learner.guide.draw(state, _Numbers(3), None, mi.UInt32(1), active)[2]
+    guided = learner.guide.draw(state, _Numbers(3), vertex_at(1), active)[2]
     assert not (guided == 1).numpy().all()
 
 
@@ -188,11 +189,13 @@ def test_regions_follow_the_film_and_the_pilots() -> None:
     # Two voxels with the least number of places, and one with less
     p = np.array([[0.1, 0.9, 0.1], [0.1, 0.9, 0.9], [0.1, 0.9, 0.1]]).repeat([8, 8, 7], axis=1)
     up = np.tile([[0], [0], [1]], 23)
+    lit = mi.load_dict({"type": "scene", "lamp": {"type": "point"}})
     made = []
     for regions in ("tiles", "surfaces"):
         tile = {"tile": 4} if regions == "tiles" else {}
         integrator = mi.load_dict({"type": "pss_guided", "regions": regions, **tile})
-        (learner,) = integrator.learners(None, camera, 14 * 10 * 8)
+        setting = Setting(lit, camera, 0, 3, 8, pilot_spp=8)
+        learner = integrator.slots["directions"].learner(setting, {})
         assert learner.wants_scout == (regions == "surfaces")
         made.append(learner.make_regions(mi.Point3f(p), mi.Normal3f(up)))
     assert made[0].count == 4 * 3
@@ -229,7 +232,7 @@ def test_importance_is_that_of_the_place_in_the_image() -> None:
         records.begin(160, dr.arange(mi.UInt32, 160))
         for depth in range(2):
             sample, L = mi.Point2f(0.5), mi.Color3f(0)
-            records.direction(None, mi.UInt32(depth), sample, 1.0, L, mi.Bool(True))
+            records.direction(vertex_at(depth), sample, 1.0, L, mi.Bool(True))
         records.end(mi.Color3f(mi.Float(brought)))
     records.finish()
     # The last group is filled up with the first paths

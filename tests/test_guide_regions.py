@@ -9,12 +9,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import diffuse, sensor, stage
+from maps import vertex_at
 
 from mitsuba_ext.decisions.directions.path_records import PathRecords
 from mitsuba_ext.decisions.directions.sample_trees import LEAF, SampleTrees
 from mitsuba_ext.decisions.directions.surface_regions import SurfaceRegions
 from mitsuba_ext.decisions.directions.tile_regions import TileRegions
 from mitsuba_ext.decisions.directions.tree_builder import cell_code
+from mitsuba_ext.transport.estimator import CameraRays
+from mitsuba_ext.transport.observer import Observer
 from mitsuba_ext.transport.walk import Walk
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -31,7 +34,7 @@ def _pass(records: PathRecords, bounces: list[int], samples: np.ndarray) -> None
         L = mi.Color3f(10.0 + depth * (depth + 1) / 2)
         active = mi.Bool([depth < count for count in bounces])
         sample = mi.Point2f(samples[depth])
-        records.direction(None, mi.UInt32(depth), sample, 2.0 + depth, L, active)
+        records.direction(vertex_at(depth), sample, 2.0 + depth, L, active)
     brought = [10.0 + count * (count + 1) / 2 for count in bounces]
     records.end(mi.Color3f(mi.Float(brought)))
 
@@ -81,7 +84,7 @@ def test_one_path_in_a_stride_is_recorded_in_each_pass() -> None:
 def test_a_stage_without_a_path_that_scatters_has_no_records() -> None:
     records = PathRecords(lambda si, pixel, active: pixel, bounces=2, stride=5)
     records.begin(3, dr.arange(mi.UInt32, 3))
-    records.direction(None, mi.UInt32(0), mi.Point2f(0.5), 1.0, mi.Color3f(0), mi.Bool(False))
+    records.direction(vertex_at(0), mi.Point2f(0.5), 1.0, mi.Color3f(0), mi.Bool(False))
     records.end(mi.Color3f(1))
     records.finish()
     assert (records.count, records.paths) == (0, 1)
@@ -91,7 +94,7 @@ def test_infinite_radiance_decides_nothing() -> None:
     records = PathRecords(lambda si, pixel, active: pixel, bounces=1, stride=1)
     records.begin(4, dr.arange(mi.UInt32, 4))
     sample = mi.Point2f([0.1, 0.2, 0.3, 0.4], 0.5)
-    records.direction(None, mi.UInt32(0), sample, 1.0, mi.Color3f(1), mi.Bool(True))
+    records.direction(vertex_at(0), sample, 1.0, mi.Color3f(1), mi.Bool(True))
     records.end(mi.Color3f(mi.Float(2, np.inf, np.nan, 3)))
     records.finish()
     np.testing.assert_array_equal(records.value.numpy(), [1, 0, 0, 2])
@@ -111,8 +114,8 @@ def test_records_of_a_walk_are_the_radiance_of_longer_paths() -> None:
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(5, lanes)
         ray, _ = mi.load_dict(sensor()).sample_ray(0, 0, sampler.next_2d(), mi.Point2f(0.5))
-        walk = Walk(max_depth, rr_depth=100, observer=observer)
-        sample = walk(scene, sampler, ray, mi.Bool(True), dr.arange(mi.UInt32, lanes))
+        walk = Walk(max_depth, rr_depth=100, observer=observer or Observer())
+        sample = walk(scene, sampler, CameraRays(ray, dr.arange(mi.UInt32, lanes)), mi.Bool(True))
         dr.eval(sample.L)
         return sample.L.numpy().mean(axis=0)
 

@@ -241,7 +241,7 @@ def test_wrong_value_is_named_with_its_parameter_and_plugin(
     ("plugin", "unknown"),
     [
         ("composed_path", "max_depht"),
-        ("composed_path", "grid"),  # known only with shadow_test=visibility_roulette
+        ("composed_path", "grid"),  # of nested decisions
         ("neepp", "voxels"),
         ("pss_guided", "tile"),  # known only with regions=tiles
     ],

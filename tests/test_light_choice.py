@@ -7,9 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from lights import ball
-from maps import floor, lamp, learner_of, map_of, observe, row_of, surface
+from maps import connect, floor, lamp, learner_of, map_of, observe, row_of, surface
 
 from mitsuba_ext.decisions.next_event.light_table import LightSelection, OneRow
+from mitsuba_ext.decisions.shadow_test.light_map_roulette import LightMapRouletteLearner
 from mitsuba_ext.lights import weights as lights_weights
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.transport.path_decisions import EmitterSampling
@@ -33,10 +34,10 @@ def test_the_density_of_a_light_that_is_hit_is_that_of_choosing_it():
     selection = LightSelection(light_map.rows, light_map.cells, mi.Float(weights))
     lanes = 1 << 12
     si = surface((0.1, 0.1, 0), width=lanes)
-    ds, _weight, choice = selection.sample(None, scene, _sampler(lanes), si, mi.Bool(True))
+    ds, _weight, _choice, state = connect(selection, scene, _sampler(lanes), si)
     hit = scene.ray_intersect(si.spawn_ray(ds.d))
     found = mi.DirectionSample3f(scene, hit, si)
-    pdf, _ = selection.pdf(choice, scene, si, hit, found, mi.Bool(True))
+    pdf = selection.density(state, scene, si, hit, found, mi.Bool(True))
     # At the edge of a cell, rounding may find its neighbour
     assert np.mean(np.isclose(pdf.numpy(), ds.pdf.numpy(), rtol=1e-3)) > 0.99
 
@@ -60,7 +61,7 @@ def test_dim_lights_among_many_are_chosen_as_often_as_is_said(count: int):
     sampler, si = _sampler(lanes), dr.zeros(mi.SurfaceInteraction3f, lanes)
     chosen = np.zeros(count)
     for _ in range(rounds):
-        choice = selection.sample(None, None, sampler, si, mi.Bool(True))[2]
+        choice = connect(selection, None, sampler, si)[2]
         chosen += np.bincount(choice.cell.numpy(), minlength=count)
     expected = rounds * lanes * weights / weights.sum(dtype=float)
     is_dim = weights < 1
@@ -72,7 +73,7 @@ def test_dim_lights_among_many_are_chosen_as_often_as_is_said(count: int):
 
 def test_no_light_has_less_than_its_defensive_share():
     learner = learner_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1)))
-    light_map = learner._map
+    light_map = learner.map
     observe(light_map, 0, 0, 100_000, 0.0)
     observe(light_map, 1, 100_000, 0, row_of(light_map, light_map.unoccluded)[1])
     p = row_of(light_map, learner._probabilities(light_map.weights("contribution")))
@@ -86,8 +87,8 @@ def test_a_beam_that_the_expectation_misses_keeps_a_share_as_large_as_in_path():
     scene = floor(beam=beam, sky={"type": "constant"})
     learner = learner_of(scene, grid=2)
     beam_cell = [e.class_name() for e in scene.emitters()].index("SpotLight")
-    cells = learner._map.cells
-    p = row_of(learner._map, learner._probabilities(learner._map.unoccluded))
+    cells = learner.map.cells
+    p = row_of(learner.map, learner._probabilities(learner.map.unoccluded))
     assert cells.count > 500
     assert 0.024 < p[cells.emitter_index == beam_cell].item() < 0.1
 
@@ -100,11 +101,11 @@ def test_lights_without_sampling_weight_stay_dark_where_no_other_light_arrives()
     )
     learner = learner_of(scene, grid=8)
     selection = LightSelection(
-        learner._map.rows, learner._map.cells, learner._probabilities(learner._map.unoccluded)
+        learner.map.rows, learner.map.cells, learner._probabilities(learner.map.unoccluded)
     )
     lanes = 1 << 12
     si = surface((0.6, 0.1, 0), width=lanes)
-    _ds, weight, choice = selection.sample(None, scene, _sampler(lanes), si, mi.Bool(True))
+    _ds, weight, choice, _state = connect(selection, scene, _sampler(lanes), si)
     assert not weight.numpy().any() and bool(dr.all(choice.probability == 1))
 
 
@@ -166,22 +167,25 @@ def test_pairs_that_are_all_alike_are_not_measured_again(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "wishes, ends",
-    [({}, True), ({"grid": 4}, False),
-     ({"rejection": {"law": "affine", "slope": 10.0, "floor": 0.1}}, False)],
-)  # fmt: skip
-def test_learning_that_does_not_pay_ends_with_the_choice_of_path_unless_needed(wishes, ends):
+    "wishes, rejects, ends",
+    [({}, False, True), ({"grid": 4}, False, False), ({}, True, False)],
+)
+def test_learning_that_does_not_pay_ends_with_the_choice_of_path_unless_needed(
+    wishes, rejects, ends
+):
     scene = floor(a=lamp(-0.1, 0, 50), b=lamp(0.1, 0, 50))  # nothing to choose between
     learner = learner_of(scene, **wishes)
+    if rejects:
+        LightMapRouletteLearner(learner, law="affine", slope=10.0, floor=0.1)
     for cell in (0, 1):
-        observe(learner._map, cell, 1000, 0, row_of(learner._map, learner._map.unoccluded)[cell])
-    decisions = learner.learn(scene, is_last=False)
-    assert (type(decisions["next_event"]) is EmitterSampling) == ends
-    assert ("not used" in str(learner)) == ends and (learner._map is None) == ends
+        observe(learner.map, cell, 1000, 0, row_of(learner.map, learner.map.unoccluded)[cell])
+    decision = learner.learn(scene, is_last=False)
+    assert (type(decision) is EmitterSampling) == ends
+    assert ("not used" in str(learner)) == ends and (learner.map is None) == ends
 
 
 def test_smooth_meshes_are_sampled_by_their_triangles_even_where_nothing_is_gained():
     assert not learner_of(floor(a=lamp(0, 0, 1)))._is_needed
     light = {**ball(16, 8, smooth=True), "emitter": {"type": "area"}}
     learner = learner_of(mi.load_dict({"type": "scene", "ball": light}))
-    assert learner._is_needed and learner._map is not None
+    assert learner._is_needed and learner.map is not None

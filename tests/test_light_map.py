@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from maps import floor, lamp, learner_of, map_of, observe, row_of, surface, vertices
+from maps import connect, floor, lamp, learner_of, map_of, observe, row_of, surface, vertices
 from statistical import assert_same_mean
 
 from mitsuba_ext.decisions.next_event.light_map import LightMap
@@ -19,6 +19,7 @@ from mitsuba_ext.decisions.shadow_test.light_map_roulette import LightRoulette
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.regions.surface_rows import RowCounts, SurfaceRows
 from mitsuba_ext.regions.surface_sides import region
+from mitsuba_ext.transport.estimator import CameraRays
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -32,8 +33,8 @@ def _scout(scene: mi.Scene, lanes: int = 4096) -> Scout:
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, lanes)
     ray = scene.sensors()[0].sample_ray(0, 0.5, sampler.next_2d(), sampler.next_2d())[0]
-    walk = integrator.stage(observer=scout).walk
-    dr.eval(walk(scene, sampler, mi.Ray3f(ray), mi.Bool(True)).L)
+    walk = integrator.walk(observer=scout)
+    dr.eval(walk(scene, sampler, CameraRays(ray), mi.Bool(True)).L)
     return scout
 
 
@@ -187,7 +188,7 @@ def test_probabilities_of_a_selection_are_those_of_its_weights_and_no_light_is_l
     lanes = 1 << 18
     sampler.seed(0, lanes)
     si = surface((0.1, 0.1, 0), width=lanes)
-    _ds, _weight, choice = selection.sample(None, scene, sampler, si, mi.Bool(True))
+    _ds, _weight, choice, _state = connect(selection, scene, sampler, si)
     row = weights.reshape(-1, 80)[int(choice.row[0])].astype(np.float64)
     expected = row / row.sum()
     counts = np.bincount(choice.cell.numpy(), minlength=80)
@@ -205,7 +206,7 @@ def test_the_grid_follows_the_number_of_samples_and_the_memory():
     scene = floor(**{f"lamp_{i}": lamp(i / 10 - 1, 0, 1, size=0.01) for i in range(20)})
 
     def entries(**parameters) -> int:
-        return len(learner_of(scene, **parameters)._map.tests)
+        return len(learner_of(scene, **parameters).map.tests)
 
     assert entries(pilot_samples=100) < entries(pilot_samples=100_000)
     assert entries(grid=64, max_memory=2**22) * 128 <= 2**22
@@ -217,9 +218,9 @@ def test_voxels_of_a_selection_without_learning_fit_into_the_memory():
 
     def rows(**parameters) -> int:
         integrator = mi.load_dict(
-            {"type": "composed_path", "next_event": "spatial", **parameters}
+            {"type": "neepp", "light_sampling": "spatial", **parameters}
         )
-        return integrator.light_sampling.voxel_rows(scene, 80).count
+        return integrator.slots["next_event"].voxel_rows(scene, 80).count
 
     assert 1 < rows(max_memory=0.5) <= 2**19 / 40 / 80 < rows()
     assert rows(grid=1) == 2

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from maps import floor, lamp, surface
+from maps import connect, floor, lamp, surface
 
 from mitsuba_ext.decisions.next_event.light_table import LightSelection, OneRow
 from mitsuba_ext.decisions.next_event.linear_lights import LinearSelection
@@ -125,8 +125,7 @@ def test_a_spot_of_one_bright_texel_is_not_lost_beside_a_lamp(by: str):
     si = surface((*_target(scene), 0), width=LANES)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, LANES)
-    state = selection.begin(sampler, mi.Ray3f())
-    _ds, weight, _state = selection.sample(state, scene, sampler, si, mi.Bool(True))
+    _ds, weight, _choice, _state = connect(selection, scene, sampler, si)
     chosen = weight.x.numpy()
     exact = sum(
         float(dr.mean(emitter.sample_direction(si, sampler.next_2d())[1].x)[0])

@@ -7,11 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import area, diffuse, film, lookat, rectangle, rgb, sensor
+from maps import connect
 from scipy import stats
 from statistical import REFERENCE_SEEDS, SEEDS, assert_same_mean, batches
 from techniques import REFERENCE
 
 from mitsuba_ext.decisions.next_event.linear_lights import LinearSelection
+from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.walk import Walk
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -132,8 +134,8 @@ def _select(scene: mi.Scene, si: mi.SurfaceInteraction3f):
     selection = LinearSelection(scene)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(7, LANES)
-    state = selection.begin(sampler, mi.Ray3f())
-    return selection, selection.sample(state, scene, sampler, si, mi.Bool(True))
+    ds, weight, _choice, state = connect(selection, scene, sampler, si)
+    return selection, (ds, weight, state)
 
 
 def _choices(
@@ -181,7 +183,7 @@ def test_emitters_are_chosen_as_often_as_the_density_says():
         at_the_point = dr.norm(ds_hit.p - ds.p) < 1e-4
         at_the_point |= ds.emitter == scene.environment()
         same = ~ds.delta & (ds_hit.emitter == ds.emitter) & at_the_point
-        pdf, _state = selection.pdf(state, scene, mi.Interaction3f(si), hit, ds_hit, same)
+        pdf = selection.density(state, scene, mi.Interaction3f(si), hit, ds_hit, same)
         same = same.numpy()
         assert same.mean() > 0.05
         np.testing.assert_allclose(pdf.numpy()[same], ds.pdf.numpy()[same], rtol=2e-3)
@@ -337,18 +339,25 @@ class _Recording(LinearSelection):
     def begin(self, sampler, ray):
         return mi.UInt32(0), super().begin(sampler, ray)
 
-    def sample(self, state, scene, sampler, si, active):
-        bounce, vertex = state
+    def visit(self, state, scene, si, active):
+        bounce, before = state
         inside = active & (bounce < self.bounces)
-        dr.scatter(self.previous, vertex.total, bounce, inside)
-        ds, weight, vertex = super().sample(vertex, scene, sampler, si, active)
-        dr.scatter(self.totals, vertex.total, bounce, inside)
-        dr.scatter(self.distances, ds.dist, bounce, inside)
-        return ds, weight, (bounce + 1, vertex)
+        dr.scatter(self.previous, before.total, bounce, inside)
+        place = super().visit(before, scene, si, active)
+        dr.scatter(self.totals, place[0].total, bounce, inside)
+        return bounce, place
 
-    def pdf(self, state, scene, ref, si, ds, active):
-        pdf, vertex = super().pdf(state[1], scene, ref, si, ds, active)
-        return pdf, (state[0], vertex)
+    def sample(self, place, scene, numbers, si, active):
+        bounce, place = place
+        ds, weight, choice = super().sample(place, scene, numbers, si, active)
+        dr.scatter(self.distances, ds.dist, bounce, active & (bounce < self.bounces))
+        return ds, weight, choice
+
+    def remember(self, place):
+        return place[0] + 1, super().remember(place[1])
+
+    def density(self, state, *arguments):
+        return super().density(state[1], *arguments)
 
 
 def test_each_bounce_sees_other_numbers_and_the_state_of_the_last():
@@ -364,7 +373,7 @@ def test_each_bounce_sees_other_numbers_and_the_state_of_the_last():
     sampler.seed(1, 1)
     ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -0.5), dr.normalize(mi.Vector3f(0.3, 0.2, -1)))
     sample = Walk(selection.bounces + 1, 100, next_event=selection)(
-        scene, sampler, ray, mi.Bool(True)
+        scene, sampler, CameraRays(ray), mi.Bool(True)
     )
     dr.eval(sample.L)
     totals, previous = selection.totals.numpy(), selection.previous.numpy()

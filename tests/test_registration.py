@@ -110,14 +110,16 @@ def test_a_scene_names_every_parameter_in_xml():
     _run("""
 import mitsuba_ext, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-neepp = '''<string name="law" value="affine"/> <float name="slope" value="4"/>
-    <integer name="refine" value="0"/> <float name="max_memory" value="8"/>
-    <integer name="grid" value="7"/> <integer name="pilot_spp" value="2"/>
-    <float name="floor" value="0.5"/> <integer name="max_depth" value="-1"/>
+common = '''<integer name="pilot_spp" value="2"/> <integer name="max_depth" value="-1"/>
     <integer name="rr_depth" value="9"/> <boolean name="hide_emitters" value="true"/>
     <float name="timeout" value="5"/> <string name="aovs" value="d:depth"/>'''
-composed = neepp + '<string name="shadow_test" value="visibility_roulette"/>'
-neepp += '''<boolean name="rejection" value="true"/>
+roulette = '''<string name="law" value="affine"/> <float name="slope" value="4"/>
+    <integer name="refine" value="0"/> <float name="max_memory" value="8"/>
+    <integer name="grid" value="7"/> <float name="floor" value="0.5"/>'''
+composed = (
+    f'{common} <sampler name="shadow_test" type="visibility_roulette">{roulette}</sampler>'
+)
+neepp = f'''{common} {roulette} <boolean name="rejection" value="true"/>
     <string name="light_sampling" value="uniform"/>'''
 for name, parameters in (("neepp", neepp), ("composed_path", composed)):
     integrator = mi.load_string(

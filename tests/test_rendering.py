@@ -10,10 +10,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.rendering import interrupts, time_budget
+from mitsuba_ext.rendering import interrupts, plan, time_budget
 from mitsuba_ext.rendering import render as rendering
-from mitsuba_ext.rendering.render import Stage
-from mitsuba_ext.transport.walk import PathSample
+from mitsuba_ext.rendering.stages import Stage
+from mitsuba_ext.transport.estimator import Sample
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -42,19 +42,29 @@ def scene(variant: str) -> mi.Scene:
 def small_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Four samples per pixel and pass."""
     limits = {dr.JitBackend.LLVM: 4 * WIDTH * HEIGHT}
-    monkeypatch.setattr(rendering, "_PASS_SAMPLES", limits)
-    monkeypatch.setattr(rendering, "_PASS_SPP", 1)
+    monkeypatch.setattr(plan, "_PASS_SAMPLES", limits)
+    monkeypatch.setattr(plan, "_PASS_SPP", 1)
 
 
 class _Constant:
-    """A walk whose every sample is worth the same."""
+    """An estimator whose every sample is worth the same."""
 
     def __init__(self, value: float) -> None:
         self.value = value
 
-    def __call__(self, scene, sampler, ray, active, pixel, hero_weight):
-        zero = dr.zeros(mi.UInt32, dr.width(ray))
-        return PathSample(mi.Color3f(self.value), mi.Bool(True), zero, zero, zero)
+    def __call__(self, scene, sampler, rays, active):
+        zero = dr.zeros(mi.UInt32, dr.width(rays.ray))
+        return Sample(mi.Color3f(self.value), mi.Bool(True), zero, zero, zero)
+
+
+class _Schedule:
+    """Stages that are there beforehand."""
+
+    def __init__(self, *stages: Stage) -> None:
+        self._stages = iter(stages)
+
+    def next_stage(self) -> Stage:
+        return next(self._stages)
 
 
 class _TwoStages:
@@ -71,9 +81,8 @@ class _TwoStages:
     def samples_per_set(self, spp):
         return 1
 
-    def stages(self, scene, sensor, samples, seed):
-        yield Stage(_Constant(1.0))
-        yield Stage(_Constant(3.0), "something")
+    def schedule(self, scene, sensor, samples, seed):
+        return _Schedule(Stage(_Constant(1.0)), Stage(_Constant(3.0), "something"))
 
     def aov_names(self):
         return []
@@ -95,7 +104,7 @@ def test_passes_of_large_films_keep_the_samples_of_a_pixel_together(scene, sampl
     sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
                            "film": {"type": "hdrfilm", "width": 2048, "height": 1024}})
     job = rendering._Job(_path(), scene, sensor, 0, spp)
-    assert job.stages == [spp] and job._pass_length(spp) == length
+    assert job.plan.stages == (spp,) and job.plan.pass_length(spp) == length
 
 
 def test_passes_of_expensive_samples_are_shorter(scene):
@@ -103,7 +112,7 @@ def test_passes_of_expensive_samples_are_shorter(scene):
     def length(**parameters):
         integrator = mi.load_dict({"type": "reweighted_direct", **parameters})
         job = rendering._Job(integrator, scene, scene.sensors()[0], 0, 1 << 20)
-        return job._pass_length(1 << 20)
+        return job.plan.pass_length(1 << 20)
 
     assert length(light_samples=1024) <= length(light_samples=1) / 60
 
@@ -167,7 +176,7 @@ def test_the_timeout_is_kept_and_cuts_the_pilots_short(scene, monkeypatch, timeo
     sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
                            "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT,
                                     "rfilter": {"type": "box"}}})
-    monkeypatch.setattr(rendering, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 8 * WIDTH * HEIGHT})
+    monkeypatch.setattr(plan, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 8 * WIDTH * HEIGHT})
     clock = _Clock(monkeypatch)
     integrator = _TwoStages(pilot_spp=25, timeout=timeout)
     image = rendering.render(integrator, scene, sensor, 0, 144, True, True).numpy()

@@ -99,11 +99,11 @@ def test_a_scene_names_it() -> None:
             </integrator>
         </scene>""")
     shown = str(scene.integrator())
-    assert "light_samples = 12" in shown and "weights = voronoi" in shown
+    assert "count = 12" in shown and "weights = voronoi" in shown
 
 
 @pytest.mark.parametrize("parameters, says", [
-    ({"light_samples": 0}, "at least 1"), ({"camera_samples": -1}, "at least 0"),
+    ({"light_samples": -1}, "at least 0"), ({"camera_samples": -1}, "at least 0"),
     ({"pattern": "grid"}, "one of independent"), ({"light_sample": 3}, "light_sample"),
 ])  # fmt: skip
 def test_errors_say_what_is_wrong(parameters, says):

@@ -17,6 +17,7 @@ from mitsuba_ext.decisions.shadow_test.visibility_roulette import (
     VisibilityRoulette,
 )
 from mitsuba_ext.regions.voxel_grid import VoxelGrid
+from mitsuba_ext.transport.estimator import CameraRays
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -170,11 +171,11 @@ def test_the_same_seed_gives_bitwise_the_same_map(scenes):
         integrator = mi.load_dict({"type": "neepp", "max_depth": 4})
         learner = VisibilityLearner(12, 16, 4, law="affine", slope=10, floor=0.1)
         learner.start(scene, mi.Point3f(), mi.Normal3f())
-        stage, visibility = integrator.stage(observer=learner), learner._map
+        walk, visibility = integrator.walk(observer=learner), learner._map
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(3, 50_000)
         ray = scene.sensors()[0].sample_ray(0, 0, sampler.next_2d(), sampler.next_2d())[0]
-        dr.eval(stage.walk(scene, sampler, ray, mi.Bool(True)).L)
+        dr.eval(walk(scene, sampler, CameraRays(ray), mi.Bool(True)).L)
         visibility.refine(scene, 4)
         walk_maps.append((visibility.tests.numpy(), visibility.successes.numpy()))
     (tests, successes), (tests_again, successes_again) = walk_maps

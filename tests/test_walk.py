@@ -11,7 +11,13 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from mitsuba_ext.decisions import DirectionSamples, EmitterSampling, SceneQuery, ShadowTest
+from mitsuba_ext.transport.estimator import CameraRays
+from mitsuba_ext.transport.path_decisions import (
+    DirectionSamples,
+    EmitterSampling,
+    SceneQuery,
+    ShadowTest,
+)
 from mitsuba_ext.transport.walk import Walk
 
 BOUNCES = 4
@@ -37,8 +43,8 @@ class _RecordingDirections(DirectionSamples):
     def begin(self, sampler, ray, pixel):
         return mi.UInt32(0)
 
-    def draw(self, state, sampler, si, depth, active):
-        sample_1, sample_2, weight, _ = super().draw((), sampler, si, depth, active)
+    def draw(self, state, sampler, vertex, active):
+        sample_1, sample_2, weight, _ = super().draw((), sampler, vertex, active)
         self.recorder.write(state, sample_2.x, active)
         return sample_1, sample_2, weight, state + 1
 
@@ -50,14 +56,13 @@ class _RecordingNextEvent(EmitterSampling):
     def begin(self, sampler, ray):
         return mi.UInt32(0)
 
-    def sample(self, state, scene, sampler, si, active):
-        ds, weight, _ = super().sample((), scene, sampler, si, active)
-        self.recorder.write(state, ds.uv.x, active)
-        return ds, weight, state + 1
+    def visit(self, state, scene, si, active):
+        return state + 1
 
-    def pdf(self, state, scene, ref, si, ds, active):
-        pdf, _ = super().pdf((), scene, ref, si, ds, active)
-        return pdf, state
+    def sample(self, place, scene, numbers, si, active):
+        ds, weight, _ = super().sample((), scene, numbers, si, active)
+        self.recorder.write(place - 1, ds.uv.x, active)
+        return ds, weight, place
 
 
 class _RecordingShadowTest(ShadowTest):
@@ -114,7 +119,7 @@ def _trace(scene: mi.Scene, **decisions):
     ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -0.5), dr.normalize(mi.Vector3f(0.3, 0.2, -1)))
     ray.time = dr.zeros(mi.Float, LANES)
     walk = Walk(max_depth=BOUNCES + 1, rr_depth=100, **decisions)
-    sample = walk(scene, sampler, ray, mi.Bool(True))
+    sample = walk(scene, sampler, CameraRays(ray), mi.Bool(True))
     dr.eval(sample.L)
     return sample
 
@@ -153,7 +158,7 @@ def test_a_rejected_connection_traces_no_shadow_ray_and_survivors_weigh_more(box
         sampler.seed(0, 200_000)
         ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -0.5), dr.normalize(mi.Vector3f(0.3, 0.2, -1)))
         ray.time = dr.zeros(mi.Float, 200_000)
-        sample = walk(box, sampler, ray, mi.Bool(True))
+        sample = walk(box, sampler, CameraRays(ray), mi.Bool(True))
         return float(dr.mean(sample.L.x)[0]), float(dr.mean(mi.Float(sample.shadow_count))[0])
 
     L, rays = total(Walk(3, 100))
@@ -176,7 +181,7 @@ def test_weights_of_guided_samples_do_not_end_paths(box):
         ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -0.5), dr.normalize(mi.Vector3f(0.3, 0.2, -1)))
         ray.time = dr.zeros(mi.Float, 10_000)
         walk = Walk(20, rr_depth=1, directions=directions)
-        sample = walk(box, sampler, ray, mi.Bool(True))
+        sample = walk(box, sampler, CameraRays(ray), mi.Bool(True))
         return float(dr.mean(mi.Float(sample.scatter_count))[0])
 
     expected = scattered(DirectionSamples())

@@ -82,7 +82,7 @@ def test_sets_within_sets_are_cut_alike_at_any_depth(variant):
         inner = nest(("lens", "time"), timeout=3.0)
         outer = mi.load_dict({"type": "reweighted_wavelength", "timeout": timeout, "nested": inner})
         scene = white()
-        (stage,) = outer.stages(scene, scene.sensors()[0], [4096], 1)
+        stage = outer.schedule(scene, scene.sensors()[0], (4096,), 1).next_stage()
         return {numbers._sets.count for numbers in vars(stage.camera).values()}
 
     assert points_of_sets(9.0) == {64} and points_of_sets(-1.0) == {1024}
@@ -92,7 +92,8 @@ def test_sets_within_sets_are_cut_alike_at_any_depth(variant):
 def test_purposes_pixels_and_sets_draw_numbers_of_their_own(variant):
     nested = nest(("lens", "time", "wavelength"), pattern="sobol")
     scene = white()
-    (stage,) = mi.load_dict(nested).stages(scene, scene.sensors()[0], [16], 1)
+    schedule = mi.load_dict(nested).schedule(scene, scene.sensors()[0], (16,), 1)
+    stage = schedule.next_stage()
     pixel = dr.arange(mi.UInt32, 1 << 15)
     sets = vars(stage.camera).values()
     for one in sets:

@@ -1,0 +1,90 @@
+"""Imports point one way: plugins → composition → decisions → transport, regions, lights; rendering
+knows estimators only, and ``pointsets`` needs nobody's scene."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "mitsuba_ext"
+
+#: The folders of plugins, which are installed as parts of the package.
+PLUGINS = ("integrators", "emitters", "bsdfs", "shapes", "samplers")
+
+#: By room, what it imports nothing of.
+FORBIDDEN = {
+    "transport": {"decisions", "composition", "rendering", *PLUGINS},
+    "regions": {"transport", "decisions", "composition", "rendering", *PLUGINS},
+    "lights": {"decisions", "composition", "rendering", *PLUGINS},
+    "decisions": {"composition", "rendering", *PLUGINS},
+    "rendering": {"decisions", "composition", *PLUGINS},
+    "composition": set(PLUGINS),
+    "pointsets": {"transport", "regions", "lights", "decisions", "composition", "rendering",
+                  *PLUGINS},
+    "compare": {"transport", "regions", "lights", "decisions", "composition", *PLUGINS},
+}  # fmt: skip
+
+
+def _imports(file: Path, package: list[str]) -> Iterator[tuple[str, ...]]:
+    """The modules that a file imports, anywhere in it, as paths from ``mitsuba_ext``.
+
+    Parameters:
+        package: The path of the package that holds the file, ``mitsuba_ext`` included.
+    """
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            modules = [alias.name.split(".") for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            base = base + (node.module.split(".") if node.module else [])
+            # What is imported may itself be a module
+            modules = [[*base, alias.name] for alias in node.names]
+        else:
+            continue
+        yield from (tuple(module[1:]) for module in modules if module[0] == "mitsuba_ext")
+
+
+def _files(folder: Path) -> Iterator[tuple[Path, list[str]]]:
+    for file in sorted(folder.rglob("*.py")):
+        yield file, ["mitsuba_ext", *file.relative_to(PACKAGE).parts[:-1]]
+
+
+@pytest.mark.parametrize("room", FORBIDDEN)
+def test_a_room_imports_nothing_that_stands_above_it(room: str) -> None:
+    files = list(_files(PACKAGE / room))
+    assert files, "the room is gone"
+    upward = [
+        f"{file.relative_to(ROOT)} imports {'.'.join(module)}"
+        for file, package in files
+        for module in _imports(file, package)
+        if module and module[0] in FORBIDDEN[room]
+    ]
+    assert not upward, "\n".join(upward)
+
+
+def test_pointsets_need_neither_mitsuba_nor_drjit() -> None:
+    for file, _package in _files(PACKAGE / "pointsets"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not {name.split(".")[0] for name in names} & {"mitsuba", "drjit"}, file
+
+
+def test_the_parser_of_imports_sees_relative_and_absolute_ones(tmp_path: Path) -> None:
+    file = tmp_path / "file.py"
+    file.write_text(
+        "from ..lights import weights\n"
+        "from .maps.grid import Grid\n"
+        "from ... import bounds\n"
+        "import mitsuba_ext.rendering.plan, numpy\n"
+        "def late():\n    from mitsuba_ext.composition import slots\n"
+    )
+    found = set(_imports(file, ["mitsuba_ext", "decisions", "next_event"]))
+    assert found == {
+        ("decisions", "lights", "weights"), ("decisions", "next_event", "maps", "grid", "Grid"),
+        ("bounds",), ("rendering", "plan"), ("composition", "slots"),
+    }  # fmt: skip
