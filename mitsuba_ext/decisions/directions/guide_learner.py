@@ -26,6 +26,9 @@ _LEAST_SHARE = 0.2
 #: path (measured: 0 to 10 %, and 1 to 8 %); and the efficiency that it must reach.
 _COST, _COST_OF_BOUNCE, _LEAST_EFFICIENCY = 0.05, 0.05, 1.02
 
+#: The efficiency of trees of few samples that lets learning go on: those of more are better.
+_TRIAL_EFFICIENCY = 0.97
+
 
 class Guidance(NamedTuple):
     """How to guide, and what that is worth.
@@ -117,11 +120,12 @@ class GuideLearner(Learner):
         if self.guide is not None and records.count > records.first_new:
             self.guidance = most_efficient(self.gains(records), all_bounces=self.always)
             share, bounces, gain, efficiency = self.guidance
-            # A trial tells whether guiding pays, but not for how many bounces
+            least = _LEAST_EFFICIENCY
             if records.paths < _LEAST_SHARE * self.pilot_samples / records.stride:
-                bounces = self.bounces
+                # A short trial tells whether guiding is hopeless, but not for how many bounces
+                bounces, least = self.bounces, _TRIAL_EFFICIENCY
             effect = f"about {gain:.0%} less variance"
-            if efficiency < _LEAST_EFFICIENCY and not self.always:
+            if efficiency < least and not self.always:
                 self.guide, self._records = None, None
                 self._summary = f"no guide: with {self._regions}, {effect}"
                 return DirectionSamples()

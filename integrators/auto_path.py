@@ -1,0 +1,68 @@
+"""Path tracing that decides by itself what to learn."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.composition.decision_parameters import ParameterReader
+from mitsuba_ext.composition.directions import Guided
+from mitsuba_ext.composition.next_event import LearnedLights
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+
+
+@registry.plugin
+class AutoPath(WalkIntegrator):
+    r"""
+    .. _integrator-auto_path:
+
+    Self-configuring path tracer (:monosp:`auto_path`)
+    --------------------------------------------------
+
+    A path tracer that tries in its first samples whether guiding directions and learning lights
+    pay in this scene, and keeps what does. There is nothing to choose.
+
+    .. pluginparameters::
+
+     * - pilot_spp
+       - |int|
+       - Samples per pixel from which is learned, at most a quarter of all. They count towards the
+         image. With 0 nothing is learned, and this is :monosp:`path`. (Default: 32)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+
+    **Use it when** you do not know which technique a scene needs, with 16 samples per pixel or
+    more. **Not when** an image has fewer samples (there is nothing to learn from), or when light
+    comes through glass from small lamps (no path from the camera finds it).
+
+    It is a :monosp:`composed_path` with :monosp:`directions=guided` and
+    :monosp:`next_event=contribution`; :monosp:`guided_directions` and :monosp:`learned_lights` tell
+    what is learned, and how. The first two pilots are short: together they predict by how much each
+    of the two lowers the variance of the image. What costs more time than it saves ends there.
+    :monosp:`integrator.statistics.learned` says what was kept, and why.
+
+    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
+    pilot.
+
+    Sources: those of :monosp:`guided_directions` and :monosp:`learned_lights`. The predictions are
+    ours.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="auto_path">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'auto_path',
+            'max_depth': 8
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        read = ParameterReader.of_defaults(self.name)
+        self.fill(props, directions=Guided(read), next_event=LearnedLights(read))
