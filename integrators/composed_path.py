@@ -73,9 +73,9 @@ class ComposedPath(WalkIntegrator):
 
     A scene nests a decision as a :monosp:`sampler`, which is what Mitsuba takes it for, under the
     name of the slot. Every decision goes with every decision of the other slots, and the image
-    stays unbiased (but for :monosp:`voronoi` weights). All that learn share the same pilots: three
-    where directions are guided, two where lights are learned, one where only
-    :monosp:`visibility_roulette` learns. Beside learned lights, :monosp:`visibility_roulette` uses
+    stays unbiased (but for :monosp:`voronoi` weights). All that learn share the same pilots: two
+    short ones, which show whether learning pays, and one or two longer ones (a single one, if only
+    :monosp:`visibility_roulette` learns). Beside learned lights, :monosp:`visibility_roulette` uses
     their map, and knows no parameters of a map of its own. :monosp:`neepp`, :monosp:`pss_guided`
     and :monosp:`reweighted_direct` are path tracers with some of these decisions, under one name
     each.

@@ -52,11 +52,11 @@ class GuidedDirectionsPlugin(DecisionPlugin):
 
     Each tree is a k-d tree over the two numbers by which a BSDF chooses a direction. Its density is
     the average that paths brought from there on, drawn to the average of larger surroundings where
-    there are few samples, and mixed with uniform numbers. The second of three pilots shows what the
-    trees of the first are worth. From that follows how much of the samples trees decide (40, 60 or
-    80 %), and how many bounces are worth the time of guiding them. If none is, learning ends there,
-    and directions are those of :monosp:`path`. With fewer than 3 pilot samples per pixel
-    (:monosp:`pilot_spp` of the integrator) nothing is guided. After a render,
+    there are few samples, and mixed with uniform numbers. The second pilot draws from the trees of
+    the first, and shows what they are worth. From that follows how much of the samples trees decide
+    (40, 60 or 80 %), and how many bounces are worth the time of guiding them. If none is, learning
+    ends there, and directions are those of :monosp:`path`. With fewer than 3 pilot samples per
+    pixel (:monosp:`pilot_spp` of the integrator) nothing is guided. After a render,
     :monosp:`integrator.statistics.learned` tells what was found, and
     :monosp:`integrator.learners["directions"].guide` holds it (see examples/learned_samples.py).
 

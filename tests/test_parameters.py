@@ -36,9 +36,13 @@ def test_only_parameters_with_an_effect_are_shown():
     assert "law" not in str(mi.load_dict({"type": "neepp"}))
     paper = str(mi.load_dict({"type": "neepp", "rejection": True, "law": "paper"}))
     assert "law = paper" in paper and "slope" not in paper and "refine" not in paper
-    spatial = {"type": "composed_path", "next_event": "spatial", "grid": 7, "aovs": "d:depth"}
-    text = str(mi.load_dict(spatial))
+    spatial = {"type": "spatial_lights", "grid": 7}
+    composed = {"type": "composed_path", "shadow_test": "visibility_roulette", "aovs": "d:depth"}
+    text = str(mi.load_dict({"type": "composed_path", "next_event": spatial, "aovs": "d:depth"}))
     assert "grid = 7" in text and "pilot_spp" not in text and "aovs = d:depth" in text
+    assert "refine = 16" in str(mi.load_dict(composed))
+    # Beside learned lights, the roulette has no map of its own
+    assert "refine" not in str(mi.load_dict({**composed, "next_event": "contribution"}))
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import mitsuba as mi
@@ -99,6 +100,10 @@ class ParameterReader:
                 )
 
 
+#: What fills the slots of an integrator.
+Slots = Mapping[str, "DecisionParameters"]
+
+
 class DecisionParameters:
     """The parameters of what can take over one decision of the walk. One object serves all renders:
     it holds nothing that belongs to one.
@@ -128,7 +133,7 @@ class DecisionParameters:
                 f"{', '.join(self.slots)}"
             )
 
-    def check_together(self, plugin: str, slots: Mapping[str, DecisionParameters]) -> None:
+    def check_together(self, plugin: str, slots: Slots) -> None:
         """
         Raises:
             ValueError: One of these parameters has no effect beside what fills the other slots.
@@ -146,11 +151,16 @@ class DecisionParameters:
         """Who learns, if anyone does; ``others`` are the learners of earlier slots."""
         return None
 
-    def parameters(self) -> dict[str, Any]:
-        """Names and values for ``str()``: of all parameters but those that are empty."""
+    def parameters(self, slots: Slots = MappingProxyType({})) -> dict[str, Any]:
+        """Names and values for ``str()``, of the parameters that are not empty and have an effect
+        beside what fills ``slots``."""
         own = {key: value for key, value in vars(self).items() if not key.startswith("_")}
         return {key: value for key, value in own.items() if value != ""}
 
-    def __str__(self) -> str:
-        values = ", ".join(f"{key} = {value}" for key, value in self.parameters().items())
+    def describe(self, slots: Slots = MappingProxyType({})) -> str:
+        """Name and parameters beside what fills ``slots``, in one line."""
+        values = ", ".join(f"{key} = {value}" for key, value in self.parameters(slots).items())
         return f"{self.name}[{values}]" if values else self.name
+
+    def __str__(self) -> str:
+        return self.describe()

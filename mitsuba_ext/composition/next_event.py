@@ -18,7 +18,7 @@ from ..files import check_target
 from ..lights.light_cells import LightCells
 from ..lights.weights import VoxelRows, power_weights, spatial_weights
 from ..regions.voxel_grid import VoxelGrid
-from .decision_parameters import DecisionParameters, ParameterReader, Setting
+from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 
 #: Voxels along each axis for ``spatial``, where the scene's author does not say.
 _SPATIAL_GRID = 32
@@ -80,8 +80,8 @@ class SpatialLights(DecisionParameters):
             )
         return rows
 
-    def parameters(self) -> dict[str, Any]:
-        return {**super().parameters(), "grid": self.grid or "automatic"}
+    def parameters(self, *slots: Slots) -> dict[str, Any]:
+        return {**super().parameters(*slots), "grid": self.grid or "automatic"}
 
 
 class LearnedLights(DecisionParameters):
@@ -135,8 +135,8 @@ class LearnedLights(DecisionParameters):
             self._plugin,
         )
 
-    def parameters(self) -> dict[str, Any]:
-        return {**super().parameters(), "grid": self.grid or "automatic"}
+    def parameters(self, *slots: Slots) -> dict[str, Any]:
+        return {**super().parameters(*slots), "grid": self.grid or "automatic"}
 
 
 #: What lights can be learned for, the default first.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
 
 import mitsuba as mi
 
@@ -10,11 +12,14 @@ from ..decisions.learner import Learner
 from ..decisions.next_event.light_map_learner import LightLearner
 from ..decisions.shadow_test.light_map_roulette import LightMapRouletteLearner
 from ..decisions.shadow_test.visibility_roulette import VisibilityLearner, has_lights_at_points
-from .decision_parameters import DecisionParameters, ParameterReader, Setting
+from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 from .next_event import LearnedLights
 
 #: Voxels along each axis where the scene's author does not say.
 _GRID = 16
+
+#: Parameters of a map of its own.
+_OF_OWN_MAP = ("grid", "max_memory", "refine")
 
 
 class RejectedShadowRays(DecisionParameters):
@@ -46,14 +51,19 @@ class RejectedShadowRays(DecisionParameters):
             self.grid = read("grid", _GRID, minimum=1, maximum=1024)
             self.max_memory = read("max_memory", 512.0, minimum=1e-3)
             self.refine = read("refine", 16, minimum=0, maximum=1024)
-            self._given = [key for key in ("grid", "max_memory", "refine") if read.is_given(key)]
+            self._given = [key for key in _OF_OWN_MAP if read.is_given(key)]
 
-    def check_together(self, plugin: str, slots: Mapping[str, DecisionParameters]) -> None:
-        if self._given and isinstance(slots.get("next_event"), LearnedLights):
+    def check_together(self, plugin: str, slots: Slots) -> None:
+        if self._given and not self._uses_own_map(slots):
             raise ValueError(
                 f'"{plugin}": the parameter "{self._given[0]}" of "shadow_test" needs lights that '
                 f"are not learned; leave it out"
             )
+
+    def parameters(self, slots: Slots = MappingProxyType({})) -> dict[str, Any]:
+        of_own_map = () if self._uses_own_map(slots) else _OF_OWN_MAP
+        own = super().parameters(slots)
+        return {key: value for key, value in own.items() if key not in of_own_map}
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
         return spp > 0 and (not self._has_own_map or has_lights_at_points(scene))
@@ -70,3 +80,6 @@ class RejectedShadowRays(DecisionParameters):
         if not self.can_learn(setting.scene, setting.pilot_spp):
             return None
         return VisibilityLearner(self.grid, self.max_memory, self.refine, **law)
+
+    def _uses_own_map(self, slots: Slots) -> bool:
+        return not isinstance(slots.get("next_event"), LearnedLights)

@@ -90,9 +90,7 @@ class WalkIntegrator(StagedIntegrator):
             self._pilot_spp = self.parameter(props, "pilot_spp", max(wishes), minimum=0)
 
     def parameters(self) -> dict[str, Any]:
-        slots = {
-            slot: str(parameters).replace("\n", "\n  ") for slot, parameters in self.slots.items()
-        }
+        slots = {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
         return {**slots, **({} if self._pilot_spp is None else {"pilot_spp": self._pilot_spp})}
 
     # ---- What the render asks for ----
