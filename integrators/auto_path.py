@@ -8,6 +8,7 @@ from mitsuba_ext import registry
 from mitsuba_ext.composition.decision_parameters import ParameterReader
 from mitsuba_ext.composition.directions import Guided
 from mitsuba_ext.composition.next_event import LearnedLights
+from mitsuba_ext.composition.roulette import GuidedRoulette
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 
 
@@ -65,4 +66,9 @@ class AutoPath(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         read = ParameterReader.of_defaults(self.name)
-        self.fill(props, directions=Guided(read), next_event=LearnedLights(read))
+        self.fill(
+            props,
+            directions=Guided(read),
+            next_event=LearnedLights(read),
+            roulette=GuidedRoulette(),
+        )

@@ -8,6 +8,7 @@ from mitsuba_ext import registry
 from mitsuba_ext.composition.connections import Connections
 from mitsuba_ext.composition.decision_parameters import ParameterReader
 from mitsuba_ext.composition.directions import Guided
+from mitsuba_ext.composition.roulette import GuidedRoulette
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.decisions.directions.guide_learner import GuideLearner
 from mitsuba_ext.decisions.directions.guided_directions import GuidedDirections
@@ -95,6 +96,7 @@ class PSSGuided(WalkIntegrator):
         self.fill(
             props,
             directions=Guided(self.reader(props)),
+            roulette=GuidedRoulette(),
             connections=Connections(none) if none else None,
         )
 

@@ -21,7 +21,7 @@ class Setting:
     Attributes:
         scene, sensor: What is rendered.
         seed: Of the render.
-        max_depth: Longest path in segments.
+        max_depth, rr_depth: Longest path in segments, and depth at which roulette begins.
         spp: Samples per pixel of the render.
         pilot_spp: Of these, in pilots.
         is_timed: Can a timeout end the render before it has all samples?
@@ -31,6 +31,7 @@ class Setting:
     sensor: mi.Sensor
     seed: int
     max_depth: int
+    rr_depth: int
     spp: int
     pilot_spp: int = 0
     is_timed: bool = False

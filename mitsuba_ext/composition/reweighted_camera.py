@@ -87,7 +87,7 @@ class ReweightedCamera(StagedIntegrator):
             check_motion_is_seen(self.nested, scene)
             schedule = OneStage(_NestedEstimator(self.nested, sensor.get_medium()))
         setting = Setting(
-            scene, sensor, seed, NO_LIMIT, sum(samples), is_timed=self.timeout > 0
+            scene, sensor, seed, NO_LIMIT, NO_LIMIT, sum(samples), is_timed=self.timeout > 0
         )
         numbers = self.numbers.numbers(self.name, self.purpose, setting)
         return _Reweighted(schedule, self.purpose, numbers) if numbers else schedule

@@ -12,6 +12,7 @@ from .connections import Connections
 from .decision_parameters import DecisionParameters, ParameterReader
 from .directions import Guided
 from .next_event import METHODS, LearnedLights, SpatialLights
+from .roulette import GuidedRoulette
 from .shadow_test import RejectedShadowRays
 
 _Maker = Callable[[ParameterReader], DecisionParameters]
@@ -22,6 +23,7 @@ _Maker = Callable[[ParameterReader], DecisionParameters]
 SLOTS: dict[str, dict[str, _Maker | None]] = {
     "directions": {"uniform": None, "guided": Guided},
     "next_event": METHODS,
+    "roulette": {"automatic": lambda read: GuidedRoulette(), "throughput": None},
     "connections": {"one": None},
     "shadow_test": {"always": None, "visibility_roulette": RejectedShadowRays},
     **{slot: {"sampler": None} for slot in PURPOSES},

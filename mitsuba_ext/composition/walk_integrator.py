@@ -114,8 +114,9 @@ class WalkIntegrator(StagedIntegrator):
     ) -> Schedule:
         *pilots, _rest = samples
         setting = Setting(
-            scene, sensor, seed, self.max_depth, sum(samples), sum(pilots), self.timeout > 0
-        )
+            scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), sum(pilots),
+            self.timeout > 0,
+        )  # fmt: skip
         schedule = Schedule(
             self.name, self.slots, setting, len(pilots), self.walk, self._query(scene)
         )
@@ -132,7 +133,7 @@ class WalkIntegrator(StagedIntegrator):
         """One sample, for integrators that nest this one and draw its samples (``moment``; ``aov``
         calls :meth:`render`). Nothing is learned there: each decision that needs a pilot falls
         back to its default."""
-        setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, 1)
+        setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1)
         decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}
         decisions = {slot: decision for slot, decision in decisions.items() if decision}
         walk = self.walk(query=self._query(scene), **decisions)

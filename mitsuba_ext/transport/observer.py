@@ -7,7 +7,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from .vertex import Vertex
+from .vertex import PathState, Vertex
 
 
 class Observer:
@@ -48,6 +48,10 @@ class Observer:
         """The number ``sample``, of density 1 / ``weight``, chose the direction in which a path
         goes on; it has brought ``L`` until now."""
 
+    def survival(self, path: PathState, probability: mi.Float, active: mi.Bool) -> None:
+        """A path goes on with this probability; ``path`` is what it carries to the next vertex, not
+        yet divided by the probability."""
+
     def end(self, L: mi.Spectrum) -> None:
         """All paths of the pass are at their end, and bring ``L``."""
 
@@ -76,6 +80,10 @@ class Observers(Observer):
     def direction(self, *arguments: Any) -> None:
         for observer in self._observers:
             observer.direction(*arguments)
+
+    def survival(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.survival(*arguments)
 
     def end(self, L: mi.Spectrum) -> None:
         for observer in self._observers:

@@ -249,6 +249,10 @@ class SceneQuery:
         return ray
 
 
+#: The largest probability with which ``path`` lets a path go on.
+LARGEST_PROBABILITY = 0.95
+
+
 class Roulette:
     """Which paths go on: the rule of Mitsuba's ``path``, by throughput."""
 
@@ -259,9 +263,14 @@ class Roulette:
     def survival(
         self, state: Any, vertex: Vertex, path: PathState, active: mi.Bool
     ) -> tuple[mi.Float, Any]:
-        """The probability, in (0, 1], with which a path goes on from ``vertex`` in the direction
-        that was chosen there, and the new state. ``path`` is what it would carry along."""
-        # Where guided samples are dense, paths have little throughput because they matter; a hero
-        # has more since it stands for four
-        β_max = dr.max(path.β)
-        return dr.minimum(β_max / path.sampling_weight * dr.square(path.η), 0.95), state
+        """The probability, in (0, 1] where ``active``, with which a path leaves ``vertex`` in the
+        direction that was chosen there, and the new state. ``path`` is what it would carry along:
+        its depth is that of the next vertex, and what survives is divided by the probability."""
+        return dr.minimum(unguided_throughput(path), LARGEST_PROBABILITY), state
+
+
+def unguided_throughput(path: PathState) -> mi.Float:
+    """The largest component of the throughput, without its sampling weight, and without what
+    refraction does to it. Where guided samples are dense, paths have little throughput because they
+    matter; and a hero stands for four wavelengths."""
+    return dr.max(path.β) / path.sampling_weight * dr.square(path.η)

@@ -180,12 +180,14 @@ class Walk:
             next_event_state = self._leave(connects, place)
 
             # ----- Russian roulette -----
-            survival, roulette_state = self.roulette.survival(
-                roulette_state, vertex, path, active_next
-            )
             rr_active = path.depth >= self.rr_depth
+            is_black = dr.max(path.β) == 0
+            survival, roulette_state = self.roulette.survival(
+                roulette_state, vertex, path, active_next & rr_active & ~is_black
+            )
             rr_continue = sampler.next_1d() < survival
-            active = active_next & (~rr_active | rr_continue) & (dr.max(path.β) != 0)
+            self.observer.survival(path, dr.select(rr_active, survival, 1), active_next)
+            active = active_next & (~rr_active | rr_continue) & ~is_black
             path.β[rr_active] *= dr.rcp(survival)
 
             pi = self.query.closest(scene, ray, coherent=False, active=active)

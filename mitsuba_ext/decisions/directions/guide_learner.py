@@ -9,8 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...transport.path_decisions import DirectionSamples
+from ...transport.observer import Observer
+from ...transport.path_decisions import DirectionSamples, Roulette
 from ..learner import Learner
+from ..roulette.adjoint_roulette import AdjointRoulette
+from ..roulette.pixel_estimates import PixelEstimates
+from ..roulette.roulette_trial import BYTES_PER_PATH, RouletteTrial
 from .guided_directions import GuidedDirections, Regions
 from .path_records import BYTES_PER_RECORD, PathRecords
 from .sample_trees import SampleTrees
@@ -57,11 +61,15 @@ class GuideLearner(Learner):
         bounces: How many directions of a path are guided, at most.
         max_memory: Bytes for what is recorded, and for what is built from it.
         pilot_samples: Samples of all pilots together.
-        always: Guide all ``bounces``, also where the second pilot shows that it does not pay?
+        always: Guide all ``bounces``, and learn the roulette, also where the pilots show that it
+            does not pay?
 
     Attributes:
         guide (GuidedDirections): What was learned; ``None`` where nothing is guided.
+        roulette (Roulette): That of the next stage.
         guidance (Guidance): The last choice; ``None`` before the second pilot has shown a gain.
+        trial (RouletteTrial): What the roulette of the last pilot was worth; ``None`` where none is
+            learned.
         sample_count (int): How many samples of directions the trees were built from.
     """
 
@@ -79,6 +87,9 @@ class GuideLearner(Learner):
         self.always = always
         self.guide: GuidedDirections | None = None
         self.guidance: Guidance | None = None
+        self.roulette, self.trial = Roulette(), None
+        self._rr_depth: int | None = None
+        self._pixels: PixelEstimates | None = None
         self.sample_count = 0
         self._records: PathRecords | None = None
         self._share, self._summary = _FIRST_SHARE, ""
@@ -88,22 +99,45 @@ class GuideLearner(Learner):
         if self.wants_scout and dr.width(p) == 0:
             return
         self._regions = self.make_regions(p, n)
-        most = self.pilot_samples * self.bounces * BYTES_PER_RECORD
-        self._records = PathRecords(self._regions.label, self.bounces, -(-most // self.max_memory))
+        bytes_per_path = self.bounces * BYTES_PER_RECORD
+        if self._rr_depth is not None:
+            bytes_per_path += BYTES_PER_PATH
+        stride = -(-self.pilot_samples * bytes_per_path // self.max_memory)
+        if self._rr_depth is not None:
+            self.trial = RouletteTrial(stride, self._rr_depth)
+        self._records = PathRecords(self._regions.label, self.bounces, stride, self._pixels)
+
+    def learn_roulette(self, rr_depth: int, film_width: int) -> None:
+        """Asks for a roulette as well.
+
+        Parameters:
+            rr_depth: Depth at which roulette begins.
+            film_width: Pixels of a row of the film, with its border where that is sampled.
+        """
+        self._rr_depth, self._pixels = rr_depth, PixelEstimates(film_width)
 
     # ---- Observer ----
 
-    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
-        if self._records is not None:
-            self._records.begin(lanes, pixel)
+    def begin(self, *arguments: Any) -> None:
+        for observer in self._observers():
+            observer.begin(*arguments)
 
     def direction(self, *arguments: Any) -> None:
-        if self._records is not None:
-            self._records.direction(*arguments)
+        for observer in self._observers():
+            observer.direction(*arguments)
+
+    def survival(self, *arguments: Any) -> None:
+        for observer in self._observers():
+            observer.survival(*arguments)
 
     def end(self, L: mi.Spectrum) -> None:
-        if self._records is not None:
-            self._records.end(L)
+        for observer in self._observers():
+            observer.end(L)
+
+    def _observers(self) -> list[Observer]:
+        if self._records is None:
+            return []
+        return [observer for observer in (self._records, self.trial) if observer is not None]
 
     # ---- Between the stages ----
 
@@ -112,21 +146,26 @@ class GuideLearner(Learner):
         if records is None:
             return None
         records.finish()
+        if self.trial is not None:
+            self.trial.finish()
         if records.count == 0:
             self._records, self._summary = None, "no guide: no path scatters"
             return None
         bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
         self.sample_count = records.count
         if self.guide is not None and records.count > records.first_new:
-            self.guidance = most_efficient(self.gains(records), all_bounces=self.always)
+            # A short trial tells whether guiding is hopeless, but not for how many bounces
+            is_trial = records.paths < _LEAST_SHARE * self.pilot_samples / records.stride
+            least = _TRIAL_EFFICIENCY if is_trial else _LEAST_EFFICIENCY
+            gains = self.gains(records)
+            against_path = self._against_path(gains, least)
+            self.guidance = most_efficient(gains, self.always, *against_path)
             share, bounces, gain, efficiency = self.guidance
-            least = _LEAST_EFFICIENCY
-            if records.paths < _LEAST_SHARE * self.pilot_samples / records.stride:
-                # A short trial tells whether guiding is hopeless, but not for how many bounces
-                bounces, least = self.bounces, _TRIAL_EFFICIENCY
+            if is_trial:
+                bounces = self.bounces
             effect = f"about {gain:.0%} less variance"
             if efficiency < least and not self.always:
-                self.guide, self._records = None, None
+                self.guide, self._records, self.roulette = None, None, Roulette()
                 self._summary = f"no guide: with {self._regions}, {effect}"
                 return DirectionSamples()
         builder, roots, below = self._regions.build(records)
@@ -139,6 +178,8 @@ class GuideLearner(Learner):
             below,
         )
         records.restart_counting()
+        if self.trial is not None:
+            self.trial.restart()
         self._share = share
         self._summary = (
             f"guide: {self._regions}, {records.count} samples, trees of "
@@ -146,14 +187,35 @@ class GuideLearner(Learner):
             f"samples, {effect}"
         )
         self.guide = GuidedDirections(trees, self._regions, bounces)
+        if self._pixels is not None:
+            radiance = self._regions.incident_radiance(records)
+            self.roulette = AdjointRoulette(self._regions, radiance, self._pixels.scale())
         return self.guide
 
     def finish(self) -> None:
         self._records = None
 
+    def _against_path(
+        self, gains: Mapping[float, np.ndarray], least: float
+    ) -> tuple[float, float]:
+        """What uniform samples would have with the roulette of the next stage, in units of what
+        ``path`` has: variance, and length of paths. Takes the roulette of ``path`` again where the
+        last pilot shows that the learned one has not ``least`` times its efficiency."""
+        if self.trial is None:
+            return 1.0, 1.0
+        chosen, path = self.trial.drawn, self.trial.unguided
+        by_throughput = self.trial.by_throughput
+        if self._pixels is not None and not self.always:
+            if chosen.efficiency(by_throughput) < least:
+                self._pixels, self.roulette, chosen = None, Roulette(), by_throughput
+        if path.variance <= 0 or not np.isfinite(path.variance + chosen.variance):
+            return 1.0, 1.0
+        guided = max(1 - gains[self._share].sum(), 1e-3)
+        return chosen.variance / path.variance / guided, chosen.segments / path.segments
+
     def gains(self, records: PathRecords) -> dict[float, np.ndarray]:
-        """By how much, relatively, the trees that drew the last samples lower the variance: for
-        each share that they could decide, by bounce."""
+        """By how much, relatively, the trees that drew the last samples lower the variance
+        under the same roulette: for each share that they could decide, by bounce."""
         new = dr.arange(mi.UInt32, records.count - records.first_new)
         new += dr.opaque(mi.UInt32, records.first_new)
         value, weight, importance, bounce = (
@@ -184,20 +246,24 @@ class GuideLearner(Learner):
 
 
 def most_efficient(
-    gains: Mapping[float, np.ndarray], all_bounces: bool = False
+    gains: Mapping[float, np.ndarray],
+    all_bounces: bool = False,
+    variance: float = 1.0,
+    segments: float = 1.0,
 ) -> Guidance:
     """The most efficient way to guide.
 
     Parameters:
         gains: By how much, relatively, the variance is lower: for each share, by bounce.
         all_bounces: Choose among those that guide all bounces?
+        variance, segments: Of uniform samples under the same roulette, in units of ``path``'s.
     """
     candidates = []
     for share, by_bounce in gains.items():
-        for index, gain in enumerate(np.cumsum(by_bounce)):
+        for index, left in enumerate(variance * (1 - np.cumsum(by_bounce))):
             if all_bounces and index < len(by_bounce) - 1:
                 continue
-            cost = 1 + _COST + _COST_OF_BOUNCE * index
-            efficiency = 1 / (max(1 - gain, 1e-3) * cost)
-            candidates.append(Guidance(share, index + 1, float(gain), efficiency))
+            cost = segments * (1 + _COST + _COST_OF_BOUNCE * index)
+            efficiency = 1 / (max(left, 1e-3) * cost)
+            candidates.append(Guidance(share, index + 1, float(1 - left), efficiency))
     return max(candidates, key=lambda guidance: (guidance.efficiency, guidance[:3]))

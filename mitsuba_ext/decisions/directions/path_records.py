@@ -10,6 +10,7 @@ import mitsuba as mi
 from ...transport.observer import Observer
 from ..path_importance import brightness
 from ..path_importance import importance as path_importance
+from ..roulette.pixel_estimates import PixelEstimates
 from .tree_builder import DEPTH, cell_code, joined
 
 #: The most bytes of a record, including the temporaries while trees are built.
@@ -24,13 +25,16 @@ class PathRecords(Observer):
             each lane and a mask are given).
         bounces: Bounces of a path that are recorded.
         stride: One in so many paths is recorded.
+        pixels: Is told what the paths bring, if there is one.
 
     Attributes:
         paths (int): How many paths were recorded.
         region, code (mi.UInt32): Of each sample: its region, and the cell of the primary sample.
         history (mi.UInt32): The cells of the path's earlier samples, the last one in the low byte.
         bounce (mi.UInt32): 0 for the first.
-        value (mi.Float): What the path brought from there on, divided by densities of samples.
+        throughput (mi.Float): Of the path, with this bounce, before roulette.
+        value (mi.Float): What the path contributed after the bounce, divided by the densities of
+            its samples.
         weight (mi.Float): 1 / density of the sample.
         importance (mi.Float): By how much a squared error counts, at the place in the image.
         variance (float): Sum over the paths of the squared errors that they make, weighted so.
@@ -41,8 +45,10 @@ class PathRecords(Observer):
         region: Callable[[mi.SurfaceInteraction3f, mi.UInt32, mi.Bool], mi.UInt32],
         bounces: int,
         stride: int,
+        pixels: PixelEstimates | None = None,
     ) -> None:
         self._region, self.bounces, self.stride = region, bounces, stride
+        self._pixels = pixels
         self._lanes, self._passes = 0, []
         self.restart_counting()
 
@@ -67,12 +73,12 @@ class PathRecords(Observer):
         self._path = lane // stride
         self._is_recorded = self._path * stride == lane
         slots = self._lanes * self.bounces
-        self._keys, self._weights, self._before, self._total = (
-            dr.zeros(mi.UInt32, slots), dr.zeros(mi.Float, slots), dr.zeros(mi.Float, slots),
-            dr.zeros(mi.Float, self._lanes),
+        self._keys, self._total = dr.zeros(mi.UInt32, slots), dr.zeros(mi.Float, self._lanes)
+        self._weights, self._before, self._throughput = (
+            dr.zeros(mi.Float, slots) for _ in range(3)
         )
         self._slots = dr.opaque(mi.UInt32, self._lanes)
-        dr.eval(self._keys, self._weights, self._before, self._total)
+        dr.eval(self._keys, self._weights, self._before, self._throughput, self._total)
 
     def direction(self, vertex, sample, weight, L, active) -> None:
         active = active & self._is_recorded & (vertex.depth < self.bounces)
@@ -81,6 +87,11 @@ class PathRecords(Observer):
         dr.scatter(self._keys, key, slot, active)
         dr.scatter(self._weights, mi.Float(weight), slot, active)
         dr.scatter(self._before, brightness(L), slot, active)
+
+    def survival(self, path, probability, active) -> None:
+        active = active & self._is_recorded & (path.depth <= self.bounces)
+        slot = (path.depth - 1) * self._slots + self._path
+        dr.scatter(self._throughput, brightness(path.β), slot, active)
 
     def end(self, L: mi.Spectrum) -> None:
         dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
@@ -94,7 +105,7 @@ class PathRecords(Observer):
             return
         columns = [joined(parts) for parts in zip(*self._passes)]
         self.region, self.code, self.history, self.bounce = columns[:4]
-        self.value, self.weight, self.importance = columns[4:]
+        self.value, self.weight, self.importance, self.throughput = columns[4:]
         self._passes = [columns]
 
     def _collect(self) -> None:
@@ -102,6 +113,9 @@ class PathRecords(Observer):
         if self._lanes == 0:
             return
         importance, error = path_importance(self._total)
+        if self._pixels is not None and self._pixel is not None:
+            recorded = dr.arange(mi.UInt32, self._lanes) * dr.opaque(mi.UInt32, self.stride)
+            self._pixels.add(dr.gather(mi.UInt32, self._pixel, recorded), self._total)
         self.paths += self._lanes
         self.variance += float(dr.sum(mi.Float64(error))[0])
         slot = dr.compress(self._weights > 0)
@@ -124,8 +138,9 @@ class PathRecords(Observer):
             history = dr.select(is_earlier, (history << DEPTH) | code, history)
         columns = [
             key >> DEPTH, key & ((1 << DEPTH) - 1), history, bounce, value, weight,
-            dr.gather(mi.Float, importance, path),
+            dr.gather(mi.Float, importance, path), dr.gather(mi.Float, self._throughput, slot),
         ]
         dr.eval(columns)
         self._passes.append(columns)
-        self._keys = self._weights = self._before = self._total = self._pixel = None
+        self._keys = self._weights = self._before = self._throughput = None
+        self._total = self._pixel = None

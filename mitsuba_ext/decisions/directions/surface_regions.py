@@ -15,6 +15,9 @@ from .tree_builder import UNIFORM, Samples, TreeBuilder
 #: Voxels along each axis, level by level: the voxels of a level divide those of the level before.
 _GRIDS = (4, 8, 16, 32)
 
+#: The weight, in samples, of the surrounding region as the prior of a region's mean radiance.
+_PRIOR = 32
+
 
 class SurfaceRegions:
     """Regions are pairs of a voxel of the box in which paths scatter and a side of its surfaces.
@@ -105,6 +108,29 @@ class SurfaceRegions:
             first = builder.add(samples, tree, size, expected)
             roots[regions] = first + np.arange(size)
         return builder, mi.UInt32(roots), None
+
+    def incident_radiance(self, records: PathRecords) -> mi.Float:
+        """The mean radiance that bounces find in each region; the surrounding region is the prior.
+        −1 for mirrors and glass. Shape [regions]."""
+        region = records.region.numpy()
+        # In double precision, one after the other: equal seeds make equal sums
+        value, throughput, count = (
+            np.bincount(region, x, self.count + 1)
+            for x in (records.value.numpy(), records.throughput.numpy(), np.ones(len(region)))
+        )
+        for regions in reversed(self._levels[1:]):
+            for x in (value, throughput, count):
+                np.add.at(x, self._parent[regions], x[regions])
+        radiance = np.full(self.count + 1, -1.0)
+        for level, regions in enumerate(self._levels):
+            prior, expected = 0.0, 0.0
+            if level > 0:
+                prior = _PRIOR * throughput[regions] / np.maximum(count[regions], 1)
+                expected = radiance[self._parent[regions]]
+            radiance[regions] = (value[regions] + prior * expected) / np.maximum(
+                throughput[regions] + prior, 1e-30
+            )
+        return mi.Float(np.minimum(radiance, 1e30).astype(np.float32))
 
     def _numbers(self, level: int) -> np.ndarray:
         """For each region, the number of the region of a level in which it lies; a number too large
