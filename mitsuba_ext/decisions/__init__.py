@@ -9,8 +9,18 @@ from ..transport.path_decisions import (
     AlwaysTest,
     DirectionSamples,
     EmitterSampling,
+    Roulette,
     SceneQuery,
     ShadowTest,
+    ThroughputRoulette,
 )
 
-__all__ = ["AlwaysTest", "DirectionSamples", "EmitterSampling", "SceneQuery", "ShadowTest"]
+__all__ = [
+    "AlwaysTest",
+    "DirectionSamples",
+    "EmitterSampling",
+    "Roulette",
+    "SceneQuery",
+    "ShadowTest",
+    "ThroughputRoulette",
+]

@@ -45,6 +45,18 @@ class Observer:
         """The number ``sample``, of density 1 / ``weight``, chose the direction in which a path
         goes on; it has brought ``L`` until now."""
 
+    def roulette(
+        self,
+        depth: mi.UInt32,
+        throughput: mi.Spectrum,
+        unguided: mi.Float,
+        η: mi.Float,
+        probability: mi.Float,
+        active: mi.Bool,
+    ) -> None:
+        """A path goes on, to a vertex of this depth, with this probability. The other parameters
+        are those of :meth:`Roulette.probability`."""
+
     def end(self, L: mi.Spectrum) -> None:
         """All paths of the pass are at their end, and bring ``L``."""
 
@@ -73,6 +85,10 @@ class Observers(Observer):
     def direction(self, *arguments: Any) -> None:
         for observer in self._observers:
             observer.direction(*arguments)
+
+    def roulette(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.roulette(*arguments)
 
     def end(self, L: mi.Spectrum) -> None:
         for observer in self._observers:

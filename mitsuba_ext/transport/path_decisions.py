@@ -98,6 +98,45 @@ class AlwaysTest(ShadowTest):
         return None, state
 
 
+class Roulette:
+    """With which probability a path goes on after a bounce."""
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
+        """The state before the first bounce of paths that begin in ``pixel`` of the film."""
+        return ()
+
+    def probability(
+        self,
+        state: Any,
+        si: mi.SurfaceInteraction3f,
+        depth: mi.UInt32,
+        throughput: mi.Spectrum,
+        unguided: mi.Float,
+        η: mi.Float,
+        weight: mi.Float | float,
+        active: mi.Bool,
+    ) -> tuple[mi.Float, Any]:
+        """The probability, in (0, 1] where ``active``, with which a path leaves the vertex ``si``,
+        and the new state.
+
+        Parameters:
+            depth: Of the vertex to which the path would go on; 1 after the first bounce.
+            throughput: With the bounce at ``si``; what survives is divided by the probability.
+            unguided: The largest component of the throughput, less what says nothing about its
+                use: guided samples are dense where paths matter, and a hero stands for four.
+            η: Product of the relative indices of refraction.
+            weight: 1 / density of the number that chose the direction.
+        """
+        raise NotImplementedError
+
+
+class ThroughputRoulette(Roulette):
+    """Paths survive in proportion to their throughput."""
+
+    def probability(self, state, si, depth, throughput, unguided, η, weight, active):
+        return dr.minimum(unguided * dr.square(η), 0.95), state
+
+
 class SceneQuery:
     """How a ray meets the scene."""
 

@@ -18,7 +18,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..decisions import AlwaysTest, DirectionSamples, EmitterSampling, SceneQuery, ShadowTest
+from ..decisions import (
+    AlwaysTest,
+    DirectionSamples,
+    EmitterSampling,
+    Roulette,
+    SceneQuery,
+    ShadowTest,
+    ThroughputRoulette,
+)
 from ..garbage import garbage_left_alone
 from .heroes import Heroes
 from .mis import power_heuristic
@@ -57,6 +65,7 @@ class Walk:
         directions: Which primary samples choose the lobe and the direction of a BSDF sample.
         next_event: Which point of which light to connect to, and with what pdf.
         shadow_test: Whether the shadow ray of a connection is traced.
+        roulette: With which probability a path goes on, from ``rr_depth`` on.
         query: How a ray meets the scene.
         observer: Is told what happens (``learning.learner.Observer``); ``None`` in final stages.
     """
@@ -67,6 +76,7 @@ class Walk:
     directions: DirectionSamples = field(default_factory=DirectionSamples)
     next_event: EmitterSampling = field(default_factory=EmitterSampling)
     shadow_test: ShadowTest = field(default_factory=AlwaysTest)
+    roulette: Roulette = field(default_factory=ThroughputRoulette)
     query: SceneQuery = field(default_factory=SceneQuery)
     observer: Any = None
 
@@ -111,6 +121,7 @@ class Walk:
         directions_state = self.directions.begin(sampler, ray, pixel)
         next_event_state = self.next_event.begin(sampler, ray)
         shadow_state = self.shadow_test.begin(sampler, ray)
+        roulette_state = self.roulette.begin(sampler, ray, pixel)
         hero_is_alone = heroes.begin()
         if dr.hint(self.observer is not None, mode="scalar"):
             self.observer.begin(dr.width(ray), pixel)
@@ -199,12 +210,18 @@ class Walk:
             depth[si.is_valid()] += 1
 
             # ----- Russian roulette -----
-            # Where guided samples are dense, paths have little throughput because they matter; a
-            # hero has more since it stands for four
             β_max = dr.max(β)
-            rr_probability = dr.minimum(β_max / guidance * dr.square(η), 0.95)
             rr_active = depth >= self.rr_depth
+            rr_probability, roulette_state = self.roulette.probability(
+                roulette_state, si, depth, β, β_max / guidance, η, directions_weight,
+                active_next & rr_active & (β_max != 0),
+            )
             rr_continue = sampler.next_1d() < rr_probability
+            if dr.hint(self.observer is not None, mode="scalar"):
+                self.observer.roulette(
+                    depth, β, β_max / guidance, η, dr.select(rr_active, rr_probability, 1),
+                    active_next,
+                )
             β[rr_active] *= dr.rcp(rr_probability)
             active = active_next & (~rr_active | rr_continue) & (β_max != 0)
 
