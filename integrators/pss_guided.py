@@ -141,7 +141,9 @@ class PSSGuided(WalkIntegrator):
         return self.guiding.pilots(scene, spp, self.max_depth)
 
     def learners(self, scene: mi.Scene, sensor: mi.Sensor, samples: int) -> list[Learner]:
-        return self.guiding.learners(scene, sensor, samples, self.max_depth)
+        return self.guiding.learners(
+            scene, sensor, samples, self.max_depth, self.rr_depth
+        )
 
     def parameters(self) -> dict[str, Any]:
         return {**self.guiding.parameters(), "nee_first_bounce": self.nee_first_bounce}

@@ -61,7 +61,12 @@ class Guiding:
         return [first, first, samples - 2 * first]
 
     def learners(
-        self, scene: mi.Scene, sensor: mi.Sensor, samples: int, max_depth: int
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        samples: int,
+        max_depth: int,
+        rr_depth: int,
     ) -> list[Learner]:
         """Who learns from ``samples`` pilot samples (of all pixels together)."""
         if samples == 0:
@@ -83,6 +88,9 @@ class Guiding:
             int(self.max_memory * 2**20),
             samples,
             self.always_guide,
+            # What bounces bring depends on where they are, of which tiles know nothing
+            rr_depth=None if by_tiles or rr_depth >= max_depth else rr_depth,
+            film_width=width,
         )
         return [self._learner]
 

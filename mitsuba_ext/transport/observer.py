@@ -45,7 +45,7 @@ class Observer:
         """The number ``sample``, of density 1 / ``weight``, chose the direction in which a path
         goes on; it has brought ``L`` until now."""
 
-    def roulette(
+    def survival(
         self,
         depth: mi.UInt32,
         throughput: mi.Spectrum,
@@ -86,9 +86,9 @@ class Observers(Observer):
         for observer in self._observers:
             observer.direction(*arguments)
 
-    def roulette(self, *arguments: Any) -> None:
+    def survival(self, *arguments: Any) -> None:
         for observer in self._observers:
-            observer.roulette(*arguments)
+            observer.survival(*arguments)
 
     def end(self, L: mi.Spectrum) -> None:
         for observer in self._observers:

@@ -8,6 +8,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+#: With which a path that loses nothing survives: Mitsuba's.
+LARGEST_PROBABILITY = 0.95
+
 
 class DirectionSamples:
     """Which primary samples choose the lobe and the direction of a BSDF sample: uniform ones."""
@@ -113,7 +116,6 @@ class Roulette:
         throughput: mi.Spectrum,
         unguided: mi.Float,
         η: mi.Float,
-        weight: mi.Float | float,
         active: mi.Bool,
     ) -> tuple[mi.Float, Any]:
         """The probability, in (0, 1] where ``active``, with which a path leaves the vertex ``si``,
@@ -125,7 +127,6 @@ class Roulette:
             unguided: The largest component of the throughput, less what says nothing about its
                 use: guided samples are dense where paths matter, and a hero stands for four.
             η: Product of the relative indices of refraction.
-            weight: 1 / density of the number that chose the direction.
         """
         raise NotImplementedError
 
@@ -133,8 +134,8 @@ class Roulette:
 class ThroughputRoulette(Roulette):
     """Paths survive in proportion to their throughput."""
 
-    def probability(self, state, si, depth, throughput, unguided, η, weight, active):
-        return dr.minimum(unguided * dr.square(η), 0.95), state
+    def probability(self, state, si, depth, throughput, unguided, η, active):
+        return dr.minimum(unguided * dr.square(η), LARGEST_PROBABILITY), state
 
 
 class SceneQuery:

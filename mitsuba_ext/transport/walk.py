@@ -213,12 +213,12 @@ class Walk:
             β_max = dr.max(β)
             rr_active = depth >= self.rr_depth
             rr_probability, roulette_state = self.roulette.probability(
-                roulette_state, si, depth, β, β_max / guidance, η, directions_weight,
+                roulette_state, si, depth, β, β_max / guidance, η,
                 active_next & rr_active & (β_max != 0),
             )
             rr_continue = sampler.next_1d() < rr_probability
             if dr.hint(self.observer is not None, mode="scalar"):
-                self.observer.roulette(
+                self.observer.survival(
                     depth, β, β_max / guidance, η, dr.select(rr_active, rr_probability, 1),
                     active_next,
                 )

@@ -9,10 +9,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...transport.path_decisions import DirectionSamples
+from ...transport.observer import Observer
+from ...transport.path_decisions import DirectionSamples, Roulette, ThroughputRoulette
 from ..learner import Learner
+from ..roulette.adjoint_roulette import AdjointRoulette
+from ..roulette.pixel_estimates import PixelEstimates
+from ..roulette.roulette_trial import BYTES_PER_PATH, RouletteTrial
 from .guided_directions import GuidedDirections, Regions
-from .path_records import BYTES_PER_RECORD, PathRecords
+from .path_records import BYTES_PER_RECORD, PathRecords, importance_and_error
 from .sample_trees import SampleTrees
 
 #: The share of the samples that trees decide in the second pilot, and those from which one is
@@ -52,10 +56,14 @@ class GuideLearner(Learner):
         max_memory: Bytes for what is recorded, and for what is built from it.
         pilot_samples: Samples of all pilots together.
         always: Guide all ``bounces``, also where the second pilot shows that it does not pay?
+        rr_depth: Depth at which roulette begins; ``None`` where no path is that long.
+        film_width: Pixels of a row of the film, with its border where that is sampled.
 
     Attributes:
         guide (GuidedDirections): What was learned; ``None`` where nothing is guided.
         guidance (Guidance): The last choice; ``None`` before the second pilot has shown a gain.
+        trial (RouletteTrial): What the roulette of the last pilot was worth; ``None`` where there
+            is no roulette.
         sample_count (int): How many samples of directions the trees were built from.
     """
 
@@ -67,14 +75,19 @@ class GuideLearner(Learner):
         max_memory: int,
         pilot_samples: int,
         always: bool = False,
+        rr_depth: int | None = None,
+        film_width: int = 1,
     ) -> None:
         self.make_regions, self.wants_scout = regions, wants_scout
         self.bounces, self.max_memory, self.pilot_samples = bounces, max_memory, pilot_samples
-        self.always = always
+        self.always, self.rr_depth, self.film_width = always, rr_depth, film_width
         self.guide: GuidedDirections | None = None
         self.guidance: Guidance | None = None
+        self.roulette: Roulette = ThroughputRoulette()
+        self.trial: RouletteTrial | None = None
         self.sample_count = 0
         self._records: PathRecords | None = None
+        self._pixels: PixelEstimates | None = None
         self._share, self._summary = _FIRST_SHARE, ""
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> dict[str, Any]:
@@ -82,23 +95,38 @@ class GuideLearner(Learner):
         if self.wants_scout and dr.width(p) == 0:
             return {}
         self._regions = self.make_regions(p, n)
-        most = self.pilot_samples * self.bounces * BYTES_PER_RECORD
-        self._records = PathRecords(self._regions.label, self.bounces, -(-most // self.max_memory))
+        self._learns_roulette = self.rr_depth is not None
+        bytes_per_path = self.bounces * BYTES_PER_RECORD
+        bytes_per_path += BYTES_PER_PATH if self._learns_roulette else 0
+        stride = -(-self.pilot_samples * bytes_per_path // self.max_memory)
+        if self._learns_roulette:
+            self._pixels = PixelEstimates(self.film_width)
+            self.trial = RouletteTrial(stride, self.rr_depth, importance_and_error)
+        self._records = PathRecords(self._regions.label, self.bounces, stride, self._pixels)
         return {}
 
     # ---- Observer ----
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
-        if self._records is not None:
-            self._records.begin(lanes, pixel)
+        for observer in self._observers():
+            observer.begin(lanes, pixel)
 
     def direction(self, *arguments: Any) -> None:
-        if self._records is not None:
-            self._records.direction(*arguments)
+        for observer in self._observers():
+            observer.direction(*arguments)
+
+    def survival(self, *arguments: Any) -> None:
+        for observer in self._observers():
+            observer.survival(*arguments)
 
     def end(self, L: mi.Spectrum) -> None:
-        if self._records is not None:
-            self._records.end(L)
+        for observer in self._observers():
+            observer.end(L)
+
+    def _observers(self) -> list[Observer]:
+        if self._records is None:
+            return []
+        return [x for x in (self._records, self.trial) if x is not None]
 
     # ---- Between the stages ----
 
@@ -107,19 +135,22 @@ class GuideLearner(Learner):
         if records is None:
             return {}
         records.finish()
+        if self.trial is not None:
+            self.trial.finish()
         if records.count == 0:
             self._records, self._summary = None, "no guide: no path scatters"
             return {}
         bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
         self.sample_count = records.count
         if self.guide is not None and records.count > records.first_new:
-            self.guidance = most_efficient(self.gains(records), all_bounces=self.always)
+            gains = self.gains(records)
+            self.guidance = most_efficient(gains, self.always, *self._against_path(gains))
             share, bounces, gain, efficiency = self.guidance
             effect = f"about {gain:.0%} less variance"
             if efficiency < _LEAST_EFFICIENCY and not self.always:
                 self.guide, self._records = None, None
                 self._summary = f"no guide: with {self._regions}, {effect}"
-                return {"directions": DirectionSamples()}
+                return {"directions": DirectionSamples(), "roulette": ThroughputRoulette()}
         builder, roots, below = self._regions.build(records)
         trees = SampleTrees(
             builder.probability,
@@ -130,6 +161,8 @@ class GuideLearner(Learner):
             below,
         )
         records.restart_counting()
+        if self.trial is not None:
+            self.trial.restart()
         self._share = share
         self._summary = (
             f"guide: {self._regions}, {records.count} samples, trees of "
@@ -137,13 +170,32 @@ class GuideLearner(Learner):
             f"samples, {effect}"
         )
         self.guide = GuidedDirections(trees, self._regions, bounces)
+        if self._learns_roulette:
+            radiance = self._regions.incident_radiance(records)
+            self.roulette = AdjointRoulette(self._regions, radiance, self._pixels.scale())
         if is_last:
             self._records = None
-        return {"directions": self.guide}
+        return {"directions": self.guide, "roulette": self.roulette}
+
+    def _against_path(self, gains: Mapping[float, np.ndarray]) -> tuple[float, float]:
+        """What uniform samples would have with the roulette of the next stage, in units of what
+        ``path`` has: variance, and length of paths. Takes the roulette of ``path`` again where it
+        would have been better in the last pilot."""
+        if self.trial is None:
+            return 1.0, 1.0
+        drawn, path = self.trial.drawn, self.trial.unguided
+        chosen = drawn
+        if self._learns_roulette and self.trial.by_throughput.efficiency(drawn) > 1:
+            self._learns_roulette, self.roulette = False, ThroughputRoulette()
+            chosen = self.trial.by_throughput
+        if path.variance <= 0 or not np.isfinite(path.variance + chosen.variance):
+            return 1.0, 1.0
+        guided = max(1 - gains[self._share].sum(), 1e-3)
+        return chosen.variance / path.variance / guided, chosen.segments / path.segments
 
     def gains(self, records: PathRecords) -> dict[float, np.ndarray]:
-        """By how much, relatively, the trees that drew the last samples lower the variance: for
-        each share that they could decide, by bounce."""
+        """By how much, relatively, the trees that drew the last samples lower the variance under
+        the same roulette: for each share that they could decide, by bounce."""
         new = dr.arange(mi.UInt32, records.count - records.first_new)
         new += dr.opaque(mi.UInt32, records.first_new)
         value, weight, importance, bounce = (
@@ -174,20 +226,24 @@ class GuideLearner(Learner):
 
 
 def most_efficient(
-    gains: Mapping[float, np.ndarray], all_bounces: bool = False
+    gains: Mapping[float, np.ndarray],
+    all_bounces: bool = False,
+    variance: float = 1.0,
+    segments: float = 1.0,
 ) -> Guidance:
     """The most efficient way to guide.
 
     Parameters:
         gains: By how much, relatively, the variance is lower: for each share, by bounce.
         all_bounces: Choose among those that guide all bounces?
+        variance, segments: Of uniform samples under the same roulette, in units of ``path``'s.
     """
     candidates = []
     for share, by_bounce in gains.items():
-        for index, gain in enumerate(np.cumsum(by_bounce)):
+        for index, left in enumerate(variance * (1 - np.cumsum(by_bounce))):
             if all_bounces and index < len(by_bounce) - 1:
                 continue
-            cost = 1 + _COST + _COST_OF_BOUNCE * index
-            efficiency = 1 / (max(1 - gain, 1e-3) * cost)
-            candidates.append(Guidance(share, index + 1, float(gain), efficiency))
+            cost = segments * (1 + _COST + _COST_OF_BOUNCE * index)
+            efficiency = 1 / (max(left, 1e-3) * cost)
+            candidates.append(Guidance(share, index + 1, float(1 - left), efficiency))
     return max(candidates, key=lambda guidance: (guidance.efficiency, guidance[:3]))

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...transport.observer import Observer
+from ..roulette.pixel_estimates import PixelEstimates
 from .tree_builder import DEPTH, cell_code, joined
 
 #: Bytes of a record, at most: what is kept of it, and what trees are built from.
@@ -26,12 +27,14 @@ class PathRecords(Observer):
             each lane and a mask are given).
         bounces: Bounces of a path that are recorded.
         stride: One in so many paths is recorded.
+        pixels: Is told what the paths bring, if there is one.
 
     Attributes:
         paths (int): How many paths were recorded.
         region, code (mi.UInt32): Of each sample: its region, and the cell of the primary sample.
         history (mi.UInt32): The cells of the path's earlier samples, the last one in the low byte.
         bounce (mi.UInt32): 0 for the first.
+        throughput (mi.Float): Of the path, with this bounce (before roulette).
         value (mi.Float): What the path brought from there on, divided by densities of samples.
         weight (mi.Float): 1 / density of the sample.
         importance (mi.Float): By how much a squared error counts, at the place in the image.
@@ -43,8 +46,10 @@ class PathRecords(Observer):
         region: Callable[[mi.SurfaceInteraction3f, mi.UInt32, mi.Bool], mi.UInt32],
         bounces: int,
         stride: int,
+        pixels: PixelEstimates | None = None,
     ) -> None:
         self._region, self.bounces, self._stride = region, bounces, stride
+        self._pixels = pixels
         self._lanes, self._passes = 0, []
         self.restart_counting()
 
@@ -69,12 +74,12 @@ class PathRecords(Observer):
         self._path = lane // stride
         self._is_recorded = self._path * stride == lane
         slots = self._lanes * self.bounces
-        self._keys, self._weights, self._before, self._total = (
-            dr.zeros(mi.UInt32, slots), dr.zeros(mi.Float, slots), dr.zeros(mi.Float, slots),
-            dr.zeros(mi.Float, self._lanes),
+        self._keys, self._total = dr.zeros(mi.UInt32, slots), dr.zeros(mi.Float, self._lanes)
+        self._weights, self._before, self._throughput = (
+            dr.zeros(mi.Float, slots) for _ in range(3)
         )
         self._slots = dr.opaque(mi.UInt32, self._lanes)
-        dr.eval(self._keys, self._weights, self._before, self._total)
+        dr.eval(self._keys, self._weights, self._before, self._throughput, self._total)
 
     def direction(self, si, depth, sample, weight, L, active) -> None:
         active = active & self._is_recorded & (depth < self.bounces)
@@ -83,6 +88,11 @@ class PathRecords(Observer):
         dr.scatter(self._keys, key, slot, active)
         dr.scatter(self._weights, mi.Float(weight), slot, active)
         dr.scatter(self._before, _brightness(L), slot, active)
+
+    def survival(self, depth, throughput, unguided, η, probability, active) -> None:
+        active = active & self._is_recorded & (depth <= self.bounces)
+        slot = (depth - 1) * self._slots + self._path
+        dr.scatter(self._throughput, _brightness(throughput), slot, active)
 
     def end(self, L: mi.Spectrum) -> None:
         dr.scatter(self._total, _brightness(L), self._path, self._is_recorded)
@@ -96,14 +106,17 @@ class PathRecords(Observer):
             return
         columns = [joined(parts) for parts in zip(*self._passes)]
         self.region, self.code, self.history, self.bounce = columns[:4]
-        self.value, self.weight, self.importance = columns[4:]
+        self.value, self.weight, self.importance, self.throughput = columns[4:]
         self._passes = [columns]
 
     def _collect(self) -> None:
         """Keeps what the last pass has recorded."""
         if self._lanes == 0:
             return
-        importance, error = _importance(self._total)
+        importance, error = importance_and_error(self._total)
+        if self._pixels is not None and self._pixel is not None:
+            recorded = dr.arange(mi.UInt32, self._lanes) * dr.opaque(mi.UInt32, self._stride)
+            self._pixels.add(dr.gather(mi.UInt32, self._pixel, recorded), self._total)
         self.paths += self._lanes
         self.variance += float(dr.sum(mi.Float64(error))[0])
         slot = dr.compress(self._weights > 0)
@@ -126,14 +139,15 @@ class PathRecords(Observer):
             history = dr.select(is_earlier, (history << DEPTH) | code, history)
         columns = [
             key >> DEPTH, key & ((1 << DEPTH) - 1), history, bounce, value, weight,
-            dr.gather(mi.Float, importance, path),
+            dr.gather(mi.Float, importance, path), dr.gather(mi.Float, self._throughput, slot),
         ]
         dr.eval(columns)
         self._passes.append(columns)
-        self._keys = self._weights = self._before = self._total = self._pixel = None
+        self._keys = self._weights = self._before = self._throughput = None
+        self._total = self._pixel = None
 
 
-def _importance(total: mi.Float) -> tuple[mi.Float, mi.Float]:
+def importance_and_error(total: mi.Float) -> tuple[mi.Float, mi.Float]:
     """For each path, by how much squared errors count at its place, and its own, weighted so."""
     total = dr.select(dr.isfinite(total), total, 0)
     path = dr.arange(mi.UInt32, -(-len(total) // _NEIGHBOURS) * _NEIGHBOURS)

@@ -17,6 +17,9 @@ _GRIDS = (4, 8, 16, 32)
 #: The six directions of the axes.
 _SIDES = 6
 
+#: So many samples count for what was found in larger surroundings.
+_PRIOR = 32
+
 
 class SurfaceRegions:
     """Voxels of the region in which paths scatter, and the sides of their surfaces.
@@ -105,6 +108,29 @@ class SurfaceRegions:
             first = builder.add(samples, tree, size, expected)
             roots[regions] = first + np.arange(size)
         return builder, mi.UInt32(roots), None
+
+    def incident_radiance(self, records: PathRecords) -> mi.Float:
+        """The mean radiance that bounces find in each region, where a region expects what the one
+        around it found; −1 for mirrors and glass. Shape [regions]."""
+        region = records.region.numpy()
+        # In double precision, one after the other: equal seeds make equal sums
+        value, throughput, count = (
+            np.bincount(region, x, self.count + 1)
+            for x in (records.value.numpy(), records.throughput.numpy(), np.ones(len(region)))
+        )
+        for regions in reversed(self._levels[1:]):
+            for x in (value, throughput, count):
+                np.add.at(x, self._parent[regions], x[regions])
+        radiance = np.full(self.count + 1, -1.0)
+        for level, regions in enumerate(self._levels):
+            prior, expected = 0.0, 0.0
+            if level > 0:
+                prior = _PRIOR * throughput[regions] / np.maximum(count[regions], 1)
+                expected = radiance[self._parent[regions]]
+            radiance[regions] = (value[regions] + prior * expected) / np.maximum(
+                throughput[regions] + prior, 1e-30
+            )
+        return mi.Float(np.minimum(radiance, 1e30).astype(np.float32))
 
     def _numbers(self, level: int) -> np.ndarray:
         """For each region, which one of a level's it lies in; too large a number for none."""

@@ -1,0 +1,54 @@
+"""Russian roulette by what a path is expected to bring.
+
+Source: J. Vorba, J. Křivánek, *Adjoint-Driven Russian Roulette and Splitting in Light Transport
+Simulation*, 2016, sections 3 and 4. Without splitting: a lane of the walk is one path. The lower
+end of the weight window is ours.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ...transport.path_decisions import Roulette
+from ..directions.guided_directions import Regions
+
+#: A path that is expected to bring this share of its pixel's radiance goes on in any case. (With
+#: 0.1 paths are longer, with 1 there is more noise: both are less efficient.)
+_CERTAIN = 0.3
+
+#: The least probability: an estimate that is too low must not make the survivors too heavy.
+_LEAST = 0.1
+
+#: From this depth on, no path survives with certainty: some would never end.
+_DEEP, _DEEP_PROBABILITY = 16, 0.95
+
+
+class AdjointRoulette(Roulette):
+    """Compares what a path is expected to bring with the radiance of the pixel it began in.
+
+    The expected contribution is the throughput times the mean radiance that bounces find in the
+    region of the vertex. (The density of the guided direction could tell more; it gained nothing.)
+    Mirrors and glass have no such mean, and no path ends there: what was expected before has not
+    changed.
+
+    Parameters:
+        regions: Where the means belong to.
+        radiance: Mean incident radiance of each region, negative where nothing is known. [regions]
+        scale: 1 / radiance of each pixel of the film, row by row. [pixels]
+    """
+
+    def __init__(self, regions: Regions, radiance: mi.Float, scale: mi.Float) -> None:
+        self._regions, self._radiance, self._scale = regions, radiance, scale
+        dr.eval(self._radiance, self._scale)
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> mi.Float:
+        return dr.gather(mi.Float, self._scale, pixel)
+
+    def probability(self, state, si, depth, throughput, unguided, η, active):
+        region = self._regions.label(si, None, active)
+        radiance = dr.gather(mi.Float, self._radiance, region, active)
+        expected = dr.mean(throughput) * radiance * state
+        p = dr.clip(expected * (1 / _CERTAIN), _LEAST, 1)
+        p = dr.select(radiance < 0, 1, p)
+        return dr.select(depth >= _DEEP, dr.minimum(p, _DEEP_PROBABILITY), p), state

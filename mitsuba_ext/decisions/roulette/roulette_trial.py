@@ -1,0 +1,142 @@
+"""What other roulettes, or no guide, would have cost and brought."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from ...transport.observer import Observer
+from ...transport.path_decisions import LARGEST_PROBABILITY
+
+#: Bounces of a path that are looked at: what comes later is as it was drawn.
+_BOUNCES = 12
+
+#: Bytes that a path takes.
+BYTES_PER_PATH = 4 * (4 * _BOUNCES + 1)
+
+
+class Effect(NamedTuple):
+    """Of a way to draw paths.
+
+    Attributes:
+        variance: Sum over the paths of their squared errors, weighted by place.
+        segments: Of all paths together.
+    """
+
+    variance: float
+    segments: float
+
+    def efficiency(self, other: Effect) -> float:
+        """In units of another one's."""
+        return other.variance * other.segments / max(self.variance * self.segments, 1e-30)
+
+
+class RouletteTrial(Observer):
+    """Estimates from the paths that were drawn what others would have been worth.
+
+    Let a path bring ``V_j`` after bounce j, ``V`` in all; other densities and other probabilities
+    of survival would multiply that by ``A_j``, and make such paths as much rarer. The mean square
+    would then be that of V² + Σ (A_j − A_{j−1}) V_j², with A before the first bounce 1.
+
+    Parameters:
+        stride: One in so many paths is looked at.
+        rr_depth: Depth at which roulette begins.
+
+    Attributes:
+        drawn: The effect of what was drawn.
+        by_throughput: Of the same directions with ``ThroughputRoulette``.
+        unguided: Of that, and uniform samples.
+    """
+
+    def __init__(self, stride: int, rr_depth: int, importance) -> None:
+        self._stride, self._rr_depth, self._importance = stride, rr_depth, importance
+        self._paths = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Lets the effects be those of the paths that come from now on."""
+        self.drawn = self.by_throughput = self.unguided = Effect(0.0, 0.0)
+
+    # ---- Observer of the walk ----
+
+    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
+        self.finish()
+        self._paths = -(-lanes // self._stride)
+        lane = dr.arange(mi.UInt32, lanes)
+        stride = dr.opaque(mi.UInt32, self._stride)
+        self._path = lane // stride
+        self._is_recorded = self._path * stride == lane
+        self._slots = dr.opaque(mi.UInt32, self._paths)
+        self._weight, self._before, self._throughput, self._probability = (
+            dr.zeros(mi.Float, self._paths * _BOUNCES) for _ in range(4)
+        )
+        self._total = dr.zeros(mi.Float, self._paths)
+        dr.eval(
+            self._weight, self._before, self._throughput, self._probability, self._total
+        )
+
+    def direction(self, si, depth, sample, weight, L, active) -> None:
+        active = active & self._is_recorded & (depth < _BOUNCES)
+        slot = depth * self._slots + self._path
+        dr.scatter(self._weight, mi.Float(weight), slot, active)
+        dr.scatter(self._before, dr.mean(L), slot, active)
+
+    def survival(self, depth, throughput, unguided, η, probability, active) -> None:
+        active = active & self._is_recorded & (depth <= _BOUNCES)
+        slot = (depth - 1) * self._slots + self._path
+        dr.scatter(self._throughput, unguided * dr.square(η), slot, active)
+        dr.scatter(self._probability, probability, slot, active)
+
+    def end(self, L: mi.Spectrum) -> None:
+        dr.scatter(self._total, dr.mean(L), self._path, self._is_recorded)
+
+    # ---- Between passes ----
+
+    def finish(self) -> None:
+        """Adds what the last pass has recorded."""
+        if self._paths == 0:
+            return
+        total = dr.select(dr.isfinite(self._total), self._total, 0)
+        importance, error = self._importance(total)
+        sums = [dr.sum(mi.Float64(error))]
+        for roulette, is_guided in ((False, True), (True, True), (True, False)):
+            more, segments = self._other(total, roulette, is_guided)
+            sums += [dr.sum(mi.Float64(more * importance)), dr.sum(mi.Float64(segments))]
+        dr.eval(sums)
+        error, *sums = (float(x[0]) for x in sums)
+        effects = [Effect(error + more, segments) for more, segments in zip(sums[::2], sums[1::2])]
+        self.drawn, self.by_throughput, self.unguided = (
+            Effect(*(x + y for x, y in zip(old, new)))
+            for old, new in zip((self.drawn, self.by_throughput, self.unguided), effects)
+        )
+        self._paths = 0
+        self._weight = self._before = self._throughput = self._probability = self._total = None
+
+    def _other(
+        self, total: mi.Float, by_throughput: bool, is_guided: bool
+    ) -> tuple[mi.Float, mi.Float]:
+        """By how much the square of each path would be larger, and its segments."""
+        path = dr.arange(mi.UInt32, self._paths)
+        factor, throughput, reached = mi.Float(1), mi.Float(1), mi.Float(1)
+        more, segments = mi.Float(0), mi.Float(1)
+        for bounce in range(_BOUNCES):
+            weight, before, unguided, p = (
+                dr.gather(mi.Float, x, bounce * self._slots + path)
+                for x in (self._weight, self._before, self._throughput, self._probability)
+            )
+            # Where the BSDF let nothing through, the path is at its end
+            goes_on = (weight > 0) & (unguided > 0) & (p > 0)
+            other = p
+            if by_throughput and bounce + 1 >= self._rr_depth:
+                other = dr.minimum(unguided * throughput, LARGEST_PROBABILITY)
+            ratio, density = p / other, mi.Float(1) if is_guided else weight
+            change = dr.select(goes_on, factor * (ratio / density - 1), 0)
+            more += change * dr.square(dr.maximum(total - before, 0))
+            factor += change
+            segments += dr.select(goes_on, reached * density * other, 0)
+            reached = dr.select(goes_on, reached * density / ratio, reached)
+            throughput = dr.select(goes_on, throughput * ratio, throughput)
+        # Squares of large numbers overflow: they say nothing
+        return dr.select(dr.isfinite(more), more, 0), segments
