@@ -66,8 +66,11 @@ class PSSGuided(WalkIntegrator):
          illumination, and so on. (Default: -1)
      * - rr_depth
        - |int|
-       - Path depth at which Russian roulette on the throughput begins. What guiding adds to the
-         throughput does not count: paths to bright places are not ended sooner. (Default: 5)
+       - Path depth at which Russian roulette begins. A path is more likely to survive the more it
+         is expected to bring, compared to its pixel: throughput times the radiance that the pilots
+         found around the place. Where the pilots show that this does not pay, and with
+         :monosp:`tiles`, the throughput decides as in :monosp:`path` (what guiding adds to it does
+         not count). (Default: 5)
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: false)
@@ -89,7 +92,8 @@ class PSSGuided(WalkIntegrator):
     what paths brought on average from there on, drawn to what was found in larger surroundings
     where there are few samples, and mixed with uniform numbers. The second of three pilots shows
     what the trees of the first are worth. From that follows how much of the samples trees decide
-    (40, 60 or 80 %) and how many bounces are worth the time of guiding them; if none is, learning
+    (40, 60 or 80 %), how many bounces are worth the time of guiding them, and which roulette is
+    better; if no guide pays, learning
     ends there, and the rest is rendered as by :monosp:`path`. After a render,
     :monosp:`integrator.statistics.learned` tells, and :monosp:`integrator.guide` holds what was
     learned (see examples/learned_samples.py).
@@ -100,7 +104,9 @@ class PSSGuided(WalkIntegrator):
     :monosp:`moment` there is no pilot.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of
-    film tiles. Regions of surfaces, the estimates, and the measurement of the gain are ours.
+    film tiles. J. Vorba, J. Křivánek, *Adjoint-Driven Russian Roulette and Splitting in Light
+    Transport Simulation*, 2016: roulette (without splitting). Regions of surfaces, the estimates,
+    and the measurement of the gain are ours.
 
     .. tabs::
         .. code-tab:: xml

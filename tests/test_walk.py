@@ -10,7 +10,13 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from mitsuba_ext.decisions import DirectionSamples, EmitterSampling, SceneQuery, ShadowTest
+from mitsuba_ext.decisions import (
+    DirectionSamples,
+    EmitterSampling,
+    Roulette,
+    SceneQuery,
+    ShadowTest,
+)
 from mitsuba_ext.transport.walk import Walk
 
 BOUNCES = 4
@@ -71,6 +77,18 @@ class _RecordingShadowTest(ShadowTest):
         return mi.Float(1), state + 1
 
 
+class _RecordingRoulette(Roulette):
+    def __init__(self, recorder: _Recorder) -> None:
+        self.recorder = recorder
+
+    def begin(self, sampler, ray, pixel):
+        return mi.UInt32(0)
+
+    def probability(self, state, si, depth, throughput, unguided, η, active):
+        self.recorder.write(state, throughput.x * mi.Float(depth), active)
+        return mi.Float(1), state + 1
+
+
 class _RecordingQuery(SceneQuery):
     """Has no state: what it is asked must differ from bounce to bounce."""
 
@@ -107,12 +125,12 @@ def box(variant: str) -> mi.Scene:
     )
 
 
-def _trace(scene: mi.Scene, **decisions):
+def _trace(scene: mi.Scene, rr_depth: int = 100, **decisions):
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1, LANES)
     ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -0.5), dr.normalize(mi.Vector3f(0.3, 0.2, -1)))
     ray.time = dr.zeros(mi.Float, LANES)
-    walk = Walk(max_depth=BOUNCES + 1, rr_depth=100, **decisions)
+    walk = Walk(BOUNCES + 1, rr_depth, **decisions)
     sample = walk(scene, sampler, ray, mi.Bool(True))
     dr.eval(sample.L)
     return sample
@@ -124,11 +142,12 @@ def _trace(scene: mi.Scene, **decisions):
         ("directions", _RecordingDirections),
         ("next_event", _RecordingNextEvent),
         ("shadow_test", _RecordingShadowTest),
+        ("roulette", _RecordingRoulette),
     ],
 )
 def test_each_bounce_sees_another_number_and_another_state(box, decision, recording):
     recorder = _Recorder()
-    _trace(box, **{decision: recording(recorder)})
+    _trace(box, 1 if decision == "roulette" else 100, **{decision: recording(recorder)})
     numbers = recorder.table.numpy()
     assert len(set(numbers)) == BOUNCES, numbers
     assert (numbers != 0).all(), "the state did not advance"
@@ -159,6 +178,26 @@ def test_a_rejected_connection_traces_no_shadow_ray_and_survivors_weigh_more(box
     L_half, rays_half = total(Walk(3, 100, shadow_test=Half()))
     assert rays_half == pytest.approx(rays / 2, rel=0.02)
     assert L_half == pytest.approx(L, rel=0.02)
+
+
+def test_survivors_of_roulette_weigh_more(box):
+    class Half(Roulette):
+        def probability(self, state, si, depth, throughput, unguided, η, active):
+            return mi.Float(0.5), state
+
+    def total(walk: Walk) -> tuple[float, float]:
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(0, 400_000)
+        ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -0.5), dr.normalize(mi.Vector3f(0.3, 0.2, -1)))
+        ray.time = dr.zeros(mi.Float, 400_000)
+        sample = walk(box, sampler, ray, mi.Bool(True))
+        return float(dr.mean(sample.L.x)[0]), float(dr.mean(mi.Float(sample.scatter_count))[0])
+
+    L, rays = total(Walk(3, 100))
+    L_half, rays_half = total(Walk(3, 1, roulette=Half()))
+    # One ray for the first bounce of each path
+    assert rays_half == pytest.approx(1 / 2 + (rays - 1) / 4, rel=0.02)
+    assert L_half == pytest.approx(L, rel=0.03)
 
 
 def test_weights_of_guided_samples_do_not_end_paths(box):

@@ -55,12 +55,14 @@ class GuideLearner(Learner):
         bounces: How many directions of a path are guided, at most.
         max_memory: Bytes for what is recorded, and for what is built from it.
         pilot_samples: Samples of all pilots together.
-        always: Guide all ``bounces``, also where the second pilot shows that it does not pay?
+        always: Guide all ``bounces``, and learn the roulette, also where the second pilot shows
+            that it does not pay?
         rr_depth: Depth at which roulette begins; ``None`` where no path is that long.
         film_width: Pixels of a row of the film, with its border where that is sampled.
 
     Attributes:
         guide (GuidedDirections): What was learned; ``None`` where nothing is guided.
+        roulette (Roulette): That of the last stage.
         guidance (Guidance): The last choice; ``None`` before the second pilot has shown a gain.
         trial (RouletteTrial): What the roulette of the last pilot was worth; ``None`` where there
             is no roulette.
@@ -179,13 +181,17 @@ class GuideLearner(Learner):
 
     def _against_path(self, gains: Mapping[float, np.ndarray]) -> tuple[float, float]:
         """What uniform samples would have with the roulette of the next stage, in units of what
-        ``path`` has: variance, and length of paths. Takes the roulette of ``path`` again where it
-        would have been better in the last pilot."""
+        ``path`` has: variance, and length of paths. Takes the roulette of ``path`` again where the
+        last pilot shows that the learned one does not pay."""
         if self.trial is None:
             return 1.0, 1.0
         drawn, path = self.trial.drawn, self.trial.unguided
         chosen = drawn
-        if self._learns_roulette and self.trial.by_throughput.efficiency(drawn) > 1:
+        if (
+            self._learns_roulette
+            and not self.always
+            and drawn.efficiency(self.trial.by_throughput) < _LEAST_EFFICIENCY
+        ):
             self._learns_roulette, self.roulette = False, ThroughputRoulette()
             chosen = self.trial.by_throughput
         if path.variance <= 0 or not np.isfinite(path.variance + chosen.variance):
