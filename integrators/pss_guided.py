@@ -93,10 +93,9 @@ class PSSGuided(WalkIntegrator):
     where there are few samples, and mixed with uniform numbers. The second of three pilots shows
     what the trees of the first are worth. From that follows how much of the samples trees decide
     (40, 60 or 80 %), how many bounces are worth the time of guiding them, and which roulette is
-    better; if no guide pays, learning
-    ends there, and the rest is rendered as by :monosp:`path`. After a render,
-    :monosp:`integrator.statistics.learned` tells, and :monosp:`integrator.guide` holds what was
-    learned (see examples/learned_samples.py).
+    better; if no guide pays, learning ends there, and the rest is rendered as by :monosp:`path`.
+    After a render, :monosp:`integrator.statistics.learned` tells, and :monosp:`integrator.guide`
+    holds what was learned (see examples/learned_samples.py).
 
     The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass
     (with tiles they are, in vain). Participating media are ignored, as by :monosp:`path`. Gradients

@@ -150,9 +150,9 @@ class GuideLearner(Learner):
             share, bounces, gain, efficiency = self.guidance
             effect = f"about {gain:.0%} less variance"
             if efficiency < _LEAST_EFFICIENCY and not self.always:
-                self.guide, self._records = None, None
+                self.guide, self._records, self.roulette = None, None, ThroughputRoulette()
                 self._summary = f"no guide: with {self._regions}, {effect}"
-                return {"directions": DirectionSamples(), "roulette": ThroughputRoulette()}
+                return {"directions": DirectionSamples(), "roulette": self.roulette}
         builder, roots, below = self._regions.build(records)
         trees = SampleTrees(
             builder.probability,
