@@ -13,9 +13,9 @@ import mitsuba as mi
 from ...transport.path_decisions import Roulette
 from ..directions.guided_directions import Regions
 
-#: A path that is expected to bring this share of its pixel's radiance goes on in any case. (With
-#: 0.1 paths are longer, with 1 there is more noise: both are less efficient.)
-_CERTAIN = 0.3
+#: A path that is expected to bring this share of its pixel's radiance goes on in any case. (On a
+#: lamp in a glass ball, 0.3 has 1.25 times the error, and 0.08 has 0.92 of it with 8 % more rays.)
+_CERTAIN = 0.15
 
 #: The least probability: an estimate that is too low must not make the survivors too heavy.
 _LEAST = 0.1
