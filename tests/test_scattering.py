@@ -78,7 +78,7 @@ _FOUR = {"connections": {"type": "weighted_connections", "count": 4, "vertices":
     ("mirrors_and_glass", 3, 0.5, {}),
     ("cornell_box", 6, 0.3, _FOUR),
     pytest.param("mirrors_and_glass", 3, 0.3, _FOUR, marks=pytest.mark.slow),
-    pytest.param("cornell_box", 6, 0.8, {"connections": 0}, marks=pytest.mark.slow),
+    pytest.param("cornell_box", 6, 0.5, {"connections": 0}, marks=pytest.mark.slow),
     pytest.param("cornell_box", 6, 0.5, {"directions": {"type": "guided_directions",
                                                         "always_guide": True}},
                  marks=pytest.mark.slow),
@@ -89,7 +89,7 @@ def test_a_mixture_of_directions_has_the_mean_of_path(
     scene = load(scene_name, width=32, height=18, rfilter="box")
     expected = two_halves(scene, REFERENCE.make(max_depth), 2048, REFERENCE_SEEDS)
     images = two_halves(scene, _mixing(max_depth, share, **slots), 1024, SEEDS)
-    precision = 0.01 if scene_name == "cornell_box" else 0.03
+    precision = 0.03 if scene_name != "cornell_box" else 0.015 if "connections" in slots else 0.01
     assert_same_pixels_on_average(images, expected, precision)
 
 
