@@ -158,6 +158,22 @@ TECHNIQUES: dict[str, Technique] = {
             )
         ),
     ),
+    # All decisions at once: ``test_combinations.py`` has pairs of them
+    "composed": Technique(
+        "composed_path",
+        {
+            "directions": {"type": "guided_directions", "always_guide": True},
+            "next_event": {"type": "learned_lights", "grid": 8},
+            "connections": {"type": "weighted_connections", "count": 4, "vertices": "all"},
+            "shadow_test": {"type": "visibility_roulette", "slope": 2.0, "floor": 0.3},
+            "pilot_spp": 32,
+        },
+        checks=Checks(cases=["no_light", "empty"]),
+        thorough=Checks(
+            ["rooms", "mirrors_and_glass", "window"], ["llvm_ad_mono", "llvm_ad_spectral"],
+            FURNACES, [-1], _LEARNERS,
+        ),
+    ),
     # Lights by power, by distance, by a loop over all of them; nothing is learned
     "power": Technique("composed_path", {"next_event": "power"}, checks=Checks(["rooms"])),
     "spatial": Technique(

@@ -221,7 +221,12 @@ _WRONG_GUIDING = [
     (ValueError, {"max_memory": math.nan}),
 ]
 WRONG_VALUES = [(name, *wrong) for name in DEFAULTS for wrong in _WRONG]
-WRONG_VALUES += [("neepp", *wrong) for wrong in _WRONG_REJECTION]
+# Most of them are known only where shadow rays are rejected, by a map of their own
+_REJECTION = {"light_sampling": "uniform", "rejection": True}
+WRONG_VALUES += [
+    ("neepp", kind, {**wrong, **({} if wrong.keys() & {*_REJECTION, "load_map"} else _REJECTION)})
+    for kind, wrong in _WRONG_REJECTION
+]
 WRONG_VALUES += [("pss_guided", *wrong) for wrong in _WRONG_GUIDING]
 WRONG_VALUES += [("composed_path", ValueError, {"shadow_test": "sometimes"})]
 WRONG_VALUES += [("composed_path", ValueError, {"next_event": "always"})]
@@ -231,7 +236,7 @@ WRONG_VALUES += [("composed_path", ValueError, {"next_event": "always"})]
 def test_wrong_value_is_named_with_its_parameter_and_plugin(
     name: str, kind: type, wrong: dict
 ) -> None:
-    ((parameter, value),) = wrong.items()
+    (parameter, value), *_needed = wrong.items()
     with pytest.raises((TypeError, ValueError, RuntimeError)) as caught:
         mi.load_dict({"type": TECHNIQUES[name].plugin, **wrong})
     assert _mentions(caught.value, kind, f'"{TECHNIQUES[name].plugin}"', parameter, repr(value))

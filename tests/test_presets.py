@@ -55,8 +55,12 @@ def _composed(**slots: Any) -> dict[str, Any]:
 _ROULETTE = {"law": "affine", "slope": 3.0, "floor": 0.2}
 
 
+def _slow(*values: Any) -> Any:
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize("preset, slots", [
-    ({}, {"next_event": "contribution"}),
+    _slow({}, {"next_event": "contribution"}),
     ({"light_sampling": "visibility", "grid": 4, "max_memory": 3.0, "pilot_spp": 9},
      {"next_event": {"type": "learned_lights", "target": "visibility", "grid": 4,
                      "max_memory": 3.0}, "pilot_spp": 9}),
@@ -68,16 +72,16 @@ _ROULETTE = {"law": "affine", "slope": 3.0, "floor": 0.2}
     ({"light_sampling": "spatial", "grid": 5}, {"next_event": {"type": "spatial_lights",
                                                                "grid": 5}}),
     ({"light_sampling": "linear"}, {"next_event": "linear"}),
-    ({"light_sampling": "power"}, {"next_event": "power"}),
-    ({"light_sampling": "uniform"}, {}),
+    _slow({"light_sampling": "power"}, {"next_event": "power"}),
+    _slow({"light_sampling": "uniform"}, {}),
 ], ids=lambda parameters: "-".join(map(str, parameters)))  # fmt: skip
 def test_neepp_is_composed_path(preset: dict[str, Any], slots: dict[str, Any]) -> None:
     _assert_same_image({"type": "neepp", **preset}, _composed(**slots))
 
 
 @pytest.mark.parametrize("guiding, connections", [
-    ({"always_guide": True}, {}),
-    ({"always_guide": True, "regions": "tiles", "tile": 5, "bounces": 3}, {}),
+    _slow({"always_guide": True}, {}),
+    _slow({"always_guide": True, "regions": "tiles", "tile": 5, "bounces": 3}, {}),
     ({"always_guide": True, "bounces": 2, "max_memory": 0.5}, {"connections": 0}),
 ], ids=["surfaces", "tiles", "without connections"])  # fmt: skip
 def test_pss_guided_is_composed_path(guiding: dict[str, Any], connections: dict[str, Any]) -> None:
@@ -88,7 +92,7 @@ def test_pss_guided_is_composed_path(guiding: dict[str, Any], connections: dict[
     )
 
 
-@pytest.mark.parametrize("pattern, weights", [("sobol", "torus"), ("hammersley", "none")])
+@pytest.mark.parametrize("pattern, weights", [("sobol", "torus"), _slow("hammersley", "none")])
 def test_reweighted_direct_is_composed_path(pattern: str, weights: str) -> None:
     many = {"pattern": pattern, "weights": weights}
     _assert_same_image(

@@ -77,7 +77,7 @@ class RejectedShadowRays(DecisionParameters):
         lights = others.get("next_event")
         if isinstance(lights, LightLearner):
             return LightMapRouletteLearner(lights, **law)
-        if not self.can_learn(setting.scene, setting.pilot_spp):
+        if not self._has_own_map or not self.can_learn(setting.scene, setting.pilot_spp):
             return None
         return VisibilityLearner(self.grid, self.max_memory, self.refine, **law)
 

@@ -12,6 +12,7 @@ from .heroes import Heroes
 from .mis import power_heuristic
 from .observer import Observer
 from .path_decisions import (
+    AlwaysTest,
     ConnectionCount,
     EmitterSampling,
     LightNumbers,
@@ -20,6 +21,9 @@ from .path_decisions import (
     ShadowTest,
 )
 from .vertex import Vertex
+
+#: The golden ratio: its multiples, modulo one, are evenly spread.
+_GOLDEN = 0.6180339887
 
 
 @dataclass
@@ -87,7 +91,7 @@ class Connector:
     def unoccluded(
         self,
         state: Any,
-        sampler: mi.Sampler,
+        survival_sample: mi.Float | tuple[()],
         vertex: Vertex,
         β: mi.Spectrum,
         connection: Connection,
@@ -100,6 +104,7 @@ class Connector:
 
         Parameters:
             state: Of the shadow test.
+            survival_sample: See :meth:`survival_sample`.
             β: Multiplies the result.
             bsdf_value, pdf: The BSDF's value towards the light (cosine included), and the density
                 with which scattering finds this direction.
@@ -117,21 +122,27 @@ class Connector:
         considered = active & (ds.pdf != 0)
         # A connection that cannot contribute needs no shadow ray
         tested = considered & (dr.max(dr.abs(value)) > 0)
-        value, tested, state = self._roulette(state, connection, sampler, si, value, tested)
+        value, tested, state = self._roulette(
+            state, connection, survival_sample, si, value, tested
+        )
         visible = tested & ~self._query.occluded(self._scene, si, ds, tested)
         self._observer.connection(
             connection.choice, vertex, ds, contribution, value, visible, tested
         )
         return value, considered, tested, visible, state
 
-    def _roulette(self, state, connection, sampler, si, value, active):
+    def survival_sample(self, sampler: mi.Sampler) -> mi.Float | tuple[()]:
+        """The number that decides whether a connection is tested; ``()`` if all are."""
+        return () if isinstance(self._shadow_test, AlwaysTest) else sampler.next_1d()
+
+    def _roulette(self, state, connection, survival_sample, si, value, active):
         """Lets the shadow test's decision drop connections; the survivors weigh 1/p."""
         p, state = self._shadow_test.probability(
             state, connection.choice, si, connection.ds, active
         )
         if p is None:
             return value, active, state
-        survives = sampler.next_1d() < p
+        survives = survival_sample < p
         # p > 0 wherever a lane survives: the random number is not negative
         return value * dr.select(survives, dr.rcp(p), 0), active & survives, state
 
@@ -151,6 +162,8 @@ class Connector:
         the shadow test."""
         dimension = self._next_event.choice_dimension
         chosen = self._connections.begin(sampler, dimension)
+        # One number for all connections: a vertex draws as many numbers wherever it lies
+        survival_sample = self.survival_sample(sampler)
         total, index = mi.Spectrum(0), mi.UInt32(0)
         connection_count, shadow_count = mi.UInt32(0), mi.UInt32(0)
         count = self._connections.weight(vertex.depth)
@@ -166,8 +179,8 @@ class Connector:
                 vertex.path.hero_is_alone, bsdf_value, vertex.bsdf, vertex.si, wo
             )
             value, considered, tested, visible, shadow_state = self.unoccluded(
-                shadow_state, sampler, vertex, mi.Spectrum(weight), connection, bsdf_value, pdf,
-                count, active,
+                shadow_state, _turned(survival_sample, index), vertex, mi.Spectrum(weight),
+                connection, bsdf_value, pdf, count, active,
             )  # fmt: skip
             total[visible] += value
             connection_count += dr.select(considered, 1, 0)
@@ -176,3 +189,11 @@ class Connector:
             active &= mi.Float(index) < count
         # Where there is one connection or none, the total is 0
         return total / dr.maximum(count, 1), connection_count, shadow_count, shadow_state
+
+
+def _turned(sample: mi.Float | tuple[()], index: mi.UInt32) -> mi.Float | tuple[()]:
+    """A number of its own for each connection: uniform if ``sample`` is, and evenly spread."""
+    if isinstance(sample, tuple):
+        return sample
+    turned = dr.fma(mi.Float(index), _GOLDEN, sample)
+    return turned - dr.floor(turned)

@@ -156,8 +156,8 @@ class Walk:
             # ----- Does the light reach this vertex? -----
             if dr.hint(makes_one, mode="scalar"):
                 unoccluded, considered, tested, visible, shadow_state = connector.unoccluded(
-                    shadow_state, sampler, vertex, path.β, connection, bsdf_value, light_pdf, 1.0,
-                    active_em,
+                    shadow_state, connector.survival_sample(sampler), vertex, path.β, connection,
+                    bsdf_value, light_pdf, 1.0, active_em,
                 )  # fmt: skip
                 L[visible] += unoccluded
                 connection_count += dr.select(considered, 1, 0)

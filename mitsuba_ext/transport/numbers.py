@@ -1,0 +1,68 @@
+"""Where the random numbers of an estimator come from, besides Mitsuba's samplers.
+
+An estimator draws with ``next_1d`` and ``next_2d``. What stands in for a sampler is a dataclass:
+Dr.Jit's loops then see the place that it has reached, and change it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+
+class Numbers(Protocol):
+    """What an estimator asks of a sampler."""
+
+    def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
+        """The next number in [0, 1)."""
+
+    def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
+        """The next two."""
+
+
+# Not a dataclass: loops only read it, and it has not the width of their state
+class NumberTable:
+    """A vector of numbers for each lane.
+
+    Parameters (and attributes):
+        values: In [0, 1): all first numbers, then all second ones, and so on.
+        lanes: How many lanes there are.
+    """
+
+    def __init__(self, values: mi.Float, lanes: int) -> None:
+        self.values, self.lanes = values, dr.opaque(mi.UInt32, lanes)
+        self.count = dr.opaque(mi.UInt32, len(values) // lanes)
+
+
+@dataclass
+class StoredNumbers:
+    """Numbers from a stored vector, for replay: lane i draws those of lane i of the table.
+
+    Attributes:
+        table: The numbers. After the last one, all are 0: a path that asks for more than is stored
+            is not the one that was stored.
+        lane: Which vector a lane draws from.
+        index: How many numbers a lane has drawn.
+    """
+
+    table: NumberTable
+    lane: mi.UInt32
+    index: mi.UInt32
+
+    @classmethod
+    def begin(cls, table: NumberTable, lanes: int) -> StoredNumbers:
+        """Before the first number of the first ``lanes`` vectors."""
+        return cls(table, dr.arange(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes))
+
+    def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
+        known = active & (self.index < self.table.count)
+        entry = self.index * self.table.lanes + self.lane
+        self.index = self.index + 1
+        return dr.gather(mi.Float, self.table.values, entry, known)
+
+    def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
+        x = self.next_1d(active)
+        return mi.Point2f(x, self.next_1d(active))
