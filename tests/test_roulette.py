@@ -45,11 +45,11 @@ def _probability(throughput: float, radiance: float, pixel: float, depth: int = 
 
 
 def test_paths_survive_in_proportion_to_what_they_are_expected_to_bring() -> None:
-    half = _probability(0.1, 2.0, 2.0)
-    assert 0 < half < 1
-    assert _probability(0.2, 2.0, 2.0) == pytest.approx(2 * half)
-    assert _probability(0.1, 4.0, 2.0) == pytest.approx(2 * half)
-    assert _probability(0.1, 2.0, 1.0) == pytest.approx(2 * half)
+    one = _probability(0.04, 2.0, 2.0)
+    assert 0.1 < one < 0.5
+    assert _probability(0.08, 2.0, 2.0) == pytest.approx(2 * one)
+    assert _probability(0.04, 4.0, 2.0) == pytest.approx(2 * one)
+    assert _probability(0.04, 2.0, 1.0) == pytest.approx(2 * one)
 
 
 def test_probabilities_lie_between_the_least_and_one() -> None:
