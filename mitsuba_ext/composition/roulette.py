@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..decisions.directions.guide_learner import GuideLearner
+from ..decisions.directions.guided_roulette import RouletteLearner
 from ..decisions.learner import Learner
-from ..decisions.roulette.roulette_learner import RouletteLearner
 from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, Setting
 

@@ -15,6 +15,7 @@ from ..transport.observer import Observers
 from ..transport.path_decisions import NoConnections
 from ..transport.walk import Walk
 from .decision_parameters import DecisionParameters, Setting
+from .learned_file import States
 
 #: Paths of each of the first two pilots, about: they show what learning is worth.
 _TRIAL_PATHS = 1 << 17
@@ -65,6 +66,9 @@ class Schedule:
         walk: Makes a walk with the integrator's parameters from the decisions that differ from
             those of ``path``.
         query: How rays meet the scene.
+        restored: What an earlier render has learned (``Learner.state``, by slot): there is no
+            pilot then. ``None`` to learn.
+        learned: Is called with what was learned, before the last stage.
 
     Attributes:
         learners: Who learns, by slot.
@@ -79,6 +83,8 @@ class Schedule:
         pilot_count: int,
         walk: Callable[..., Walk],
         query: Any,
+        restored: States | None = None,
+        learned: Callable[[States], None] | None = None,
     ) -> None:
         self._setting, self._pilot_count, self._walk = setting, pilot_count, walk
         self.decisions: dict[str, Any] = {"query": query}
@@ -95,12 +101,15 @@ class Schedule:
                 learner = parameters.learner(setting, self.learners)
                 if learner is not None:
                     self.learners[slot] = learner
+        self._restored, self._learned = restored, learned
         self._scout: Scout | None = None
         self._finished_stages = -1
 
     def next_stage(self) -> Stage:
         """See :class:`mitsuba_ext.rendering.stages.Schedule`."""
         learners = list(self.learners.values())
+        if self._restored is not None:
+            return self._restored_stage(self._restored)
         if self._scout is None and any(learner.wants_scout for learner in learners):
             self._scout = Scout()
             return self._scout_stage()
@@ -111,12 +120,23 @@ class Schedule:
                 self._replace(slot, learner.start(self._setting.scene, p, n))
         if self._finished_stages == self._pilot_count:
             self._learn(is_last=True)
-            learned = "; ".join(filter(None, map(str, learners)))
-            return Stage(self._walk(**self.decisions), learned, camera=self._camera)
+            return self._last_stage()
         if self._finished_stages > 0:
             self._learn(is_last=False)
         observer = _one_observer(learners)
         return Stage(self._walk(observer=observer, **self.decisions), camera=self._camera)
+
+    def _restored_stage(self, states: States) -> Stage:
+        for slot, learner in self.learners.items():
+            if slot in states:
+                self._replace(slot, learner.restore(self._setting.scene, states[slot]))
+        for learner in self.learners.values():
+            learner.finish()
+        return self._last_stage()
+
+    def _last_stage(self) -> Stage:
+        learned = "; ".join(filter(None, map(str, self.learners.values())))
+        return Stage(self._walk(**self.decisions), learned, camera=self._camera)
 
     def _scout_stage(self) -> Stage:
         depth = min(SCOUT_DEPTH, self._setting.max_depth)
@@ -130,6 +150,9 @@ class Schedule:
         for slot, learner in self.learners.items():
             self._replace(slot, learner.learn(self._setting.scene, is_last))
         if is_last:
+            if self._learned is not None:
+                states = {slot: learner.state() for slot, learner in self.learners.items()}
+                self._learned({slot: state for slot, state in states.items() if state})
             for learner in self.learners.values():
                 learner.finish()
 

@@ -5,19 +5,24 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 
 from ..decisions.learner import Learner
 from ..decisions.query.moving_scene import scene_query
+from ..errors import InputError
+from ..files import check_target
 from ..movers import refuse_movers
 from ..rendering.aovs import check_aovs
 from ..rendering.staged_integrator import NO_LIMIT, StagedIntegrator
 from ..transport.estimator import CameraRays
 from ..transport.path_decisions import SceneQuery
 from ..transport.walk import Walk
+from . import learned_file
 from .camera_numbers import PURPOSES, samples_per_set
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 from .schedule import Schedule, pilot_samples
@@ -50,6 +55,9 @@ class WalkIntegrator(StagedIntegrator):
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
          :monosp:`depth:depth,nn:sh_normal`. (Default: none)
 
+    Where something learns, also ``pilot_spp``, ``save_learned`` and ``load_learned``; see
+    :class:`composed_path`.
+
     Attributes:
         slots (dict[str, DecisionParameters]): What fills the slots of the walk.
         learners (dict[str, Learner]): Who learned in the last render, by slot.
@@ -65,6 +73,7 @@ class WalkIntegrator(StagedIntegrator):
         self.slots: dict[str, DecisionParameters] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
+        self.save_learned = self.load_learned = ""
 
     # ---- What a subclass says ----
 
@@ -88,16 +97,24 @@ class WalkIntegrator(StagedIntegrator):
         wishes = [p.pilot_spp for p in self.slots.values() if p.pilot_spp]
         if wishes:
             self._pilot_spp = self.parameter(props, "pilot_spp", max(wishes), minimum=0)
+            self.save_learned = self.parameter(props, "save_learned", "")
+            self.load_learned = self.parameter(props, "load_learned", "")
 
     def parameters(self) -> dict[str, Any]:
-        slots = {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
-        return {**slots, **({} if self._pilot_spp is None else {"pilot_spp": self._pilot_spp})}
+        learning = {
+            "pilot_spp": self._pilot_spp,
+            "save_learned": self.save_learned,
+            "load_learned": self.load_learned,
+        }
+        given = {key: value for key, value in learning.items() if value not in (None, "")}
+        return {**self._described_slots(), **given}
 
     # ---- What the render asks for ----
 
     def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
         self.learners = {}
-        if self.max_depth < 2:
+        self._check_learned_file()
+        if self.max_depth < 2 or self.load_learned:
             return []
         return pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
 
@@ -113,13 +130,24 @@ class WalkIntegrator(StagedIntegrator):
         self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
     ) -> Schedule:
         *pilots, _rest = samples
+        # What an earlier render has learned needs no pilots, but somebody to take it over
+        pilot_spp = self._pilot_spp or 0 if self.load_learned else sum(pilots)
         setting = Setting(
-            scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), sum(pilots),
+            scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), pilot_spp,
             self.timeout > 0,
         )  # fmt: skip
+        made_by = ", ".join(f"{slot} = {text}" for slot, text in self._described_slots().items())
+        restored, learned = None, None
+        if self.load_learned:
+            where = f'"{self.name}": the parameter "load_learned"'
+            restored = learned_file.load(Path(self.load_learned), scene, made_by, where)
+        if self.save_learned:
+            path = Path(self.save_learned)
+            learned = functools.partial(learned_file.save, path, scene, made_by)
         schedule = Schedule(
-            self.name, self.slots, setting, len(pilots), self.walk, self._query(scene)
-        )
+            self.name, self.slots, setting, len(pilots), self.walk, self._query(scene), restored,
+            learned,
+        )  # fmt: skip
         self.learners = schedule.learners
         return schedule
 
@@ -159,6 +187,20 @@ class WalkIntegrator(StagedIntegrator):
         }
 
     # ---- Helpers ----
+
+    def _described_slots(self) -> dict[str, str]:
+        return {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
+
+    def _check_learned_file(self) -> None:
+        """
+        Raises:
+            ValueError: What is going to be learned cannot be written.
+        """
+        if self.save_learned:
+            try:
+                check_target(Path(self.save_learned))
+            except InputError as error:
+                raise ValueError(f'"{self.name}": "save_learned": {error}') from None
 
     def _query(self, scene: mi.Scene) -> SceneQuery:
         """How rays meet ``scene``. The output variables are Mitsuba's, which knows no motion."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from ..transport.observer import Observer
 
@@ -23,6 +24,16 @@ class Learner(Observer):
     def learn(self, scene: mi.Scene, is_last: bool) -> Any | None:
         """The decision of the next stage, which is the last one if ``is_last`` says so; ``None``
         for the same as before."""
+        raise NotImplementedError
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What the decision of the last stage is made of, once that has been learned; empty where
+        it is that of Mitsuba's ``path``."""
+        return {}
+
+    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> Any | None:
+        """The decision of the last stage, from a :meth:`state` that is not empty, for the same
+        scene. Nothing else is asked of a learner that is restored."""
         raise NotImplementedError
 
     def finish(self) -> None:

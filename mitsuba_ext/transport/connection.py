@@ -127,7 +127,7 @@ class Connector:
         )
         visible = tested & ~self._query.occluded(self._scene, si, ds, tested)
         self._observer.connection(
-            connection.choice, vertex, ds, contribution, value, visible, tested
+            connection.choice, vertex, ds, contribution, value, pdf, visible, tested
         )
         return value, considered, tested, visible, state
 

@@ -30,12 +30,14 @@ class Observer:
         ds: mi.DirectionSample3f,
         contribution: mi.Spectrum,
         value: mi.Spectrum,
+        pdf: mi.Float,
         visible: mi.Bool,
         tested: mi.Bool,
     ) -> None:
         """A shadow ray was traced where ``tested``. ``choice`` is what the next event decision told
         of its choice; ``contribution`` is BSDF · radiance / pdf; ``value`` is this times MIS weight
-        and throughput: what the path gains where the light is ``visible``."""
+        and throughput: what the path gains where the light is ``visible``; ``pdf`` is the density
+        with which scattering finds the direction."""
 
     def direction(
         self,

@@ -192,6 +192,21 @@ class GuideLearner(Learner):
             self.roulette = AdjointRoulette(self._regions, radiance, self._pixels.scale())
         return self.guide
 
+    def state(self) -> dict[str, np.ndarray]:
+        if self.guide is None:
+            return {}
+        arrays = {**self.guide.trees.state(), **self.guide.regions.state()}
+        return {**arrays, "bounces": np.array(self.guide.bounces)}
+
+    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> GuidedDirections:
+        # Any vertex: these regions are replaced
+        regions = self.make_regions(mi.Point3f(0, 0, 0), mi.Normal3f(0, 0, 1))
+        regions.restore(state)
+        trees, bounces = SampleTrees.of_state(state), int(state["bounces"])
+        self.guide = GuidedDirections(trees, regions, bounces)
+        self._summary = f"guide: {regions}, for {bounces} bounces"
+        return self.guide
+
     def finish(self) -> None:
         self._records = None
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 #: The value that marks a leaf, in place of a probability.
 LEAF = -1.0
@@ -78,6 +79,24 @@ class SampleTrees:
         is_leaf = dr.gather(mi.Float, probability, root) < 0
         self.share = dr.select(is_leaf, 0, share)
         dr.eval(self._nodes, self.share, self._values)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The trees as arrays."""
+        return {
+            "nodes": self._nodes.numpy().view(np.uint32),
+            "values": self._values.numpy(),
+            "share": self.share.numpy(),
+        }
+
+    @classmethod
+    def of_state(cls, state: dict[str, np.ndarray]) -> SampleTrees:
+        """The trees that :meth:`state` has made arrays of."""
+        trees = cls.__new__(cls)
+        # As integers: bit patterns of nodes may be those of NaNs
+        trees._nodes = dr.reinterpret_array(mi.Float, mi.UInt32(state["nodes"]))
+        trees._values, trees.share = mi.UInt32(state["values"]), mi.Float(state["share"])
+        dr.eval(trees._nodes, trees._values, trees.share)
+        return trees
 
     @property
     def bytes(self) -> int:

@@ -39,6 +39,7 @@ class SurfaceRegions:
         bbox = region(p)
         finest = _GRIDS[-1]
         scale = finest / mi.Vector3f(bbox.max - bbox.min)
+        self._origin, self._scale = np.array(bbox.min), np.array(scale).ravel()
         self._pairs = VoxelSides(mi.Point3f(bbox.min), scale, finest)
         pair, inside = (x.numpy() for x in self._pairs.number(p, n, mi.Bool(True)))
         voxel, side = np.divmod(pair[inside], SIDES)
@@ -60,6 +61,24 @@ class SurfaceRegions:
             self.count += len(seen)
         self._parent = np.concatenate(parents)
         self._table = mi.UInt32(table.ravel())
+        self._specular = dr.opaque(mi.UInt32, self.count)
+        dr.eval(self._table)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What the walk needs of the regions, as arrays."""
+        return {
+            "origin": self._origin,
+            "scale": self._scale,
+            "table": self._table.numpy(),
+            "count": np.array(self.count),
+        }
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Takes over the regions that :meth:`state` has made arrays of."""
+        self._pairs = VoxelSides(
+            mi.Point3f(state["origin"]), mi.Vector3f(state["scale"]), _GRIDS[-1]
+        )
+        self._table, self.count = mi.UInt32(state["table"]), int(state["count"])
         self._specular = dr.opaque(mi.UInt32, self.count)
         dr.eval(self._table)
 

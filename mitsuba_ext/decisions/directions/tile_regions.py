@@ -41,6 +41,13 @@ class TileRegions:
             dr.opaque(mi.UInt32, x) for x in (width, tile, self._columns)
         )
 
+    def state(self) -> dict[str, np.ndarray]:
+        """What depends on the pilots: nothing."""
+        return {}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Takes over what :meth:`state` has made arrays of."""
+
     # ---- During the walk ----
 
     def begin(self, pixel: mi.UInt32) -> mi.UInt32:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ...transport.mis import power_heuristic
 from ...transport.observer import Observer
 from ..path_importance import brightness, importance
 from .light_table import Choice
@@ -22,6 +23,7 @@ class ConnectionRecords(Observer):
         as_path: The probabilities, for each cell, with which Mitsuba would choose.
 
     Attributes:
+        samples (int): Paths of the last pilot, those that are not recorded included.
         row_squares (mi.Float64): For each row, the sum of the squares of what its connections would
             bring if Mitsuba had chosen, in the image, weighted by :func:`importance`; shape [rows].
         variance (float): Sum of the squared errors of the paths, weighted so, if Mitsuba had
@@ -29,15 +31,20 @@ class ConnectionRecords(Observer):
     """
 
     def __init__(self, rows: int, as_path: mi.Float) -> None:
-        self._as_path = as_path
-        self.row_squares = dr.zeros(mi.Float64, rows)
-        self.variance = 0.0
+        self._as_path, self._rows = as_path, rows
         self._lanes = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Forgets the last pilot."""
+        self.row_squares = dr.zeros(mi.Float64, self._rows)
+        self.samples, self.variance, self._removed = 0, 0.0, 0.0
 
     # ---- Observer of the walk ----
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None = None) -> None:
         self._collect()
+        self.samples += lanes
         stride = max(1, lanes // _MOST_PATHS)
         self._lanes = -(-lanes // stride)
         lane = dr.arange(mi.UInt32, lanes)
@@ -51,13 +58,20 @@ class ConnectionRecords(Observer):
         self._total = dr.zeros(mi.Float, self._lanes)
         dr.eval(self._row, self._value, self._ratio, self._total)
 
-    def connection(self, choice: Choice, vertex, ds, contribution, value, visible, tested) -> None:
+    def connection(
+        self, choice: Choice, vertex, ds, contribution, value, pdf, visible, tested
+    ) -> None:
         active = visible & self._is_recorded & (vertex.depth < _VERTICES)
         slot = vertex.depth * self._slots + self._path
         as_path = dr.gather(mi.Float, self._as_path, choice.cell, active)
         dr.scatter(self._row, choice.row, slot, active)
         dr.scatter(self._value, brightness(value), slot, active)
-        dr.scatter(self._ratio, choice.probability / as_path, slot, active)
+        # The probability of the choice changes the MIS weight as well
+        ratio = choice.probability / as_path
+        mis = power_heuristic(ds.pdf, pdf)
+        mis_as_path = power_heuristic(ds.pdf / ratio, pdf)
+        change = dr.select(ds.delta, 1, mis_as_path / mis)
+        dr.scatter(self._ratio, ratio * dr.square(change), slot, active)
 
     def end(self, L: mi.Spectrum) -> None:
         dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
@@ -81,11 +95,17 @@ class ConnectionRecords(Observer):
         dr.scatter_add(self.row_squares, as_path, self._row)
         change = float(dr.sum(as_path - actual)[0])
         self.variance += float(dr.sum(mi.Float64(error))[0]) + change
+        self._removed += change
         self._lanes = 0
         self._row = self._value = self._ratio = self._total = None
 
-    def gain(self, ratio: mi.Float) -> float:
-        """By how much, relatively, the variance of the image falls if the mean squares of the
-        connections of each row become ``ratio`` times those of Mitsuba's choice; shape [rows]."""
+    def measured_gain(self) -> float:
+        """By how much, relatively, the choice of the last pilot has lowered the variance of the
+        image below that with Mitsuba's choice."""
+        return self._removed / max(self.variance, 1e-30)
+
+    def predicted_gain(self, ratio: mi.Float) -> float:
+        """The same for a choice with which the mean squares of the connections of each row become
+        ``ratio`` times those with Mitsuba's choice; shape [rows]."""
         removed = float(dr.sum(self.row_squares * mi.Float64(1 - ratio))[0])
         return removed / max(self.variance, 1e-30)

@@ -87,6 +87,7 @@ class LightMap(Observer):
         ds: mi.DirectionSample3f,
         contribution: mi.Spectrum,
         value: mi.Spectrum,
+        pdf: mi.Float,
         visible: mi.Bool,
         tested: mi.Bool,
     ) -> None:

@@ -50,8 +50,8 @@ _TYPES = {
 }  # fmt: skip
 
 
-def save(path: Path, scene: mi.Scene, light_map: LightMap) -> None:
-    """Writes a map, with a fingerprint of the scene that it belongs to."""
+def arrays_of(scene: mi.Scene, light_map: LightMap) -> dict[str, np.ndarray]:
+    """A map as arrays, with a fingerprint of the scene that it belongs to."""
     rows, cells = light_map.rows, light_map.cells
     order = _cell_order(scene, cells)
     counts = (light_map.tests, light_map.successes, light_map.squares)
@@ -66,8 +66,18 @@ def save(path: Path, scene: mi.Scene, light_map: LightMap) -> None:
         successes=successes,
         squares=squares,
     )
+    return vars(stored)
+
+
+def save(path: Path, scene: mi.Scene, light_map: LightMap) -> None:
+    """Writes a map."""
     with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, format=_FORMAT, **vars(stored))
+        np.savez_compressed(file, format=_FORMAT, **arrays_of(scene, light_map))
+
+
+def of_arrays(arrays: dict[str, np.ndarray], scene: mi.Scene) -> LightMap:
+    """The map that :func:`arrays_of` has made arrays of, for the same scene."""
+    return _light_map(_Stored(**arrays), scene, 0)
 
 
 def load(
@@ -111,6 +121,11 @@ def _load(path: Path, scene: mi.Scene, samples: int, max_memory: int) -> LightMa
             f"needs {memory / 2**20:.1f} MiB, more than the {max_memory / 2**20:g} of "
             f'"max_memory": raise it, or learn a coarser map'
         )
+    return _light_map(stored, scene, samples)
+
+
+def _light_map(stored: _Stored, scene: mi.Scene, samples: int) -> LightMap:
+    resolution = int(stored.resolution)
     bbox = mi.ScalarBoundingBox3f(*stored.bbox)
     rows = SurfaceRows(bbox, resolution, mi.Point3f(stored.p), mi.Normal3f(stored.n))
     cells = LightCells(scene, voxel_edges(bbox, resolution))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...lights.light_cells import LightCells
 from ...lights.weights import uniform_weights
@@ -31,7 +32,13 @@ _GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 
 #: What choosing from a table costs, in units of the time of a path (measured: 0 to 15 %), and the
 #: efficiency that it must reach.
-_COST, _LEAST_EFFICIENCY = 0.06, 1.02
+_COST, _LEAST_EFFICIENCY = 0.12, 1.05
+
+#: The efficiency, from few samples, that lets learning go on: tables of more are better.
+_TRIAL_EFFICIENCY = 0.97
+
+#: Share of all pilots' samples that decide, at least.
+_LEAST_SHARE = 0.2
 
 
 class LightLearner(Learner):
@@ -71,7 +78,8 @@ class LightLearner(Learner):
         self._is_needed = grid > 0 or load is not None or save is not None
         self.map: LightMap | None = None
         self._records: ConnectionRecords | None = None
-        self._summary = ""
+        self._summary, self._effect = "", "not measured"
+        self._is_tested = False
 
     def keep_map(self) -> None:
         """Asks for the map also where it does not pay for the choice of lights."""
@@ -93,9 +101,8 @@ class LightLearner(Learner):
                 self.map, self._summary = None, "lights: there is one to choose"
         if self.map is None:
             return None
-        self._as_path = _normalized(
-            uniform_weights(scene, self.map.cells), self.map.cells.count
-        )
+        self._scene = scene
+        self._set_as_path(scene)
         if not self._is_needed:
             self._records = ConnectionRecords(self.map.rows.count, self._as_path)
         return self._selection(self._probabilities(self.map.unoccluded))
@@ -150,30 +157,55 @@ class LightLearner(Learner):
             return None
         self.map.evaluate()
         probabilities = self._probabilities(self.map.weights(self.target))
-        if self._records is not None:
-            gain = self._gain(probabilities)
-            self._records = None
-            if (1 - gain) * (1 + _COST) * _LEAST_EFFICIENCY > 1:
-                self._summary = (
-                    f"{self.map}; not used, the variance would be only {max(0.0, gain):.0%} lower"
-                )
-                self.map = None
-                return EmitterSampling()
+        if self._records is not None and not self._pays(probabilities, is_last):
+            self.map = self._records = None
+            return EmitterSampling()
         if is_last:
-            self._summary = str(self.map)
+            self._summary = f"{self.map}, {self._effect}"
             if self.save is not None:
                 light_map_file.save(self.save, scene, self.map)
         return self._selection(probabilities)
 
-    def finish(self) -> None:
-        self.map = None
+    def state(self) -> dict[str, np.ndarray]:
+        return {} if self.map is None else light_map_file.arrays_of(self._scene, self.map)
 
-    def _gain(self, probabilities: mi.Float) -> float:
-        """By how much, relatively, these probabilities lower the variance of the image below that
-        with Mitsuba's choice."""
-        self._records.finish()
-        as_path = dr.tile(self._as_path, self.map.rows.count)
-        return self._records.gain(self.map.square_ratios(as_path, probabilities))
+    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightSelection:
+        self.map = light_map_file.of_arrays(state, scene)
+        self._set_as_path(scene)
+        self.map.evaluate()
+        self._summary = str(self.map)
+        return self._selection(self._probabilities(self.map.weights(self.target)))
+
+    def finish(self) -> None:
+        self.map = self._scene = None
+
+    def _set_as_path(self, scene: mi.Scene) -> None:
+        cells = self.map.cells
+        self._as_path = _normalized(uniform_weights(scene, cells), cells.count)
+
+    def _pays(self, probabilities: mi.Float, is_last: bool) -> bool:
+        """Has the last pilot shown that learning pays, or may it still?"""
+        records = self._records
+        records.finish()
+        is_trial = records.samples < _LEAST_SHARE * self.pilot_samples and not is_last
+        if self._is_tested:
+            # Samples that did not teach the table from which they were drawn
+            gain = records.measured_gain()
+        else:
+            # Too optimistic: the samples judge what they have taught
+            as_path = dr.tile(self._as_path, self.map.rows.count)
+            gain = records.predicted_gain(self.map.square_ratios(as_path, probabilities))
+            is_trial = not is_last
+        efficiency = 1 / (max(1 - gain, 1e-3) * (1 + _COST))
+        self._effect = f"about {max(0.0, gain):.0%} less variance"
+        if efficiency < (_TRIAL_EFFICIENCY if is_trial else _LEAST_EFFICIENCY):
+            self._summary = f"lights as path: with {self.map}, {self._effect}"
+            return False
+        self._is_tested = True
+        records.restart()
+        if not is_trial:
+            self._records = None
+        return True
 
     def _probabilities(self, weights: mi.Float) -> mi.Float:
         """Probabilities that no wrong expectation can keep from any cell."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...transport.path_decisions import ShadowTest
 from ..learner import Learner
@@ -56,6 +57,17 @@ class LightMapRouletteLearner(Learner):
     def learn(self, scene: mi.Scene, is_last: bool) -> ShadowTest | None:
         if not is_last or self._lights.map is None:
             return None
+        return self._make_roulette()
+
+    def state(self) -> dict[str, np.ndarray]:
+        # All of it is in the light map
+        return {} if self._lights.map is None else {"law": np.array(self._law["law"])}
+
+    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> ShadowTest | None:
+        return self._make_roulette()
+
+    def _make_roulette(self) -> ShadowTest | None:
+        """The roulette by the map; ``None`` if it does not pay."""
         roulette = LightRoulette(self._lights.map, **self._law)
         pays = roulette.rejected_share >= WORTHWHILE
         verb = "rejects" if pays else "does not reject"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...regions.voxel_grid import VoxelGrid
 
@@ -62,6 +63,20 @@ class VisibilityMap:
         self.tests = dr.zeros(mi.UInt32, entries)
         self.successes = dr.zeros(mi.UInt32, entries)
         self._holds_light = dr.zeros(mi.UInt32, self.voxels.occupied_count)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The counters as arrays."""
+        return {
+            "tests": self.tests.numpy(),
+            "successes": self.successes.numpy(),
+            "holds_light": self._holds_light.numpy(),
+        }
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Takes over the counters of a map of the same scene and grid."""
+        self.tests, self.successes, self._holds_light = (
+            mi.UInt32(state[key]) for key in ("tests", "successes", "holds_light")
+        )
 
     def _entry_count(self) -> int:
         n = self.voxels.occupied_count

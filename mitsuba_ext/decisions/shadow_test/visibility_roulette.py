@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...bounds import scene_bounds
 from ...regions.voxel_grid import EMPTY
@@ -79,7 +80,7 @@ class VisibilityLearner(Learner):
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> None:
         self._map = VisibilityMap(scene, self._grid, self._max_memory)
 
-    def connection(self, choice, vertex, ds, contribution, value, visible, tested) -> None:
+    def connection(self, choice, vertex, ds, contribution, value, pdf, visible, tested) -> None:
         self._map.shadow_ray(vertex.si.p, ds.p, visible, tested)
 
     def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
@@ -89,6 +90,10 @@ class VisibilityLearner(Learner):
         if not is_last:
             return None
         self._map.refine(scene, self._refine)
+        return self._make_roulette()
+
+    def _make_roulette(self) -> ShadowTest | None:
+        """The roulette by the map; ``None`` if it does not pay."""
         self._summary = str(self._map)
         roulette = None
         if len(self._map.light_voxels()) > 0:
@@ -97,6 +102,14 @@ class VisibilityLearner(Learner):
                 self._summary += f"; not used, it would reject only {roulette.rejected_share:.0%}"
                 roulette = None
         return roulette
+
+    def state(self) -> dict[str, np.ndarray]:
+        return self._map.state()
+
+    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> ShadowTest | None:
+        self._map = VisibilityMap(scene, self._grid, self._max_memory)
+        self._map.restore(state)
+        return self._make_roulette()
 
     def finish(self) -> None:
         del self._map  # the counters: the last stage needs the roulette's table only

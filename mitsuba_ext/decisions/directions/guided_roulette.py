@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import mitsuba as mi
+import numpy as np
 
 from ...transport.path_decisions import Roulette
-from ..directions.guide_learner import GuideLearner
 from ..learner import Learner
+from ..roulette.adjoint_roulette import AdjointRoulette
+from .guide_learner import GuideLearner
 
 
 class RouletteLearner(Learner):
@@ -26,6 +28,15 @@ class RouletteLearner(Learner):
         return None
 
     def learn(self, scene: mi.Scene, is_last: bool) -> Roulette:
+        return self._guide.roulette
+
+    def state(self) -> dict[str, np.ndarray]:
+        roulette = self._guide.roulette
+        return roulette.state() if isinstance(roulette, AdjointRoulette) else {}
+
+    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> Roulette:
+        radiance, scale = mi.Float(state["radiance"]), mi.Float(state["scale"])
+        self._guide.roulette = AdjointRoulette(self._guide.guide.regions, radiance, scale)
         return self._guide.roulette
 
     def __str__(self) -> str:

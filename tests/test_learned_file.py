@@ -1,0 +1,101 @@
+"""What a render has learned can be saved as a whole, and serves the next render of the scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from statistical import load, one_thread
+
+from mitsuba_ext.plugin_text import parse_plugin
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+#: All that learns, in several combinations.
+LEARNING = {
+    "guide and lights": "auto_path:rr_depth=2",
+    "tiles": "composed_path:directions=[guided_directions:regions=tiles,always_guide=true]",
+    "lights and roulette": "neepp:rejection=true",
+    "visibility": "neepp:rejection=true,light_sampling=spatial",
+}
+
+
+def _integrator(text: str, **parameters: str) -> mi.Integrator:
+    return mi.load_dict({**parse_plugin(text), "max_depth": 6, **parameters})
+
+
+@pytest.mark.parametrize("name", LEARNING)
+def test_a_restored_render_draws_what_the_last_stage_would_have_drawn(name, tmp_path: Path) -> None:
+    """Without pilots: the last stage of the same seed is the whole render."""
+    scene, file = load("rooms"), tmp_path / "learned.npz"
+    first = _integrator(LEARNING[name], save_learned=str(file))
+    with one_thread():
+        first.render(scene, seed=3, spp=64)
+        assert first.statistics.learning_seconds > 0
+        images = []
+        for _ in range(2):
+            again = _integrator(LEARNING[name], load_learned=str(file))
+            images.append(np.array(again.render(scene, seed=5, spp=8)))
+            assert again.statistics.spp == 8
+            assert again.statistics.passes == 1
+    np.testing.assert_array_equal(*images)
+    walk = first.schedule(scene, scene.sensors()[0], (8,), 5)
+    assert type(again.learners) is type(walk.learners)
+
+
+def test_restored_decisions_are_those_that_were_saved(tmp_path: Path) -> None:
+    """The tables themselves, bit for bit."""
+    scene, file = load("rooms"), tmp_path / "learned.npz"
+    integrator = mi.load_dict({
+        "type": "composed_path", "max_depth": 6, "rr_depth": 2, "save_learned": str(file),
+        "directions": {"type": "guided_directions", "always_guide": True},
+        "next_event": "contribution", "shadow_test": "visibility_roulette",
+    })  # fmt: skip
+    stages = []
+    schedule = integrator.schedule
+
+    def spied(*arguments):
+        made = schedule(*arguments)
+        stages.append(made)
+        return made
+
+    integrator.schedule = spied
+    integrator.render(scene, seed=3, spp=64)
+    again = mi.load_dict({
+        "type": "composed_path", "max_depth": 6, "rr_depth": 2, "load_learned": str(file),
+        "directions": {"type": "guided_directions", "always_guide": True},
+        "next_event": "contribution", "shadow_test": "visibility_roulette",
+    })  # fmt: skip
+    sensor = scene.sensors()[0]
+    restored = again.schedule(scene, sensor, (64,), 3)
+    restored.next_stage()
+    old, new = stages[0].decisions, restored.decisions
+    assert set(old) == set(new) >= {"directions", "next_event", "roulette"}
+    for key, array in old["directions"].trees.state().items():
+        np.testing.assert_array_equal(array, new["directions"].trees.state()[key])
+    for key, array in old["directions"].regions.state().items():
+        np.testing.assert_array_equal(array, new["directions"].regions.state()[key])
+    for key, array in old["roulette"].state().items():
+        np.testing.assert_array_equal(array, new["roulette"].state()[key])
+    np.testing.assert_array_equal(old["next_event"]._table, new["next_event"]._table)
+
+
+def test_files_of_other_scenes_and_parameters_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "learned.npz"
+    _integrator("neepp", save_learned=str(file)).render(load("rooms"), spp=16)
+    with pytest.raises(ValueError, match="another scene"):
+        _integrator("neepp", load_learned=str(file)).render(load("open"), spp=16)
+    with pytest.raises(ValueError, match="other parameters"):
+        _integrator("neepp:grid=4", load_learned=str(file)).render(load("rooms"), spp=16)
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        _integrator("neepp", load_learned=str(tmp_path / "none")).render(load("rooms"), spp=16)
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    file.write_bytes(data)
+    with pytest.raises(ValueError, match="damaged"):
+        _integrator("neepp", load_learned=str(file)).render(load("rooms"), spp=16)
+    with pytest.raises(ValueError, match="save_learned"):
+        target = tmp_path / "no folder" / "learned.npz"
+        _integrator("neepp", save_learned=str(target)).render(load("rooms"), spp=16)
