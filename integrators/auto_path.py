@@ -29,6 +29,11 @@ class AutoPath(WalkIntegrator):
        - |int|
        - Samples per pixel from which is learned, at most a quarter of all. They count towards the
          image. With 0 nothing is learned, and this is :monosp:`path`. (Default: 32)
+     * - save_learned, load_learned
+       - |string|
+       - Files. The first is written: what was learned, as a whole. The second is read in place of
+         pilots: what a render of the same scene, with the same parameters and size of film, has
+         saved. (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.

@@ -40,6 +40,13 @@ class ComposedPath(WalkIntegrator):
          :monosp:`spatial_lights`, :monosp:`linear` (by an estimate for each light at each vertex;
          its cost grows with their number). Learned: :monosp:`contribution`, :monosp:`visibility`,
          or a nested :monosp:`learned_lights`. (Default: uniform)
+     * - roulette
+       - |string|
+       - Which paths go on from :monosp:`rr_depth` on. With :monosp:`automatic`, where directions
+         are guided by regions of surfaces: paths are more likely to survive the more they are
+         expected to bring, compared to their pixel, by what the guide has learned; elsewhere, and
+         where pilots show that this does not pay, as with :monosp:`throughput`: by the rule of
+         :monosp:`path`. (Default: automatic)
      * - connections
        - |string|, |int| or |decision|
        - To how many points of lights the first vertex of a path is connected: :monosp:`one`, a
@@ -62,6 +69,11 @@ class ComposedPath(WalkIntegrator):
          image. Known only where something learns; with 0 nothing is learned. A sampler that is
          stratified over all samples may need longer pilots. (Default: 32 with guided directions,
          otherwise 16)
+     * - save_learned, load_learned
+       - |string|
+       - Files. The first is written: what was learned, as a whole. The second is read in place of
+         pilots: what a render of the same scene, with the same parameters and size of film, has
+         saved. (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.

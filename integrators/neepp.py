@@ -66,6 +66,11 @@ class NEEPlusPlus(WalkIntegrator):
          image. With 0 nothing is learned: lights are chosen as by :monosp:`path`, and every shadow
          ray is traced. A sampler that is stratified over all samples may need longer pilots.
          (Default: 16)
+     * - save_learned, load_learned
+       - |string|
+       - Files. The first is written: what was learned, as a whole. The second is read in place of
+         pilots: what a render of the same scene, with the same parameters and size of film, has
+         saved. (Default: none)
      * - law, slope, floor
        - |several|
        - With :monosp:`rejection`: the law of :monosp:`visibility_roulette`. (Default: affine, 10,

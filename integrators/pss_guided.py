@@ -50,6 +50,11 @@ class PSSGuided(WalkIntegrator):
        - Samples per pixel from which is learned, at most a quarter of all. They count towards the
          image. With 0, or where they are fewer than 3, nothing is guided. A sampler that is
          stratified over all samples may need longer pilots. (Default: 32)
+     * - save_learned, load_learned
+       - |string|
+       - Files. The first is written: what was learned, as a whole. The second is read in place of
+         pilots: what a render of the same scene, with the same parameters and size of film, has
+         saved. (Default: none)
      * - always_guide
        - |bool|
        - Guide all :monosp:`bounces`, also where the pilots show that it does not pay? (Default:

@@ -81,7 +81,9 @@ def observe(light_map: LightMap, cell: int, visible: int, blocked: int, value: f
     choice = Choice(row, dr.full(mi.UInt32, cell, visible + blocked), mi.Float(0.5))
     arrived = dr.arange(mi.UInt32, visible + blocked) < visible
     # The contribution of an estimator that chose with probability 0.5
-    light_map.connection(choice, si, None, mi.Color3f(value / 0.5), arrived, mi.Bool(True))
+    light_map.connection(
+        choice, vertex_at(0, si), None, mi.Color3f(value / 0.5), None, None, arrived, mi.Bool(True)
+    )
     light_map.evaluate()
 
 

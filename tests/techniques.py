@@ -126,6 +126,17 @@ TECHNIQUES: dict[str, Technique] = {
         ),
         thorough=EVERYTHING,
     ),
+    "auto_path": Technique(
+        "auto_path", is_plugin=True,
+        checks=Checks(
+            ["rooms"], furnaces=FURNACES[2:3], depths=[-1],
+            cases=(
+                "no_light", "empty", "film_of_one_pixel", "three_samples",
+                "light_that_nothing_sees",
+            ),
+        ),
+        thorough=EVERYTHING,
+    ),
     "guided_as_it_pays": Technique(
         "pss_guided", checks=Checks(["cornell_box"]), thorough=Checks(["door_ajar", "rooms"])
     ),

@@ -194,7 +194,7 @@ def test_regions_follow_the_film_and_the_pilots() -> None:
     for regions in ("tiles", "surfaces"):
         tile = {"tile": 4} if regions == "tiles" else {}
         integrator = mi.load_dict({"type": "pss_guided", "regions": regions, **tile})
-        setting = Setting(lit, camera, 0, 3, 8, pilot_spp=8)
+        setting = Setting(lit, camera, 0, 3, 5, 8, pilot_spp=8)
         learner = integrator.slots["directions"].learner(setting, {})
         assert learner.wants_scout == (regions == "surfaces")
         made.append(learner.make_regions(mi.Point3f(p), mi.Normal3f(up)))

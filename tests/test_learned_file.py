@@ -26,6 +26,11 @@ def _integrator(text: str, **parameters: str) -> mi.Integrator:
     return mi.load_dict({**parse_plugin(text), "max_depth": 6, **parameters})
 
 
+def _larger_film() -> mi.Sensor:
+    film = {"type": "hdrfilm", "width": 80, "height": 60}
+    return mi.load_dict({"type": "perspective", "film": film})
+
+
 @pytest.mark.parametrize("name", LEARNING)
 def test_a_restored_render_draws_what_the_last_stage_would_have_drawn(name, tmp_path: Path) -> None:
     """Without pilots: the last stage of the same seed is the whole render."""
@@ -89,6 +94,8 @@ def test_files_of_other_scenes_and_parameters_are_refused(tmp_path: Path) -> Non
         _integrator("neepp", load_learned=str(file)).render(load("open"), spp=16)
     with pytest.raises(ValueError, match="other parameters"):
         _integrator("neepp:grid=4", load_learned=str(file)).render(load("rooms"), spp=16)
+    with pytest.raises(ValueError, match="film = "):
+        _integrator("neepp", load_learned=str(file)).render(load("rooms"), _larger_film(), spp=16)
     with pytest.raises(FileNotFoundError, match="does not exist"):
         _integrator("neepp", load_learned=str(tmp_path / "none")).render(load("rooms"), spp=16)
     data = bytearray(file.read_bytes())

@@ -9,7 +9,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from maps import connect, floor, lamp, learner_of, map_of, observe, row_of, surface, vertices
+from maps import (
+    connect,
+    floor,
+    lamp,
+    learner_of,
+    map_of,
+    observe,
+    row_of,
+    surface,
+    vertex_at,
+    vertices,
+)
 from statistical import assert_same_mean
 
 from mitsuba_ext.decisions.next_event.light_map import LightMap
@@ -128,20 +139,23 @@ def test_one_bright_sample_does_not_decide():
     assert np.isfinite(after) and after < 10 * max(before, 0.3)
 
 
-def test_the_predicted_variance_is_that_of_the_counts():
+def test_the_predicted_squares_are_those_of_the_counts():
     light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1)))
     unoccluded = row_of(light_map, light_map.unoccluded)
     observe(light_map, 0, 20_000, 0, unoccluded[0])
     observe(light_map, 1, 10_000, 10_000, 0.5 * unoccluded[1])
-    mean = np.array([1, 0.25]) * unoccluded
     square = np.array([1, 0.125]) * np.square(unoccluded)
-    selections = [np.array([0.5, 0.5]), np.array([0.8, 0.2]), np.array([1, 0])]
-    expected = [(square / p).sum() / mean.sum() ** 2 - 1 for p in selections[:2]]
-    # A cell that is never chosen brings nothing
-    expected.append(square[0] / mean.sum() ** 2 - 1)
-    tiled = [mi.Float(np.tile(p, light_map.rows.count)) for p in selections]
-    predicted = light_map.relative_variances(*tiled)
-    assert predicted == pytest.approx(np.maximum(expected, 0), rel=5e-3, abs=1e-3)
+    equal, other = np.array([0.5, 0.5]), np.array([0.8, 0.2])
+    expected = (square / other).sum() / (square / equal).sum()
+    tiled = [mi.Float(np.tile(p, light_map.rows.count)) for p in (equal, other)]
+    predicted = row_of_rows(light_map, light_map.square_ratios(*tiled))
+    assert predicted == pytest.approx(expected, rel=5e-3)
+    assert row_of_rows(light_map, light_map.square_ratios(*tiled[:1] * 2)) == 1
+
+
+def row_of_rows(light_map: LightMap, values: mi.Float) -> float:
+    row = int(light_map.rows.row(surface((0.1, 0.1, 0)), mi.Bool(True))[0])
+    return float(values[row])
 
 
 def test_of_a_large_pilot_a_part_is_recorded():
@@ -155,7 +169,10 @@ def test_of_a_large_pilot_a_part_is_recorded():
         light_map.begin(lanes)
         choice = Choice(mi.UInt32(0), mi.UInt32(0), mi.Float(0.5))
         si = surface((0.1, 0.1, 0), width=lanes)
-        light_map.connection(choice, si, None, mi.Color3f(0.1), mi.Bool(True), mi.Bool(True))
+        light_map.connection(
+            choice, vertex_at(0, si), None, mi.Color3f(0.1), None, None, mi.Bool(True),
+            mi.Bool(True),
+        )  # fmt: skip
         light_map.evaluate()
         assert bool(dr.all(light_map.tests == light_map.successes))
         assert int(light_map.squares[0]) / int(light_map.tests[0]) > 0
@@ -290,7 +307,7 @@ def _stage(**lights) -> mi.Scene:
 
 def test_learning_ends_where_it_would_not_pay():
     """Two lamps side by side are chosen well enough by chance."""
-    assert "one light" in str(learner_of(floor(a=lamp(0, 0, 9, size=0.05))))
+    assert "there is one to choose" in str(learner_of(floor(a=lamp(0, 0, 9, size=0.05))))
     assert "not used" in _learned(_stage(a=lamp(0, 0, 9, size=0.1), b=lamp(0.1, 0, 9, size=0.1)))
     # One is hidden from nearly everything
     different = _stage(a=lamp(0, 0, 9, size=0.1), b=lamp(0, 0, -1, size=0.5))

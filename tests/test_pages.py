@@ -20,10 +20,11 @@ FILES = {file.stem: file for folder in FOLDERS for file in registry.plugin_files
 README = Path(__file__).parents[1] / "README.md"
 DECISIONS = FOLDERS["samplers"]
 #: The integrators that nest no other one.
-WALKS = ["composed_path", "neepp", "pss_guided", "reweighted_direct"]
+WALKS = ["auto_path", "composed_path", "neepp", "pss_guided", "reweighted_direct"]
 
 #: A value that each parameter accepts, besides the words that its row begins with.
 VALUES = {
+    "roulette": "throughput", "save_learned": "learned.npz", "load_learned": "learned.npz",
     **dict.fromkeys(["max_depth", "rr_depth", "grid", "pilot_spp", "refine", "tile", "bounces"], 3),
     **dict.fromkeys(["connections", "count", "light_samples", "camera_samples"], 3),
     **dict.fromkeys(["hide_emitters", "rejection", "always_guide", "nee_first_bounce"], True),
@@ -37,7 +38,8 @@ VALUES = {
 
 #: What makes a parameter known that is not always.
 CONDITIONS = {
-    ("composed_path", "pilot_spp"): {"next_event": "contribution"},
+    **{("composed_path", key): {"next_event": "contribution"}
+       for key in ("pilot_spp", "save_learned", "load_learned")},
     ("pss_guided", "tile"): {"regions": "tiles"},
     ("guided_directions", "tile"): {"regions": "tiles"},
     **{("neepp", key): {"rejection": True} for key in ("law", "slope", "floor")},

@@ -32,7 +32,7 @@ def _refusal(**slots: Any) -> str:
     ("directions", "learned_lights", "next_event"),
     ("next_event", "guided_directions", "directions"),
     ("next_event", "visibility_roulette", "shadow_test"),
-    ("connections", "weighted_numbers", "aperture or time or wavelength"),
+    ("connections", "weighted_numbers", "aperture, time, wavelength"),
     ("shadow_test", "spatial_lights", "next_event"),
     ("aperture", "weighted_connections", "connections"),
 ])  # fmt: skip

@@ -25,7 +25,7 @@ def save(path: Path, scene: mi.Scene, made_by: str, states: Mapping[str, dict]) 
     Parameters:
         path: The file.
         scene: For which it was learned.
-        made_by: The parameters of those who learned.
+        made_by: The parameters of those who learned, and the size of the film.
         states: By slot, from ``Learner.state``.
     """
     arrays = {

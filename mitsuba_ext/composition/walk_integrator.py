@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..files import check_target
 from ..movers import refuse_movers
 from ..rendering.aovs import check_aovs
+from ..rendering.camera import film_extent
 from ..rendering.staged_integrator import NO_LIMIT, StagedIntegrator
 from ..transport.estimator import CameraRays
 from ..transport.path_decisions import SceneQuery
@@ -136,7 +137,10 @@ class WalkIntegrator(StagedIntegrator):
             scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), pilot_spp,
             self.timeout > 0,
         )  # fmt: skip
-        made_by = ", ".join(f"{slot} = {text}" for slot, text in self._described_slots().items())
+        slots = [f"{slot} = {text}" for slot, text in self._described_slots().items()]
+        # The tables of some decisions have an entry for each pixel
+        width, height = film_extent(sensor.film())
+        made_by = ", ".join([*slots, f"film = {width}x{height}"])
         restored, learned = None, None
         if self.load_learned:
             where = f'"{self.name}": the parameter "load_learned"'

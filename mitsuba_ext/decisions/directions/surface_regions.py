@@ -75,8 +75,9 @@ class SurfaceRegions:
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Takes over the regions that :meth:`state` has made arrays of."""
+        self._origin, self._scale = state["origin"], state["scale"]
         self._pairs = VoxelSides(
-            mi.Point3f(state["origin"]), mi.Vector3f(state["scale"]), _GRIDS[-1]
+            mi.Point3f(self._origin), mi.Vector3f(self._scale), _GRIDS[-1]
         )
         self._table, self.count = mi.UInt32(state["table"]), int(state["count"])
         self._specular = dr.opaque(mi.UInt32, self.count)

@@ -83,7 +83,7 @@ class LightLearner(Learner):
 
     def keep_map(self) -> None:
         """Asks for the map also where it does not pay for the choice of lights."""
-        self._is_needed = True
+        self._is_needed, self._records = True, None
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> EmitterSampling | None:
         self.map, self._records = None, None
