@@ -21,13 +21,12 @@ import mitsuba as mi  # isort: skip
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "scenes"
 
-#: ``path``, the strongest light selection without learning, learned light selection, and path
-#: guiding.
+#: ``path``, learned lights, path guiding, and both where they pay.
 INTEGRATORS = {
     "path": "path",
-    "spatial": "composed_path:next_event=spatial",
     "neepp": "neepp",
     "pss_guided": "pss_guided",
+    "auto_path": "auto_path",
 }
 
 #: Our scenes, at their own size.

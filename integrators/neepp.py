@@ -92,10 +92,10 @@ class NEEPlusPlus(WalkIntegrator):
     when** one small light lights an open scene, or when the difficulty lies elsewhere, in indirect
     or glossy light: it then costs the pilots' bookkeeping.
 
-    A first sample per pixel, which is none of the image's, finds the region and the surfaces. Each
-    pilot but the first chooses its lights by what those before it have learned. If the first one
-    shows that little is to gain, learning ends there, unless :monosp:`grid`, :monosp:`rejection` or
-    a file of a map is given.
+    A first sample per pixel, which is not added to the film, finds the region and the surfaces.
+    Each pilot but the first chooses its lights by what those before it have learned. If they show
+    that little is to gain, learning ends there, unless :monosp:`grid`, :monosp:`rejection` or a
+    file of a map is given.
 
     Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no

@@ -61,12 +61,15 @@ class GuidedDirectionsPlugin(DecisionPlugin):
     :monosp:`integrator.learners["directions"].guide` holds it (see examples/learned_samples.py).
 
     The number that chooses a lobe of the BSDF is not guided, and neither are mirrors and glass
-    (with tiles they are, in vain). Russian roulette leaves out of account what guiding adds to the
-    throughput: paths to bright places are not ended sooner. Nested in :monosp:`moment` there is no
-    pilot, and nothing is guided.
+    (with tiles they are, in vain). With regions of surfaces, Russian roulette is learned as well
+    (:monosp:`roulette` of :monosp:`composed_path`): paths that the throughput alone would end where
+    they matter go on, without which guided paths lose much of their gain. Nested in
+    :monosp:`moment` there is no pilot, and nothing is guided.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of
-    film tiles. Regions of surfaces, the estimates, and the measurement of the gain are ours.
+    film tiles. J. Vorba, J. Křivánek, *Adjoint-Driven Russian Roulette and Splitting in Light
+    Transport Simulation*, 2016: roulette (without splitting). Regions of surfaces, the estimates,
+    and the measurement of the gain are ours.
 
     .. tabs::
         .. code-tab:: xml

@@ -48,13 +48,13 @@ class LearnedLightsPlugin(DecisionPlugin):
     when** one small light lights an open scene, or when the difficulty lies elsewhere, in indirect
     or glossy light: it then costs the pilots' bookkeeping.
 
-    A first sample per pixel, which is none of the image's, finds the region and the surfaces. Each
-    pilot but the first chooses its lights by what those before it have learned. All samples weigh
-    the same, and none teaches a stage that it is part of, so that the image is unbiased. A tenth of
-    the choices does not depend on what was learned. If the first pilot shows that choosing as
-    :monosp:`path` does is nearly as good (about 7 % of the image's variance to gain, or less),
-    learning ends there, unless :monosp:`grid`, a file of a map, or a :monosp:`visibility_roulette`
-    beside it is given.
+    A first sample per pixel, which is not added to the film, finds the region and the surfaces.
+    Each pilot but the first chooses its lights by what those before it have learned. All samples
+    weigh the same, and none teaches a stage that it is part of, so that the image is unbiased. A
+    tenth of the choices does not depend on what was learned. The second pilot and the third show by
+    how much the variance of the image is lower than with :monosp:`path`'s choice. If that is less
+    than about 15 %, the time for looking lights up is not worth it, and learning ends there, unless
+    :monosp:`grid`, a file of a map, or a :monosp:`visibility_roulette` beside it is given.
 
     Lights on meshes with interpolated normals are sampled by the area of their triangles;
     :monosp:`path` is biased there, by a fault in Mitsuba. Nested in :monosp:`moment` there is no
