@@ -106,7 +106,7 @@ def _assert_all_is_used(row: dict[str, str], integrator: mi.Integrator) -> None:
     if row["directions"] != "uniform":
         assert integrator.learners["directions"].guide is not None
     if row["next_event"] in ("visibility", "contribution") and row["connections"] != "none":
-        assert "not used" not in str(integrator.learners["next_event"])
+        assert "as path" not in str(integrator.learners["next_event"])
 
 
 # ---- The mean of ``path`` ----

@@ -96,7 +96,7 @@ def _camera(scene: mi.Scene) -> CameraRays:
 
 def _decisions(scene: mi.Scene, name: str) -> dict[str, Any]:
     cells = LightCells(scene, None)
-    setting = Setting(scene, scene.sensors()[0], 0, DEPTH, 16)
+    setting = Setting(scene, scene.sensors()[0], 0, DEPTH, 5, 16)
     if name == "path":
         return {}
     if name == "table":
@@ -111,7 +111,8 @@ def _decisions(scene: mi.Scene, name: str) -> dict[str, Any]:
         "many at first": {"connections": 3},
     }[name]
     integrator = mi.load_dict({"type": "composed_path", **nested})
-    return {slot: p.decision(setting) for slot, p in integrator.slots.items()}
+    decisions = {slot: p.decision(setting) for slot, p in integrator.slots.items()}
+    return {slot: decision for slot, decision in decisions.items() if decision is not None}
 
 
 _NAMES = ["path", "table", "linear", "roulette", "many", "many at first", "many with roulette"]

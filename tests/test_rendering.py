@@ -75,7 +75,7 @@ class _TwoStages:
         self.progress, self.is_cancelled = None, False
         self.name, self.sample_cost = "two_stages", 1
 
-    def pilots(self, scene, spp):
+    def pilots(self, scene, pixel_count, spp):
         return [self.pilot_spp]
 
     def samples_per_set(self, spp):
@@ -286,16 +286,16 @@ def test_passes_share_kernels_and_memory(scene):
     integrator.progress = lambda _: compiled.append(sum(dr.detail.launch_stats()[1:]))
     integrator.render(scene, sensor, spp=30)
     few = integrator.statistics
-    # Pilots of 1 and 6 samples in passes of 1, 3 and 3, the rest of 23 in passes of four
-    assert len(compiled) == few.passes == 9
-    assert compiled[1] == compiled[2], "a pass of a pilot had to compile"
-    assert compiled[3] == compiled[8], "a pass of the last stage had to compile"
+    # Pilots of 1, 1 and 5 samples in passes of 1, 1, 3 and 2, the rest of 23 in passes of four
+    assert len(compiled) == few.passes == 10
+    assert compiled[2] == compiled[3], "a pass of a pilot had to compile"
+    assert compiled[4] == compiled[9], "a pass of the last stage had to compile"
     integrator.render(scene, sensor, spp=30, seed=1)
     # Small kernels that make tables may be new, but not those that trace paths
-    assert compiled[10] == compiled[11] and compiled[12] == compiled[17], "another seed compiled"
+    assert compiled[12] == compiled[13] and compiled[14] == compiled[19], "another seed compiled"
     integrator.render(scene, sensor, spp=69)
     many = integrator.statistics
-    assert many.passes > 1.9 * few.passes
+    assert many.passes > 1.7 * few.passes
     assert many.memory <= 1.05 * few.memory
 
 

@@ -263,13 +263,15 @@ _CROP_AND_BORDER = {"width": 31, "height": 29, "crop_offset_x": 5, "crop_offset_
 )
 def test_odd_films_hold_what_is_returned(nested, changes):
     scene = small_scene(**changes)
-    image = mi.render(scene, integrator=with_variance(nested), spp=64).numpy()
+    # A single pixel has few samples to tell its variance from
+    spp = 64 if "crop_width" in changes else 1024
+    image = mi.render(scene, integrator=with_variance(nested), spp=spp).numpy()
     crop = scene.sensors()[0].film().crop_size()
     assert image.shape[:2] == (crop[1], crop[0])
     assert np.isfinite(image).all() and image.any() and (image[..., -3:] >= 0).all()
     channels = film_channels(scene)
     np.testing.assert_allclose(np.stack(list(channels.values()), 2), image, rtol=1e-6)
-    plain = mi.load_dict({"type": nested}).render(scene, spp=256).numpy()
+    plain = mi.load_dict({"type": nested}).render(scene, spp=4 * spp).numpy()
     error = np.sqrt(image[..., -3:].mean())
     assert abs(image[..., :3].mean() - plain[..., :3].mean()) < 4 * error + 1e-3 * plain.mean()
 

@@ -135,7 +135,7 @@ def plan_render(
         # that are stratified over the whole render must come in passes of equal length, to which
         # the pilots are rounded
         if pilots:
-            limit = min(limit, max(*pilots, spp // _MIN_STRUCTURED_PASSES))
+            limit = min(limit, max(min(pilots), spp // _MIN_STRUCTURED_PASSES))
         limit = max(d for d in range(1, limit + 1) if _divides(d, spp, set_size))
         pilots = [limit * max(1, samples // limit) for samples in pilots]
     stages = (*pilots, spp - sum(pilots))
