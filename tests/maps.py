@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_ext.decisions.next_event.light_map import LightMap
-from mitsuba_ext.decisions.next_event.light_map_learner import LightLearner
+from mitsuba_ext.decisions.next_event.light_map_learner import LightMapLearner
 from mitsuba_ext.decisions.next_event.light_table import Choice
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.regions.surface_rows import SurfaceRows, voxel_edges
@@ -92,9 +92,9 @@ def row_of(light_map: LightMap, values: mi.Float) -> np.ndarray:
     return values.numpy().reshape(-1, light_map.cells.count)[row]
 
 
-def learner_of(scene: mi.Scene, **parameters) -> LightLearner:
+def learner_of(scene: mi.Scene, **parameters) -> LightMapLearner:
     defaults = {"target": "contribution", "grid": 0, "max_memory": 2**26,
                 "pilot_samples": 100_000}
-    learner = LightLearner(**{**defaults, **parameters})
+    learner = LightMapLearner(**{**defaults, **parameters})
     learner.start(scene, *vertices())
     return learner

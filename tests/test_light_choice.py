@@ -9,8 +9,8 @@ import pytest
 from lights import ball
 from maps import connect, floor, lamp, learner_of, map_of, observe, row_of, surface, vertex_at
 
-from mitsuba_ext.decisions.next_event.light_map_learner import LightLearner
-from mitsuba_ext.decisions.next_event.light_table import Choice, LightSelection, OneRow
+from mitsuba_ext.decisions.next_event.light_map_learner import LightMapLearner
+from mitsuba_ext.decisions.next_event.light_table import Choice, LightTable, OneRow
 from mitsuba_ext.decisions.shadow_test.light_map_roulette import LightMapRouletteLearner
 from mitsuba_ext.lights import weights as lights_weights
 from mitsuba_ext.lights.light_cells import LightCells
@@ -32,7 +32,7 @@ def test_the_density_of_a_light_that_is_hit_is_that_of_choosing_it():
     light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1), c=lamp(-0.5, 0, 1)))
     scene = light_map.cells._emitters._scene
     weights = np.tile([1, 2, 5], light_map.rows.count).astype(np.float32)
-    selection = LightSelection(light_map.rows, light_map.cells, mi.Float(weights))
+    selection = LightTable(light_map.rows, light_map.cells, mi.Float(weights))
     lanes = 1 << 12
     si = surface((0.1, 0.1, 0), width=lanes)
     ds, _weight, _choice, state = connect(selection, scene, _sampler(lanes), si)
@@ -58,7 +58,7 @@ def test_dim_lights_among_many_are_chosen_as_often_as_is_said(count: int):
     lanes, rounds = 1 << 22, 8
     weights = np.full(count, 1e-3, np.float32) * np.linspace(0.9, 1.1, count, dtype=np.float32)
     weights[::20] = 20
-    selection = LightSelection(OneRow(), _Cells(count), mi.Float(weights))
+    selection = LightTable(OneRow(), _Cells(count), mi.Float(weights))
     sampler, si = _sampler(lanes), dr.zeros(mi.SurfaceInteraction3f, lanes)
     chosen = np.zeros(count)
     for _ in range(rounds):
@@ -101,7 +101,7 @@ def test_lights_without_sampling_weight_stay_dark_where_no_other_light_arrives()
         off={"type": "point", "position": [0.5, 0, 1], "sampling_weight": 0.0},
     )
     learner = learner_of(scene, grid=8)
-    selection = LightSelection(
+    selection = LightTable(
         learner.map.rows, learner.map.cells, learner._probabilities(learner.map.unoccluded)
     )
     lanes = 1 << 12
@@ -192,11 +192,11 @@ def test_learning_goes_on_where_lights_were_chosen_better_than_by_path():
     learner = learner_of(scene)
     learner._is_tested = True  # the first pilot is over
     _pilot(learner, as_path=0.05)
-    assert type(learner.learn(scene, is_last=False)) is LightSelection
+    assert type(learner.learn(scene, is_last=False)) is LightTable
     assert "less variance" in str(learner._effect)
 
 
-def _pilot(learner: LightLearner, as_path: float) -> None:
+def _pilot(learner: LightMapLearner, as_path: float) -> None:
     """Paths of which each has one connection, to the first of two lights; Mitsuba would choose it
     with the probability ``as_path`` · 0.5."""
     lanes = 1 << 12

@@ -24,9 +24,9 @@ from maps import (
 from statistical import assert_same_mean
 
 from mitsuba_ext.decisions.next_event.light_map import LightMap
-from mitsuba_ext.decisions.next_event.light_table import Choice, LightSelection
+from mitsuba_ext.decisions.next_event.light_table import Choice, LightTable
 from mitsuba_ext.decisions.scout import Scout
-from mitsuba_ext.decisions.shadow_test.light_map_roulette import LightRoulette
+from mitsuba_ext.decisions.shadow_test.light_map_roulette import LightMapRoulette
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.regions.surface_rows import RowCounts, SurfaceRows
 from mitsuba_ext.regions.surface_sides import region
@@ -188,7 +188,7 @@ def test_the_roulette_reads_the_chosen_cell():
     si = surface((0.1, 0.1, 0))
     row = light_map.rows.row(si, mi.Bool(True))
     for law, blocked in (("affine", 0.01), ("paper", 1e-4)):
-        roulette = LightRoulette(light_map, slope=10, floor=0.005, law=law)
+        roulette = LightMapRoulette(light_map, slope=10, floor=0.005, law=law)
         choices = [Choice(row, mi.UInt32(cell), None) for cell in (0, 1)]
         p = [float(roulette.probability((), c, si, None, True)[0][0]) for c in choices]
         assert p[1] == 1 and p[0] == pytest.approx(blocked, abs=0.02)
@@ -200,7 +200,7 @@ def test_probabilities_of_a_selection_are_those_of_its_weights_and_no_light_is_l
     light_map = map_of(scene, grid=1)
     rng = np.random.default_rng(1)
     weights = rng.uniform(0, 1, light_map.rows.count * 80).astype(np.float32) ** 8
-    selection = LightSelection(light_map.rows, light_map.cells, mi.Float(weights))
+    selection = LightTable(light_map.rows, light_map.cells, mi.Float(weights))
     sampler = mi.load_dict({"type": "independent"})
     lanes = 1 << 18
     sampler.seed(0, lanes)

@@ -11,7 +11,7 @@ import pytest
 from maps import floor, lamp, map_of
 
 from mitsuba_ext.decisions.next_event import light_map_file
-from mitsuba_ext.decisions.next_event.light_map_learner import LightLearner
+from mitsuba_ext.decisions.next_event.light_map_learner import LightMapLearner
 from mitsuba_ext.lights.division import emitter_shapes
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -113,7 +113,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path):
         arrays = dict(data)
 
     def refusal() -> str:
-        learner = LightLearner("contribution", 0, MEMORY, 1000, load=file, plugin="name")
+        learner = LightMapLearner("contribution", 0, MEMORY, 1000, load=file, plugin="name")
         with pytest.raises(ValueError) as caught:
             learner.start(scene, mi.Point3f(), mi.Normal3f())
         message = str(caught.value)

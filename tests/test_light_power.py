@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from maps import connect, floor, lamp, surface
 
-from mitsuba_ext.decisions.next_event.light_table import LightSelection, OneRow
-from mitsuba_ext.decisions.next_event.linear_lights import LinearSelection
+from mitsuba_ext.decisions.next_event.light_table import LightTable, OneRow
+from mitsuba_ext.decisions.next_event.linear_lights import LinearChoice
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.lights.power import emitter_powers
 from mitsuba_ext.lights.spectra import brightness
@@ -119,9 +119,9 @@ def test_a_spot_of_one_bright_texel_is_not_lost_beside_a_lamp(by: str):
     scene = floor(spot=_spot(_texel()), lamp=lamp(0.3, 0, 1, radiance=3.0))
     if by == "power":
         cells = LightCells(scene, None)
-        selection = LightSelection(OneRow(), cells, power_weights(scene, cells))
+        selection = LightTable(OneRow(), cells, power_weights(scene, cells))
     else:
-        selection = LinearSelection(scene)
+        selection = LinearChoice(scene)
     si = surface((*_target(scene), 0), width=LANES)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, LANES)

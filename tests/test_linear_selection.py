@@ -12,7 +12,7 @@ from scipy import stats
 from statistical import REFERENCE_SEEDS, SEEDS, assert_same_mean, batches
 from techniques import REFERENCE
 
-from mitsuba_ext.decisions.next_event.linear_lights import LinearSelection
+from mitsuba_ext.decisions.next_event.linear_lights import LinearChoice
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.walk import Walk
 
@@ -131,7 +131,7 @@ def _vertex(scene: mi.Scene, origin: list[float], target: list[float]) -> mi.Sur
 
 def _select(scene: mi.Scene, si: mi.SurfaceInteraction3f):
     """One choice for each lane."""
-    selection = LinearSelection(scene)
+    selection = LinearChoice(scene)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(7, LANES)
     ds, weight, _choice, state = connect(selection, scene, sampler, si)
@@ -312,7 +312,7 @@ def test_a_thousand_lamps_estimate_the_sum_of_a_thousand_lamps():
 
 def test_one_emitter_needs_no_estimates_and_none_no_tables():
     scene = _floor(diffuse(), lamp=_panel(0, 0, 1, angle=180))
-    selection = LinearSelection(scene)
+    selection = LinearChoice(scene)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 4)
     assert selection.begin(sampler, mi.Ray3f()) == ()
@@ -326,7 +326,7 @@ def test_one_emitter_needs_no_estimates_and_none_no_tables():
 # ---- In the walk ----
 
 
-class _Recording(LinearSelection):
+class _Recording(LinearChoice):
     """Writes what it saw at each bounce into tables."""
 
     bounces = 4

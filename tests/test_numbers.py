@@ -12,7 +12,7 @@ import pytest
 from hard_cases import diffuse, rectangle, stage
 
 from mitsuba_ext.composition.decision_parameters import Setting
-from mitsuba_ext.decisions.next_event.light_table import LightSelection, OneRow
+from mitsuba_ext.decisions.next_event.light_table import LightTable, OneRow
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.lights.weights import power_weights
 from mitsuba_ext.transport.estimator import CameraRays
@@ -100,7 +100,7 @@ def _decisions(scene: mi.Scene, name: str) -> dict[str, Any]:
     if name == "path":
         return {}
     if name == "table":
-        return {"next_event": LightSelection(OneRow(), cells, power_weights(scene, cells))}
+        return {"next_event": LightTable(OneRow(), cells, power_weights(scene, cells))}
     if name == "roulette":
         return {"shadow_test": _Half()}
     if name == "many with roulette":

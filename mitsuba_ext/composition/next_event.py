@@ -10,9 +10,9 @@ import mitsuba as mi
 
 from ..bounds import scene_bounds
 from ..decisions.learner import Learner
-from ..decisions.next_event.light_map_learner import LightLearner
-from ..decisions.next_event.light_table import TABLE_BYTES, LightSelection, OneRow
-from ..decisions.next_event.linear_lights import LinearSelection
+from ..decisions.next_event.light_map_learner import LightMapLearner
+from ..decisions.next_event.light_table import TABLE_BYTES, LightTable, OneRow
+from ..decisions.next_event.linear_lights import LinearChoice
 from ..errors import InputError
 from ..files import check_target
 from ..lights.light_cells import LightCells
@@ -34,7 +34,7 @@ class PowerLights(DecisionParameters):
         if len(setting.scene.emitters()) < 2:
             return None
         cells = LightCells(setting.scene, None)
-        return LightSelection(OneRow(), cells, power_weights(setting.scene, cells))
+        return LightTable(OneRow(), cells, power_weights(setting.scene, cells))
 
 
 class LinearLights(DecisionParameters):
@@ -44,7 +44,7 @@ class LinearLights(DecisionParameters):
     slots = ("next_event",)
 
     def decision(self, setting: Setting) -> Any | None:
-        return LinearSelection(setting.scene) if len(setting.scene.emitters()) > 1 else None
+        return LinearChoice(setting.scene) if len(setting.scene.emitters()) > 1 else None
 
 
 class SpatialLights(DecisionParameters):
@@ -64,7 +64,7 @@ class SpatialLights(DecisionParameters):
             return None
         cells = LightCells(scene, None)
         rows = self.voxel_rows(scene, cells.count)
-        return LightSelection(rows, cells, spatial_weights(scene, rows, cells))
+        return LightTable(rows, cells, spatial_weights(scene, rows, cells))
 
     def voxel_rows(self, scene: mi.Scene, cells: int) -> VoxelRows:
         """Voxels, not more than there is memory for."""
@@ -125,7 +125,7 @@ class LearnedLights(DecisionParameters):
             return None
         if setting.pilot_spp == 0 and not self.load_map:
             return None
-        return LightLearner(
+        return LightMapLearner(
             self.target,
             self.grid,
             int(self.max_memory * 2**20),

@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..decisions.learner import Learner
-from ..decisions.next_event.light_map_learner import LightLearner
+from ..decisions.next_event.light_map_learner import LightMapLearner
 from ..decisions.shadow_test.light_map_roulette import LightMapRouletteLearner
 from ..decisions.shadow_test.visibility_roulette import VisibilityLearner, has_lights_at_points
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
@@ -75,7 +75,7 @@ class RejectedShadowRays(DecisionParameters):
             "floor": getattr(self, "floor", 1.0),
         }
         lights = others.get("next_event")
-        if isinstance(lights, LightLearner):
+        if isinstance(lights, LightMapLearner):
             return LightMapRouletteLearner(lights, **law)
         if not self._has_own_map or not self.can_learn(setting.scene, setting.pilot_spp):
             return None

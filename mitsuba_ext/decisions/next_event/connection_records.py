@@ -38,7 +38,8 @@ class ConnectionRecords(Observer):
     def restart(self) -> None:
         """Forgets the last pilot."""
         self.row_squares = dr.zeros(mi.Float64, self._rows)
-        self.samples, self.variance, self._removed = 0, 0.0, 0.0
+        self.samples, self.variance = 0, 0.0
+        self._error, self._removed = 0.0, [0.0, 0.0]
 
     # ---- Observer of the walk ----
 
@@ -54,9 +55,9 @@ class ConnectionRecords(Observer):
         self._slots = dr.opaque(mi.UInt32, self._lanes)
         slots = self._lanes * _VERTICES
         self._row = dr.zeros(mi.UInt32, slots)
-        self._value, self._ratio = dr.zeros(mi.Float, slots), dr.zeros(mi.Float, slots)
+        self._value, self._ratio, self._mis = (dr.zeros(mi.Float, slots) for _ in range(3))
         self._total = dr.zeros(mi.Float, self._lanes)
-        dr.eval(self._row, self._value, self._ratio, self._total)
+        dr.eval(self._row, self._value, self._ratio, self._mis, self._total)
 
     def connection(
         self, choice: Choice, vertex, ds, contribution, value, pdf, visible, tested
@@ -66,12 +67,12 @@ class ConnectionRecords(Observer):
         as_path = dr.gather(mi.Float, self._as_path, choice.cell, active)
         dr.scatter(self._row, choice.row, slot, active)
         dr.scatter(self._value, brightness(value), slot, active)
-        # The probability of the choice changes the MIS weight as well
         ratio = choice.probability / as_path
         mis = power_heuristic(ds.pdf, pdf)
         mis_as_path = power_heuristic(ds.pdf / ratio, pdf)
         change = dr.select(ds.delta, 1, mis_as_path / mis)
-        dr.scatter(self._ratio, ratio * dr.square(change), slot, active)
+        dr.scatter(self._ratio, ratio, slot, active)
+        dr.scatter(self._mis, dr.square(change), slot, active)
 
     def end(self, L: mi.Spectrum) -> None:
         dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
@@ -91,18 +92,25 @@ class ConnectionRecords(Observer):
         weight = dr.gather(mi.Float, weight, slot % self._slots)
         actual = mi.Float64(dr.square(self._value) * weight)
         actual = dr.select(dr.isfinite(actual), actual, 0)
-        as_path = dr.select(dr.isfinite(self._ratio), actual * self._ratio, 0)
-        dr.scatter_add(self.row_squares, as_path, self._row)
-        change = float(dr.sum(as_path - actual)[0])
-        self.variance += float(dr.sum(mi.Float64(error))[0]) + change
-        self._removed += change
+        self._error += float(dr.sum(mi.Float64(error))[0])
+        for index, ratio in enumerate((self._ratio * self._mis, self._ratio)):
+            as_path = dr.select(dr.isfinite(ratio), actual * ratio, 0)
+            if index == 0:
+                dr.scatter_add(self.row_squares, as_path, self._row)
+            self._removed[index] += float(dr.sum(as_path - actual)[0])
+        self.variance = self._error + self._removed[0]
         self._lanes = 0
-        self._row = self._value = self._ratio = self._total = None
+        self._row = self._value = self._ratio = self._mis = self._total = None
 
     def measured_gain(self) -> float:
         """By how much, relatively, the choice of the last pilot has lowered the variance of the
-        image below that with Mitsuba's choice."""
-        return self._removed / max(self.variance, 1e-30)
+        image below that with Mitsuba's choice, about.
+
+        A less likely choice has a smaller MIS weight, and what scattering finds in its place a
+        larger one. Of that part nothing is recorded: the first bound leaves its variance out, the
+        second one leaves all of it to the connections. This is the mean of both."""
+        gains = [removed / max(self._error + removed, 1e-30) for removed in self._removed]
+        return sum(gains) / 2
 
     def predicted_gain(self, ratio: mi.Float) -> float:
         """The same for a choice with which the mean squares of the connections of each row become

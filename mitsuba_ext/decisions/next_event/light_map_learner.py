@@ -19,7 +19,7 @@ from ..learner import Learner
 from . import light_map_file
 from .connection_records import ConnectionRecords
 from .light_map import BYTES_PER_ENTRY, LightMap
-from .light_table import LightSelection
+from .light_table import LightTable
 
 #: Share of the choices that what was learned does not decide: half of them go by the unoccluded
 #: contributions, half are those of ``path``, so that no choice is less likely than 1/20 of what it
@@ -41,11 +41,11 @@ _TRIAL_EFFICIENCY = 0.97
 _LEAST_SHARE = 0.2
 
 
-class LightLearner(Learner):
+class LightMapLearner(Learner):
     """Learns a light map in the pilots, and chooses lights with it.
 
-    Where the map says that choosing lights as ``path`` does is nearly as good, and nothing else
-    needs it, learning ends there.
+    Where the pilots show that choosing lights as ``path`` does is nearly as good, and nothing else
+    needs the map, learning ends there.
 
     Parameters:
         target: ``visibility`` or ``contribution``.
@@ -169,7 +169,7 @@ class LightLearner(Learner):
     def state(self) -> dict[str, np.ndarray]:
         return {} if self.map is None else light_map_file.arrays_of(self._scene, self.map)
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightSelection:
+    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightTable:
         self.map = light_map_file.of_arrays(state, scene)
         self._set_as_path(scene)
         self.map.evaluate()
@@ -216,8 +216,8 @@ class LightLearner(Learner):
         # Cells with a sampling_weight of 0 have no weight in any row
         return _normalized(dr.select(unoccluded > 0, mixed, 0), count)
 
-    def _selection(self, probabilities: mi.Float) -> LightSelection:
-        return LightSelection(self.map.rows, self.map.cells, probabilities)
+    def _selection(self, probabilities: mi.Float) -> LightTable:
+        return LightTable(self.map.rows, self.map.cells, probabilities)
 
     def __str__(self) -> str:
         return self._summary

@@ -52,7 +52,7 @@ class Choice:
     probability: mi.Float
 
 
-class LightSelection(EmitterSampling):
+class LightTable(EmitterSampling):
     """Chooses a cell with the probabilities of the vertex's row, then a point on it.
 
     Parameters:

@@ -42,7 +42,7 @@ class Estimates:
     total: mi.Float
 
 
-class LinearSelection(EmitterSampling):
+class LinearChoice(EmitterSampling):
     """Chooses emitter i with the probability α_i = e_i / Σ e_j, then a point on it; e_i estimates
     what emitter i contributes to the vertex if nothing is in between.
 

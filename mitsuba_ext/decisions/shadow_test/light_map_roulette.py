@@ -9,11 +9,11 @@ import numpy as np
 from ...transport.path_decisions import ShadowTest
 from ..learner import Learner
 from ..next_event.light_map import LightMap
-from ..next_event.light_map_learner import LightLearner
+from ..next_event.light_map_learner import LightMapLearner
 from .rejection_law import WORTHWHILE, RejectionLaw, rejected_share
 
 
-class LightRoulette(ShadowTest):
+class LightMapRoulette(ShadowTest):
     """Tests a connection with a probability that grows with the visibility of the chosen cell from
     the vertex's row. Lights at infinity have cells too.
 
@@ -43,10 +43,10 @@ class LightMapRouletteLearner(Learner):
 
     Parameters:
         lights: Who learns the map; comes before this learner.
-        slope, floor, law: See :class:`LightRoulette`.
+        slope, floor, law: See :class:`LightMapRoulette`.
     """
 
-    def __init__(self, lights: LightLearner, slope: float, floor: float, law: str) -> None:
+    def __init__(self, lights: LightMapLearner, slope: float, floor: float, law: str) -> None:
         self._lights, self._law = lights, {"slope": slope, "floor": floor, "law": law}
         self._summary = ""
         lights.keep_map()
@@ -68,7 +68,7 @@ class LightMapRouletteLearner(Learner):
 
     def _make_roulette(self) -> ShadowTest | None:
         """The roulette by the map; ``None`` if it does not pay."""
-        roulette = LightRoulette(self._lights.map, **self._law)
+        roulette = LightMapRoulette(self._lights.map, **self._law)
         pays = roulette.rejected_share >= WORTHWHILE
         verb = "rejects" if pays else "does not reject"
         self._summary = f"{verb} {roulette.rejected_share:.0%} of the shadow rays"
