@@ -21,9 +21,11 @@ import mitsuba as mi  # isort: skip
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "scenes"
 
-#: ``path``, learned lights, path guiding, and both where they pay.
+#: ``path``, the strongest choice of lights that learns nothing, learned lights, path guiding, and
+#: both of these where they pay.
 INTEGRATORS = {
     "path": "path",
+    "spatial": "composed_path:next_event=spatial",
     "neepp": "neepp",
     "pss_guided": "pss_guided",
     "auto_path": "auto_path",
@@ -147,8 +149,8 @@ def _write_figure(results: dict[str, Any]) -> None:
         values = [ratio["value"] for ratio in ratios]
         errors = [[ratio["value"] - ratio["low"] for ratio in ratios],
                   [ratio["high"] - ratio["value"] for ratio in ratios]]
-        rows = [row + 0.2 * (number - 1) for row in range(len(scenes))]
-        axes.errorbar(values, rows, xerr=errors, fmt="osD"[number], capsize=3, label=label)
+        rows = [row + 0.2 * (number - 1.5) for row in range(len(scenes))]
+        axes.errorbar(values, rows, xerr=errors, fmt="osD^"[number], capsize=3, label=label)
     axes.axvline(1, color="gray", linewidth=0.8)
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
