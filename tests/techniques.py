@@ -135,7 +135,7 @@ TECHNIQUES: dict[str, Technique] = {
                 "light_that_nothing_sees",
             ),
         ),
-        thorough=EVERYTHING,
+        thorough=Checks(["door_ajar", "window"], ["llvm_ad_spectral"], cases=_LEARNERS),
     ),
     "guided_as_it_pays": Technique(
         "pss_guided", checks=Checks(["cornell_box"]), thorough=Checks(["door_ajar", "rooms"])
@@ -181,8 +181,7 @@ TECHNIQUES: dict[str, Technique] = {
         },
         checks=Checks(cases=["no_light", "empty"]),
         thorough=Checks(
-            ["rooms", "mirrors_and_glass", "window"], ["llvm_ad_mono", "llvm_ad_spectral"],
-            FURNACES, [-1], _LEARNERS,
+            ["mirrors_and_glass"], ["llvm_ad_spectral"], FURNACES[2:3], [-1], _LEARNERS,
         ),
     ),
     # Lights by power, by distance, by a loop over all of them; nothing is learned
