@@ -107,7 +107,7 @@ def _divide_shape(shape: mi.Shape, voxel: np.ndarray | None, limit: int) -> Divi
     whole = Division(_WHOLE, np.ones(1, int))
     kind = _GRIDS.get(shape.class_name())
     if kind is None and shape.is_mesh() and shape.face_count() > 0:
-        is_smooth = _is_smooth(shape)
+        is_smooth = has_interpolated_normals(shape)
         is_cut = voxel is not None and limit > 1
         if not is_cut and not is_smooth:
             return whole
@@ -171,7 +171,8 @@ def _cuts(edges: np.ndarray, limit: int) -> tuple[int, int]:
 # ---- Meshes ----
 
 
-def _is_smooth(mesh: mi.Mesh) -> bool:
+def has_interpolated_normals(mesh: mi.Mesh) -> bool:
+    """Do the interpolated normals of a mesh differ from those of its faces?"""
     if not mesh.has_vertex_normals() or mesh.has_face_normals():
         return False
     a, b, c = triangles(mesh)

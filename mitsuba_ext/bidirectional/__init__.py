@@ -1,0 +1,1 @@
+"""Paths from lights: emission, the light walk with its stored vertices, and the sensor's end."""
