@@ -17,11 +17,12 @@ PLUGINS = ("integrators", "emitters", "bsdfs", "shapes", "samplers")
 
 #: By room, what it imports nothing of.
 FORBIDDEN = {
-    "transport": {"decisions", "composition", "rendering", *PLUGINS},
-    "regions": {"transport", "decisions", "composition", "rendering", *PLUGINS},
-    "lights": {"decisions", "composition", "rendering", *PLUGINS},
-    "decisions": {"composition", "rendering", *PLUGINS},
-    "rendering": {"decisions", "composition", *PLUGINS},
+    "transport": {"decisions", "bidirectional", "composition", "rendering", *PLUGINS},
+    "regions": {"transport", "decisions", "bidirectional", "composition", "rendering", *PLUGINS},
+    "lights": {"decisions", "bidirectional", "composition", "rendering", *PLUGINS},
+    "decisions": {"bidirectional", "composition", "rendering", *PLUGINS},
+    "bidirectional": {"decisions", "composition", "rendering", *PLUGINS},
+    "rendering": {"decisions", "bidirectional", "composition", *PLUGINS},
     "composition": set(PLUGINS),
     "pointsets": {"transport", "regions", "lights", "decisions", "composition", "rendering",
                   *PLUGINS},

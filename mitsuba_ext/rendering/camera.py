@@ -179,16 +179,24 @@ def put(
         _put_splats(film, block, splats, len(aovs))
 
 
-def _put_splats(
-    film: mi.Film, block: mi.ImageBlock, splats: Splats, aov_count: int
-) -> None:
-    """Adds splats to the same block, without a weight: the film divides by the filter weights of
-    the camera samples, of which there are as many as light paths, also at the film's edges."""
+def check_takes_splats(film: mi.Film) -> None:
+    """
+    Raises:
+        NotImplementedError: Splats cannot be added to this film.
+    """
     if film.sample_border() or mi.has_flag(film.flags(), mi.FilmFlags.Special):
         raise NotImplementedError(
             f'light that reaches other pixels cannot be added to the film "{film.class_name()}"'
             f'{" with a sampled border" if film.sample_border() else ""}'
         )
+
+
+def _put_splats(
+    film: mi.Film, block: mi.ImageBlock, splats: Splats, aov_count: int
+) -> None:
+    """Adds splats to the same block, without a weight: the film divides by the filter weights of
+    the camera samples, of which there are as many as light paths, also at the film's edges."""
+    check_takes_splats(film)
     channels = _channels(film, splats.value, splats.wavelengths, mi.Float(0))
     zeros = [mi.Float(0)] * (1 + aov_count)
     block.put(splats.position, [*channels, *zeros], splats.active)

@@ -45,6 +45,10 @@ class Planned(Protocol):
     def sample_cost(self) -> int:
         """The time of a sample in units of that of a path, about."""
 
+    @property
+    def most_lanes(self) -> int:
+        """Samples of a pass, at most, as its memory allows; one for each pixel is always taken."""
+
     def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
         """The samples per pixel of each pilot stage, out of ``spp``."""
 
@@ -121,7 +125,8 @@ def plan_render(
     is_timed = integrator.timeout > 0
     if structured and is_timed:
         limit //= _TIMEOUT_PASS_DIVISOR
-    limit = max(1, min(limit, integrator.samples_per_pass))
+    limit = min(limit, integrator.samples_per_pass, integrator.most_lanes // pixel_count)
+    limit = max(1, limit)
     if spp > limit * _MOST_PASSES:
         raise ValueError(
             f'"{integrator.name}": {spp} samples for each of {pixel_count} pixels '

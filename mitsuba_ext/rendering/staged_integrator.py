@@ -64,6 +64,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
         """The time of a sample in units of that of a path, about: passes are the shorter."""
         return 1
 
+    @property
+    def most_lanes(self) -> int:
+        """Samples of a pass, at most, as its memory allows."""
+        return NO_LIMIT
+
     def samples_per_set(self, spp: int) -> int:
         """So many samples of a pixel belong together, out of ``spp``: a timeout keeps them whole.
         """

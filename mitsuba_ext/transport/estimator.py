@@ -35,7 +35,7 @@ class CameraRays:
 @dataclass
 class Splats:
     """Radiance for other pixels than those in which the camera rays begin: what light paths bring
-    to the sensor.
+    to the sensor. There may be more or fewer of them than camera rays.
 
     Attributes:
         value: Radiance times importance; the mean over all camera samples of a pixel's splats is
@@ -59,7 +59,7 @@ class Sample:
         L: Radiance estimate.
         valid: Did the path meet a surface (or the visible environment)? It becomes alpha.
         scatter_count: Rays traced in directions that a BSDF chose.
-        shadow_count: Shadow rays traced.
+        shadow_count: Shadow rays traced; like all counts, in each lane, or in any other partition.
         connection_count: Connections to a light that were considered: ``path`` traces a shadow ray
             for each of them.
         aovs: Values of arbitrary output variables, if the estimator finds any.

@@ -140,6 +140,19 @@ class EmitterSampling:
         ``ref`` was left."""
         return scene.pdf_emitter_direction(ref, ds, active)
 
+    def probability(
+        self,
+        state: Any,
+        scene: mi.Scene,
+        ref: mi.Interaction3f,
+        emitter: mi.UInt32,
+        active: mi.Bool,
+    ) -> mi.Float:
+        """The probability with which :meth:`sample`, at ``ref``, chooses an emitter that is a
+        single point or direction, by its number in ``scene.emitters()``; ``state`` is that with
+        which ``ref`` was left."""
+        return scene.pdf_emitter(emitter, active)
+
 
 class NoConnections(EmitterSampling):
     """Connects to no light: light is found by BSDF samples only."""
@@ -148,6 +161,9 @@ class NoConnections(EmitterSampling):
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), place
 
     def density(self, state, scene, ref, si, ds, active):
+        return mi.Float(0)
+
+    def probability(self, state, scene, ref, emitter, active):
         return mi.Float(0)
 
 

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...discrete_sampling import alias_tables
 from ...lights.light_cells import LightCells
@@ -70,6 +71,10 @@ class LightTable(EmitterSampling):
         self._table = _table(weights, rows.count, cells.count)
         # Opaque: scenes that differ in it only share their kernels
         self._count = dr.opaque(mi.UInt32, cells.count)
+        # The first cell of each emitter
+        first = np.zeros(cells.emitter_index.max(initial=0) + 1, dtype=np.uint32)
+        first[cells.emitter_index[::-1]] = np.arange(cells.count)[::-1]
+        self._cell_of = mi.UInt32(first)
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> mi.UInt32:
         return mi.UInt32(0)
@@ -93,6 +98,11 @@ class LightTable(EmitterSampling):
     def density(self, state, scene, ref, si, ds, active):
         # Few rays run into a light: the others jump over all this
         return _if(active, self._density, (state, ref, si, ds, active))
+
+    def probability(self, state, scene, ref, emitter, active):
+        # Points and directions are cells of their own
+        entry = state * self._count + dr.gather(mi.UInt32, self._cell_of, emitter, active)
+        return dr.gather(mi.Float, self._table, 4 * entry + 2, active)
 
     def _density(self, row, ref, si, ds, active) -> mi.Float:
         cell, pdf = self.cells.pdf(ref, si, ds, active)

@@ -141,6 +141,12 @@ class LinearChoice(EmitterSampling):
         # Also where the lookups above were masked, the density must be a number
         return dr.select(active, pdf, 0)
 
+    def probability(self, state, scene, ref, emitter, active):
+        if self.count == 1:
+            return mi.Float(1)
+        e = self._estimate(emitter, ref.p, state.normal, state.is_opaque, active)
+        return self._probability(emitter, e, state.total, active)
+
     # The first pass sums the estimates, also up to the end of each block of about √n emitters. The
     # second pass searches the blocks, and then one block. Reservoir sampling needs no second pass,
     # but rescales the random number at each emitter: its 24 bits would be used up, and stratified

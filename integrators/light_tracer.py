@@ -1,0 +1,133 @@
+"""Light tracing: paths from lights, each vertex of which is connected to the sensor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.bidirectional.light_tracer import STRIDE, LightTracer
+from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
+from mitsuba_ext.bidirectional.light_walk import LightWalk
+from mitsuba_ext.bidirectional.sensor import ConnectableSensor
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.rendering.camera import check_takes_splats
+from mitsuba_ext.rendering.stages import OneStage
+from mitsuba_ext.transport.walk import Walk
+
+#: Memory for the vertices of a pass, and about what a path takes besides.
+_PASS_BYTES, _PATH_BYTES = 1 << 29, 256
+
+
+@registry.plugin
+class LightTracerIntegrator(WalkIntegrator):
+    r"""
+    .. _integrator-light_tracer:
+
+    Light tracer (:monosp:`light_tracer`)
+    -------------------------------------
+
+    Traces paths from the lights and connects each of their vertices to the sensor. It shows the
+    same image as :monosp:`path`, but for what it cannot see, and finds caustics that
+    :monosp:`path` hardly ever finds.
+
+    .. pluginparameters::
+
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+
+    **Use it when** light reaches diffuse surfaces through glass or by mirrors (caustics), above all
+    from small lamps, points and spots, or as an independent check of other integrators. **Not
+    when** mirrors or glass matter in the image, or when most light goes where the camera does not
+    look: a lamp far away, or a sky over a large scene.
+
+    **What it cannot see.** A vertex cannot be connected to the sensor by way of a mirror, or
+    through glass, masks and null surfaces. Whatever the camera sees in a smooth mirror, through
+    smooth glass, through a hole of a mask or through a null surface, is black; it warns where the
+    scene has such materials. Emitters that the camera sees directly are there. Lights of the type
+    :monosp:`directionalarea`, which :monosp:`path` does not find, are seen here (in spectral
+    variants they are refused).
+
+    **Sensors and films.** The sensor must be a :monosp:`perspective` or :monosp:`thinlens`; the
+    film any :monosp:`hdrfilm`, with any filter and crop window, but without
+    :monosp:`sample_border`.
+
+    For each sample of a pixel there is one camera ray, which sees emitters, and one light path. The
+    emitter of a light path is chosen by power and by :monosp:`sampling_weight`, half of the paths
+    each. Surface and sky emit as :monosp:`path` sees it, also where Mitsuba's :monosp:`ptracer`
+    errs: for turned spheres and environment maps, lights with interpolated normals, textured
+    lights, merged rectangles, normal and bump maps, filters at the film's edges.
+
+    Alpha and output variables are those of the camera rays. Participating media are ignored, as by
+    :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized
+    variants, nor nesting in :monosp:`moment`.
+
+    Source: J. Arvo, *Backward Ray Tracing*, SIGGRAPH course, 1986; E. Veach, *Robust Monte Carlo
+    Methods for Light Transport Simulation*, PhD thesis, 1997, section 10.2 (t = 1); adjoint BSDFs:
+    section 5.3 there.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="light_tracer">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'light_tracer',
+            'max_depth': 8
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.fill(props)
+
+    @property
+    def sample_cost(self) -> int:
+        return 2
+
+    @property
+    def most_lanes(self) -> int:
+        layout = Layout(len(mi.Spectrum()), False, True)
+        return _PASS_BYTES // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
+
+    def schedule(self, scene, sensor, samples, seed) -> OneStage:
+        if not ConnectableSensor.can_connect(sensor):
+            raise NotImplementedError(
+                f'"{self.name}": nothing can be connected to the sensor "{sensor.class_name()}": '
+                f'use a "perspective" or "thinlens", or the integrator "path"'
+            )
+        try:
+            check_takes_splats(sensor.film())
+        except NotImplementedError as error:
+            raise NotImplementedError(f'"{self.name}": {error}') from None
+        query = self._query(scene)
+        walk = None
+        if scene.emitters() and self.max_depth > 1:
+            self._warn_of_hidden(scene)
+            try:
+                emission = LightEmission(scene)
+            except NotImplementedError as error:
+                raise NotImplementedError(f'"{self.name}": {error}') from None
+            walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
+        directly = Walk(min(self.max_depth, 1), self.rr_depth, self.hide_emitters, query=query)
+        return OneStage(LightTracer(directly, walk, ConnectableSensor(sensor)))
+
+    def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
+        raise NotImplementedError(
+            f'"{self.name}": light paths do not end where a ray begins: it cannot be nested in an '
+            f'integrator that asks for single samples, such as "moment"; "variance" can hold it'
+        )
+
+    def _warn_of_hidden(self, scene: mi.Scene) -> None:
+        hidden = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
+        if any(shape.bsdf() and int(shape.bsdf().flags()) & hidden for shape in scene.shapes()):
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'"{self.name}": what the camera sees in mirrors, through glass, and through masks '
+                f"and null surfaces, is black.",
+            )

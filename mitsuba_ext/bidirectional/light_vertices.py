@@ -1,0 +1,206 @@
+"""Vertices of light paths: how the light walk stores them, and how they are read back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..movers import movers
+from ..transport.path_decisions import SceneQuery
+from .partial_sums import Sums
+
+#: Bit of the last word: only the hero wavelength is left of the path.
+_HERO_IS_ALONE = 1 << 31
+
+
+@dataclass
+class Layout:
+    """The words of a stored vertex: 14 to 17 in RGB variants.
+
+    Attributes:
+        spectrum: Words of a spectrum.
+        has_sums: Are partial sums of MIS weights stored?
+        has_instances: May a vertex lie on an instance?
+    """
+
+    spectrum: int
+    has_sums: bool
+    has_instances: bool
+
+    @classmethod
+    def of(cls, scene: mi.Scene, has_sums: bool) -> Layout:
+        # The scenes of moving shapes may hold instances
+        has_instances = bool(movers(scene)) or any(
+            shape.class_name() == "Instance" for shape in scene.shapes()
+        )
+        return cls(dr.size_v(mi.Spectrum), has_sums, has_instances)
+
+    @property
+    def words(self) -> int:
+        return 11 + self.spectrum + 2 * self.has_sums + self.has_instances
+
+
+class VertexStore:
+    """Where a light walk writes its vertices: ``stride`` places for each path, one after the other.
+
+    Parameters:
+        layout: Of the words.
+        lanes: Number of paths.
+        stride: Vertices of a path, at most.
+    """
+
+    def __init__(self, layout: Layout, lanes: int, stride: int) -> None:
+        self.layout, self.stride, self.lanes = layout, stride, lanes
+        self.words = dr.empty(mi.Float, lanes * stride * layout.words)
+        self.is_taken = dr.zeros(mi.Bool, lanes * stride)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the store."""
+        return self.lanes * self.stride * bytes_per_vertex(self.layout)
+
+    def write(
+        self,
+        slot: mi.UInt32,
+        pi: mi.PreliminaryIntersection3f,
+        si: mi.SurfaceInteraction3f,
+        d: mi.Vector3f,
+        β: mi.Spectrum,
+        sums: Sums,
+        depth: mi.UInt32,
+        hero_is_alone: Any,
+        active: mi.Bool,
+    ) -> None:
+        """Writes a vertex."""
+        mark = mi.UInt32(depth)
+        if not isinstance(hero_is_alone, tuple):
+            mark |= dr.select(hero_is_alone, mi.UInt32(_HERO_IS_ALONE), 0)
+        words = [*si.p, *d, *pi.prim_uv, _as_float(pi.prim_index), _as_float(pi.shape), *β]
+        if self.layout.has_sums:
+            words += [sums.dVCM, sums.dVC]
+        words += [_as_float(mark)]
+        if self.layout.has_instances:
+            words += [_as_float(pi.instance)]
+        dr.scatter(self.words, mi.ArrayXf(words), slot, active)
+        dr.scatter(self.is_taken, mi.Bool(True), slot, active)
+
+
+def bytes_per_vertex(layout: Layout) -> int:
+    """Memory that a place in the store takes: the words, and a flag."""
+    return 4 * layout.words + 1
+
+
+@dataclass
+class LightVertex:
+    """A stored vertex, in each lane.
+
+    Attributes:
+        p: Its position.
+        d: The direction in which light arrives.
+        prim_uv, prim_index, shape, instance: What was hit, and where.
+        β: Radiance · throughput / density of the path up to the vertex.
+        sums: Partial sums of the MIS weights (0 if none are stored).
+        depth: Segments between the light and the vertex; at least 1.
+        hero_is_alone: Is only the first wavelength left? ``()`` where nothing disperses light.
+        lane: The number of the light path.
+    """
+
+    p: mi.Point3f
+    d: mi.Vector3f
+    prim_uv: mi.Point2f
+    prim_index: mi.UInt32
+    shape: mi.ShapePtr
+    instance: Any
+    β: mi.Spectrum
+    sums: Sums
+    depth: mi.UInt32
+    hero_is_alone: Any
+    lane: mi.UInt32
+
+
+class LightVertices:
+    """The vertices that a pass has stored, as a list without gaps, in the order of the paths and
+    along each path. All of them can be connected: their BSDFs have a smooth part.
+
+    Parameters:
+        store: What the light walk has written.
+        time, wavelengths: Of each path.
+        disperses: Are there vertices of which only the hero is left?
+
+    Attributes:
+        count (int): How many there are.
+        slot (mi.UInt32): The place of each in the store: path · stride + place along the path.
+        stride (int): Places of each path.
+        bytes (int): Memory that the vertices take.
+    """
+
+    def __init__(
+        self, store: VertexStore, time: mi.Float, wavelengths: mi.Spectrum, disperses: bool
+    ) -> None:
+        self._layout, self._words = store.layout, store.words
+        self._time, self._wavelengths, self._disperses = time, wavelengths, disperses
+        self.stride = store.stride
+        self.slot = dr.compress(store.is_taken)
+        self.count = len(self.slot)
+        self.bytes = store.bytes + 4 * self.count
+
+    def gather(self, index: mi.UInt32, active: mi.Bool) -> LightVertex:
+        """The vertices of these numbers, 0 to ``count`` − 1."""
+        return self.at(dr.gather(mi.UInt32, self.slot, index, active), active)
+
+    def at(self, slot: mi.UInt32, active: mi.Bool) -> LightVertex:
+        """The vertices at these places of the store, which must be taken."""
+        layout, n = self._layout, self._layout.spectrum
+        w = dr.gather(
+            mi.ArrayXf, self._words, slot, active, shape=(layout.words, dr.width(slot))
+        )
+        sums, rest = Sums(mi.Float(0), mi.Float(0)), 10 + n
+        if layout.has_sums:
+            sums, rest = Sums(w[rest], w[rest + 1]), rest + 2
+        mark = dr.reinterpret_array(mi.UInt32, w[rest])
+        instance = _as_shape(w[rest + 1]) if layout.has_instances else None
+        hero_is_alone = (mark & _HERO_IS_ALONE) != 0 if self._disperses else ()
+        return LightVertex(
+            mi.Point3f(w[0], w[1], w[2]), mi.Vector3f(w[3], w[4], w[5]), mi.Point2f(w[6], w[7]),
+            dr.reinterpret_array(mi.UInt32, w[8]), _as_shape(w[9]), instance,
+            mi.Spectrum(*(w[10 + i] for i in range(n))), sums, mark & (_HERO_IS_ALONE - 1),
+            hero_is_alone, slot // self.stride,
+        )  # fmt: skip
+
+    def interaction(
+        self, query: SceneQuery, vertex: LightVertex, active: mi.Bool
+    ) -> mi.SurfaceInteraction3f:
+        """The interaction at a vertex, as the light walk saw it: ``wi`` is where light comes
+        from."""
+        pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(vertex.p))
+        pi.prim_uv, pi.prim_index = vertex.prim_uv, vertex.prim_index
+        pi.shape, pi.valid = vertex.shape, mi.Bool(active)
+        if vertex.instance is not None:
+            pi.instance = vertex.instance
+        # The ray begins where it ends
+        pi.t = dr.select(active, mi.Float(0), dr.inf)
+        ray = mi.Ray3f(vertex.p, vertex.d)
+        ray.time = self._of_lane(self._time, vertex.lane, active)
+        if mi.is_spectral:
+            ray.wavelengths = self._of_lane(self._wavelengths, vertex.lane, active)
+        return query.interaction(pi, ray)
+
+    def wavelengths(self, vertex: LightVertex, active: mi.Bool) -> mi.Spectrum | None:
+        """The wavelengths of a vertex's path; ``None`` in variants that are not spectral."""
+        return self._of_lane(self._wavelengths, vertex.lane, active) if mi.is_spectral else None
+
+    def _of_lane(self, values: Any, lane: mi.UInt32, active: mi.Bool) -> Any:
+        return values if dr.width(values) == 1 else dr.gather(type(values), values, lane, active)
+
+
+def _as_float(value: Any) -> mi.Float:
+    if not isinstance(value, mi.UInt32):
+        value = dr.reinterpret_array(mi.UInt32, value)
+    return dr.reinterpret_array(mi.Float, value)
+
+
+def _as_shape(word: mi.Float) -> mi.ShapePtr:
+    return dr.reinterpret_array(mi.ShapePtr, dr.reinterpret_array(mi.UInt32, word))

@@ -1,0 +1,230 @@
+"""The traced random walk of light paths, which stores its vertices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..garbage import garbage_left_alone
+from ..transport.heroes import Heroes
+from ..transport.numbers import Numbers
+from ..transport.path_decisions import Roulette, SceneQuery
+from ..transport.vertex import Arrival, PathState, Vertex
+from .emission import LightEmission
+from .light_vertices import Layout, LightVertices, VertexStore
+from .partial_sums import PartialSums, Sums
+from .scattering import delta_correction, evaluate, geometric_cosine
+
+
+@dataclass
+class LightPaths:
+    """Light paths on their way, one in each lane, at a vertex that is not stored yet.
+
+    Attributes:
+        ray, pi: The ray that led to the vertex, and its intersection.
+        emitted: Radiance / density of the emitted ray.
+        β: Throughput up to the vertex, emission not included.
+        sampling_weight: See :class:`~mitsuba_ext.transport.vertex.PathState`.
+        sums: Partial sums of the MIS weights: at the first vertex for the vertex, later for the
+            direction that led to it.
+        depth: Segments between the light and the vertex.
+        hero_is_alone: Is only the first wavelength left? ``()`` where nothing disperses light.
+        scatter_count: Rays traced in directions that a BSDF chose.
+        active: Which paths are on their way.
+    """
+
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    emitted: mi.Spectrum
+    β: mi.Spectrum
+    sampling_weight: mi.Float
+    sums: Sums
+    depth: mi.UInt32
+    hero_is_alone: Any
+    scatter_count: mi.UInt32
+    active: mi.Bool
+
+
+@dataclass
+class LightWalk:
+    """Traces light paths: the mirror image of :class:`~mitsuba_ext.transport.walk.Walk`.
+
+    Its vertices come in rounds: :meth:`begin` emits rays, each :meth:`advance` walks so many
+    vertices on and returns them. What follows after the last round is lost: the vertices of depths
+    1 to rounds · stride are there, and no others.
+
+    A path draws 6 numbers for the ray and 4 for each bounce.
+
+    Parameters:
+        emission: Where paths begin.
+        max_depth: Longest path from light to sensor, in segments: vertices up to the depth
+            ``max_depth`` − 1 are stored, since one segment more leads to the sensor.
+        rr_depth: Depth at which Russian roulette begins.
+        sums: Computes partial sums of MIS weights; ``None`` where nobody asks for them.
+        roulette: Which paths go on. It is told the throughput without the light's power: dim lights
+            are sampled rarely enough.
+        query: How a ray meets the scene.
+    """
+
+    emission: LightEmission
+    max_depth: int
+    rr_depth: int
+    sums: PartialSums | None = None
+    roulette: Roulette = field(default_factory=Roulette)
+    query: SceneQuery = field(default_factory=SceneQuery)
+
+    def layout(self, scene: mi.Scene) -> Layout:
+        """Of the stored vertices."""
+        return Layout.of(scene, self.sums is not None)
+
+    def begin(
+        self,
+        scene: mi.Scene,
+        numbers: Numbers,
+        time: mi.Float,
+        wavelengths: mi.Spectrum,
+        active: mi.Bool,
+    ) -> LightPaths:
+        """Emits a ray in each lane, and traces it.
+
+        Parameters:
+            time, wavelengths: Of each path; those of the camera path in the same lane.
+            active: Which lanes emit.
+        """
+        with garbage_left_alone():
+            active = mi.Bool(active) & (self.max_depth > 1)
+            emitted = self.emission.sample(numbers, time, wavelengths, active)
+            active &= dr.max(emitted.weight) > 0
+            pi = self.query.closest(scene, emitted.ray, coherent=False, active=active)
+            active &= pi.is_valid()
+            sums = Sums(mi.Float(0), mi.Float(0))
+            if self.sums is not None:
+                si = self.query.interaction(pi, emitted.ray)
+                sums = self.sums.first(scene, emitted, si, active)
+            width = dr.width(emitted.ray)
+            paths = LightPaths(
+                emitted.ray, pi, emitted.weight, dr.full(mi.Spectrum, 1, width),
+                dr.full(mi.Float, 1, width), sums, dr.full(mi.UInt32, 1, width),
+                Heroes(scene).begin(), dr.zeros(mi.UInt32, width), active,
+            )  # fmt: skip
+            if not isinstance(paths.hero_is_alone, tuple):
+                paths.hero_is_alone = dr.zeros(mi.Bool, width)
+            return paths
+
+    def advance(
+        self, scene: mi.Scene, numbers: Numbers, paths: LightPaths, stride: int
+    ) -> tuple[LightVertices, LightPaths]:
+        """Walks up to ``stride`` vertices on. It evaluates ``paths``, so that all rounds share a
+        kernel.
+
+        Returns:
+            The vertices whose BSDF has a smooth part, and the paths that are still on their way.
+        """
+        if isinstance(numbers, mi.Sampler):
+            numbers.schedule_state()
+        # Fresh copies: kernels would otherwise differ in which of the inputs are the same array
+        dr.make_opaque(paths)
+        dr.eval(paths)
+        store = VertexStore(self.layout(scene), dr.width(paths.active), stride)
+        time, wavelengths = paths.ray.time, paths.ray.wavelengths
+        with garbage_left_alone():
+            numbers, paths = self._trace(scene, numbers, paths, store)
+        dr.eval(paths, store.words, store.is_taken)
+        disperses = not isinstance(paths.hero_is_alone, tuple)
+        return LightVertices(store, time, wavelengths, disperses), paths
+
+    @dr.syntax
+    def _trace(self, scene, numbers, paths, store) -> tuple[Numbers, LightPaths]:
+        heroes = Heroes(scene)
+        ctx = heroes.context()
+        ctx.mode = mi.TransportMode.Importance
+        place = dr.arange(mi.UInt32, store.lanes) * store.stride
+        # No vertex of a path is stored beyond this place
+        end = place + store.stride
+        last_depth = dr.opaque(mi.UInt32, self.max_depth - 1)
+        rr_depth = dr.opaque(mi.UInt32, self.rr_depth)
+        # A copy: the mask of the loop is not that of the paths
+        active = mi.Bool(paths.active)
+
+        while dr.hint(active, label="light walk"):
+            si = self.query.interaction(paths.pi, paths.ray)
+            bsdf = si.bsdf(paths.ray)
+            sums = self._arrive(paths, si)
+
+            # ----- Store what can be connected -----
+            connectable = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            store.write(
+                place, paths.pi, si, paths.ray.d, paths.emitted * paths.β, sums, paths.depth,
+                paths.hero_is_alone, connectable,
+            )  # fmt: skip
+            place += 1
+
+            # ----- Choose where to scatter -----
+            active_next = active & (paths.depth < last_depth)
+            sample_1, sample_2 = numbers.next_1d(), numbers.next_2d()
+            bs, weight = bsdf.sample(ctx, si, sample_1, sample_2, active_next)
+            weight, sums, hero_count, hero_is_alone = self._scatter(
+                heroes, paths, bsdf, si, bs, weight, sums, active_next
+            )
+            β = paths.β * weight
+            sampling_weight = paths.sampling_weight * hero_count
+
+            # ----- Russian roulette -----
+            is_black = dr.max(β) == 0
+            depth = paths.depth + 1
+            rr_active = depth >= rr_depth
+            survival = self._survival(paths, si, bsdf, β, sampling_weight, depth, hero_is_alone,
+                                      active_next & rr_active & ~is_black)
+            rr_continue = numbers.next_1d() < survival
+            active_next &= (~rr_active | rr_continue) & ~is_black
+            β[rr_active] *= dr.rcp(survival)
+
+            # ----- Move on to the next vertex -----
+            ray = si.spawn_ray(si.to_world(bs.wo))
+            pi = self.query.closest(scene, ray, coherent=False, active=active_next)
+            scatter_count = paths.scatter_count + dr.select(active_next, 1, 0)
+            active_next &= pi.is_valid()
+            paths = LightPaths(
+                ray, pi, paths.emitted, β, sampling_weight, sums, depth, hero_is_alone,
+                scatter_count, active_next,
+            )  # fmt: skip
+            active = active_next & (place < end)
+        return numbers, paths
+
+    def _arrive(self, paths: LightPaths, si: mi.SurfaceInteraction3f) -> Sums:
+        """The partial sums at a vertex."""
+        if self.sums is None:
+            return paths.sums
+        later = self.sums.arrive(paths.sums, si)
+        is_first = paths.depth == 1
+        return Sums(
+            dr.select(is_first, paths.sums.dVCM, later.dVCM),
+            dr.select(is_first, paths.sums.dVC, later.dVC),
+        )
+
+    def _scatter(self, heroes, paths, bsdf, si, bs, weight, sums, active):
+        """The weight of a BSDF sample, and the partial sums behind it."""
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        weight, hero_count, hero_is_alone = heroes.scatter(
+            paths.hero_is_alone, weight, bsdf, si, bs
+        )
+        value, reverse_pdf = evaluate(
+            heroes, paths.hero_is_alone, bsdf, si, bs.wo, active & ~is_delta
+        )
+        value *= dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
+        weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
+        if self.sums is not None:
+            sums = self.sums.leave(
+                sums, geometric_cosine(si, bs.wo), bs.pdf, reverse_pdf, is_delta
+            )
+        return dr.select(active, weight, 0), sums, hero_count, hero_is_alone
+
+    def _survival(self, paths, si, bsdf, β, sampling_weight, depth, hero_is_alone, active):
+        """The probability with which a path goes on. Importance is not scaled by refraction: the
+        index of refraction is left out."""
+        arrival = Arrival(mi.Interaction3f(si), mi.Float(1), mi.Bool(False))
+        path = PathState(β, mi.Float(1), sampling_weight, depth, arrival, hero_is_alone)
+        return self.roulette.survival((), Vertex(si, bsdf, path), path, active)[0]

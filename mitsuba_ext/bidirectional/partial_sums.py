@@ -1,0 +1,135 @@
+"""What a subpath has to know of itself for the MIS weights of all techniques that could have made
+the path that it becomes a part of.
+
+Source: I. Georgiev, *Implementing Vertex Connection and Merging*, technical report, 2012: the
+quantities dVCM and dVC, without merging. All ratios of densities are raised to the heuristic's
+exponent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.path_decisions import EmitterSampling
+
+if TYPE_CHECKING:
+    from .emission import EmittedRay
+
+
+@dataclass
+class Sums:
+    """The partial sums of a subpath at its last vertex (Eqs. 31 to 36 of the report).
+
+    Attributes:
+        dVCM: 1 / density of the last vertex, times, at the first vertex, the ratio of the densities
+            with which a connection and emission find the point of the light.
+        dVC: The sum over the techniques that connect earlier vertices of the subpath.
+    """
+
+    dVCM: mi.Float
+    dVC: mi.Float
+
+
+class PartialSums:
+    """Computes the sums along light paths.
+
+    Parameters:
+        next_event: The decision with which the other end's vertices are connected to points of
+            lights.
+        exponent: 1 for the balance heuristic, 2 for the power heuristic.
+    """
+
+    def __init__(self, next_event: EmitterSampling, exponent: int = 2) -> None:
+        self._next_event, self.exponent = next_event, exponent
+
+    def ratio(self, x: mi.Float) -> mi.Float:
+        """A ratio of densities, raised to the exponent."""
+        return dr.square(x) if self.exponent == 2 else x
+
+    def first(
+        self, scene: mi.Scene, emitted: EmittedRay, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> Sums:
+        """At the first vertex after the light, ``si``."""
+        is_delta = emitted.is_delta_position | emitted.is_delta_direction
+        chosen = emitted.probability * emitted.pdf_position * emitted.pdf_direction
+        # Per area at the vertex; per area at the light
+        arrives = chosen * _cosine(si) / dr.select(emitted.is_infinite, 1, dr.square(si.t))
+        connected = self._connection_density(scene, emitted, si, active)
+        leaves = dr.select(emitted.is_infinite, 1, emitted.cosine / dr.square(si.t))
+        connected *= dr.select(is_delta, 1, leaves)
+        inverse = dr.select(arrives > 0, dr.rcp(arrives), 0)
+        return Sums(
+            self.ratio(connected * inverse),
+            dr.select(is_delta, 0, self.ratio(leaves * inverse)),
+        )
+
+    def _connection_density(self, scene, emitted, si, active) -> mi.Float:
+        """With which a connection from ``si`` finds the point of the light: per solid angle, or
+        the probability of choosing the light if it is a point or a direction."""
+        place = self._next_event.visit(
+            self._next_event.begin(None, emitted.ray), scene, si, active
+        )
+        state = self._next_event.remember(place)
+        start, ds = emitted.start, dr.zeros(mi.DirectionSample3f, dr.width(si))
+        ds.p, ds.n, ds.uv, ds.time = start.p, start.sh_frame.n, start.uv, si.time
+        ds.d, ds.dist, ds.emitter = -emitted.ray.d, si.t, emitted.emitter
+        ds.dist = dr.select(emitted.is_infinite, ds.dist, dr.norm(start.p - si.p))
+        ref = mi.Interaction3f(si)
+        is_delta = emitted.is_delta_position | (
+            emitted.is_delta_direction & emitted.is_infinite
+        )
+        is_beam = emitted.is_delta_direction & ~emitted.is_infinite
+        density = self._next_event.density(
+            state, scene, ref, start, ds, active & ~is_delta & ~is_beam
+        )
+        if not _has_delta(scene):
+            return density
+        probability = self._next_event.probability(
+            state, scene, ref, emitted.index, active & is_delta
+        )
+        return dr.select(is_beam, 0, dr.select(is_delta, probability, density))
+
+    def arrive(self, sums: Sums, si: mi.SurfaceInteraction3f) -> Sums:
+        """From a vertex to the next one, ``si``: solid angles become areas."""
+        inverse = dr.rcp(dr.maximum(_cosine(si), 1e-12))
+        return Sums(
+            sums.dVCM * self.ratio(dr.square(si.t) * inverse), sums.dVC * self.ratio(inverse)
+        )
+
+    def leave(
+        self,
+        sums: Sums,
+        cosine: mi.Float,
+        pdf: mi.Float,
+        reverse_pdf: mi.Float,
+        is_delta: mi.Bool,
+    ) -> Sums:
+        """A direction was sampled.
+
+        Parameters:
+            cosine: Between it and the geometric normal, not negative.
+            pdf, reverse_pdf: Its density, and that of the opposite way through the vertex, per
+                solid angle.
+            is_delta: Did a discrete distribution choose it? Then no other technique connects here.
+        """
+        leaves = cosine * dr.select(pdf > 0, dr.rcp(pdf), 0)
+        smooth = self.ratio(leaves) * (sums.dVCM + self.ratio(reverse_pdf) * sums.dVC)
+        dVCM = self.ratio(dr.select(pdf > 0, dr.rcp(pdf), 0))
+        return Sums(
+            dr.select(is_delta, 0, dVCM),
+            dr.select(is_delta, sums.dVC * self.ratio(cosine), smooth),
+        )
+
+
+def _cosine(si: mi.SurfaceInteraction3f) -> mi.Float:
+    """Between the direction of arrival and the geometric normal."""
+    return dr.abs(dr.dot(si.n, si.to_world(si.wi)))
+
+
+def _has_delta(scene: mi.Scene) -> bool:
+    delta = int(mi.EmitterFlags.DeltaPosition) | int(mi.EmitterFlags.DeltaDirection)
+    return any(int(e.flags()) & delta for e in scene.emitters())

@@ -1,0 +1,147 @@
+"""Connecting points of the scene to the sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.path_decisions import SceneQuery
+
+#: The sensors of Mitsuba to which a point can be connected.
+_CONNECTABLE = ("PerspectiveCamera", "ThinLensCamera")
+
+
+@dataclass
+class SensorConnection:
+    """A point of the scene, seen by the sensor.
+
+    Attributes:
+        d, dist: Direction to the point of the aperture, and the distance.
+        target: Where the sensor's rays begin on this line (at the near clip plane): nothing behind
+            it can be in between.
+        position: Where on the film, in pixels of its crop window plus that window's offset.
+        pdf: Density with which the sensor, from this point of the aperture, would send a camera
+            ray here, per solid angle; it integrates to 1 over the crop window.
+        importance: ``pdf`` / ``dist``²: what multiplies flux per solid angle.
+        active: Which points are seen, if nothing is in between.
+    """
+
+    d: mi.Vector3f
+    dist: mi.Float
+    target: mi.Point3f
+    position: mi.Point2f
+    pdf: mi.Float
+    importance: mi.Float
+    active: mi.Bool
+
+
+class UniformLens:
+    """Chooses points of the aperture: uniformly."""
+
+    def sample(
+        self, sample: mi.Point2f, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.Point2f, mi.Float | float]:
+        """The numbers that choose a point of the aperture for a connection to ``si``, and the
+        weight of the connection (1 / density of the numbers)."""
+        return sample, 1.0
+
+
+class ConnectableSensor:
+    """A sensor that can be connected to.
+
+    Mitsuba's ``sample_direction`` is only asked for positions. Its importance is 0 on a part of the
+    film of a ``perspective`` with a shifted principal point, and it returns points behind a
+    ``thinlens``.
+
+    Parameters:
+        sensor: Passes :meth:`can_connect`.
+        lens: Chooses the points of the aperture.
+    """
+
+    def __init__(self, sensor: mi.Sensor, lens: UniformLens | None = None) -> None:
+        self._sensor, self._lens = sensor, lens or UniformLens()
+        film = sensor.film()
+        width, height = (int(n) for n in film.size())
+        crop_width, crop_height = (int(n) for n in film.crop_size())
+        angle = float(dr.slice(mi.traverse(sensor)["x_fov"]))
+        crop = crop_width * crop_height / (width * height)
+        #: Area of the crop window's image at the distance 1
+        area = (2 * math.tan(math.radians(angle) / 2)) ** 2 * height / width * crop
+        self._inverse_area = dr.opaque(mi.Float, 1 / area)
+        self._size = dr.opaque(mi.Vector2f, [crop_width, crop_height])
+        self._offset = mi.Vector2f(mi.ScalarVector2f(film.crop_offset()))
+        self._near = dr.opaque(mi.Float, sensor.near_clip())
+        self._far = dr.opaque(mi.Float, sensor.far_clip())
+
+    @staticmethod
+    def can_connect(sensor: mi.Sensor) -> bool:
+        """Can points of the scene be connected to this sensor?"""
+        return sensor.class_name() in _CONNECTABLE
+
+    @property
+    def needs_aperture_sample(self) -> bool:
+        return self._sensor.needs_aperture_sample()
+
+    def connect(
+        self, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool
+    ) -> tuple[SensorConnection, mi.Float | float]:
+        """Connects ``si`` to a point of the aperture, which ``sample`` chooses.
+
+        Returns:
+            The connection, and its weight (1 unless the lens prefers some points).
+        """
+        sample, weight = self._lens.sample(sample, si, active)
+        ds, _importance = self._sensor.sample_direction(si, sample, active)
+        cosine = -dr.dot(ds.d, ds.n)
+        depth = cosine * ds.dist
+        inside = dr.all((ds.uv >= 0) & (ds.uv < self._size))
+        # A negative density marks points behind a thin lens
+        active = active & (ds.pdf > 0) & inside & (depth > self._near) & (depth < self._far)
+        pdf = self._inverse_area * dr.rcp(dr.select(active, cosine, 1) ** 3)
+        return SensorConnection(
+            ds.d, ds.dist, ds.p - ds.d * (self._near / dr.select(active, cosine, 1)),
+            ds.uv + self._offset, dr.select(active, pdf, 0),
+            dr.select(active, pdf / dr.square(ds.dist), 0), active,
+        ), weight  # fmt: skip
+
+    def pdf(self, origin: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        """Density per solid angle, for rays that leave the point ``origin`` of the aperture through
+        the crop window in the direction ``d``."""
+        axis = mi.Transform4f(self._sensor.world_transform()) @ mi.Vector3f(0, 0, 1)
+        cosine = dr.dot(d, dr.normalize(axis))
+        return dr.select(cosine > 0, self._inverse_area * dr.rcp(cosine**3), 0)
+
+
+def is_occluded(
+    query: SceneQuery,
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    connection: SensorConnection,
+    active: mi.Bool,
+    hides_emitters: bool = False,
+) -> mi.Bool:
+    """Is there anything between ``si`` and the sensor? With ``hides_emitters``, anything but area
+    lights."""
+    ds = dr.zeros(mi.DirectionSample3f, dr.width(si))
+    ds.p, ds.d, ds.dist = connection.target, connection.d, connection.dist
+    if not hides_emitters:
+        return query.occluded(scene, si, ds, active)
+    return _is_occluded_by_others(query, scene, query.shadow_ray(scene, si, ds), ds.p, active)
+
+
+@dr.syntax
+def _is_occluded_by_others(query, scene, ray, target, active) -> mi.Bool:
+    ray = mi.Ray3f(ray)
+    occluded = mi.Bool(False)
+    active = mi.Bool(active)
+    while active:
+        pi = query.closest(scene, ray, coherent=False, active=active)
+        active &= pi.is_valid()
+        passes = active & (pi.shape.emitter() != None)  # noqa: E711
+        occluded |= active & ~passes
+        ray = query.interaction(pi, ray).spawn_ray_to(target)
+        active = passes
+    return occluded
