@@ -135,7 +135,7 @@ class Walk:
                 gathered, connections, shadow_rays, shadow_state = connector.gather(
                     shadow_state, scattering_state, place, ctx, sampler, vertex, active_em
                 )
-                L = dr.fma(path.β, gathered, L)
+                L += gathered
                 connection_count += connections
                 shadow_count += shadow_rays
             connection = self._connect(connector, makes_one, place, sampler, vertex, active_em)

@@ -55,9 +55,11 @@ class ConnectionRecords(Observer):
         self._slots = dr.opaque(mi.UInt32, self._lanes)
         slots = self._lanes * _VERTICES
         self._row = dr.zeros(mi.UInt32, slots)
-        self._value, self._ratio, self._mis = (dr.zeros(mi.Float, slots) for _ in range(3))
+        # Squares of what the connections of a vertex bring: as drawn, and as Mitsuba would choose,
+        # with its MIS weight and with the one that was used
+        self._squares = [dr.zeros(mi.Float, slots) for _ in range(3)]
         self._total = dr.zeros(mi.Float, self._lanes)
-        dr.eval(self._row, self._value, self._ratio, self._mis, self._total)
+        dr.eval(self._row, self._squares, self._total)
 
     def connection(
         self, choice: Choice, vertex, ds, contribution, value, pdf, visible, tested
@@ -66,13 +68,14 @@ class ConnectionRecords(Observer):
         slot = vertex.depth * self._slots + self._path
         as_path = dr.gather(mi.Float, self._as_path, choice.cell, active)
         dr.scatter(self._row, choice.row, slot, active)
-        dr.scatter(self._value, brightness(value), slot, active)
+        square = dr.square(brightness(value))
         ratio = choice.probability / as_path
         mis = power_heuristic(ds.pdf, pdf)
         mis_as_path = power_heuristic(ds.pdf / ratio, pdf)
         change = dr.select(ds.delta, 1, mis_as_path / mis)
-        dr.scatter(self._ratio, ratio, slot, active)
-        dr.scatter(self._mis, dr.square(change), slot, active)
+        # A vertex may have several connections
+        for squares, factor in zip(self._squares, (1, ratio * dr.square(change), ratio)):
+            dr.scatter_add(squares, square * factor, slot, active)
 
     def end(self, L: mi.Spectrum) -> None:
         dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
@@ -88,19 +91,18 @@ class ConnectionRecords(Observer):
         if self._lanes == 0:
             return
         weight, error = importance(self._total)
-        slot = dr.arange(mi.UInt32, len(self._value))
+        slot = dr.arange(mi.UInt32, len(self._row))
         weight = dr.gather(mi.Float, weight, slot % self._slots)
-        actual = mi.Float64(dr.square(self._value) * weight)
-        actual = dr.select(dr.isfinite(actual), actual, 0)
+        weighted = [mi.Float64(squares * weight) for squares in self._squares]
+        is_number = dr.isfinite(weighted[0] + weighted[1] + weighted[2])
+        actual, *as_path = (dr.select(is_number, squares, 0) for squares in weighted)
+        dr.scatter_add(self.row_squares, as_path[0], self._row)
         self._error += float(dr.sum(mi.Float64(error))[0])
-        for index, ratio in enumerate((self._ratio * self._mis, self._ratio)):
-            as_path = dr.select(dr.isfinite(ratio), actual * ratio, 0)
-            if index == 0:
-                dr.scatter_add(self.row_squares, as_path, self._row)
-            self._removed[index] += float(dr.sum(as_path - actual)[0])
+        for index, squares in enumerate(as_path):
+            self._removed[index] += float(dr.sum(squares - actual)[0])
         self.variance = self._error + self._removed[0]
         self._lanes = 0
-        self._row = self._value = self._ratio = self._mis = self._total = None
+        self._row = self._squares = self._total = None
 
     def measured_gain(self) -> float:
         """By how much, relatively, the choice of the last pilot has lowered the variance of the
