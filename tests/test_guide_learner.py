@@ -17,6 +17,7 @@ from mitsuba_ext.decisions.directions.guided_directions import GuidedDirections
 from mitsuba_ext.decisions.directions.path_records import BYTES_PER_RECORD, PathRecords
 from mitsuba_ext.decisions.directions.surface_regions import SurfaceRegions
 from mitsuba_ext.decisions.directions.tile_regions import TileRegions
+from mitsuba_ext.decisions.pixel_estimates import PixelEstimates
 from mitsuba_ext.transport.path_decisions import DirectionSamples
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -38,7 +39,8 @@ class _Numbers:
 
 
 def _pixels() -> mi.UInt32:
-    return dr.arange(mi.UInt32, LANES) // (LANES // 2)
+    """Two, far from each other."""
+    return 31 * (dr.arange(mi.UInt32, LANES) // (LANES // 2))
 
 
 def _brought(pixel: mi.UInt32, u: mi.Point2f) -> mi.Float:
@@ -66,8 +68,9 @@ def _pilot(
 
 
 def _learner(kind: type[GuideLearner] = GuideLearner, **changes) -> GuideLearner:
-    parameters = {"bounces": 2, "max_memory": 1 << 30, "pilot_samples": 3 * LANES, **changes}
-    learner = kind(lambda p, n: TileRegions(2, 1, 1), False, **parameters)
+    parameters = {"bounces": 2, "max_memory": 1 << 30, "pilot_samples": 3 * LANES,
+                  "film_width": 32, **changes}
+    learner = kind(lambda p, n: TileRegions(32, 1, 16), False, **parameters)
     learner.start(None, mi.Point3f(), mi.Normal3f())
     return learner
 
@@ -224,23 +227,30 @@ def test_memory_is_bounded_where_no_path_ends() -> None:
 
 
 def test_importance_is_that_of_the_place_in_the_image() -> None:
-    """Errors are relative to the mean of 64 paths that follow each other, and to little of all."""
-    records = PathRecords(lambda si, pixel, active: pixel, bounces=2, stride=1)
-    brought = np.repeat([1.0, 4.0, 0.0], [64, 64, 32])
-    brought[:128] *= np.tile([0.5, 1.5], 64)
+    """Errors are relative to the mean of the pixels around, and to little of all."""
+    width, count = 32, 4
+    pixels = PixelEstimates(width)
+    records = PathRecords(lambda si, pixel, active: pixel, bounces=2, stride=1, pixels=pixels)
+    # The right half of the film is brighter; paths bring half or three halves of that
+    radiance = np.where(np.arange(width) < width // 2, 1.0, 4.0)[None].repeat(width, axis=0)
+    pixel = np.arange(width * width, dtype=np.uint32).repeat(count)
+    brought = radiance.ravel().repeat(count) * np.tile([0.5, 1.5], width * width * count // 2)
     for _ in range(2):
-        records.begin(160, dr.arange(mi.UInt32, 160))
+        records.begin(len(pixel), mi.UInt32(pixel))
         for depth in range(2):
             sample, L = mi.Point2f(0.5), mi.Color3f(0)
             records.direction(vertex_at(depth), sample, 1.0, L, mi.Bool(True))
         records.end(mi.Color3f(mi.Float(brought)))
     records.finish()
-    # The last group is filled up with the first paths
-    mean = np.repeat([1.0, 4.0, 0.5], [64, 64, 32])
-    importance = 1 / (mean**2 + 0.01 * brought.mean() ** 2)
-    np.testing.assert_allclose(records.importance.numpy(), np.tile(importance, 4), rtol=1e-4)
-    error = ((brought - mean) ** 2 * importance).sum()
-    assert records.variance == pytest.approx(2 * error, rel=1e-4)
+    floor = 0.01 * brought.mean() ** 2
+    importance = records.importance.numpy().reshape(2, 2, width, width, count)
+    for columns, mean in ((slice(0, 11), 1.0), (slice(21, width), 4.0)):
+        np.testing.assert_allclose(importance[..., columns, :], 1 / (mean**2 + floor), rtol=1e-4)
+    _, error = pixels.importance(mi.UInt32(pixel), mi.Float(brought))
+    assert records.variance == pytest.approx(2 * error.numpy().sum(), rel=1e-4)
+    error = error.numpy().reshape(width, width, count)
+    np.testing.assert_allclose(error[:, :11], 0.25 / (1 + floor), rtol=1e-4)
+
 
 
 def test_regions_have_the_least_of_places() -> None:

@@ -106,3 +106,8 @@ def test_files_of_other_scenes_and_parameters_are_refused(tmp_path: Path) -> Non
     with pytest.raises(ValueError, match="save_learned"):
         target = tmp_path / "no folder" / "learned.npz"
         _integrator("neepp", save_learned=str(target)).render(load("rooms"), spp=16)
+
+
+def test_to_load_and_to_save_at_once_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match='leave "save_learned" out'):
+        _integrator("neepp", save_learned=str(tmp_path / "a"), load_learned=str(tmp_path / "b"))

@@ -113,7 +113,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path):
         arrays = dict(data)
 
     def refusal() -> str:
-        learner = LightMapLearner("contribution", 0, MEMORY, 1000, load=file, plugin="name")
+        learner = LightMapLearner("contribution", 0, MEMORY, 1000, 64, load=file, plugin="name")
         with pytest.raises(ValueError) as caught:
             learner.start(scene, mi.Point3f(), mi.Normal3f())
         message = str(caught.value)

@@ -18,6 +18,7 @@ from ..files import check_target
 from ..lights.light_cells import LightCells
 from ..lights.weights import VoxelRows, power_weights, spatial_weights
 from ..regions.voxel_grid import VoxelGrid
+from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 
 #: Voxels along each axis for ``spatial``, where the scene's author does not say.
@@ -130,6 +131,7 @@ class LearnedLights(DecisionParameters):
             self.grid,
             int(self.max_memory * 2**20),
             setting.pilot_samples,
+            film_extent(setting.sensor.film())[0],
             Path(self.load_map) if self.load_map else None,
             Path(self.save_map) if self.save_map else None,
             self._plugin,

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from ..decisions.directions.guide_learner import GuideLearner
 from ..decisions.directions.guided_roulette import RouletteLearner
 from ..decisions.learner import Learner
-from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, Setting
 
 
@@ -25,5 +24,4 @@ class GuidedRoulette(DecisionParameters):
             return None
         if setting.rr_depth >= setting.max_depth:
             return None
-        width, _height = film_extent(setting.sensor.film())
-        return RouletteLearner(guide, setting.rr_depth, width)
+        return RouletteLearner(guide, setting.rr_depth)

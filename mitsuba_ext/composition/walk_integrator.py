@@ -100,6 +100,11 @@ class WalkIntegrator(StagedIntegrator):
             self._pilot_spp = self.parameter(props, "pilot_spp", max(wishes), minimum=0)
             self.save_learned = self.parameter(props, "save_learned", "")
             self.load_learned = self.parameter(props, "load_learned", "")
+            if self.save_learned and self.load_learned:
+                raise ValueError(
+                    f'"{self.name}": with "load_learned" nothing is learned: leave "save_learned" '
+                    f"out"
+                )
 
     def parameters(self) -> dict[str, Any]:
         learning = {

@@ -157,9 +157,9 @@ class Connector:
         vertex: Vertex,
         active: mi.Bool,
     ) -> tuple[mi.Spectrum, mi.UInt32, mi.UInt32, Any]:
-        """The light of all connections of vertices that have more than one: the scattered radiance,
-        the number of connections that were considered, that of shadow rays, and the new state of
-        the shadow test."""
+        """What all connections of vertices that have more than one bring to the path, throughput
+        included; the number of connections that were considered, that of shadow rays, and the new
+        state of the shadow test."""
         dimension = self._next_event.choice_dimension
         chosen = self._connections.begin(sampler, dimension)
         # One number for all connections: a vertex draws as many numbers wherever it lies
@@ -168,6 +168,8 @@ class Connector:
         connection_count, shadow_count = mi.UInt32(0), mi.UInt32(0)
         count = self._connections.weight(vertex.depth)
         active = active & (count > 1)
+        # Where there is no connection, nothing is added
+        share = vertex.path.β / dr.maximum(count, 1)
         while active:
             numbers, weight = self._connections.numbers(
                 chosen, index, dimension, active
@@ -179,7 +181,7 @@ class Connector:
                 vertex.path.hero_is_alone, bsdf_value, vertex.bsdf, vertex.si, wo
             )
             value, considered, tested, visible, shadow_state = self.unoccluded(
-                shadow_state, _turned(survival_sample, index), vertex, mi.Spectrum(weight),
+                shadow_state, _turned(survival_sample, index), vertex, share * weight,
                 connection, bsdf_value, pdf, count, active,
             )  # fmt: skip
             total[visible] += value
@@ -187,8 +189,7 @@ class Connector:
             shadow_count += dr.select(tested, 1, 0)
             index += 1
             active &= mi.Float(index) < count
-        # Where there is one connection or none, the total is 0
-        return total / dr.maximum(count, 1), connection_count, shadow_count, shadow_state
+        return total, connection_count, shadow_count, shadow_state
 
 
 def _turned(sample: mi.Float | tuple[()], index: mi.UInt32) -> mi.Float | tuple[()]:

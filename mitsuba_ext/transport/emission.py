@@ -18,9 +18,10 @@ def emission(
     next_event: EmitterSampling,
     state: Any,
     count: mi.Float | float = 1.0,
-) -> mi.Spectrum:
+) -> tuple[mi.Spectrum, mi.DirectionSample3f, mi.Float]:
     """The radiance that ``si`` (or the environment, if nothing was hit) emits towards the vertex
-    before it, times the MIS weight of having been found by scattering.
+    before it, times the MIS weight of having been found by scattering; the direction from there,
+    and the density with which connections find it (0 where they cannot).
 
     Parameters:
         next_event, state: The decision whose connections could have found the light as well, and
@@ -30,7 +31,8 @@ def emission(
     ds = mi.DirectionSample3f(scene, si, arrival.ref)
     is_connectable = ~arrival.is_delta & (ds.emitter != None)  # noqa: E711
     pdf = next_event.density(state, scene, arrival.ref, si, ds, is_connectable)
-    return ds.emitter.eval(si, arrival.pdf > 0) * power_heuristic(arrival.pdf, count * pdf)
+    emitted = ds.emitter.eval(si, arrival.pdf > 0) * power_heuristic(arrival.pdf, count * pdf)
+    return emitted, ds, pdf
 
 
 def can_be_hit(scene: mi.Scene) -> bool:

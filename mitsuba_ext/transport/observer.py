@@ -20,6 +20,18 @@ class Observer:
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         """A pass of so many paths begins, one in each lane, in ``pixel`` of the film."""
 
+    def emission(
+        self,
+        path: PathState,
+        ds: mi.DirectionSample3f,
+        value: mi.Spectrum,
+        pdf: mi.Float,
+        active: mi.Bool,
+    ) -> None:
+        """``path`` may have run into a light, in the direction ``ds`` from its last vertex, and
+        gains ``value``, its MIS weight included. ``pdf`` is the density with which a connection
+        finds this direction; 0 where none can."""
+
     def vertex(self, vertex: Vertex, active: mi.Bool) -> None:
         """A path is about to connect ``vertex`` to lights."""
 
@@ -70,6 +82,10 @@ class Observers(Observer):
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         for observer in self._observers:
             observer.begin(lanes, pixel)
+
+    def emission(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.emission(*arguments)
 
     def vertex(self, *arguments: Any) -> None:
         for observer in self._observers:

@@ -118,10 +118,11 @@ class Walk:
             # ----- How much does this vertex emit towards the previous one? -----
             if dr.hint(can_hit_emitters, mode="scalar"):
                 count = self.connections.weight(path.depth - 1)
-                emitted = emission(
+                emitted, hit, light_pdf = emission(
                     scene, si, path.arrival, self.next_event, next_event_state, count
                 )
                 L = dr.fma(path.β, emitted, L)
+                self.observer.emission(path, hit, path.β * emitted, light_pdf, active)
 
             # ----- Should we continue tracing to reach one more vertex? -----
             active_next = (path.depth + 1 < self.max_depth) & si.is_valid()
@@ -135,7 +136,7 @@ class Walk:
                 gathered, connections, shadow_rays, shadow_state = connector.gather(
                     shadow_state, scattering_state, place, ctx, sampler, vertex, active_em
                 )
-                L = dr.fma(path.β, gathered, L)
+                L += gathered
                 connection_count += connections
                 shadow_count += shadow_rays
             connection = self._connect(connector, makes_one, place, sampler, vertex, active_em)

@@ -12,8 +12,8 @@ import numpy as np
 from ...transport.observer import Observer
 from ...transport.path_decisions import DirectionSamples, Roulette
 from ..learner import Learner
+from ..pixel_estimates import PixelEstimates
 from ..roulette.adjoint_roulette import AdjointRoulette
-from ..roulette.pixel_estimates import PixelEstimates
 from ..roulette.roulette_trial import BYTES_PER_PATH, RouletteTrial
 from .guided_directions import GuidedDirections, Regions
 from .path_records import BYTES_PER_RECORD, PathRecords
@@ -61,6 +61,7 @@ class GuideLearner(Learner):
         bounces: How many directions of a path are guided, at most.
         max_memory: Bytes for what is recorded, and for what is built from it.
         pilot_samples: Samples of all pilots together.
+        film_width: Pixels of a row of the film, with its border where that is sampled.
         always: Guide all ``bounces``, and learn the roulette, also where the pilots show that it
             does not pay?
 
@@ -80,6 +81,7 @@ class GuideLearner(Learner):
         bounces: int,
         max_memory: int,
         pilot_samples: int,
+        film_width: int,
         always: bool = False,
     ) -> None:
         self.make_regions, self.wants_scout = regions, wants_scout
@@ -89,7 +91,7 @@ class GuideLearner(Learner):
         self.guidance: Guidance | None = None
         self.roulette, self.trial = Roulette(), None
         self._rr_depth: int | None = None
-        self._pixels: PixelEstimates | None = None
+        self._pixels = PixelEstimates(film_width)
         self.sample_count = 0
         self._records: PathRecords | None = None
         self._share, self._summary = _FIRST_SHARE, ""
@@ -104,17 +106,12 @@ class GuideLearner(Learner):
             bytes_per_path += BYTES_PER_PATH
         stride = -(-self.pilot_samples * bytes_per_path // self.max_memory)
         if self._rr_depth is not None:
-            self.trial = RouletteTrial(stride, self._rr_depth)
+            self.trial = RouletteTrial(stride, self._rr_depth, self._pixels)
         self._records = PathRecords(self._regions.label, self.bounces, stride, self._pixels)
 
-    def learn_roulette(self, rr_depth: int, film_width: int) -> None:
-        """Asks for a roulette as well.
-
-        Parameters:
-            rr_depth: Depth at which roulette begins.
-            film_width: Pixels of a row of the film, with its border where that is sampled.
-        """
-        self._rr_depth, self._pixels = rr_depth, PixelEstimates(film_width)
+    def learn_roulette(self, rr_depth: int) -> None:
+        """Asks for a roulette as well, which begins at that depth."""
+        self._rr_depth = rr_depth
 
     # ---- Observer ----
 
@@ -187,7 +184,7 @@ class GuideLearner(Learner):
             f"samples, {effect}"
         )
         self.guide = GuidedDirections(trees, self._regions, bounces)
-        if self._pixels is not None:
+        if self._rr_depth is not None:
             radiance = self._regions.incident_radiance(records)
             self.roulette = AdjointRoulette(self._regions, radiance, self._pixels.scale())
         return self.guide
@@ -220,9 +217,9 @@ class GuideLearner(Learner):
             return 1.0, 1.0
         chosen, path = self.trial.drawn, self.trial.unguided
         by_throughput = self.trial.by_throughput
-        if self._pixels is not None and not self.always:
+        if self._rr_depth is not None and not self.always:
             if chosen.efficiency(by_throughput) < least:
-                self._pixels, self.roulette, chosen = None, Roulette(), by_throughput
+                self._rr_depth, self.roulette, chosen = None, Roulette(), by_throughput
         if path.variance <= 0 or not np.isfinite(path.variance + chosen.variance):
             return 1.0, 1.0
         guided = max(1 - gains[self._share].sum(), 1e-3)

@@ -17,12 +17,12 @@ class RouletteLearner(Learner):
 
     Parameters:
         guide: The learner of directions, by regions of surfaces.
-        rr_depth, film_width: See :meth:`GuideLearner.learn_roulette`.
+        rr_depth: Depth at which roulette begins.
     """
 
-    def __init__(self, guide: GuideLearner, rr_depth: int, film_width: int) -> None:
+    def __init__(self, guide: GuideLearner, rr_depth: int) -> None:
         self._guide = guide
-        guide.learn_roulette(rr_depth, film_width)
+        guide.learn_roulette(rr_depth)
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> None:
         return None

@@ -8,9 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...transport.observer import Observer
-from ..path_importance import brightness
-from ..path_importance import importance as path_importance
-from ..roulette.pixel_estimates import PixelEstimates
+from ..pixel_estimates import PixelEstimates, brightness
 from .tree_builder import DEPTH, cell_code, joined
 
 #: The most bytes of a record, including the temporaries while trees are built.
@@ -25,7 +23,7 @@ class PathRecords(Observer):
             each lane and a mask are given).
         bounces: Bounces of a path that are recorded.
         stride: One in so many paths is recorded.
-        pixels: Is told what the paths bring, if there is one.
+        pixels: Is told what the paths bring.
 
     Attributes:
         paths (int): How many paths were recorded.
@@ -45,7 +43,7 @@ class PathRecords(Observer):
         region: Callable[[mi.SurfaceInteraction3f, mi.UInt32, mi.Bool], mi.UInt32],
         bounces: int,
         stride: int,
-        pixels: PixelEstimates | None = None,
+        pixels: PixelEstimates,
     ) -> None:
         self._region, self.bounces, self.stride = region, bounces, stride
         self._pixels = pixels
@@ -64,7 +62,7 @@ class PathRecords(Observer):
 
     # ---- Observer of the walk ----
 
-    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
+    def begin(self, lanes: int, pixel: mi.UInt32) -> None:
         self._collect()
         self._lanes = -(-lanes // self.stride)
         self._pixel = pixel
@@ -112,10 +110,10 @@ class PathRecords(Observer):
         """Keeps what the last pass has recorded."""
         if self._lanes == 0:
             return
-        importance, error = path_importance(self._total)
-        if self._pixels is not None and self._pixel is not None:
-            recorded = dr.arange(mi.UInt32, self._lanes) * dr.opaque(mi.UInt32, self.stride)
-            self._pixels.add(dr.gather(mi.UInt32, self._pixel, recorded), self._total)
+        recorded = dr.arange(mi.UInt32, self._lanes) * dr.opaque(mi.UInt32, self.stride)
+        pixel = dr.gather(mi.UInt32, self._pixel, recorded)
+        self._pixels.add(pixel, self._total)
+        importance, error = self._pixels.importance(pixel, self._total)
         self.paths += self._lanes
         self.variance += float(dr.sum(mi.Float64(error))[0])
         slot = dr.compress(self._weights > 0)

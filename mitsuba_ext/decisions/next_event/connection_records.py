@@ -1,4 +1,4 @@
-"""Recording what the connections of paths contribute to the variance of the image."""
+"""Recording what a choice of lights contributes to the variance of the image."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ...transport.mis import power_heuristic
 from ...transport.observer import Observer
-from ..path_importance import brightness, importance
+from ..pixel_estimates import PixelEstimates, brightness
 from .light_table import Choice
 
 #: Connections of a path that are recorded, those of its first vertices; and paths of a pass, at
@@ -16,63 +16,84 @@ _VERTICES, _MOST_PATHS = 6, 1 << 18
 
 
 class ConnectionRecords(Observer):
-    """Records connections that were chosen from a light table.
+    """Records what paths bring by connections that were chosen from a light table, and by running
+    into lights that these could have found: what one of them finds less often, MIS leaves to the
+    other.
 
     Parameters:
+        scene: The scene.
+        pixels: Is told what the paths bring.
         rows: Rows of the table.
         as_path: The probabilities, for each cell, with which Mitsuba would choose.
 
     Attributes:
         samples (int): Paths of the last pilot, those that are not recorded included.
         row_squares (mi.Float64): For each row, the sum of the squares of what its connections would
-            bring if Mitsuba had chosen, in the image, weighted by :func:`importance`; shape [rows].
+            bring if Mitsuba had chosen, in the image, weighted by their place; shape
+            [rows].
         variance (float): Sum of the squared errors of the paths, weighted so, if Mitsuba had
             chosen.
+        measured_gain (float): By how much, relatively, the choice of the last pilot has lowered
+            that variance.
     """
 
-    def __init__(self, rows: int, as_path: mi.Float) -> None:
-        self._as_path, self._rows = as_path, rows
+    def __init__(
+        self, scene: mi.Scene, pixels: PixelEstimates, rows: int, as_path: mi.Float
+    ) -> None:
+        self._scene, self._pixels, self._as_path, self._rows = scene, pixels, as_path, rows
         self._lanes = 0
         self.restart()
 
     def restart(self) -> None:
         """Forgets the last pilot."""
         self.row_squares = dr.zeros(mi.Float64, self._rows)
-        self.samples, self.variance = 0, 0.0
-        self._error, self._removed = 0.0, [0.0, 0.0]
+        self.samples, self.variance, self.measured_gain = 0, 0.0, 0.0
+        self._error = self._removed = 0.0
 
     # ---- Observer of the walk ----
 
-    def begin(self, lanes: int, pixel: mi.UInt32 | None = None) -> None:
+    def begin(self, lanes: int, pixel: mi.UInt32) -> None:
         self._collect()
         self.samples += lanes
         stride = max(1, lanes // _MOST_PATHS)
         self._lanes = -(-lanes // stride)
         lane = dr.arange(mi.UInt32, lanes)
         stride = dr.opaque(mi.UInt32, stride)
+        self._pixel = dr.gather(mi.UInt32, pixel, dr.arange(mi.UInt32, self._lanes) * stride)
         self._path = lane // stride
         self._is_recorded = self._path * stride == lane
         self._slots = dr.opaque(mi.UInt32, self._lanes)
         slots = self._lanes * _VERTICES
-        self._row = dr.zeros(mi.UInt32, slots)
-        self._value, self._ratio, self._mis = (dr.zeros(mi.Float, slots) for _ in range(3))
+        self._row, self._square = dr.zeros(mi.UInt32, slots), dr.zeros(mi.Float, slots)
+        # By how much the sum of squares of a path would be larger if Mitsuba had chosen
+        self._more = dr.zeros(mi.Float, self._lanes)
         self._total = dr.zeros(mi.Float, self._lanes)
-        dr.eval(self._row, self._value, self._ratio, self._mis, self._total)
+        dr.eval(self._row, self._square, self._more, self._total)
+
+    def emission(self, path, ds, value, pdf, active) -> None:
+        # A number that is not finite would hide those of the others in the sum
+        active = active & self._is_recorded & (pdf > 0) & (path.arrival.pdf > 0)
+        as_path = self._scene.pdf_emitter_direction(path.arrival.ref, ds, active)
+        change = power_heuristic(path.arrival.pdf, as_path)
+        change /= power_heuristic(path.arrival.pdf, pdf)
+        more = dr.square(brightness(value)) * (dr.square(change) - 1)
+        dr.scatter_add(self._more, more, self._path, active & dr.isfinite(more))
 
     def connection(
         self, choice: Choice, vertex, ds, contribution, value, pdf, visible, tested
     ) -> None:
-        active = visible & self._is_recorded & (vertex.depth < _VERTICES)
+        active = visible & self._is_recorded
+        ratio = choice.probability / dr.gather(mi.Float, self._as_path, choice.cell, active)
+        change = power_heuristic(ds.pdf / ratio, pdf) / power_heuristic(ds.pdf, pdf)
+        square = dr.square(brightness(value))
+        as_path = square * ratio * dr.select(ds.delta, 1, dr.square(change))
+        active &= dr.isfinite(as_path)
+        dr.scatter_add(self._more, as_path - square, self._path, active)
+        active &= vertex.depth < _VERTICES
         slot = vertex.depth * self._slots + self._path
-        as_path = dr.gather(mi.Float, self._as_path, choice.cell, active)
         dr.scatter(self._row, choice.row, slot, active)
-        dr.scatter(self._value, brightness(value), slot, active)
-        ratio = choice.probability / as_path
-        mis = power_heuristic(ds.pdf, pdf)
-        mis_as_path = power_heuristic(ds.pdf / ratio, pdf)
-        change = dr.select(ds.delta, 1, mis_as_path / mis)
-        dr.scatter(self._ratio, ratio, slot, active)
-        dr.scatter(self._mis, dr.square(change), slot, active)
+        # A vertex may have several connections
+        dr.scatter_add(self._square, as_path, slot, active)
 
     def end(self, L: mi.Spectrum) -> None:
         dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
@@ -87,33 +108,23 @@ class ConnectionRecords(Observer):
         """Keeps what the last pass has recorded."""
         if self._lanes == 0:
             return
-        weight, error = importance(self._total)
-        slot = dr.arange(mi.UInt32, len(self._value))
-        weight = dr.gather(mi.Float, weight, slot % self._slots)
-        actual = mi.Float64(dr.square(self._value) * weight)
-        actual = dr.select(dr.isfinite(actual), actual, 0)
+        self._pixels.add(self._pixel, self._total)
+        weight, error = self._pixels.importance(self._pixel, self._total)
+        slot = dr.arange(mi.UInt32, len(self._row))
+        squares = self._square * dr.gather(mi.Float, weight, slot % self._slots)
+        squares = mi.Float64(dr.select(dr.isfinite(squares), squares, 0))
+        dr.scatter_add(self.row_squares, squares, self._row)
+        more = self._more * weight
+        more = dr.select(dr.isfinite(more), more, 0)
         self._error += float(dr.sum(mi.Float64(error))[0])
-        for index, ratio in enumerate((self._ratio * self._mis, self._ratio)):
-            as_path = dr.select(dr.isfinite(ratio), actual * ratio, 0)
-            if index == 0:
-                dr.scatter_add(self.row_squares, as_path, self._row)
-            self._removed[index] += float(dr.sum(as_path - actual)[0])
-        self.variance = self._error + self._removed[0]
+        self._removed += float(dr.sum(mi.Float64(more))[0])
+        self.variance = self._error + self._removed
+        self.measured_gain = self._removed / max(self.variance, 1e-30)
         self._lanes = 0
-        self._row = self._value = self._ratio = self._mis = self._total = None
-
-    def measured_gain(self) -> float:
-        """By how much, relatively, the choice of the last pilot has lowered the variance of the
-        image below that with Mitsuba's choice, about.
-
-        A less likely choice has a smaller MIS weight, and what scattering finds in its place a
-        larger one. Of that part nothing is recorded: the first bound leaves its variance out, the
-        second one leaves all of it to the connections. This is the mean of both."""
-        gains = [removed / max(self._error + removed, 1e-30) for removed in self._removed]
-        return sum(gains) / 2
+        self._row = self._square = self._more = self._total = self._pixel = None
 
     def predicted_gain(self, ratio: mi.Float) -> float:
-        """The same for a choice with which the mean squares of the connections of each row become
-        ``ratio`` times those with Mitsuba's choice; shape [rows]."""
+        """By how much, relatively, a choice lowers the variance with which the mean squares of the
+        connections of each row become ``ratio`` times those with Mitsuba's choice; shape [rows]."""
         removed = float(dr.sum(self.row_squares * mi.Float64(1 - ratio))[0])
         return removed / max(self.variance, 1e-30)

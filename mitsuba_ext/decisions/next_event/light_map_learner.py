@@ -16,6 +16,7 @@ from ...regions.surface_sides import region
 from ...transport.observer import Observer
 from ...transport.path_decisions import EmitterSampling
 from ..learner import Learner
+from ..pixel_estimates import PixelEstimates
 from . import light_map_file
 from .connection_records import ConnectionRecords
 from .light_map import BYTES_PER_ENTRY, LightMap
@@ -34,8 +35,8 @@ _GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 #: efficiency that it must reach.
 _COST, _LEAST_EFFICIENCY = 0.12, 1.05
 
-#: The efficiency, from few samples, that lets learning go on: tables of more are better.
-_TRIAL_EFFICIENCY = 0.97
+#: The efficiency, from few samples, that lets learning go on: tables of more are little better.
+_TRIAL_EFFICIENCY = 1.02
 
 #: Share of all pilots' samples that decide, at least.
 _LEAST_SHARE = 0.2
@@ -53,6 +54,7 @@ class LightMapLearner(Learner):
             of pilot samples.
         max_memory: Bytes that the map may take.
         pilot_samples: Samples of all pilots together.
+        film_width: Pixels of a row of the film, with its border where that is sampled.
         load, save: Files of a map to begin with, and of the map that was learned.
         plugin: What errors call the plugin.
 
@@ -66,6 +68,7 @@ class LightMapLearner(Learner):
         grid: int,
         max_memory: int,
         pilot_samples: int,
+        film_width: int,
         load: Path | None = None,
         save: Path | None = None,
         plugin: str = "neepp",
@@ -73,6 +76,7 @@ class LightMapLearner(Learner):
         self.target, self.grid = target, grid
         self.max_memory, self.pilot_samples = max_memory, pilot_samples
         self.load, self.save, self.plugin = load, save, plugin
+        self._pixels = PixelEstimates(film_width)
         # A loaded map brings its region and its rows
         self.wants_scout = load is None
         self._is_needed = grid > 0 or load is not None or save is not None
@@ -104,7 +108,9 @@ class LightMapLearner(Learner):
         self._scene = scene
         self._set_as_path(scene)
         if not self._is_needed:
-            self._records = ConnectionRecords(self.map.rows.count, self._as_path)
+            self._records = ConnectionRecords(
+                scene, self._pixels, self.map.rows.count, self._as_path
+            )
         return self._selection(self._probabilities(self.map.unoccluded))
 
     def _new_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
@@ -138,6 +144,10 @@ class LightMapLearner(Learner):
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         for observer in self._observers():
             observer.begin(lanes, pixel)
+
+    def emission(self, *arguments) -> None:
+        if self._records is not None:
+            self._records.emission(*arguments)
 
     def connection(self, *arguments) -> None:
         for observer in self._observers():
@@ -190,7 +200,7 @@ class LightMapLearner(Learner):
         is_trial = records.samples < _LEAST_SHARE * self.pilot_samples and not is_last
         if self._is_tested:
             # Samples that did not teach the table from which they were drawn
-            gain = records.measured_gain()
+            gain = records.measured_gain
         else:
             # Too optimistic: the samples judge what they have taught
             as_path = dr.tile(self._as_path, self.map.rows.count)

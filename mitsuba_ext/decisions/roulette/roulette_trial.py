@@ -9,10 +9,11 @@ import mitsuba as mi
 
 from ...transport.observer import Observer
 from ...transport.path_decisions import LARGEST_PROBABILITY, unguided_throughput
-from ..path_importance import brightness, importance
+from ..pixel_estimates import PixelEstimates, brightness
 
-#: Bounces of a path that are looked at: what comes later is as it was drawn.
-_BOUNCES = 12
+#: Bounces of a path that are looked at: what comes later is as it was drawn. And paths of a pass,
+#: at most, about: sums of few numbers need no more.
+_BOUNCES, _MOST_PATHS = 12, 1 << 18
 
 #: Bytes that a path takes.
 BYTES_PER_PATH = 4 * (4 * _BOUNCES + 1)
@@ -42,8 +43,9 @@ class RouletteTrial(Observer):
     would then be that of V² + Σ (A_j − A_{j−1}) V_j², with A before the first bounce 1.
 
     Parameters:
-        stride: One in so many paths is looked at.
+        stride: One in so many paths is looked at, at most.
         rr_depth: Depth at which roulette begins.
+        pixels: Knows what the paths bring.
 
     Attributes:
         drawn: The effect of what was drawn.
@@ -51,8 +53,8 @@ class RouletteTrial(Observer):
         unguided: Of that, and uniform samples.
     """
 
-    def __init__(self, stride: int, rr_depth: int) -> None:
-        self._stride, self._rr_depth = stride, rr_depth
+    def __init__(self, stride: int, rr_depth: int, pixels: PixelEstimates) -> None:
+        self._stride, self._rr_depth, self._pixels = stride, rr_depth, pixels
         self._paths = 0
         self.restart()
 
@@ -62,11 +64,13 @@ class RouletteTrial(Observer):
 
     # ---- Observer of the walk ----
 
-    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
+    def begin(self, lanes: int, pixel: mi.UInt32) -> None:
         self.finish()
-        self._paths = -(-lanes // self._stride)
+        stride = max(self._stride, lanes // _MOST_PATHS)
+        self._paths = -(-lanes // stride)
         lane = dr.arange(mi.UInt32, lanes)
-        stride = dr.opaque(mi.UInt32, self._stride)
+        stride = dr.opaque(mi.UInt32, stride)
+        self._pixel = dr.gather(mi.UInt32, pixel, dr.arange(mi.UInt32, self._paths) * stride)
         self._path = lane // stride
         self._is_recorded = self._path * stride == lane
         self._slots = dr.opaque(mi.UInt32, self._paths)
@@ -100,7 +104,7 @@ class RouletteTrial(Observer):
         if self._paths == 0:
             return
         total = dr.select(dr.isfinite(self._total), self._total, 0)
-        weight, error = importance(total)
+        weight, error = self._pixels.importance(self._pixel, total)
         sums = [dr.sum(mi.Float64(error))]
         for roulette, is_guided in ((False, True), (True, True), (True, False)):
             more, segments = self._other(total, roulette, is_guided)
@@ -113,7 +117,8 @@ class RouletteTrial(Observer):
             for old, new in zip((self.drawn, self.by_throughput, self.unguided), effects)
         )
         self._paths = 0
-        self._weight = self._before = self._throughput = self._probability = self._total = None
+        self._weight = self._before = self._throughput = self._probability = None
+        self._total = self._pixel = None
 
     def _other(
         self, total: mi.Float, by_throughput: bool, is_guided: bool

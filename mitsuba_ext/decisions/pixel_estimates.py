@@ -1,7 +1,8 @@
-"""What radiance the pixels have, about."""
+"""What radiance the pixels have, about, and by how much errors of paths count there."""
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -10,6 +11,11 @@ _RADIUS = 4
 
 #: Squared radiance of a dark pixel, in units of the squared mean of all.
 _FLOOR = 1e-2
+
+
+def brightness(L: mi.Spectrum) -> mi.Float:
+    """One number for a path's radiance: errors count the same in all channels."""
+    return dr.mean(L)
 
 
 class PixelEstimates:
@@ -35,12 +41,29 @@ class PixelEstimates:
 
     def scale(self) -> mi.Float:
         """1 / radiance of each pixel, row by row."""
+        return self._scale(self._means())
+
+    def importance(self, pixel: mi.UInt32, radiance: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """For each of some samples that were added: by how much squared errors count at its place
+        in the image, and its own squared error, weighted so.
+
+        A sample is part of the mean that its error is relative to. What a rare bright one counts is
+        thereby bounded, by the square of the number of samples in the mean."""
+        means = self._means()
+        weight = dr.square(dr.gather(mi.Float, self._scale(means), pixel))
+        radiance = dr.select(dr.isfinite(radiance), radiance, 0)
+        mean = dr.gather(mi.Float, mi.Float(means.astype(np.float32)), pixel)
+        return weight, dr.square(radiance - mean) * weight
+
+    def _means(self) -> np.ndarray:
         total, count = (
             _box_sums(x.reshape(-1, self._width)).ravel() for x in (self._sum, self._count)
         )
-        mean = total / np.maximum(count, 1)
+        return total / np.maximum(count, 1)
+
+    def _scale(self, means: np.ndarray) -> mi.Float:
         # An image that is black all over has no scale: all that is expected there is 0
-        square = mean**2 + _FLOOR * (self._sum.sum() / max(self._count.sum(), 1)) ** 2
+        square = means**2 + _FLOOR * (self._sum.sum() / max(self._count.sum(), 1)) ** 2
         return mi.Float((1 / np.sqrt(np.maximum(square, 1e-30))).astype(np.float32))
 
 
