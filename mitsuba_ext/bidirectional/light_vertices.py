@@ -142,7 +142,7 @@ class LightVertices:
     ) -> None:
         self._layout, self._words = store.layout, store.words
         self._time, self._wavelengths, self._disperses = time, wavelengths, disperses
-        self.stride = store.stride
+        self.stride, self._lane = store.stride, None
         self.slot = dr.compress(store.is_taken)
         self.count = len(self.slot)
         self.bytes = store.bytes + 4 * self.count
@@ -167,7 +167,7 @@ class LightVertices:
             mi.Point3f(w[0], w[1], w[2]), mi.Vector3f(w[3], w[4], w[5]), mi.Point2f(w[6], w[7]),
             dr.reinterpret_array(mi.UInt32, w[8]), _as_shape(w[9]), instance,
             mi.Spectrum(*(w[10 + i] for i in range(n))), sums, mark & (_HERO_IS_ALONE - 1),
-            hero_is_alone, slot // self.stride,
+            hero_is_alone, self._lane_of(slot, active),
         )  # fmt: skip
 
     def interaction(
@@ -192,8 +192,60 @@ class LightVertices:
         """The wavelengths of a vertex's path; ``None`` in variants that are not spectral."""
         return self._of_lane(self._wavelengths, vertex.lane, active) if mi.is_spectral else None
 
+    def _lane_of(self, slot: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        if self._lane is None:
+            return slot // self.stride
+        return dr.gather(mi.UInt32, self._lane, slot, active)
+
     def _of_lane(self, values: Any, lane: mi.UInt32, active: mi.Bool) -> Any:
         return values if dr.width(values) == 1 else dr.gather(type(values), values, lane, active)
+
+
+class VertexCache(LightVertices):
+    """The vertices of some rounds of a light walk, without gaps: those of a path follow each other.
+    Their places in the store are their numbers.
+
+    Parameters:
+        rounds: The vertices of each round. Their memory is given back.
+        lanes: Number of paths.
+
+    Attributes:
+        first, number (mi.UInt32): Of each path: its first vertex, and how many it has.
+    """
+
+    def __init__(self, rounds: list[LightVertices], lanes: int) -> None:
+        last = rounds[-1]
+        self._layout, self._disperses, self.stride = last._layout, last._disperses, 1
+        self._time, self._wavelengths = last._time, last._wavelengths
+        numbers = []
+        for vertices in rounds:
+            number = dr.zeros(mi.UInt32, lanes)
+            lane = vertices._lane_of(vertices.slot, mi.Bool(True))
+            dr.scatter_add(number, mi.UInt32(1), lane)
+            numbers.append(number)
+        self.number = sum(numbers[1:], numbers[0])
+        self.first = dr.cumsum(self.number) - self.number
+        self.count = sum(vertices.count for vertices in rounds)
+        self.slot = dr.arange(mi.UInt32, self.count)
+        words = self._layout.words
+        self._words = dr.empty(mi.Float, max(1, self.count) * words)
+        self._lane = dr.empty(mi.UInt32, max(1, self.count))
+        before = mi.UInt32(self.first)
+        for vertices, number in zip(rounds, numbers):
+            lane = vertices._lane_of(vertices.slot, mi.Bool(True))
+            # The first of this path in this round
+            begin = dr.cumsum(number) - number
+            index = dr.arange(mi.UInt32, vertices.count)
+            place = index - dr.gather(mi.UInt32, begin, lane) + dr.gather(mi.UInt32, before, lane)
+            packet = dr.gather(
+                mi.ArrayXf, vertices._words, vertices.slot, shape=(words, vertices.count)
+            )
+            dr.scatter(self._words, packet, place)
+            dr.scatter(self._lane, lane, place)
+            before = before + number
+            dr.eval(self._words, self._lane, before)
+            vertices._words = vertices._lane = None
+        self.bytes = self.count * (4 * words + 8)
 
 
 def _as_float(value: Any) -> mi.Float:

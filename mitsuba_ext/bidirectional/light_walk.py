@@ -198,7 +198,7 @@ class LightWalk:
         """The partial sums at a vertex."""
         if self.sums is None:
             return paths.sums
-        later = self.sums.arrive(paths.sums, si)
+        later = self.sums.arrive(paths.sums, si, dr.square(si.t))
         is_first = paths.depth == 1
         return Sums(
             dr.select(is_first, paths.sums.dVCM, later.dVCM),

@@ -93,11 +93,13 @@ class PartialSums:
         )
         return dr.select(is_beam, 0, dr.select(is_delta, probability, density))
 
-    def arrive(self, sums: Sums, si: mi.SurfaceInteraction3f) -> Sums:
-        """From a vertex to the next one, ``si``: solid angles become areas."""
+    def arrive(
+        self, sums: Sums, si: mi.SurfaceInteraction3f, squared_distance: mi.Float
+    ) -> Sums:
+        """From a vertex to the next one, ``si``, at this distance: solid angles become areas."""
         inverse = dr.rcp(dr.maximum(_cosine(si), 1e-12))
         return Sums(
-            sums.dVCM * self.ratio(dr.square(si.t) * inverse), sums.dVC * self.ratio(inverse)
+            sums.dVCM * self.ratio(squared_distance * inverse), sums.dVC * self.ratio(inverse)
         )
 
     def leave(

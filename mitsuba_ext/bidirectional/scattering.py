@@ -24,16 +24,28 @@ def evaluate(
     to_camera: mi.Vector3f,
     active: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Float]:
-    """What a vertex does to light that arrives from ``si.wi`` and leaves ``to_camera`` (local).
+    """What a vertex does to light that arrives from ``si.wi`` and leaves ``to_camera`` (local),
+    where it is not connected to another path.
 
     Returns:
         BSDF · geometric cosine of ``to_camera``, which multiplies flux per solid angle; and the
         density with which a camera path that arrives there samples ``si.wi``.
     """
+    value, pdf = adjoint_value(heroes.context(), bsdf, si, to_camera, active)
+    return heroes.connect(hero_is_alone, value, bsdf, si, to_camera), pdf
+
+
+def adjoint_value(
+    ctx: mi.BSDFContext,
+    bsdf: mi.BSDFPtr,
+    si: mi.SurfaceInteraction3f,
+    to_camera: mi.Vector3f,
+    active: mi.Bool,
+) -> tuple[mi.Spectrum, mi.Float]:
+    """The same for all wavelengths."""
     reversed_si = mi.SurfaceInteraction3f(si)
     reversed_si.wi = to_camera
-    value, pdf = bsdf.eval_pdf(heroes.context(), reversed_si, si.wi, active)
-    value = heroes.connect(hero_is_alone, value, bsdf, reversed_si, si.wi)
+    value, pdf = bsdf.eval_pdf(ctx, reversed_si, si.wi, active)
     arrives, leaves = geometric_cosine(si, si.wi), geometric_cosine(si, to_camera)
     # The value holds the shading cosine of arrival
     return value * dr.select(arrives > 0, leaves / arrives, 0), pdf
@@ -58,3 +70,16 @@ def delta_correction(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Flo
 def geometric_cosine(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
     """Between the geometric normal and a local direction, not negative."""
     return dr.abs(dr.dot(si.n, si.to_world(d)))
+
+
+def reverse_density(
+    ctx: mi.BSDFContext,
+    bsdf: mi.BSDFPtr,
+    si: mi.SurfaceInteraction3f,
+    wo: mi.Vector3f,
+    active: mi.Bool,
+) -> mi.Float:
+    """The density with which a path that arrives from ``wo`` goes on towards ``si.wi``."""
+    reversed_si = mi.SurfaceInteraction3f(si)
+    reversed_si.wi = wo
+    return bsdf.pdf(ctx, reversed_si, si.wi, active)

@@ -107,12 +107,13 @@ class ConnectableSensor:
             dr.select(active, pdf / dr.square(ds.dist), 0), active,
         ), weight  # fmt: skip
 
-    def pdf(self, origin: mi.Point3f, d: mi.Vector3f) -> mi.Float:
-        """Density per solid angle, for rays that leave the point ``origin`` of the aperture through
-        the crop window in the direction ``d``."""
+    def origin(self, ray: mi.Ray3f) -> tuple[mi.Point3f, mi.Float]:
+        """The point of the aperture from which a camera ray comes (it begins at the near clip
+        plane), and the density of its direction per solid angle, as :attr:`SensorConnection.pdf`.
+        """
         axis = mi.Transform4f(self._sensor.world_transform()) @ mi.Vector3f(0, 0, 1)
-        cosine = dr.dot(d, dr.normalize(axis))
-        return dr.select(cosine > 0, self._inverse_area * dr.rcp(cosine**3), 0)
+        inverse = dr.rcp(dr.maximum(dr.dot(ray.d, dr.normalize(axis)), 1e-6))
+        return ray.o - ray.d * (self._near * inverse), self._inverse_area * inverse**3
 
 
 def is_occluded(

@@ -11,6 +11,7 @@ from ..decisions.learner import Learner
 from ..decisions.scout import SCOUT_DEPTH, Scout
 from ..rendering.camera_samples import CameraSamples
 from ..rendering.stages import Stage
+from ..transport.estimator import Estimator
 from ..transport.observer import Observers
 from ..transport.path_decisions import NoConnections
 from ..transport.walk import Walk
@@ -63,8 +64,8 @@ class Schedule:
         slots: What fills the slots of the walk.
         setting: What is rendered.
         pilot_count: Number of pilots.
-        walk: Makes a walk with the integrator's parameters from the decisions that differ from
-            those of ``path``.
+        estimator: Makes the estimator of a stage, with the integrator's parameters, from the
+            decisions that differ from those of ``path``.
         query: How rays meet the scene.
         restored: What an earlier render has learned (``Learner.state``, by slot): there is no
             pilot then. ``None`` to learn.
@@ -81,12 +82,12 @@ class Schedule:
         slots: Mapping[str, DecisionParameters],
         setting: Setting,
         pilot_count: int,
-        walk: Callable[..., Walk],
+        estimator: Callable[..., Estimator],
         query: Any,
         restored: States | None = None,
         learned: Callable[[States], None] | None = None,
     ) -> None:
-        self._setting, self._pilot_count, self._walk = setting, pilot_count, walk
+        self._setting, self._pilot_count, self._estimator = setting, pilot_count, estimator
         self.decisions: dict[str, Any] = {"query": query}
         self.learners: dict[str, Learner] = {}
         self._camera = CameraSamples()
@@ -124,7 +125,7 @@ class Schedule:
         if self._finished_stages > 0:
             self._learn(is_last=False)
         observer = _one_observer(learners)
-        return Stage(self._walk(observer=observer, **self.decisions), camera=self._camera)
+        return Stage(self._estimator(observer=observer, **self.decisions), camera=self._camera)
 
     def _restored_stage(self, states: States) -> Stage:
         for slot, learner in self.learners.items():
@@ -136,7 +137,7 @@ class Schedule:
 
     def _last_stage(self) -> Stage:
         learned = "; ".join(filter(None, map(str, self.learners.values())))
-        return Stage(self._walk(**self.decisions), learned, camera=self._camera)
+        return Stage(self._estimator(**self.decisions), learned, camera=self._camera)
 
     def _scout_stage(self) -> Stage:
         depth = min(SCOUT_DEPTH, self._setting.max_depth)

@@ -6,7 +6,7 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from ..movers import refuse_movers
 from ..rendering.aovs import check_aovs
 from ..rendering.camera import film_extent
 from ..rendering.staged_integrator import NO_LIMIT, StagedIntegrator
-from ..transport.estimator import CameraRays
+from ..transport.estimator import CameraRays, Estimator
 from ..transport.path_decisions import SceneQuery
 from ..transport.walk import Walk
 from . import learned_file
@@ -154,11 +154,15 @@ class WalkIntegrator(StagedIntegrator):
             path = Path(self.save_learned)
             learned = functools.partial(learned_file.save, path, scene, made_by)
         schedule = Schedule(
-            self.name, self.slots, setting, len(pilots), self.walk, self._query(scene), restored,
-            learned,
+            self.name, self.slots, setting, len(pilots), self.estimators(scene, sensor),
+            self._query(scene), restored, learned,
         )  # fmt: skip
         self.learners = schedule.learners
         return schedule
+
+    def estimators(self, scene: mi.Scene, sensor: mi.Sensor) -> Callable[..., Estimator]:
+        """What makes the estimator of a stage from its decisions: a walk."""
+        return self.walk
 
     def walk(self, **decisions: Any) -> Walk:
         """A walk with this integrator's parameters and the given decisions."""

@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 
 from .heroes import Heroes
-from .mis import power_heuristic
 from .observer import Observer
 from .path_decisions import (
     AlwaysTest,
@@ -19,6 +18,7 @@ from .path_decisions import (
     Scattering,
     SceneQuery,
     ShadowTest,
+    Weights,
 )
 from .vertex import Vertex
 
@@ -57,9 +57,10 @@ class Connector:
         scattering: Scattering,
         query: SceneQuery,
         heroes: Heroes,
+        weights: Weights,
         observer: Observer,
     ) -> None:
-        self._scene, self._query, self._heroes = scene, query, heroes
+        self._scene, self._query, self._heroes, self._weights = scene, query, heroes, weights
         self._next_event, self._connections = next_event, connections
         self._shadow_test, self._scattering, self._observer = shadow_test, scattering, observer
         #: Has any vertex one connection, and has any more than one?
@@ -116,7 +117,7 @@ class Connector:
         """
         si, ds = vertex.si, connection.ds
         bsdf_value = si.to_world_mueller(bsdf_value, -si.to_local(ds.d), si.wi)
-        mis = dr.select(ds.delta, 1, power_heuristic(count * ds.pdf, pdf))
+        mis = self._weights.connection(self._scene, vertex, ds, count * ds.pdf, pdf)
         contribution = bsdf_value * connection.weight
         value = β * contribution * mis
         considered = active & (ds.pdf != 0)

@@ -6,17 +6,17 @@ from typing import Any
 
 import mitsuba as mi
 
-from .mis import power_heuristic
-from .path_decisions import EmitterSampling
-from .vertex import Arrival
+from .path_decisions import EmitterSampling, Weights
+from .vertex import PathState
 
 
 def emission(
     scene: mi.Scene,
     si: mi.SurfaceInteraction3f,
-    arrival: Arrival,
+    path: PathState,
     next_event: EmitterSampling,
     state: Any,
+    weights: Weights,
     count: mi.Float | float = 1.0,
 ) -> tuple[mi.Spectrum, mi.DirectionSample3f, mi.Float]:
     """The radiance that ``si`` (or the environment, if nothing was hit) emits towards the vertex
@@ -26,13 +26,15 @@ def emission(
     Parameters:
         next_event, state: The decision whose connections could have found the light as well, and
             its state when it left the vertex before.
+        weights: Of multiple importance sampling.
         count: Number of its connections there.
     """
+    arrival = path.arrival
     ds = mi.DirectionSample3f(scene, si, arrival.ref)
     is_connectable = ~arrival.is_delta & (ds.emitter != None)  # noqa: E711
     pdf = next_event.density(state, scene, arrival.ref, si, ds, is_connectable)
-    emitted = ds.emitter.eval(si, arrival.pdf > 0) * power_heuristic(arrival.pdf, count * pdf)
-    return emitted, ds, pdf
+    weight = weights.emission(scene, si, ds, path, count * pdf)
+    return ds.emitter.eval(si, arrival.pdf > 0) * weight, ds, pdf
 
 
 def can_be_hit(scene: mi.Scene) -> bool:

@@ -121,6 +121,22 @@ class Heroes:
         weight = self._collapse(bsdf_weight, refracts, is_alone)
         return weight, dr.select(refracts & ~is_alone, self._factor, 1), is_alone | refracts
 
+    def join(self, one: tuple, other: tuple) -> mi.Spectrum:
+        """The product of the values of two BSDFs, of vertices of two paths that are connected, by
+        which both throughputs are to be multiplied. Each vertex is given as the state of its path,
+        and ``bsdf_value``, ``bsdf``, ``si``, ``wo`` of :meth:`connect`."""
+        value = one[1] * other[1]
+        if not self._is_needed:
+            return value
+        refracts = self._refracts(*one[2:]) | self._refracts(*other[2:])
+        # The lost wavelengths count once, however often they are lost
+        both, any_alone = one[0] & other[0], one[0] | other[0]
+        hero = value[0] * dr.select(
+            both, 1 / self._factor, dr.select(any_alone, 1, self._factor)
+        )
+        alone = mi.Spectrum([hero] + [0] * (self._count - 1))
+        return dr.select(any_alone | refracts, alone, value)
+
     def _refracts(self, bsdf, si, wo) -> mi.Bool:
         """Connections and samples must agree, for their MIS weights to add up: what counts is where
         ``wo`` points, not which lobe of the BSDF it belongs to."""

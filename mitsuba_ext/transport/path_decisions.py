@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .mis import power_heuristic
 from .vertex import PathState, Vertex
 
 
@@ -193,6 +194,59 @@ class ConnectionCount:
         self, chosen: Any, index: mi.UInt32, choice_dimension: int, active: mi.Bool
     ) -> tuple[LightNumbers, mi.Float | float]:
         """The numbers of connection ``index``, and their weight."""
+        raise NotImplementedError
+
+
+class Weights:
+    """The MIS weights of what a path finds: the power heuristic for connections to lights, and for
+    running into them. Other techniques may find the same; what they need to know of a path is its
+    ``sums``."""
+
+    def begin(self, ray: mi.Ray3f) -> Any:
+        """The sums before the first vertex."""
+        return ()
+
+    def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Any:
+        """The sums at the vertex ``si``; ``path`` holds those with which the last one was left."""
+        return path.sums
+
+    def emission(
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        ds: mi.DirectionSample3f,
+        path: PathState,
+        pdf: mi.Float,
+    ) -> mi.Float:
+        """For a light at ``si`` that the path has run into, in the direction ``ds``. ``pdf`` is the
+        density with which connections find it, times their number."""
+        return power_heuristic(path.arrival.pdf, pdf)
+
+    def connection(
+        self,
+        scene: mi.Scene,
+        vertex: Vertex,
+        ds: mi.DirectionSample3f,
+        pdf: mi.Float,
+        scattering_pdf: mi.Float,
+    ) -> mi.Float:
+        """For a connection to the light that ``ds`` is about. ``pdf`` is its density times the
+        number of connections, ``scattering_pdf`` that with which scattering finds it."""
+        return dr.select(ds.delta, 1, power_heuristic(pdf, scattering_pdf))
+
+    def leave(self, vertex: Vertex, bs: mi.BSDFSample3f) -> Any:
+        """The sums behind ``vertex``, in the direction that was chosen there."""
+        return vertex.path.sums
+
+
+class Subpaths:
+    """Connects vertices to those of subpaths that another walk has stored. A walk needs none."""
+
+    def gather(
+        self, scene: mi.Scene, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.UInt32]:
+        """What the connections of a vertex bring to the path, throughput included, and the number
+        of shadow rays."""
         raise NotImplementedError
 
 

@@ -38,6 +38,8 @@ class PathState:
         arrival: How the path came to the vertex.
         hero_is_alone: Is only the first of the four wavelengths left? ``()`` where nothing in the
             scene disperses light.
+        sums: What the path knows of other ways to make it, for MIS weights; ``()`` where the
+            densities at the last vertex suffice.
     """
 
     β: mi.Spectrum
@@ -46,6 +48,7 @@ class PathState:
     depth: mi.UInt32
     arrival: Arrival
     hero_is_alone: Any
+    sums: Any = ()
 
 
 @dataclass

@@ -29,6 +29,8 @@ from .path_decisions import (
     Scattering,
     SceneQuery,
     ShadowTest,
+    Subpaths,
+    Weights,
 )
 from .vertex import Arrival, PathState, Vertex
 
@@ -48,6 +50,8 @@ class Walk:
         shadow_test: Whether the shadow ray of a connection is traced.
         roulette: Which paths go on.
         query: How a ray meets the scene.
+        weights: Of multiple importance sampling.
+        subpaths: Other subpaths whose vertices are connected to those of the path.
         observer: Is told what happens.
     """
 
@@ -61,6 +65,8 @@ class Walk:
     shadow_test: ShadowTest = field(default_factory=AlwaysTest)
     roulette: Roulette = field(default_factory=Roulette)
     query: SceneQuery = field(default_factory=SceneQuery)
+    weights: Weights = field(default_factory=Weights)
+    subpaths: Subpaths | None = None
     observer: Observer = field(default_factory=Observer)
 
     def __call__(
@@ -82,7 +88,7 @@ class Walk:
         ctx = heroes.context()
         connector = Connector(
             scene, self.next_event, self.connections, self.shadow_test, self.scattering,
-            self.query, heroes, self.observer,
+            self.query, heroes, self.weights, self.observer,
         )  # fmt: skip
         makes_one, makes_many = connects and connector.single, connects and connector.many
 
@@ -97,6 +103,7 @@ class Walk:
             depth=mi.UInt32(0),
             arrival=Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)),
             hero_is_alone=heroes.begin(),
+            sums=self.weights.begin(ray),
         )
         valid = mi.Bool(sees_environment and self.max_depth > 0)  # Has the path met anything?
         scatter_count, shadow_count, connection_count = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
@@ -114,12 +121,13 @@ class Walk:
 
         while dr.hint(active, label="walk"):
             si = self.query.interaction(pi, ray)
+            path.sums = self.weights.arrive(path, si)
 
             # ----- How much does this vertex emit towards the previous one? -----
             if dr.hint(can_hit_emitters, mode="scalar"):
                 count = self.connections.weight(path.depth - 1)
                 emitted, hit, light_pdf = emission(
-                    scene, si, path.arrival, self.next_event, next_event_state, count
+                    scene, si, path, self.next_event, next_event_state, self.weights, count
                 )
                 L = dr.fma(path.β, emitted, L)
                 self.observer.emission(path, hit, path.β * emitted, light_pdf, active)
@@ -141,6 +149,10 @@ class Walk:
                 shadow_count += shadow_rays
             connection = self._connect(connector, makes_one, place, sampler, vertex, active_em)
             wo = si.to_local(connection.ds.d)
+            if dr.hint(self.subpaths is not None, mode="scalar"):
+                gathered, shadow_rays = self.subpaths.gather(scene, sampler, vertex, active_em)
+                L += gathered
+                shadow_count += shadow_rays
 
             # ----- Evaluate the BSDF towards the light and choose where to scatter -----
             sample_1, sample_2, directions_weight, directions_state = self.directions.draw(
@@ -177,6 +189,7 @@ class Walk:
                 depth=path.depth + dr.select(si.is_valid(), mi.UInt32(1), 0),
                 arrival=Arrival(mi.Interaction3f(si), bs.pdf, is_delta),
                 hero_is_alone=hero_is_alone,
+                sums=self.weights.leave(vertex, bs),
             )
             next_event_state = self._leave(connects, place)
 

@@ -1,0 +1,139 @@
+"""Bidirectional path tracing."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
+from mitsuba_ext.bidirectional.path_tracer import STRIDE, BidirectionalPathTracer
+from mitsuba_ext.bidirectional.sensor import ConnectableSensor
+from mitsuba_ext.composition.slots import read_slot
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.rendering.camera import check_takes_splats
+
+#: The decisions of camera paths that a scene can replace.
+_SLOTS = ("directions", "next_event", "roulette", "shadow_test")
+
+#: Memory for what a pass stores, and about what a path takes besides the vertices that are stored
+#: at a time.
+_PASS_BYTES, _PATH_BYTES = 1 << 29, 640
+
+
+@registry.plugin
+class BidirectionalIntegrator(WalkIntegrator):
+    r"""
+    .. _integrator-bdpt:
+
+    Bidirectional path tracer (:monosp:`bdpt`)
+    ------------------------------------------
+
+    Traces a path from the camera and a path from a light for each sample, connects their vertices,
+    and weighs what they find by multiple importance sampling.
+
+    .. pluginparameters::
+
+     * - connections
+       - |int|
+       - To how many vertices of light paths, chosen at random, each vertex of a camera path is
+         connected. With 0 light paths contribute to the light image only. (Default: 1)
+     * - light_image
+       - |bool|
+       - Connect light paths to the sensor as well (t = 1)? It finds caustics that are seen
+         directly. (Default: true)
+     * - next_event, directions, roulette, shadow_test
+       - |string| or |decision|
+       - Decisions of the camera paths, as in :class:`composed_path`. (Default: those of
+         :monosp:`path`)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+
+    **Use it when** light reaches the scene by ways that camera paths find rarely: caustics of
+    lamps, lamps in fittings or near walls, indirect light from hidden lamps. **Not when**
+    :monosp:`path` converges well: a sample costs two to three times as much.
+
+    All techniques are used whose number of vertices on the light path is 0 (a camera path runs into
+    the light), 1 (a connection to a point that is chosen on a light) or more, and whose number on
+    the camera path is 1 (a vertex of a light path is connected to the sensor) or more; but light
+    paths do not run into the sensor (t = 0), which has no area, or hardly any. The weights are the
+    power heuristic over all of them. They take each vertex of a camera path for connected to one
+    vertex of a light path at each depth, whatever :monosp:`connections` is.
+
+    In a pass, the vertices of all light paths are shared by all camera paths. In spectral variants
+    and with moving shapes, a camera path shares wavelengths and time with one light path, and is
+    connected to that only.
+
+    **Sensors and films.** A :monosp:`perspective` or :monosp:`thinlens` can be connected to; with
+    other sensors, and with films that sample a border, there is no light image.
+
+    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    :monosp:`prb`), nor are scalar and polarized variants, nor nesting in :monosp:`moment`.
+
+    Source: E. Veach, *Robust Monte Carlo Methods for Light Transport Simulation*, PhD thesis, 1997,
+    chapter 10; D. Cline, PhD thesis, 2007, sections 7.6 and 7.9; I. Georgiev, *Implementing Vertex
+    Connection and Merging*, technical report, 2012 (weights).
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="bdpt">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'bdpt',
+            'max_depth': 8
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.connections = self.parameter(props, "connections", 1, minimum=0, maximum=1024)
+        self.light_image = self.parameter(props, "light_image", True)
+        self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in _SLOTS})
+
+    def parameters(self) -> dict[str, Any]:
+        own = {"connections": self.connections, "light_image": self.light_image}
+        return {**own, **super().parameters()}
+
+    @property
+    def sample_cost(self) -> int:
+        return max(3, super().sample_cost)
+
+    @property
+    def most_lanes(self) -> int:
+        layout = Layout(len(mi.Spectrum()), True, True)
+        return _PASS_BYTES // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
+
+    def estimators(self, scene: mi.Scene, sensor: mi.Sensor):
+        if not scene.emitters() or self.max_depth < 2:
+            return self.walk
+        try:
+            emission = LightEmission(scene)
+        except NotImplementedError as error:
+            raise NotImplementedError(f'"{self.name}": {error}') from None
+        target = ConnectableSensor(sensor) if self._has_light_image(sensor) else None
+        return functools.partial(self._estimator, emission, target)
+
+    def _estimator(self, emission, sensor, **decisions: Any) -> BidirectionalPathTracer:
+        return BidirectionalPathTracer(self.walk(**decisions), emission, sensor, self.connections)
+
+    def _has_light_image(self, sensor: mi.Sensor) -> bool:
+        if not self.light_image or not ConnectableSensor.can_connect(sensor):
+            return False
+        try:
+            check_takes_splats(sensor.film())
+        except NotImplementedError:
+            return False
+        return True
+
+    def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
+        raise NotImplementedError(
+            f'"{self.name}": light paths do not end where a ray begins: it cannot be nested in an '
+            f'integrator that asks for single samples, such as "moment"; "variance" can hold it'
+        )

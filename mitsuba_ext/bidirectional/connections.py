@@ -1,0 +1,128 @@
+"""Connections of camera vertices to vertices of light paths (s, t ≥ 2)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.heroes import Heroes
+from ..transport.path_decisions import SceneQuery, Subpaths
+from ..transport.vertex import Vertex
+from .light_vertices import VertexCache
+from .partial_sums import PartialSums
+from .scattering import adjoint_value, geometric_cosine, reverse_density
+
+
+class LightSubpaths(Subpaths):
+    """Connects each vertex of a camera path to vertices of light paths that are chosen at random.
+
+    A path of other wavelengths, or of another time, cannot be connected to: where such differ, the
+    choice is among the vertices of the light path in the same lane; otherwise among those of all
+    paths.
+
+    Parameters:
+        scene: The scene.
+        vertices: Of the light paths, of which there are as many as camera paths. There is at least
+            one vertex.
+        sums: Computes the partial sums of the MIS weights.
+        query: How a ray meets the scene.
+        connections: Connections of each vertex.
+        max_depth: Longest path in segments.
+        own_lane: Is the light path that of the same lane?
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        vertices: VertexCache,
+        sums: PartialSums,
+        query: SceneQuery,
+        connections: int,
+        max_depth: int,
+        own_lane: bool,
+    ) -> None:
+        self._vertices, self._sums, self._query = vertices, sums, query
+        self._connections, self._own_lane = connections, own_lane
+        self._heroes = Heroes(scene)
+        self._ctx = self._heroes.context()
+        self._max_depth = dr.opaque(mi.UInt32, max_depth)
+        self._lanes = len(vertices.first)
+        self._lane = dr.arange(mi.UInt32, self._lanes)
+        self._count = dr.opaque(mi.UInt32, vertices.count)
+        self._share = dr.opaque(mi.Float, 1 / connections)
+        self._mean = dr.opaque(mi.Float, vertices.count / self._lanes)
+
+    @dr.syntax
+    def gather(self, scene, sampler, vertex, active):
+        total, shadow_count = mi.Spectrum(0), mi.UInt32(0)
+        if dr.hint(self._connections == 1, mode="scalar"):
+            total, shadow_count = self._connect(scene, sampler.next_2d(), vertex, active)
+        else:
+            index = mi.UInt32(0)
+            while index < self._connections:
+                value, tested = self._connect(scene, sampler.next_2d(), vertex, active)
+                total += value
+                shadow_count += tested
+                index += 1
+        return total, shadow_count
+
+    def _connect(
+        self, scene: mi.Scene, sample: mi.Point2f, vertex: Vertex, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.UInt32]:
+        """One connection, to a vertex that ``sample`` chooses."""
+        index, weight, active = self._choose(sample, active)
+        other = self._vertices.at(index, active)
+        # The path's segments: those of both subpaths, and one in between
+        active &= vertex.depth + other.depth + 2 <= self._max_depth
+        si, far = vertex.si, self._vertices.interaction(self._query, other, active)
+        d = other.p - si.p
+        squared_distance = dr.squared_norm(d)
+        distance = dr.sqrt(squared_distance)
+        active &= distance > 0
+        d /= dr.select(active, distance, 1)
+        wo, back = si.to_local(d), far.to_local(-d)
+
+        # ----- What both ends let through -----
+        value, pdf = vertex.bsdf.eval_pdf(self._ctx, si, wo, active)
+        value = si.to_world_mueller(value, -wo, si.wi)
+        far_bsdf = far.bsdf()
+        far_value, far_reverse = adjoint_value(self._ctx, far_bsdf, far, back, active)
+        value = self._heroes.join(
+            (vertex.path.hero_is_alone, value, vertex.bsdf, si, wo),
+            (other.hero_is_alone, far_value, far_bsdf, far, back),
+        )
+        value *= vertex.path.β * other.β * (weight / dr.select(active, squared_distance, 1))
+
+        # ----- How else this path could have been found -----
+        ratio = self._sums.ratio
+        far_pdf = far_bsdf.pdf(self._ctx, far, back, active)
+        reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
+        arrives = pdf * geometric_cosine(far, back) / squared_distance
+        leaves = far_pdf * geometric_cosine(si, wo) / squared_distance
+        sums = vertex.path.sums
+        others = ratio(arrives) * (other.sums.dVCM + ratio(far_reverse) * other.sums.dVC)
+        others += ratio(leaves) * (sums.dVCM + ratio(reverse) * sums.dVC)
+        value *= dr.select(dr.isfinite(others), dr.rcp(1 + others), 0)
+
+        # ----- Is anything in between? -----
+        active &= (dr.max(dr.abs(value)) > 0) & dr.all(dr.isfinite(value))
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(active))
+        ds.p, ds.d, ds.dist = far.p, d, distance
+        visible = active & ~self._query.occluded(scene, si, ds, active)
+        return dr.select(visible, value, 0), dr.select(active, 1, 0)
+
+    def _choose(self, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.UInt32, Any, mi.Bool]:
+        """The number of a vertex, the weight of the connection, and where there is one to choose.
+
+        There may be more vertices than numbers of 24 bits, so that the choice takes two of them."""
+        bits = (mi.UInt32(sample.x * 65536) << 16) | mi.UInt32(sample.y * 65536)
+        first, number, weight = mi.UInt32(0), self._count, self._mean * self._share
+        if self._own_lane:
+            first = dr.gather(mi.UInt32, self._vertices.first, self._lane, active)
+            number = dr.gather(mi.UInt32, self._vertices.number, self._lane, active)
+            weight = mi.Float(number) * self._share
+        index = first + mi.UInt32((mi.UInt64(bits) * mi.UInt64(number)) >> 32)
+        return index, weight, active & (number > 0)
+

@@ -1,0 +1,106 @@
+"""MIS weights of what camera paths find, beside what light paths find."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.heroes import Heroes
+from ..transport.path_decisions import Weights
+from ..transport.vertex import PathState, Vertex
+from .emission import LightEmission
+from .partial_sums import PartialSums, Sums
+from .scattering import geometric_cosine, reverse_density
+from .sensor import ConnectableSensor
+
+
+class BidirectionalWeights(Weights):
+    """Weights of all techniques that make a path of vertices from a light to the sensor: with s
+    vertices by a light path (0: a camera path runs into the light; 1: a connection to a point that
+    was chosen on the light), and t by a camera path (1: a light path's vertex is connected to the
+    sensor).
+
+    Source: I. Georgiev, *Implementing Vertex Connection and Merging*, technical report, 2012.
+
+    Parameters:
+        scene: The scene.
+        sums: Computes the partial sums.
+        emission: Where light paths begin.
+        sensor: What light paths are connected to; ``None`` if they are not (t = 1 is no technique).
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sums: PartialSums,
+        emission: LightEmission,
+        sensor: ConnectableSensor | None,
+    ) -> None:
+        self._ctx = Heroes(scene).context()
+        self.sums, self._emission, self._sensor = sums, emission, sensor
+        self._origin = mi.Point3f(0)
+
+    def begin(self, ray: mi.Ray3f) -> Sums:
+        if self._sensor is None:
+            return Sums(mi.Float(0), mi.Float(0))
+        self._origin, pdf = self._sensor.origin(ray)
+        # As many light paths as camera paths
+        return Sums(self.sums.ratio(dr.rcp(pdf)), dr.zeros(mi.Float, dr.width(pdf)))
+
+    def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Sums:
+        ref = dr.select(path.depth == 0, self._origin, path.arrival.ref.p)
+        later = self.sums.arrive(path.sums, si, dr.squared_norm(si.p - ref))
+        # Where nothing was hit, densities stay those of directions
+        return Sums(
+            dr.select(si.is_valid(), later.dVCM, path.sums.dVCM),
+            dr.select(si.is_valid(), later.dVC, path.sums.dVC),
+        )
+
+    def emission(self, scene, si, ds, path, pdf) -> mi.Float:
+        active = ds.emitter != None  # noqa: E711
+        position, direction = self._emission.densities(
+            scene, ds.emitter, -ds.d, si.n, path.arrival.ref, active
+        )
+        # The point's density by a connection: per area on surfaces
+        found = pdf * dr.select(
+            si.is_valid(), dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist), 1
+        )
+        others = self.sums.ratio(found) * path.sums.dVCM
+        others += self.sums.ratio(position * direction) * path.sums.dVC
+        # What the sensor sees directly is found in no other way
+        return dr.select(path.depth == 0, 1, _weight(others))
+
+    def connection(self, scene, vertex, ds, pdf, scattering_pdf) -> mi.Float:
+        si, active = vertex.si, pdf > 0
+        wo = si.to_local(ds.d)
+        position, direction = self._emission.densities(
+            scene, ds.emitter, -ds.d, ds.n, mi.Interaction3f(si), active
+        )
+        flags = ds.emitter.flags()
+        is_point = mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
+        has_area = ~is_point & ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
+        # Both ways to find this segment from the light, in the measure of connections
+        emitted = position * direction * geometric_cosine(si, wo)
+        emitted *= dr.select(is_point, dr.rcp(dr.square(ds.dist)), 1)
+        emitted *= dr.select(has_area, dr.rcp(dr.abs(dr.dot(ds.n, ds.d))), 1)
+        inverse = dr.select(active, dr.rcp(pdf), 0)
+        sums = vertex.path.sums
+        reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
+        others = self.sums.ratio(emitted * inverse) * (
+            sums.dVCM + self.sums.ratio(reverse) * sums.dVC
+        )
+        others += dr.select(ds.delta, 0, self.sums.ratio(scattering_pdf * inverse))
+        return _weight(others)
+
+    def leave(self, vertex: Vertex, bs: mi.BSDFSample3f) -> Sums:
+        si = vertex.si
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        active = si.is_valid() & ~is_delta
+        reverse = reverse_density(self._ctx, vertex.bsdf, si, bs.wo, active)
+        cosine = geometric_cosine(si, bs.wo)
+        return self.sums.leave(vertex.path.sums, cosine, bs.pdf, reverse, is_delta)
+
+
+def _weight(others: mi.Float) -> mi.Float:
+    """The weight of a technique, from the sum of the others' ratios to it."""
+    return dr.select(dr.isfinite(others), dr.rcp(1 + others), 0)
