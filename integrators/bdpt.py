@@ -40,7 +40,7 @@ class BidirectionalIntegrator(WalkIntegrator):
      * - connections
        - |int|
        - To how many vertices of light paths, chosen at random, each vertex of a camera path is
-         connected. With 0 light paths contribute to the light image only. (Default: 1)
+         connected. (Default: 1)
      * - light_image
        - |bool|
        - Connect light paths to the sensor as well (t = 1)? It finds caustics that are seen
@@ -93,7 +93,7 @@ class BidirectionalIntegrator(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.connections = self.parameter(props, "connections", 1, minimum=0, maximum=1024)
+        self.connections = self.parameter(props, "connections", 1, minimum=1, maximum=1024)
         self.light_image = self.parameter(props, "light_image", True)
         self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in _SLOTS})
 
