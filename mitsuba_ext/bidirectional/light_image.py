@@ -44,8 +44,8 @@ def light_image(
         The splats, and the shadow rays of each vertex.
     """
     query = query or SceneQuery()
-    # Two lanes at least: a single one would need another kernel
-    index = dr.arange(mi.UInt32, max(2, vertices.count))
+    # Some lanes at least: very few would need other kernels
+    index = dr.arange(mi.UInt32, max(16, vertices.count))
     active = index < dr.opaque(mi.UInt32, vertices.count)
     vertex = vertices.gather(index, active)
     si = vertices.interaction(query, vertex, active)
