@@ -73,7 +73,7 @@ class _TwoStages:
     def __init__(self, pilot_spp: int, timeout: float = -1) -> None:
         self.pilot_spp, self.timeout, self.samples_per_pass = pilot_spp, timeout, 2**32 - 1
         self.progress, self.is_cancelled = None, False
-        self.name, self.sample_cost = "two_stages", 1
+        self.name, self.sample_cost, self.most_lanes = "two_stages", 1, 2**32 - 1
 
     def pilots(self, scene, pixel_count, spp):
         return [self.pilot_spp]

@@ -44,12 +44,14 @@ def light_image(
         The splats, and the shadow rays of each vertex.
     """
     query = query or SceneQuery()
-    slot, active = vertices.slot, mi.Bool(True)
-    vertex = vertices.at(slot, active)
+    # Some lanes at least: very few would need other kernels
+    index = dr.arange(mi.UInt32, max(16, vertices.count))
+    active = index < dr.opaque(mi.UInt32, vertices.count)
+    vertex = vertices.gather(index, active)
     si = vertices.interaction(query, vertex, active)
     sample = mi.Point2f(0.5)
     if seed is not None:
-        word = dr.gather(mi.UInt32, seed, vertex.lane)
+        word = dr.gather(mi.UInt32, seed, vertex.lane, active)
         sample = mi.Point2f(
             mi.sample_tea_float32(word, 2 * vertex.depth),
             mi.sample_tea_float32(word, 2 * vertex.depth + 1),
@@ -77,8 +79,10 @@ def light_image(
     active &= ~is_occluded(query, scene, si, connection, active, hides_emitters)
     if not isinstance(importance, float):
         is_single = dr.width(importance) == 1
-        value *= importance if is_single else dr.gather(type(importance), importance, vertex.lane)
+        if not is_single:
+            importance = dr.gather(type(importance), importance, vertex.lane, active)
+        value *= importance
     finite = active & dr.all(dr.isfinite(value))
     return Splats(
-        value, connection.position, vertices.wavelengths(vertex, mi.Bool(True)), finite
+        value, connection.position, vertices.wavelengths(vertex, active), finite
     ), tested

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -67,5 +68,29 @@ class LightTracer:
                 break
         scatter_count = sample.scatter_count + paths.scatter_count
         return replace(
-            sample, splats=splats, scatter_count=scatter_count, shadow_count=shadow_count
+            sample, splats=_joined(splats), scatter_count=scatter_count, shadow_count=shadow_count
         )
+
+
+def _joined(splats: list[Splats]) -> list[Splats]:
+    """The splats of all rounds as one: however many rounds there were, the film adds them by the
+    same kernel."""
+    if len(splats) < 2:
+        return splats
+    first = splats[0]
+    wavelengths = None
+    if first.wavelengths is not None:
+        wavelengths = _one_after_the_other([s.wavelengths for s in splats])
+    return [
+        Splats(
+            _one_after_the_other([s.value for s in splats]),
+            _one_after_the_other([s.position for s in splats]),
+            wavelengths,
+            dr.concat([s.active for s in splats]),
+        )
+    ]
+
+
+def _one_after_the_other(vectors: list[Any]) -> Any:
+    components = zip(*vectors)
+    return type(vectors[0])(*(dr.concat(list(component)) for component in components))

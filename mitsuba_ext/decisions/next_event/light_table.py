@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -71,10 +72,6 @@ class LightTable(EmitterSampling):
         self._table = _table(weights, rows.count, cells.count)
         # Opaque: scenes that differ in it only share their kernels
         self._count = dr.opaque(mi.UInt32, cells.count)
-        # The first cell of each emitter
-        first = np.zeros(cells.emitter_index.max(initial=0) + 1, dtype=np.uint32)
-        first[cells.emitter_index[::-1]] = np.arange(cells.count)[::-1]
-        self._cell_of = mi.UInt32(first)
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> mi.UInt32:
         return mi.UInt32(0)
@@ -103,6 +100,14 @@ class LightTable(EmitterSampling):
         # Points and directions are cells of their own
         entry = state * self._count + dr.gather(mi.UInt32, self._cell_of, emitter, active)
         return dr.gather(mi.Float, self._table, 4 * entry + 2, active)
+
+    @functools.cached_property
+    def _cell_of(self) -> mi.UInt32:
+        """The first cell of each emitter."""
+        index = self.cells.emitter_index
+        first = np.zeros(index.max(initial=0) + 1, dtype=np.uint32)
+        first[index[::-1]] = np.arange(len(index))[::-1]
+        return mi.UInt32(first)
 
     def _density(self, row, ref, si, ds, active) -> mi.Float:
         cell, pdf = self.cells.pdf(ref, si, ds, active)
