@@ -132,6 +132,9 @@ class LightWalk:
         time, wavelengths = paths.ray.time, paths.ray.wavelengths
         with garbage_left_alone():
             numbers, paths = self._trace(scene, numbers, paths, store)
+        # With the rest: the walk would be traced again for where the sampler has got to
+        if isinstance(numbers, mi.Sampler):
+            numbers.schedule_state()
         dr.eval(paths, store.words, store.is_taken)
         disperses = not isinstance(paths.hero_is_alone, tuple)
         return LightVertices(store, time, wavelengths, disperses), paths
