@@ -61,8 +61,7 @@ class BidirectionalIntegrator(WalkIntegrator):
     the light), 1 (a connection to a point that is chosen on a light) or more, and whose number on
     the camera path is 1 (a vertex of a light path is connected to the sensor) or more; but light
     paths do not run into the sensor (t = 0), which has no area, or hardly any. The weights are the
-    power heuristic over all of them. They take each vertex of a camera path for connected to one
-    vertex of a light path at each depth, whatever :monosp:`connections` is.
+    power heuristic over all of them, and know how many connections there are.
 
     In a pass, the vertices of all light paths are shared by all camera paths. In spectral variants
     and with moving shapes, a camera path shares wavelengths and time with one light path, and is

@@ -96,14 +96,15 @@ class LightSubpaths(Subpaths):
         value *= vertex.path.β * other.β * (weight / dr.select(active, squared_distance, 1))
 
         # ----- How else this path could have been found -----
-        ratio = self._sums.ratio
+        ratio, before = self._sums.ratio, self._sums.before
         far_pdf = far_bsdf.pdf(self._ctx, far, back, active)
         reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
         arrives = pdf * geometric_cosine(far, back) / squared_distance
         leaves = far_pdf * geometric_cosine(si, wo) / squared_distance
         sums = vertex.path.sums
-        others = ratio(arrives) * (other.sums.dVCM + ratio(far_reverse) * other.sums.dVC)
-        others += ratio(leaves) * (sums.dVCM + ratio(reverse) * sums.dVC)
+        others = ratio(arrives) * before(other.sums, far_reverse, other.depth == 1)
+        others += ratio(leaves) * before(sums, reverse, vertex.depth == 0)
+        others /= ratio(mi.Float(self._sums.connections))
         value *= dr.select(dr.isfinite(others), dr.rcp(1 + others), 0)
 
         # ----- Is anything in between? -----

@@ -69,9 +69,7 @@ def light_image(
     if sums is not None:
         # The density with which a camera ray finds the vertex, per area
         found = connection.importance * geometric_cosine(si, to_camera)
-        others = sums.ratio(found) * (
-            vertex.sums.dVCM + sums.ratio(reverse_pdf) * vertex.sums.dVC
-        )
+        others = sums.ratio(found) * sums.before(vertex.sums, reverse_pdf, vertex.depth == 1)
         value *= dr.rcp(1 + others)
     # A connection that cannot contribute needs no shadow ray
     active &= dr.max(dr.abs(value)) > 0

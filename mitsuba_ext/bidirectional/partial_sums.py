@@ -40,11 +40,17 @@ class PartialSums:
     Parameters:
         next_event: The decision with which the other end's vertices are connected to points of
             lights.
+        connections: To how many of the vertices of a light path a vertex of a camera path is
+            connected (s, t ≥ 2), on average, in units of all of them. All other techniques are used
+            once for each pair of paths.
         exponent: 1 for the balance heuristic, 2 for the power heuristic.
     """
 
-    def __init__(self, next_event: EmitterSampling, exponent: int = 2) -> None:
+    def __init__(
+        self, next_event: EmitterSampling, connections: mi.Float | float = 1.0, exponent: int = 2
+    ) -> None:
         self._next_event, self.exponent = next_event, exponent
+        self.connections = connections
 
     def ratio(self, x: mi.Float) -> mi.Float:
         """A ratio of densities, raised to the exponent."""
@@ -109,6 +115,7 @@ class PartialSums:
         pdf: mi.Float,
         reverse_pdf: mi.Float,
         is_delta: mi.Bool,
+        is_first: mi.Bool,
     ) -> Sums:
         """A direction was sampled.
 
@@ -117,14 +124,24 @@ class PartialSums:
             pdf, reverse_pdf: Its density, and that of the opposite way through the vertex, per
                 solid angle.
             is_delta: Did a discrete distribution choose it? Then no other technique connects here.
+            is_first: Was it sampled at the first vertex after the light or the sensor?
         """
         leaves = cosine * dr.select(pdf > 0, dr.rcp(pdf), 0)
-        smooth = self.ratio(leaves) * (sums.dVCM + self.ratio(reverse_pdf) * sums.dVC)
+        smooth = self.ratio(leaves) * self.before(sums, reverse_pdf, is_first)
         dVCM = self.ratio(dr.select(pdf > 0, dr.rcp(pdf), 0))
         return Sums(
             dr.select(is_delta, 0, dVCM),
             dr.select(is_delta, sums.dVC * self.ratio(cosine), smooth),
         )
+
+
+    def before(self, sums: Sums, reverse_pdf: mi.Float, is_first: mi.Bool) -> mi.Float:
+        """The techniques that connect at the segment that led to a vertex, or earlier: the sum of
+        their ratios to one that has sampled the subpath up to the vertex, when the other subpath
+        arrives there and would go on with the density ``reverse_pdf``. The segments from the light
+        and from the sensor (``is_first``) have techniques of their own."""
+        count = dr.select(is_first, 1, self.ratio(mi.Float(self.connections)))
+        return count * sums.dVCM + self.ratio(reverse_pdf) * sums.dVC
 
 
 def _cosine(si: mi.SurfaceInteraction3f) -> mi.Float:

@@ -20,6 +20,10 @@ from .partial_sums import PartialSums
 from .sensor import ConnectableSensor
 from .weights import BidirectionalWeights
 
+#: Vertices of a light path, about, for MIS weights. The true number would make the weights depend
+#: on the samples (door_ajar: 11 % less variance than with 1).
+_VERTICES = 2.5
+
 #: Vertices of a light path that are stored at a time, and the most rounds of a path: it has been
 #: stuck where nothing absorbs light.
 STRIDE, MOST_ROUNDS = 4, 1 << 12
@@ -45,7 +49,9 @@ class BidirectionalPathTracer:
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
     ) -> Sample:
-        walk, sums = self.walk, PartialSums(self.walk.next_event)
+        walk = self.walk
+        share = dr.opaque(mi.Float, self.connections / _VERTICES)
+        sums = PartialSums(walk.next_event, share)
         seed = None
         if self.sensor is not None and self.sensor.needs_aperture_sample:
             seed = mi.UInt32(sampler.next_1d() * 4294967040.0)

@@ -86,8 +86,8 @@ class BidirectionalWeights(Weights):
         inverse = dr.select(active, dr.rcp(pdf), 0)
         sums = vertex.path.sums
         reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
-        others = self.sums.ratio(emitted * inverse) * (
-            sums.dVCM + self.sums.ratio(reverse) * sums.dVC
+        others = self.sums.ratio(emitted * inverse) * self.sums.before(
+            sums, reverse, vertex.depth == 0
         )
         others += dr.select(ds.delta, 0, self.sums.ratio(scattering_pdf * inverse))
         return _weight(others)
@@ -98,7 +98,9 @@ class BidirectionalWeights(Weights):
         active = si.is_valid() & ~is_delta
         reverse = reverse_density(self._ctx, vertex.bsdf, si, bs.wo, active)
         cosine = geometric_cosine(si, bs.wo)
-        return self.sums.leave(vertex.path.sums, cosine, bs.pdf, reverse, is_delta)
+        return self.sums.leave(
+            vertex.path.sums, cosine, bs.pdf, reverse, is_delta, vertex.depth == 0
+        )
 
 
 def _weight(others: mi.Float) -> mi.Float:
