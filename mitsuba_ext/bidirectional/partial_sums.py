@@ -67,6 +67,17 @@ class PartialSums:
             dr.select(is_delta, 0, self.ratio(leaves * inverse)),
         )
 
+    def others(self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float) -> mi.Float:
+        """Where a subpath's last vertex is connected to something: the ratios, to that technique,
+        of all techniques that find this vertex from the other side, summed.
+
+        Parameters:
+            density: With which the other side finds the vertex, in units of the technique's density
+                (per area, where the technique itself has density 1).
+            reverse_pdf: Of going on from there to the subpath's vertex before, per solid angle.
+        """
+        return self.ratio(density) * (sums.dVCM + self.ratio(reverse_pdf) * sums.dVC)
+
     def _connection_density(self, scene, emitted, si, active) -> mi.Float:
         """With which a connection from ``si`` finds the point of the light: per solid angle, or
         the probability of choosing the light if it is a point or a direction."""
@@ -119,12 +130,17 @@ class PartialSums:
             is_delta: Did a discrete distribution choose it? Then no other technique connects here.
         """
         leaves = cosine * dr.select(pdf > 0, dr.rcp(pdf), 0)
-        smooth = self.ratio(leaves) * (sums.dVCM + self.ratio(reverse_pdf) * sums.dVC)
+        smooth = self.others(leaves, sums, reverse_pdf)
         dVCM = self.ratio(dr.select(pdf > 0, dr.rcp(pdf), 0))
         return Sums(
             dr.select(is_delta, 0, dVCM),
             dr.select(is_delta, sums.dVC * self.ratio(cosine), smooth),
         )
+
+
+def weight(others: mi.Float) -> mi.Float:
+    """The weight of a technique, from the sum of the others' ratios to it."""
+    return dr.select(dr.isfinite(others), dr.rcp(1 + others), 0)
 
 
 def _cosine(si: mi.SurfaceInteraction3f) -> mi.Float:
