@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -11,8 +12,39 @@ from ..transport.heroes import Heroes
 from ..transport.path_decisions import SceneQuery, Subpaths
 from ..transport.vertex import Vertex
 from .light_vertices import VertexCache
-from .partial_sums import PartialSums
+from .partial_sums import PartialSums, Sums, weight
 from .scattering import adjoint_value, geometric_cosine, reverse_density
+
+
+@dataclass
+class End:
+    """One of the two vertices that are connected.
+
+    Attributes:
+        si: The interaction there.
+        wo: Direction towards the other end, local.
+        pdf: Density with which the subpath that comes from ``si.wi`` goes on to the other end.
+        reverse_pdf: Density of the opposite way through the vertex.
+        sums: Partial sums of the subpath.
+    """
+
+    si: mi.SurfaceInteraction3f
+    wo: mi.Vector3f
+    pdf: mi.Float
+    reverse_pdf: mi.Float
+    sums: Sums
+
+
+def joining_weight(
+    sums: PartialSums, one: End, other: End, squared_distance: mi.Float
+) -> mi.Float:
+    """The MIS weight of joining two subpaths."""
+    inverse = dr.rcp(squared_distance)
+    to_one = other.pdf * geometric_cosine(one.si, one.wo) * inverse
+    to_other = one.pdf * geometric_cosine(other.si, other.wo) * inverse
+    others = sums.others(to_one, one.sums, one.reverse_pdf)
+    others += sums.others(to_other, other.sums, other.reverse_pdf)
+    return weight(others / sums.count)
 
 
 class LightSubpaths(Subpaths):
@@ -72,7 +104,7 @@ class LightSubpaths(Subpaths):
         self, scene: mi.Scene, sample: mi.Point2f, vertex: Vertex, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.UInt32]:
         """One connection, to a vertex that ``sample`` chooses."""
-        index, weight, active = self._choose(sample, active)
+        index, factor, active = self._choose(sample, active)
         other = self._vertices.at(index, active)
         # The path's segments: those of both subpaths, and one in between
         active &= vertex.depth + other.depth + 2 <= self._max_depth
@@ -93,19 +125,15 @@ class LightSubpaths(Subpaths):
             (vertex.path.hero_is_alone, value, vertex.bsdf, si, wo),
             (other.hero_is_alone, far_value, far_bsdf, far, back),
         )
-        value *= vertex.path.β * other.β * (weight / dr.select(active, squared_distance, 1))
+        value *= vertex.path.β * other.β * (factor / dr.select(active, squared_distance, 1))
 
         # ----- How else this path could have been found -----
-        ratio, before = self._sums.ratio, self._sums.before
-        far_pdf = far_bsdf.pdf(self._ctx, far, back, active)
         reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
-        arrives = pdf * geometric_cosine(far, back) / squared_distance
-        leaves = far_pdf * geometric_cosine(si, wo) / squared_distance
-        sums = vertex.path.sums
-        others = ratio(arrives) * before(other.sums, far_reverse, other.depth == 1)
-        others += ratio(leaves) * before(sums, reverse, vertex.depth == 0)
-        others /= ratio(mi.Float(self._sums.connections))
-        value *= dr.select(dr.isfinite(others), dr.rcp(1 + others), 0)
+        far_pdf = far_bsdf.pdf(self._ctx, far, back, active)
+        value *= joining_weight(
+            self._sums, End(si, wo, pdf, reverse, vertex.path.sums),
+            End(far, back, far_pdf, far_reverse, other.sums), squared_distance,
+        )  # fmt: skip
 
         # ----- Is anything in between? -----
         active &= (dr.max(dr.abs(value)) > 0) & dr.all(dr.isfinite(value))

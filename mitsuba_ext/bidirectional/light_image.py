@@ -11,7 +11,7 @@ from ..transport.estimator import Splats
 from ..transport.heroes import Heroes
 from ..transport.path_decisions import SceneQuery
 from .light_vertices import LightVertices
-from .partial_sums import PartialSums
+from .partial_sums import PartialSums, weight
 from .scattering import evaluate, geometric_cosine
 from .sensor import ConnectableSensor, is_occluded
 
@@ -56,7 +56,7 @@ def light_image(
             mi.sample_tea_float32(word, 2 * vertex.depth),
             mi.sample_tea_float32(word, 2 * vertex.depth + 1),
         )
-    connection, weight = sensor.connect(si, sample, active)
+    connection, lens_weight = sensor.connect(si, sample, active)
     active = active & connection.active
     if hides_emitters:
         active &= si.shape.emitter() == None  # noqa: E711
@@ -65,12 +65,11 @@ def light_image(
     value, reverse_pdf = evaluate(
         heroes, vertex.hero_is_alone, si.bsdf(), si, to_camera, active
     )
-    value *= vertex.β * (connection.importance * weight)
+    value *= vertex.β * (connection.importance * lens_weight)
     if sums is not None:
         # The density with which a camera ray finds the vertex, per area
         found = connection.importance * geometric_cosine(si, to_camera)
-        others = sums.ratio(found) * sums.before(vertex.sums, reverse_pdf, vertex.depth == 1)
-        value *= dr.rcp(1 + others)
+        value *= weight(sums.others(found, vertex.sums, reverse_pdf))
     # A connection that cannot contribute needs no shadow ray
     active &= dr.max(dr.abs(value)) > 0
     tested = mi.UInt32(dr.select(active, 1, 0))

@@ -221,7 +221,7 @@ class LightWalk:
         weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
         if self.sums is not None:
             sums = self.sums.leave(
-                sums, geometric_cosine(si, bs.wo), bs.pdf, reverse_pdf, is_delta, paths.depth == 1,
+                sums, geometric_cosine(si, bs.wo), bs.pdf, reverse_pdf, is_delta
             )
         return dr.select(active, weight, 0), sums, hero_count, hero_is_alone
 

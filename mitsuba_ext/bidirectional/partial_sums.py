@@ -25,8 +25,9 @@ class Sums:
     """The partial sums of a subpath at its last vertex (Eqs. 31 to 36 of the report).
 
     Attributes:
-        dVCM: 1 / density of the last vertex, times, at the first vertex, the ratio of the densities
-            with which a connection and emission find the point of the light.
+        dVCM: 1 / density of the last vertex, times the count of the technique that connects the
+            last two; at the first vertex, times the ratio of the densities with which a connection
+            and emission find the point of the light.
         dVC: The sum over the techniques that connect earlier vertices of the subpath.
     """
 
@@ -50,7 +51,8 @@ class PartialSums:
         self, next_event: EmitterSampling, connections: mi.Float | float = 1.0, exponent: int = 2
     ) -> None:
         self._next_event, self.exponent = next_event, exponent
-        self.connections = connections
+        #: The count of the connections, in weights.
+        self.count = self.ratio(mi.Float(connections))
 
     def ratio(self, x: mi.Float) -> mi.Float:
         """A ratio of densities, raised to the exponent."""
@@ -72,6 +74,17 @@ class PartialSums:
             self.ratio(connected * inverse),
             dr.select(is_delta, 0, self.ratio(leaves * inverse)),
         )
+
+    def others(self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float) -> mi.Float:
+        """Where a subpath's last vertex is connected to something: the ratios, to that technique,
+        of all techniques that find this vertex from the other side, summed.
+
+        Parameters:
+            density: With which the other side finds the vertex, in units of the technique's density
+                (per area, where the technique itself has density 1).
+            reverse_pdf: Of going on from there to the subpath's vertex before, per solid angle.
+        """
+        return self.ratio(density) * (sums.dVCM + self.ratio(reverse_pdf) * sums.dVC)
 
     def _connection_density(self, scene, emitted, si, active) -> mi.Float:
         """With which a connection from ``si`` finds the point of the light: per solid angle, or
@@ -115,7 +128,6 @@ class PartialSums:
         pdf: mi.Float,
         reverse_pdf: mi.Float,
         is_delta: mi.Bool,
-        is_first: mi.Bool,
     ) -> Sums:
         """A direction was sampled.
 
@@ -124,24 +136,20 @@ class PartialSums:
             pdf, reverse_pdf: Its density, and that of the opposite way through the vertex, per
                 solid angle.
             is_delta: Did a discrete distribution choose it? Then no other technique connects here.
-            is_first: Was it sampled at the first vertex after the light or the sensor?
         """
         leaves = cosine * dr.select(pdf > 0, dr.rcp(pdf), 0)
-        smooth = self.ratio(leaves) * self.before(sums, reverse_pdf, is_first)
-        dVCM = self.ratio(dr.select(pdf > 0, dr.rcp(pdf), 0))
+        smooth = self.others(leaves, sums, reverse_pdf)
+        # The technique that connects behind a vertex has other vertices on both sides
+        dVCM = self.count * self.ratio(dr.select(pdf > 0, dr.rcp(pdf), 0))
         return Sums(
             dr.select(is_delta, 0, dVCM),
             dr.select(is_delta, sums.dVC * self.ratio(cosine), smooth),
         )
 
 
-    def before(self, sums: Sums, reverse_pdf: mi.Float, is_first: mi.Bool) -> mi.Float:
-        """The techniques that connect at the segment that led to a vertex, or earlier: the sum of
-        their ratios to one that has sampled the subpath up to the vertex, when the other subpath
-        arrives there and would go on with the density ``reverse_pdf``. The segments from the light
-        and from the sensor (``is_first``) have techniques of their own."""
-        count = dr.select(is_first, 1, self.ratio(mi.Float(self.connections)))
-        return count * sums.dVCM + self.ratio(reverse_pdf) * sums.dVC
+def weight(others: mi.Float) -> mi.Float:
+    """The weight of a technique, from the sum of the others' ratios to it."""
+    return dr.select(dr.isfinite(others), dr.rcp(1 + others), 0)
 
 
 def _cosine(si: mi.SurfaceInteraction3f) -> mi.Float:

@@ -50,8 +50,8 @@ class BidirectionalPathTracer:
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
     ) -> Sample:
         walk = self.walk
-        share = dr.opaque(mi.Float, self.connections / _VERTICES)
-        sums = PartialSums(walk.next_event, share)
+        count = dr.opaque(mi.Float, self.connections / _VERTICES)
+        sums = PartialSums(walk.next_event, count)
         seed = None
         if self.sensor is not None and self.sensor.needs_aperture_sample:
             seed = mi.UInt32(sampler.next_1d() * 4294967040.0)

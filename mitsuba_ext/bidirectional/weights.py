@@ -9,7 +9,7 @@ from ..transport.heroes import Heroes
 from ..transport.path_decisions import Weights
 from ..transport.vertex import PathState, Vertex
 from .emission import LightEmission
-from .partial_sums import PartialSums, Sums
+from .partial_sums import PartialSums, Sums, weight
 from .scattering import geometric_cosine, reverse_density
 from .sensor import ConnectableSensor
 
@@ -65,10 +65,11 @@ class BidirectionalWeights(Weights):
         found = pdf * dr.select(
             si.is_valid(), dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist), 1
         )
-        others = self.sums.ratio(found) * path.sums.dVCM
+        # One connection to a light, instead of those to light paths
+        others = self.sums.ratio(found) * path.sums.dVCM / self.sums.count
         others += self.sums.ratio(position * direction) * path.sums.dVC
         # What the sensor sees directly is found in no other way
-        return dr.select(path.depth == 0, 1, _weight(others))
+        return dr.select(path.depth == 0, 1, weight(others))
 
     def connection(self, scene, vertex, ds, pdf, scattering_pdf) -> mi.Float:
         si, active = vertex.si, pdf > 0
@@ -86,11 +87,9 @@ class BidirectionalWeights(Weights):
         inverse = dr.select(active, dr.rcp(pdf), 0)
         sums = vertex.path.sums
         reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
-        others = self.sums.ratio(emitted * inverse) * self.sums.before(
-            sums, reverse, vertex.depth == 0
-        )
+        others = self.sums.others(emitted * inverse, sums, reverse)
         others += dr.select(ds.delta, 0, self.sums.ratio(scattering_pdf * inverse))
-        return _weight(others)
+        return weight(others)
 
     def leave(self, vertex: Vertex, bs: mi.BSDFSample3f) -> Sums:
         si = vertex.si
@@ -98,11 +97,5 @@ class BidirectionalWeights(Weights):
         active = si.is_valid() & ~is_delta
         reverse = reverse_density(self._ctx, vertex.bsdf, si, bs.wo, active)
         cosine = geometric_cosine(si, bs.wo)
-        return self.sums.leave(
-            vertex.path.sums, cosine, bs.pdf, reverse, is_delta, vertex.depth == 0
-        )
+        return self.sums.leave(vertex.path.sums, cosine, bs.pdf, reverse, is_delta)
 
-
-def _weight(others: mi.Float) -> mi.Float:
-    """The weight of a technique, from the sum of the others' ratios to it."""
-    return dr.select(dr.isfinite(others), dr.rcp(1 + others), 0)
