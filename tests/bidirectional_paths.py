@@ -110,7 +110,10 @@ def trace(
     for v in vertices:
         value = v.bsdf.eval(ctx, v.from_camera, v.from_light.wi, active)
         active &= v.is_delta | (dr.max(value) > 0)
-    return Paths(emitted, vertices, camera_ray, active)
+    paths = Paths(emitted, vertices, camera_ray, active)
+    # One kernel for all of it
+    dr.eval(paths)
+    return paths
 
 
 def _walk(scene, numbers, ray, count, active, mode):
@@ -148,7 +151,7 @@ def weights_of_techniques(
     # ----- Subpaths from the light -----
     by_light = [sums.first(scene, emitted, vertices[0].from_light, active)]
     # Which techniques scatter only where their densities are not 0
-    from_light, from_camera = [mi.Bool(True)], [mi.Bool(True)]
+    from_light, from_camera = [mi.Bool(True)], [mi.Bool(True), mi.Bool(True)]
     for a, b in zip(vertices, vertices[1:]):
         si, wo = a.from_light, a.from_camera.wi
         pdf = dr.select(a.is_delta, 1, a.bsdf.pdf(ctx, si, wo, active))
@@ -244,6 +247,7 @@ def weights_of_techniques(
     # from_camera: for s = 0, 1, …, t = 1; from_light: for s = 2, …
     can = [from_camera[s] & (from_light[s - 2] if s > 1 else True) for s in range(len(found))]
     found = [dr.select(active & c, w, 0) for c, w in zip(can, found)]
+    dr.eval(found, active)
     shape = np.array(active).shape
     return np.stack([np.broadcast_to(np.array(w, dtype=np.float64), shape) for w in found]), (
         np.array(active)
