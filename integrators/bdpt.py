@@ -8,10 +8,12 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext import registry
+from mitsuba_ext.bidirectional.both_ends import FromBothEnds
 from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.path_tracer import STRIDE, BidirectionalPathTracer
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
+from mitsuba_ext.composition.next_event import sampling_weights
 from mitsuba_ext.composition.slots import read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera import check_takes_splats
@@ -117,9 +119,15 @@ class BidirectionalIntegrator(WalkIntegrator):
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
         target = ConnectableSensor(sensor) if self._has_light_image(sensor) else None
-        return functools.partial(self._estimator, emission, target)
+        correct = sampling_weights(scene) if emission.has_smooth_meshes else None
+        return functools.partial(self._estimator, emission, target, correct)
 
-    def _estimator(self, emission, sensor, **decisions: Any) -> BidirectionalPathTracer:
+    def _estimator(self, emission, sensor, correct, **decisions: Any) -> BidirectionalPathTracer:
+        next_event = decisions.pop("next_event", None)
+        # Mitsuba's own density of points on meshes with interpolated normals is wrong
+        next_event = FromBothEnds(next_event) if next_event else correct
+        if next_event:
+            decisions["next_event"] = next_event
         return BidirectionalPathTracer(self.walk(**decisions), emission, sensor, self.connections)
 
     def _has_light_image(self, sensor: mi.Sensor) -> bool:

@@ -38,12 +38,13 @@ class EmittedRay:
         start: The point of the light, as a ray would find it (normals, ``uv``, triangle, shape;
             ``wi`` is the direction of emission). For lights without surface only ``p``, time and
             wavelengths are meaningful.
-        weight: Radiance · cosine / (``probability`` · ``pdf_position`` · ``pdf_direction``).
+        weight: Radiance · cosine / density.
         emitter, index: The emitter, and its number in ``scene.emitters()``.
         probability: With which the emitter was chosen.
         pdf_position: Of the point per area (of the light; of the disk at right angles to the ray,
             for lights at infinity); 1 where the position is a point.
-        pdf_direction: Of the direction per solid angle; 1 where there is only one.
+        pdf_direction: Of the direction per solid angle; 1 where there is only one; see
+            :meth:`LightEmission.densities`.
         cosine: Between the ray and the geometric normal, not negative; 1 for lights without
             surface.
         is_delta_position, is_delta_direction, is_infinite: What kind of light it is.
@@ -76,6 +77,7 @@ class LightEmission:
 
     Attributes:
         probability (numpy.ndarray): With which each emitter is chosen; shape [emitters].
+        has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
 
     Raises:
         NotImplementedError: Paths cannot start from one of the emitters.
@@ -96,7 +98,7 @@ class LightEmission:
         is_surface = kind <= pieces.CYLINDER
         self._has_surfaces = bool(is_surface.any())
         self._has_beams = bool((is_surface & self._delta_direction).any())
-        self._has_smooth = bool((self._pieces.way == pieces.TO_BOTH_SIDES).any())
+        self.has_smooth_meshes = bool((self._pieces.way == pieces.TO_BOTH_SIDES).any())
         self._kinds = set(kind.tolist())
         if self._has_beams and mi.is_spectral:
             raise NotImplementedError(
@@ -185,7 +187,7 @@ class LightEmission:
         si = self._found(piece, emitter, ray, p, prim_uv, active)
         is_back = mi.Bool(False)
         local = mi.warp.square_to_cosine_hemisphere(v)
-        if self._has_smooth:
+        if self.has_smooth_meshes:
             is_smooth = piece.parameter == float(pieces.TO_BOTH_SIDES)
             is_back = is_smooth & (v.x < _TO_BACK)
             x = dr.select(is_back, v.x / _TO_BACK, (v.x - _TO_BACK) / (1 - _TO_BACK))
@@ -196,11 +198,11 @@ class LightEmission:
         if self._has_beams:
             is_beam = piece.parameter == float(pieces.AS_BEAM)
             local = dr.select(is_beam, mi.Vector3f(0, 0, 1), local)
-        d = mi.Frame3f(si.n).to_world(local)
-        cosine = dr.abs(local.z)
+        d, cosine = mi.Frame3f(si.n).to_world(local), dr.abs(local.z)
         pdf = self._cosine_density(local.z, piece.parameter)
         si.wi = si.to_local(d)
         weight = emitter.eval(si, active) * dr.select(pdf > 0, cosine / pdf, 0)
+        pdf = self._weighing_density(local.z, piece.parameter)
         if self._has_beams:
             pdf = dr.select(is_beam, 1, pdf)
             # Its radiance is not to be asked for, but the weight is that times the area
@@ -291,7 +293,9 @@ class LightEmission:
         ref: mi.Interaction3f,
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:
-        """With what densities :meth:`sample` finds a ray that another technique has found.
+        """With what densities :meth:`sample` finds a ray that another technique has found, as
+        MIS weights see it: where normals are interpolated, both sides of a triangle count as its
+        front, since connections do not know its normal.
 
         Parameters:
             emitter: The light.
@@ -307,7 +311,7 @@ class LightEmission:
         pdf = mi.Float(1)
         if self._has_surfaces:
             pdf = dr.select(
-                row.kind <= pieces.CYLINDER, self._cosine_density(dr.dot(n, d), row.way), pdf
+                row.kind <= pieces.CYLINDER, self._weighing_density(dr.dot(n, d), row.way), pdf
             )
         if pieces.POINT in self._kinds:
             pdf = dr.select(row.kind == pieces.POINT, dr.inv_four_pi, pdf)
@@ -337,10 +341,13 @@ class LightEmission:
     def _cosine_density(self, cosine: mi.Float, way: mi.Float) -> mi.Float:
         """Of a direction that leaves a surface under this cosine."""
         front = dr.maximum(cosine, 0) * dr.inv_pi
-        if not self._has_smooth:
-            return front
         both = dr.select(cosine < 0, -_TO_BACK, 1 - _TO_BACK) * cosine * dr.inv_pi
         return dr.select(way == float(pieces.TO_BOTH_SIDES), both, front)
+
+    def _weighing_density(self, cosine: mi.Float, way: mi.Float) -> mi.Float:
+        """The same, for MIS weights."""
+        is_smooth = self.has_smooth_meshes & (way == float(pieces.TO_BOTH_SIDES))
+        return self._cosine_density(dr.select(is_smooth, dr.abs(cosine), cosine), way)
 
     def _row(self, index: mi.UInt32, active: mi.Bool) -> _Row:
         words = dr.gather(

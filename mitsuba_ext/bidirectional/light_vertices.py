@@ -18,7 +18,7 @@ _HERO_IS_ALONE = 1 << 31
 
 @dataclass
 class Layout:
-    """The words of a stored vertex: 14 to 17 in RGB variants.
+    """The words of a stored vertex: 14 to 18 in RGB variants.
 
     Attributes:
         spectrum: Words of a spectrum.
@@ -40,7 +40,7 @@ class Layout:
 
     @property
     def words(self) -> int:
-        return 11 + self.spectrum + 2 * self.has_sums + self.has_instances
+        return 11 + self.spectrum + 2 * (self.has_sums + self.has_instances)
 
 
 class VertexStore:
@@ -83,7 +83,7 @@ class VertexStore:
             words += [sums.dVCM, sums.dVC]
         words += [_as_float(mark)]
         if self.layout.has_instances:
-            words += [_as_float(pi.instance)]
+            words += [_as_float(pi.instance), _as_float(pi.shape_index)]
         dr.scatter(self.words, mi.ArrayXf(words), slot, active)
         dr.scatter(self.is_taken, mi.Bool(True), slot, active)
 
@@ -100,7 +100,8 @@ class LightVertex:
     Attributes:
         p: Its position.
         d: The direction in which light arrives.
-        prim_uv, prim_index, shape, instance: What was hit, and where.
+        prim_uv, prim_index, shape, instance, shape_index: What was hit, and where. The last two say
+            which shape of which group; they are ``None`` where there are no instances.
         β: Radiance · throughput / density of the path up to the vertex.
         sums: Partial sums of the MIS weights (0 if none are stored).
         depth: Segments between the light and the vertex; at least 1.
@@ -114,6 +115,7 @@ class LightVertex:
     prim_index: mi.UInt32
     shape: mi.ShapePtr
     instance: Any
+    shape_index: Any
     β: mi.Spectrum
     sums: Sums
     depth: mi.UInt32
@@ -161,11 +163,14 @@ class LightVertices:
         if layout.has_sums:
             sums, rest = Sums(w[rest], w[rest + 1]), rest + 2
         mark = dr.reinterpret_array(mi.UInt32, w[rest])
-        instance = _as_shape(w[rest + 1]) if layout.has_instances else None
+        instance, shape_index = None, None
+        if layout.has_instances:
+            instance = _as_shape(w[rest + 1])
+            shape_index = dr.reinterpret_array(mi.UInt32, w[rest + 2])
         hero_is_alone = (mark & _HERO_IS_ALONE) != 0 if self._disperses else ()
         return LightVertex(
             mi.Point3f(w[0], w[1], w[2]), mi.Vector3f(w[3], w[4], w[5]), mi.Point2f(w[6], w[7]),
-            dr.reinterpret_array(mi.UInt32, w[8]), _as_shape(w[9]), instance,
+            dr.reinterpret_array(mi.UInt32, w[8]), _as_shape(w[9]), instance, shape_index,
             mi.Spectrum(*(w[10 + i] for i in range(n))), sums, mark & (_HERO_IS_ALONE - 1),
             hero_is_alone, self._lane_of(slot, active),
         )  # fmt: skip
@@ -179,7 +184,7 @@ class LightVertices:
         pi.prim_uv, pi.prim_index = vertex.prim_uv, vertex.prim_index
         pi.shape, pi.valid = vertex.shape, mi.Bool(active)
         if vertex.instance is not None:
-            pi.instance = vertex.instance
+            pi.instance, pi.shape_index = vertex.instance, vertex.shape_index
         # The ray begins where it ends
         pi.t = dr.select(active, mi.Float(0), dr.inf)
         ray = mi.Ray3f(vertex.p, vertex.d)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from ..bounds import scene_bounds
 from ..decisions.learner import Learner
@@ -36,6 +37,15 @@ class PowerLights(DecisionParameters):
             return None
         cells = LightCells(setting.scene, None)
         return LightTable(OneRow(), cells, power_weights(setting.scene, cells))
+
+
+def sampling_weights(scene: mi.Scene) -> LightTable:
+    """The choice of ``path``, but with the true densities of points on meshes with interpolated
+    normals."""
+    cells = LightCells(scene, None)
+    number = mi.UInt32(cells.emitter_index.astype(np.uint32))
+    probability = np.broadcast_to(scene.pdf_emitter(number).numpy(), cells.count)
+    return LightTable(OneRow(), cells, mi.Float((probability * cells.share).astype(np.float32)))
 
 
 class LinearLights(DecisionParameters):

@@ -1,0 +1,254 @@
+"""Explicit paths from a light to the sensor, and the weights of the techniques that find them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsuba_ext.bidirectional.connections import End, joining_weight
+from mitsuba_ext.bidirectional.emission import EmittedRay, LightEmission
+from mitsuba_ext.bidirectional.partial_sums import PartialSums, weight
+from mitsuba_ext.bidirectional.scattering import geometric_cosine, reverse_density
+from mitsuba_ext.bidirectional.sensor import ConnectableSensor
+from mitsuba_ext.bidirectional.weights import BidirectionalWeights
+from mitsuba_ext.transport.emission import emission
+from mitsuba_ext.transport.path_decisions import EmitterSampling, SceneQuery
+from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex
+
+
+@dataclass
+class PathVertex:
+    """A vertex on a surface.
+
+    Attributes:
+        p, n: Position and geometric normal.
+        from_light, from_camera: The interaction, with ``wi`` towards the light, or the camera.
+        bsdf: The BSDF.
+        is_delta: Was the direction chosen by a discrete distribution?
+    """
+
+    p: mi.Point3f
+    n: mi.Normal3f
+    from_light: mi.SurfaceInteraction3f
+    from_camera: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    is_delta: mi.Bool
+
+
+@dataclass
+class Paths:
+    """Paths with the same number of vertices, one in each lane.
+
+    Attributes:
+        emitted: The ray that leaves the light.
+        vertices: From light to camera.
+        camera_ray: The ray of the camera.
+        active: Which lanes have a path.
+    """
+
+    emitted: EmittedRay
+    vertices: list[PathVertex]
+    camera_ray: mi.Ray3f
+    active: mi.Bool
+
+
+def trace(
+    scene: mi.Scene, emission: LightEmission, sensor: mi.Sensor, light: int, camera: int,
+    lanes: int = 4096,
+) -> Paths:  # fmt: skip
+    """Walks of ``light`` vertices from the light, and ``camera`` vertices from the camera, that see
+    each other; without ``camera`` vertices, the sensor sees the last vertex."""
+    numbers = mi.load_dict({"type": "independent"})
+    numbers.seed(7, lanes)
+    query, active = SceneQuery(), mi.Bool(True)
+    emitted = emission.sample(numbers, mi.Float(0), mi.Ray3f().wavelengths, active)
+    active &= dr.max(emitted.weight) > 0
+    # Exact distances are wanted
+    ray = mi.Ray3f(emitted.ray)
+    from_light, active = _walk(scene, numbers, ray, light, active, mi.TransportMode.Importance)
+    first = from_light[0][0]
+    first.t = dr.select(emitted.is_infinite, first.t, dr.norm(first.p - emitted.start.p))
+    last = from_light[-1][0]
+    if camera == 0:
+        connection, _ = ConnectableSensor(sensor).connect(last, numbers.next_2d(), active)
+        seen = mi.SurfaceInteraction3f(last)
+        ds = dr.zeros(mi.DirectionSample3f, lanes)
+        ds.p, ds.d, ds.dist = connection.target, connection.d, connection.dist
+        active &= connection.active & ~query.occluded(scene, last, ds, active)
+        camera_ray = mi.Ray3f(connection.target, -connection.d)
+        to_camera = connection.d
+        from_camera = []
+    else:
+        camera_ray, _ = sensor.sample_ray(0, 0.5, numbers.next_2d(), numbers.next_2d(), active)
+        from_camera, active = _walk(
+            scene, numbers, camera_ray, camera, active, mi.TransportMode.Radiance
+        )
+        seen = from_camera[-1][0]
+        d = seen.p - last.p
+        ds = dr.zeros(mi.DirectionSample3f, lanes)
+        ds.p, ds.dist = seen.p, dr.norm(d)
+        ds.d = d / ds.dist
+        active &= ~query.occluded(scene, last, ds, active) & (ds.dist > 0.05)
+        to_camera = ds.d
+    vertices = []
+    for i, (si, wo, is_delta) in enumerate(from_light):
+        is_end = i + 1 == light
+        other = mi.SurfaceInteraction3f(si)
+        other.wi = si.to_local(to_camera) if is_end else wo
+        delta = mi.Bool(False) if is_end else is_delta
+        vertices.append(PathVertex(si.p, si.n, si, other, si.bsdf(), delta))
+    for i, (si, wo, is_delta) in reversed(list(enumerate(from_camera))):
+        is_end = i + 1 == camera
+        other = mi.SurfaceInteraction3f(si)
+        other.wi = si.to_local(-to_camera) if is_end else wo
+        delta = mi.Bool(False) if is_end else is_delta
+        vertices.append(PathVertex(si.p, si.n, other, si, si.bsdf(), delta))
+    ctx = mi.BSDFContext()
+    for v in vertices:
+        value = v.bsdf.eval(ctx, v.from_camera, v.from_light.wi, active)
+        active &= v.is_delta | (dr.max(value) > 0)
+    paths = Paths(emitted, vertices, camera_ray, active)
+    # One kernel for all of it
+    dr.eval(paths)
+    return paths
+
+
+def _walk(scene, numbers, ray, count, active, mode):
+    """The interactions, the directions that were chosen there, and whether these are discrete."""
+    found = []
+    ctx = mi.BSDFContext(mode)
+    for i in range(count):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        if i + 1 == count:
+            found.append((si, mi.Vector3f(0, 0, 1), mi.Bool(False)))
+            active &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
+            break
+        bs, value = si.bsdf().sample(ctx, si, numbers.next_1d(), numbers.next_2d(), active)
+        active &= dr.max(value) > 0
+        found.append((si, mi.Vector3f(bs.wo), mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)))
+        ray = si.spawn_ray(si.to_world(bs.wo))
+    return found, active
+
+
+def weights_of_techniques(
+    scene: mi.Scene,
+    paths: Paths,
+    emits: LightEmission,
+    sensor: ConnectableSensor | None,
+    next_event: EmitterSampling,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The weight of each technique, as the estimator computes it: [s, path], 0 where it cannot find
+    the path; and which of the lanes have a path."""
+    sums, active = PartialSums(next_event), paths.active
+    weights = BidirectionalWeights(scene, sums, emits, sensor)
+    ctx = mi.BSDFContext()
+    vertices, emitted = paths.vertices, paths.emitted
+
+    # ----- Subpaths from the light -----
+    by_light = [sums.first(scene, emitted, vertices[0].from_light, active)]
+    # Which techniques scatter only where their densities are not 0
+    from_light, from_camera = [mi.Bool(True)], [mi.Bool(True), mi.Bool(True)]
+    for a, b in zip(vertices, vertices[1:]):
+        si, wo = a.from_light, a.from_camera.wi
+        pdf = dr.select(a.is_delta, 1, a.bsdf.pdf(ctx, si, wo, active))
+        from_light.append(from_light[-1] & (pdf > 0))
+        left = sums.leave(
+            by_light[-1], geometric_cosine(si, wo), pdf,
+            reverse_density(ctx, a.bsdf, si, wo, active), a.is_delta,
+        )  # fmt: skip
+        by_light.append(sums.arrive(left, b.from_light, dr.squared_norm(b.p - a.p)))
+
+    # ----- Subpaths from the camera -----
+    path = PathState(
+        mi.Spectrum(1), mi.Float(1), mi.Float(1), mi.UInt32(0),
+        Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)), (),
+        weights.begin(paths.camera_ray),
+    )  # fmt: skip
+    by_camera: list[Vertex] = []
+    state = next_event.begin(None, paths.camera_ray)
+    for v in reversed(vertices):
+        si = v.from_camera
+        path.sums = weights.arrive(path, si)
+        vertex = Vertex(si, v.bsdf, path)
+        by_camera.insert(0, vertex)
+        bs = dr.zeros(mi.BSDFSample3f, dr.width(si))
+        bs.wo = v.from_light.wi
+        bs.pdf = dr.select(v.is_delta, 1, v.bsdf.pdf(ctx, si, bs.wo, active))
+        from_camera.insert(0, from_camera[0] & (bs.pdf > 0))
+        delta, smooth = int(mi.BSDFFlags.DeltaReflection), int(mi.BSDFFlags.DiffuseReflection)
+        bs.sampled_type = dr.select(v.is_delta, mi.UInt32(delta), mi.UInt32(smooth))
+        place = next_event.visit(state, scene, si, active)
+        state = next_event.remember(place)
+        path = PathState(
+            mi.Spectrum(1), mi.Float(1), mi.Float(1), path.depth + 1,
+            Arrival(mi.Interaction3f(si), bs.pdf, v.is_delta), (), weights.leave(vertex, bs),
+        )  # fmt: skip
+
+    # ----- s = 0, 1 -----
+    found = []
+    first = vertices[0]
+    is_delta_light = emitted.is_delta_position | emitted.is_delta_direction
+    si = scene.ray_intersect(first.from_light.spawn_ray(-emitted.ray.d), active)
+    ds = mi.DirectionSample3f(scene, si, mi.Interaction3f(first.from_camera))
+    is_hit = active & ~is_delta_light & (ds.emitter == emitted.emitter)
+    is_hit &= emitted.is_infinite | (dr.norm(si.p - emitted.start.p) < 1e-2)
+    active &= is_hit | is_delta_light
+    hits: dict[str, mi.Float] = {}
+
+    class Record:
+        def emission(self, *arguments):
+            hits["pdf"] = arguments[-1]
+            hits["weight"] = weights.emission(*arguments)
+            return hits["weight"]
+
+    path.sums = weights.arrive(path, si)
+    emission(scene, si, path, next_event, state, Record())
+    found.append(dr.select(is_hit, hits["weight"], 0))
+
+    probability = next_event.probability(
+        state, scene, mi.Interaction3f(first.from_camera), emitted.index, active & is_delta_light
+    )
+    ds.p = dr.select(is_hit, ds.p, emitted.start.p)
+    ds.d = dr.select(is_hit, ds.d, -emitted.ray.d)
+    ds.dist = dr.select(is_hit, ds.dist, dr.norm(emitted.start.p - first.p))
+    ds.emitter = emitted.emitter
+    ds.delta = is_delta_light
+    ds.pdf = dr.select(is_hit, hits["pdf"], probability)
+    by_scattering = first.bsdf.pdf(ctx, first.from_camera, first.from_light.wi, active)
+    connected = weights.connection(scene, by_camera[0], ds, ds.pdf, by_scattering)
+    found.append(dr.select(first.is_delta, 0, connected))
+
+    # ----- s, t ≥ 2 -----
+    for i, (a, b) in enumerate(zip(vertices, vertices[1:])):
+        ends = [
+            End(si, wo, v.bsdf.pdf(ctx, si, wo, active),
+                reverse_density(ctx, v.bsdf, si, wo, active), partial)
+            for v, si, wo, partial in (
+                (b, b.from_camera, b.from_light.wi, by_camera[i + 1].path.sums),
+                (a, a.from_light, a.from_camera.wi, by_light[i]),
+            )
+        ]  # fmt: skip
+        joined = joining_weight(sums, *ends, dr.squared_norm(b.p - a.p))
+        found.append(dr.select(a.is_delta | b.is_delta, 0, joined))
+
+    # ----- t = 1 -----
+    if sensor is not None:
+        last = vertices[-1]
+        origin, pdf = sensor.origin(paths.camera_ray)
+        wo = last.from_camera.wi
+        density = pdf / dr.squared_norm(last.p - origin) * geometric_cosine(last.from_light, wo)
+        reverse = reverse_density(ctx, last.bsdf, last.from_light, wo, active)
+        seen = weight(sums.others(density, by_light[-1], reverse))
+        found.append(dr.select(last.is_delta, 0, seen))
+    # from_camera: for s = 0, 1, …, t = 1; from_light: for s = 2, …
+    can = [from_camera[s] & (from_light[s - 2] if s > 1 else True) for s in range(len(found))]
+    found = [dr.select(active & c, w, 0) for c, w in zip(can, found)]
+    dr.eval(found, active)
+    shape = np.array(active).shape
+    return np.stack([np.broadcast_to(np.array(w, dtype=np.float64), shape) for w in found]), (
+        np.array(active)
+    )

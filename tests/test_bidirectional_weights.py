@@ -1,0 +1,201 @@
+"""The weights of all techniques that find a path add up to 1, and are those of their densities."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from bidirectional_paths import Paths, trace, weights_of_techniques
+from hard_cases import _octahedron, area, diffuse, rectangle, rgb, sensor, stage
+from test_light_tracer import EMITTERS, MATERIALS, T, _balls
+
+from mitsuba_ext.bidirectional.both_ends import FromBothEnds
+from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.bidirectional.sensor import ConnectableSensor
+from mitsuba_ext.composition.decision_parameters import Setting
+from mitsuba_ext.composition.next_event import sampling_weights
+from mitsuba_ext.decisions.next_event.light_table import LightTable
+from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.regions.surface_rows import SurfaceRows
+from mitsuba_ext.transport.path_decisions import EmitterSampling
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def weights(
+    scene: mi.Scene, light: int, camera: int, next_event: EmitterSampling | None = None
+) -> tuple[np.ndarray, np.ndarray, Paths, LightEmission]:
+    """Of paths with so many vertices: [s, path] for those that exist."""
+    emission, eye = LightEmission(scene), scene.sensors()[0]
+    connectable = ConnectableSensor(eye) if ConnectableSensor.can_connect(eye) else None
+    paths = trace(scene, emission, eye, light, camera)
+    found, exists = weights_of_techniques(
+        scene, paths, emission, connectable, next_event or EmitterSampling()
+    )
+    return found[:, exists], exists, paths, emission
+
+
+def assert_they_add_up(
+    found: np.ndarray, close: float = 2e-3, share: float = 0.99, at_least: int = 20
+) -> None:
+    """Rounding: rays leave a light a little above it, and cosines may be small."""
+    error = np.abs(found.sum(axis=0) - 1)
+    assert len(error) >= at_least
+    assert np.median(error) < 1e-3 * max(1, close / 2e-3)
+    assert (error < close).mean() >= share, np.sort(error)[-5:]
+
+
+#: Numbers of vertices next to the light, and to the camera: paths of 2, 3, 4 segments.
+SHAPES = ((1, 0), (2, 0), (1, 2))
+
+
+@pytest.mark.parametrize("name", [n for n in EMITTERS if n != "sunsky"])
+def test_weights_of_an_emitter_add_up(name: str) -> None:
+    scene = mi.load_dict(stage(light=EMITTERS[name]()), optimize=False)
+    for light, camera in SHAPES:
+        # Texels have edges; rays meet cylinders less exactly
+        assert_they_add_up(weights(scene, light, camera)[0], 1e-2, 0.98)
+
+
+@pytest.mark.parametrize("changes", [
+    {"plugin": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.0},
+    {"plugin": "orthographic"},
+    {"principal_point_offset_x": 0.2, "near_clip": 1.0},
+], ids=["thinlens", "orthographic", "shifted"])  # fmt: skip
+def test_weights_of_a_sensor_add_up(changes: dict[str, Any]) -> None:
+    scene = mi.load_dict(stage(camera=sensor(**changes)), optimize=False)
+    if "orthographic" not in changes.values():
+        assert_they_add_up(weights(scene, 1, 0)[0])
+    assert_they_add_up(weights(scene, 1, 1)[0])
+
+
+SPECULAR = {
+    "glass": lambda: {"type": "dielectric"},
+    "mirror": lambda: {"type": "conductor"},
+    "plastic": lambda: {"type": "plastic"},
+    "mask": lambda: {"type": "mask", "opacity": 0.4, "bsdf": diffuse()},
+}
+
+
+@pytest.mark.parametrize("name", [*MATERIALS, *SPECULAR])
+def test_weights_of_a_material_add_up(name: str) -> None:
+    scene = mi.load_dict(_balls({**MATERIALS, **SPECULAR}[name]()), optimize=False)
+    for light, camera in ((2, 1), (1, 2)):
+        assert_they_add_up(weights(scene, light, camera)[0])
+
+
+def test_weights_of_a_lamp_with_interpolated_normals_add_up() -> None:
+    lamp = _octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0), emitter=area(5.0))
+    scene = mi.load_dict(stage(light=lamp), optimize=False)
+    assert_they_add_up(weights(scene, 1, 0, sampling_weights(scene))[0])
+
+
+def _lights() -> dict[str, Any]:
+    return {
+        "point": {"type": "point", "position": [0.8, -1, 1.5], "intensity": rgb(1.0)},
+        "sky": {"type": "constant"},
+    }
+
+
+@pytest.mark.parametrize("choice", ["power", "spatial", "linear"])
+def test_weights_of_a_choice_of_lights_add_up(choice: str) -> None:
+    scene = mi.load_dict(stage(**_lights()), optimize=False)
+    plugin = mi.load_dict({"type": "bdpt", "next_event": choice})
+    setting = Setting(scene, scene.sensors()[0], 16, 4, 5, 1)
+    decision = FromBothEnds(plugin.slots["next_event"].decision(setting))
+    for light, camera in ((1, 0), (1, 1)):
+        assert_they_add_up(weights(scene, light, camera, decision)[0])
+
+
+@pytest.mark.parametrize("bsdf", ["rough glass", "twosided plastic", "normalmap", "principled"])
+def test_both_ends_agree_on_rows_that_tell_sides_of_surfaces(bsdf: str) -> None:
+    """A pane between the lamps and the floor."""
+    pane = rectangle(T().translate([0, 0, 0.9]).rotate([1, 0, 0], 25), bsdf=MATERIALS[bsdf]())
+    scene = mi.load_dict(stage(pane=pane, **_lights()), optimize=False)
+    found, exists, paths, _ = weights(scene, 1, 1)
+    first = paths.vertices[0].from_light
+    p, n = (np.array(v)[:, exists] for v in (first.p, first.n))
+    p, n = np.concatenate([p, p], axis=1), np.concatenate([n, -n], axis=1)
+    rows = SurfaceRows(scene.bbox(), 4, mi.Point3f(p), mi.Normal3f(n))
+    cells = LightCells(scene, None)
+    likes = np.random.default_rng(5).uniform(0.01, 1, rows.count * cells.count) ** 3
+    table = LightTable(rows, cells, mi.Float(likes.astype(np.float32)))
+    assert_they_add_up(weights(scene, 1, 1, FromBothEnds(table))[0])
+
+
+# ---- Densities of diffuse paths, computed once more ----
+
+
+def _densities(name: str, paths: Paths, exists: np.ndarray, scene: mi.Scene) -> np.ndarray:
+    """The density of each technique, in common units: [s, path]."""
+    emitted, eye = paths.emitted, ConnectableSensor(scene.sensors()[0])
+    p, n = ([np.array(getattr(v, a), dtype=np.float64)[:, exists] for v in paths.vertices]
+            for a in "pn")  # fmt: skip
+    start, normal, d = (
+        np.array(v, dtype=np.float64)[:, exists]
+        for v in (emitted.start.p, emitted.start.n, emitted.ray.d)
+    )
+    near = np.array(eye.origin(paths.camera_ray)[0], dtype=np.float64)
+    origin = np.broadcast_to(near.reshape(3, -1), (3, len(exists)))[:, exists]
+
+    def to(a, b, n):
+        """Square of the distance, and the cosine at b."""
+        v = b - a
+        d2 = (v**2).sum(axis=0)
+        return d2, np.abs((v * n).sum(axis=0)) / np.sqrt(d2)
+
+    def cosine(v, n):
+        return np.abs((v * n).sum(axis=0))
+
+    def scatters(a, n, b, n_b):
+        """Density of b per area, if a diffuse surface at a chooses the direction."""
+        d2, arrives = to(a, b, n_b)
+        return to(b, a, n)[1] / np.pi * arrives / d2
+
+    # The camera: uniform on the image, whose area at the distance 1 is this
+    area = (2 * np.tan(np.radians(45.0) / 2)) ** 2
+    axis = np.array([0, 4, -0.6]) / np.hypot(4, 0.6)
+    d2, arrives = to(origin, p[-1], n[-1])
+    on_axis = ((p[-1] - origin) * axis[:, None]).sum(axis=0) / np.sqrt(d2)
+    camera = [np.ones_like(d2), arrives / d2 / (area * on_axis**3)]
+    for i in range(len(p) - 1, 0, -1):
+        camera.append(camera[-1] * scatters(p[i], n[i], p[i - 1], n[i - 1]))
+    # camera[t]: density of the t vertices next to it
+    infinite = name in ("directional", "constant")
+    d2, arrives = to(start, p[0], n[0])
+    if infinite:
+        d2, arrives = np.ones_like(d2), cosine(d, n[0])
+    leaves_0 = 1 if infinite or name == "point" else cosine(d, normal)
+    radius = 1.001 * float(scene.bbox().bounding_sphere().radius)
+    by_bsdf = cosine(d, n[0]) / np.pi * leaves_0 / d2
+    # Of the light's point by a connection, of that point by emission, of the direction
+    point, start_pdf, direction, hit = {
+        "rectangle": lambda: (1 / 0.64, 1 / 0.64, leaves_0 / np.pi, by_bsdf),
+        "point": lambda: (1, 1, 1 / (4 * np.pi), 0 * d2),
+        "directional": lambda: (1, 1 / (np.pi * radius**2), 1, 0 * d2),
+        "constant": lambda: (
+            1 / (4 * np.pi), 1 / (np.pi * radius**2), 1 / (4 * np.pi), by_bsdf,
+        ),
+    }[name]()  # fmt: skip
+    light = [start_pdf * direction * arrives / d2]
+    for i in range(len(p) - 1):
+        light.append(light[-1] * scatters(p[i], n[i], p[i + 1], n[i + 1]))
+    # s = 0, 1, 2, …: of all k − 1 vertices on surfaces, and of the light's point
+    count = len(p)
+    return np.stack(
+        [camera[count] * hit, camera[count] * point]
+        + [light[s - 2] * camera[count + 1 - s] for s in range(2, count + 2)]
+    )
+
+
+@pytest.mark.parametrize("name", ["rectangle", "point", "directional", "constant"])
+def test_weights_are_those_of_the_densities(name: str) -> None:
+    scene = mi.load_dict(stage(light=EMITTERS[name]()), optimize=False)
+    for light, camera in SHAPES:
+        found, exists, paths, _ = weights(scene, light, camera)
+        squares = _densities(name, paths, exists, scene) ** 2
+        error = np.abs(found - squares / squares.sum(axis=0))
+        assert np.median(error) < 1e-4
+        assert np.quantile(error, 0.99) < 5e-3, (light, camera, error.max(axis=1))
