@@ -26,10 +26,10 @@ PICTURES = {
     "fast_balls": 512,
     "fan": 512,
     "flint": 1024,
-    "caustic": 1024,
-    "glass_lamp": 512,
-    "corridor": 512,
-    "night_classroom": 512,
+    "caustic": 256,
+    "glass_lamp": 96,
+    "corridor": 128,
+    "night_classroom": 256,
 }
 
 #: Scenes for light paths, and the integrator that renders them; all others have "neepp".
