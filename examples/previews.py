@@ -26,7 +26,17 @@ PICTURES = {
     "fast_balls": 512,
     "fan": 512,
     "flint": 1024,
+    "caustic": 256,
+    "glass_lamp": 96,
+    "corridor": 128,
+    "night_classroom": 256,
 }
+
+#: Scenes for light paths, and the integrator that renders them; all others have "neepp".
+LIGHT_PATHS = dict.fromkeys(["caustic", "glass_lamp", "corridor"], "bdpt")
+
+#: Scenes that are not 16 : 9.
+WIDTHS = {"cornell_box": 216, "caustic": 240, "glass_lamp": 240}
 
 #: Scenes that need a spectral variant.
 SPECTRAL = {"flint"}
@@ -42,9 +52,9 @@ def main(names: tuple[str, ...]) -> None:
     for name in names or PICTURES:
         mi.set_variant("llvm_ad_spectral" if name in SPECTRAL else "llvm_ad_rgb")
         spp = PICTURES[name]
-        width = 216 if name == "cornell_box" else 320
+        width, integrator = WIDTHS.get(name, 320), LIGHT_PATHS.get(name, "neepp")
         scene = mi.load_file(
-            str(SCENES / f"{name}.xml"), width=width, height=180, integrator="neepp"
+            str(SCENES / f"{name}.xml"), width=width, height=180, integrator=integrator
         )
         mi.util.write_bitmap(str(folder / f"{name}.png"), mi.render(scene, spp=spp))
         statistics = scene.integrator().statistics

@@ -1,4 +1,4 @@
-"""The objects of the scenes: tableware, a plant, furniture, a door."""
+"""The objects of the scenes: tableware, a plant, furniture, a school desk, a door."""
 
 from __future__ import annotations
 
@@ -107,6 +107,23 @@ def furniture() -> dict[str, Mesh]:
     sofa += [box((x - 0.39, -0.44, 0.3), (x + 0.39, 0.26, 0.46), 0.05) for x in (-0.4, 0.4)]
     meshes = {"table": table, "chair": chair, "shelf": join(*shelf), "sofa": join(*sofa)}
     return meshes | {f"books_{k}": join(*group) for k, group in enumerate(books)}
+
+
+def school() -> dict[str, Mesh]:
+    """A desk with an open compartment under its top, its frame, and a lamp's fitting: a square tube
+    of 12 cm, open below, whose ceiling is at z = 0. The pupil sits at +y."""
+    top = [box((-0.6, -0.25, 0.73), (0.6, 0.25, 0.76), 0.006)]
+    top.append(box((-0.56, -0.22, 0.6), (0.56, 0.22, 0.61), 0.002))
+    top.append(box((-0.56, -0.22, 0.61), (0.56, -0.21, 0.73), 0.002))
+    top += [box((x - 0.01, -0.21, 0.61), (x + 0.01, 0.22, 0.73), 0.002) for x in (-0.55, 0, 0.55)]
+    frame = []
+    for x in (-0.54, 0.54):
+        frame += [box((x - 0.02, y - 0.02, 0), (x + 0.02, y + 0.02, 0.6)) for y in (-0.19, 0.19)]
+        frame.append(box((x - 0.015, -0.17, 0.12), (x + 0.015, 0.17, 0.15)))
+    frame.append(box((-0.52, -0.2, 0.35), (0.52, -0.18, 0.38)))
+    sides = [box((x - 0.003, -0.06, -0.1), (x + 0.003, 0.06, 0), 0.001) for x in (-0.057, 0.057)]
+    sides += [side.turned(90) for side in sides]
+    return {"desk": join(*top), "desk_frame": join(*frame), "fitting": join(*sides)}
 
 
 def door() -> dict[str, Mesh]:

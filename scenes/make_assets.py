@@ -14,7 +14,7 @@ from pathlib import Path
 from _geometry import icosphere, torus_knot, write_ply
 from _lamps import lamps
 from _maps import checker, clear_sky, painting, planks, sunny_sky, write_exr
-from _things import cupboard, door, fittings, furniture, plant, pot, prism, tableware
+from _things import cupboard, door, fittings, furniture, plant, pot, prism, school, tableware
 from _walls import house, wall_with_holes, window_room
 
 
@@ -27,7 +27,7 @@ def main() -> None:
     flat = furniture() | house() | {"door": leaf_and_knob["door"]}
     flat |= {"gem": icosphere(1), "wall_with_holes": wall_with_holes()}
     smooth["knob"] = leaf_and_knob["knob"]
-    flat |= cupboard() | fittings() | window_room() | prism()
+    flat |= cupboard() | fittings() | window_room() | prism() | school()
     for name in ("stand", "curtain"):
         smooth[name] = flat.pop(name)
     for name, mesh in smooth.items():

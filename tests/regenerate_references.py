@@ -79,6 +79,10 @@ REGRESSIONS = {
         Regression("composed_path", "flint", variant="llvm_ad_spectral"),
         Regression("reweighted_wavelength", "prism", {"nested": "composed_path"},
                    variant="llvm_ad_spectral"),
+        Regression("bdpt", "caustic", max_depth=3),
+        Regression("bdpt", "corridor"),
+        Regression("bdpt", "night_classroom"),
+        Regression("light_tracer", "glass_lamp"),
     )
 }  # fmt: skip
 
