@@ -1,0 +1,153 @@
+"""``bdpt`` shows the image of ``path``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_cases import _delta_lights, _instances, film, rectangle, sensor, stage
+from statistical import REFERENCE_SEEDS, SEEDS, THRESHOLD, batches, load, z_welch
+from test_bidirectional_weights import some
+from test_light_tracer import EMITTERS, MANY_SEEDS, MATERIALS, T, _balls, below_the_lamp, halves
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def bdpt(max_depth: int = 4, **parameters: Any) -> mi.Integrator:
+    return mi.load_dict({"type": "bdpt", "max_depth": max_depth, **parameters})
+
+
+def assert_image_of_path(
+    scene: mi.Scene | dict[str, Any],
+    max_depth: int = 4,
+    spp: int = 256,
+    precision: float = 0.005,
+    reference: str = "path",
+    both: dict[str, Any] | None = None,
+    **parameters: Any,
+) -> None:
+    """The means of the image and of its quarters are those of ``path``."""
+    if isinstance(scene, dict):
+        scene = mi.load_dict(scene, optimize=False)
+    other = mi.load_dict({"type": reference, "max_depth": max_depth, **(both or {})})
+    integrator = bdpt(max_depth, **(both or {}), **parameters)
+    images = batches(scene, integrator, spp, SEEDS[:MANY_SEEDS])
+    expected = batches(scene, other, 2 * spp, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert np.isfinite(images).all() and images.min() >= 0
+    assert expected.any(), "a black image proves nothing"
+    height, width = images.shape[1:3]
+    parts = [
+        np.stack([x[:, y, x_].mean(axis=(1, 2, 3)) for y in halves(height) for x_ in halves(width)]
+                 + [x.mean(axis=(1, 2, 3))], axis=1)
+        for x in (images, expected)
+    ]  # fmt: skip
+    z = z_welch(*parts)
+    whole = [p[:, -1] for p in parts]
+    error = np.sqrt(sum(w.var(ddof=1) / len(w) for w in whole)) / whole[1].mean()
+    ratio = whole[0].mean() / whole[1].mean()
+    assert np.abs(z).max() < THRESHOLD + 0.4, f"z = {z.round(2)}, ratio of the means {ratio:.4f}"
+    assert error <= precision, f"known to {error:.2%} only"
+
+
+@pytest.mark.parametrize("name", some("sphere", of=EMITTERS))
+def test_every_emitter_lights_the_scene_as_in_path(name: str) -> None:
+    assert_image_of_path(stage(light=EMITTERS[name](), camera=below_the_lamp()))
+
+
+@pytest.mark.parametrize("name", some(of=MATERIALS))
+def test_a_material_reflects_light_as_in_path(name: str) -> None:
+    assert_image_of_path(_balls(MATERIALS[name]()))
+
+
+@pytest.mark.parametrize("kind", some("dielectric", of=["dielectric", "conductor", "plastic"]))
+def test_caustics_are_those_of_path(kind: str) -> None:
+    assert_image_of_path(_balls({"type": kind}), 5)
+
+
+def test_instances_of_a_group_with_several_shapes_are_read_back_as_they_are() -> None:
+    assert_image_of_path({**_instances(), "sensor": below_the_lamp()}, 3, 512)
+
+
+CAMERAS = {
+    "thinlens": {"plugin": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.0},
+    "orthographic": {"plugin": "orthographic"},
+    "cropped": {"film": film(31, 29, crop_offset_x=5, crop_offset_y=9, crop_width=13,
+                             crop_height=11, rfilter={"type": "gaussian"})},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", some("thinlens", of=CAMERAS))
+def test_a_sensor_sees_what_it_sees_with_path(name: str) -> None:
+    assert_image_of_path(stage(camera=below_the_lamp(**CAMERAS[name])), precision=0.01)
+
+
+PARAMETERS = {
+    "no light image": {"light_image": False},
+    "three connections": {"connections": 3},
+    "guided": {"directions": "guided"},
+    "spatial": {"next_event": "spatial"},
+}
+
+
+@pytest.mark.parametrize("name", some(of=PARAMETERS))
+def test_parameters_do_not_change_the_mean(name: str) -> None:
+    assert_image_of_path(stage(camera=below_the_lamp(), sky={"type": "constant"}),
+                         **PARAMETERS[name])  # fmt: skip
+
+
+@pytest.mark.parametrize("max_depth", some(-1, of=[1, 2, 3, -1]))
+def test_paths_are_as_long_as_those_of_path(max_depth: int) -> None:
+    scene = stage() if max_depth == 1 else stage(camera=below_the_lamp())
+    assert_image_of_path(scene, max_depth, precision=0.03, both={"rr_depth": 2})
+
+
+@pytest.mark.slow
+def test_hidden_emitters_are_looked_through() -> None:
+    lamp = rectangle(T().translate([0, -1, 1]).rotate([1, 0, 0], -90).scale(0.3),
+                     emitter=EMITTERS["rectangle"]()["emitter"])  # fmt: skip
+    assert_image_of_path(stage(light=lamp, sky={"type": "constant"}), both={"hide_emitters": True})
+
+
+@pytest.mark.slow
+def test_points_and_directions_of_light_agree() -> None:
+    assert_image_of_path(_delta_lights(), precision=0.01)
+
+
+def test_without_lights_the_image_is_black() -> None:
+    assert not batches(mi.load_dict(stage(light={})), bdpt(), 4, [1]).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"], indirect=True)
+@pytest.mark.parametrize("connections", [1, 3])
+def test_variants_show_the_image_of_path(variant: str, connections: int) -> None:
+    assert_image_of_path(stage(camera=below_the_lamp()), connections=connections)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_dispersed_light_is_that_of_the_path_tracer(variant: str) -> None:
+    scene = load("flint", width=24, height=24)
+    assert_image_of_path(scene, 4, 256, 0.01, reference="composed_path")
+
+
+def test_the_same_seed_gives_the_same_image() -> None:
+    scene = mi.load_dict(stage(camera=sensor("thinlens", aperture_radius=0.1, focus_distance=4.0)))
+    first, second = (batches(scene, bdpt(), 32, [7])[0] for _ in range(2))
+    np.testing.assert_allclose(first, second, rtol=1e-4, atol=1e-5 * first.mean())
+
+
+def test_it_cannot_be_nested_where_single_samples_are_asked_for() -> None:
+    moment = mi.load_dict({"type": "moment", "image": {"type": "bdpt"}})
+    with pytest.raises((NotImplementedError, RuntimeError), match="light paths"):
+        moment.render(mi.load_dict(stage()), spp=1)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_a_light_that_paths_cannot_leave_is_named(variant: str) -> None:
+    beam = rectangle(T().translate([0, 0, 3]).rotate([1, 0, 0], 180),
+                     emitter={"type": "directionalarea"})  # fmt: skip
+    with pytest.raises(NotImplementedError, match='"bdpt": .*directionalarea'):
+        bdpt().render(mi.load_dict(stage(light=beam)), spp=1)
