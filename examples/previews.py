@@ -28,8 +28,8 @@ PICTURES = {
     "flint": 1024,
     "caustic": 256,
     "glass_lamp": 96,
-    "corridor": 128,
-    "night_classroom": 256,
+    "corridor": 64,
+    "night_classroom": 128,
 }
 
 #: Scenes for light paths, and the integrator that renders them; all others have "neepp".
