@@ -57,7 +57,10 @@ class BidirectionalIntegrator(WalkIntegrator):
 
     **Use it when** light reaches the scene by ways that camera paths find rarely: caustics of
     lamps, lamps in fittings or near walls, indirect light from hidden lamps. **Not when**
-    :monosp:`path` converges well: a sample costs two to three times as much.
+    :monosp:`path` converges well: a sample costs about three times as much. Where coordinates are
+    thousands of times the size of the scene, or the scene is smaller than a millimetre in its
+    units, rays start and end visibly off surfaces (Mitsuba's offset of rays is 1e-4 of the
+    coordinates, and 1e-4 at least): light paths miss other things there than camera paths.
 
     All techniques are used whose number of vertices on the light path is 0 (a camera path runs into
     the light), 1 (a connection to a point that is chosen on a light) or more, and whose number on

@@ -28,6 +28,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 from scipy import stats
 
 from mitsuba_ext.garbage import garbage_left_alone
@@ -50,6 +51,12 @@ def load(name: str, **options: Any) -> mi.Scene:
     """One of our scenes, in the active variant. Delete it after use: Dr.Jit compiles the methods of
     *all* living objects into each kernel."""
     return mi.load_file(str(SCENES / f"{name}.xml"), **options)
+
+
+def some(*quick: Any, of: Iterable[str]) -> list:
+    """Parameters of a test; all but the ``quick`` ones are marked ``slow``: each takes seconds to
+    compile."""
+    return [pytest.param(x, marks=() if x in quick else pytest.mark.slow) for x in of]
 
 
 def batches(

@@ -8,8 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import _delta_lights, _instances, film, rectangle, sensor, stage
-from statistical import REFERENCE_SEEDS, SEEDS, THRESHOLD, batches, load, z_welch
-from test_bidirectional_weights import some
+from statistical import REFERENCE_SEEDS, SEEDS, THRESHOLD, batches, load, some, z_welch
 from test_light_tracer import EMITTERS, MANY_SEEDS, MATERIALS, T, _balls, below_the_lamp, halves
 
 pytestmark = pytest.mark.usefixtures("variant")

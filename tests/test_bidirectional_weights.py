@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import mitsuba as mi
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from bidirectional_paths import Paths, trace, weights_of_techniques
 from hard_cases import _octahedron, area, diffuse, rectangle, rgb, sensor, stage
+from statistical import some
 from test_light_tracer import EMITTERS, MATERIALS, T, _balls
 
 from mitsuba_ext.bidirectional.both_ends import FromBothEnds
@@ -23,12 +23,6 @@ from mitsuba_ext.regions.surface_rows import SurfaceRows
 from mitsuba_ext.transport.path_decisions import EmitterSampling
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-def some(*quick: Any, of: Iterable[str]) -> list:
-    """Parameters of a test; all but the ``quick`` ones are marked ``slow``: each takes seconds to
-    compile."""
-    return [pytest.param(x, marks=() if x in quick else pytest.mark.slow) for x in of]
 
 
 def weights(

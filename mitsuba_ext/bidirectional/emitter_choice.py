@@ -1,0 +1,31 @@
+"""From which emitters light paths start."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from ..lights.power import emitter_powers
+
+#: The share of light paths that choose their emitter by power; the others choose it by its
+#: ``sampling_weight``, as Mitsuba does. So neither choice has more than twice the density of this
+#: one: a sky that sends most of its power past a room does not take all paths from the lamp in it.
+_BY_POWER = 0.5
+
+
+def emitter_probabilities(scene: mi.Scene) -> np.ndarray:
+    """With which each emitter is chosen. One that a camera path can hit is chosen even where its
+    ``sampling_weight`` is 0: such a path shows it too."""
+    emitters = scene.emitters()
+    delta = int(mi.EmitterFlags.DeltaPosition) | int(mi.EmitterFlags.DeltaDirection)
+    can_be_hit = np.array([not int(e.flags()) & delta for e in emitters])
+    weight = np.array([float(e.sampling_weight()) for e in emitters])
+    weight = np.where((weight <= 0) & can_be_hit, 1.0, weight)
+    power = emitter_powers(scene) * weight
+    total = power.sum()
+    if weight.sum() <= 0:
+        return np.zeros(len(emitters))
+    by_weight = weight / weight.sum()
+    if not (np.isfinite(total) and total > 0):
+        return by_weight
+    return _BY_POWER * power / total + (1 - _BY_POWER) * by_weight
