@@ -200,7 +200,7 @@ def _pilot(learner: LightMapLearner, as_path: float) -> None:
     """Paths of which each has one connection, to the first of two lights; Mitsuba would choose it
     with the probability ``as_path`` · 0.5."""
     lanes = 1 << 12
-    learner.begin(lanes, None)
+    learner.begin(lanes, dr.zeros(mi.UInt32, lanes))
     if learner._records is not None:
         learner._records._as_path = mi.Float([0.5 * as_path, 1 - 0.5 * as_path])
     si = surface((0.1, 0.1, 0), width=lanes)

@@ -261,6 +261,7 @@ def test_paths_are_as_long_as_those_of_path(max_depth: int) -> None:
     assert_image_of_path(mi.load_dict(stage(), optimize=False), max_depth, spp, precision=0.02)
 
 
+@pytest.mark.slow
 def test_paths_longer_than_a_round_of_storage_lose_nothing() -> None:
     """In a white box, paths have dozens of vertices: they are stored a few at a time."""
     white = {"type": "cube", "to_world": T().translate([0, 0, 1]).scale(5), "flip_normals": True,
@@ -301,7 +302,8 @@ def test_passes_and_rounds_share_their_kernels() -> None:
         batches(scene, integrator, 32, [3])
         kernels = dr.kernel_history([dr.KernelType.JIT])
     assert integrator.statistics.passes == 8
-    compiled = [k for k in kernels if not k["cache_hit"]]
+    # Small ones compile in no time
+    compiled = [k for k in kernels if not k["cache_hit"] and k["operation_count"] > 100]
     # The last rounds may have so few vertices that they need a kernel of their own
     assert len(compiled) <= 3, [k["operation_count"] for k in compiled]
 
