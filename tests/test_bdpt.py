@@ -34,7 +34,9 @@ def assert_image_of_path(
     integrator = bdpt(max_depth, **(both or {}), **parameters)
     images = batches(scene, integrator, spp, SEEDS[:MANY_SEEDS])
     expected = batches(scene, other, 2 * spp, REFERENCE_SEEDS[:MANY_SEEDS])
-    assert np.isfinite(images).all() and images.min() >= 0
+    assert np.isfinite(images).all()
+    # Some single wavelengths have negative components
+    assert mi.is_spectral or images.min() >= 0
     assert expected.any(), "a black image proves nothing"
     height, width = images.shape[1:3]
     parts = [
@@ -62,7 +64,7 @@ def test_a_material_reflects_light_as_in_path(name: str) -> None:
 
 @pytest.mark.parametrize("kind", some("dielectric", of=["dielectric", "conductor", "plastic"]))
 def test_caustics_are_those_of_path(kind: str) -> None:
-    assert_image_of_path(_balls({"type": kind}), 5)
+    assert_image_of_path(_balls({"type": kind}), 5, precision=0.01)
 
 
 def test_instances_of_a_group_with_several_shapes_are_read_back_as_they_are() -> None:
@@ -79,7 +81,11 @@ CAMERAS = {
 
 @pytest.mark.parametrize("name", some("thinlens", of=CAMERAS))
 def test_a_sensor_sees_what_it_sees_with_path(name: str) -> None:
-    assert_image_of_path(stage(camera=below_the_lamp(**CAMERAS[name])), precision=0.01)
+    camera = below_the_lamp(**CAMERAS[name])
+    if name == "orthographic":
+        del camera["fov"]
+        camera["to_world"] = camera["to_world"] @ T().scale([2, 2, 1])
+    assert_image_of_path(stage(camera=camera), precision=0.01)
 
 
 PARAMETERS = {
