@@ -57,7 +57,8 @@ def test_weights_of_an_emitter_add_up(name: str) -> None:
     scene = mi.load_dict(stage(light=EMITTERS[name]()), optimize=False)
     for light, camera in SHAPES:
         # Texels have edges; rays meet cylinders less exactly
-        assert_they_add_up(weights(scene, light, camera)[0], 1e-2, 0.98)
+        close = 5e-2 if name == "cylinder" else 1e-2
+        assert_they_add_up(weights(scene, light, camera)[0], close, 0.98)
 
 
 @pytest.mark.parametrize("changes", [
