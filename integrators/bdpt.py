@@ -57,23 +57,27 @@ class BidirectionalIntegrator(WalkIntegrator):
 
     **Use it when** light reaches the scene by ways that camera paths find rarely: caustics of
     lamps, lamps in fittings or near walls, indirect light from hidden lamps. **Not when**
-    :monosp:`path` converges well: a sample costs about three times as much. Where coordinates are
-    thousands of times the size of the scene, or the scene is smaller than a millimetre in its
-    units, rays start and end visibly off surfaces (Mitsuba's offset of rays is 1e-4 of the
-    coordinates, and 1e-4 at least): light paths miss other things there than camera paths.
+    :monosp:`path` converges well: a sample costs about three times as much.
+
+    Mitsuba lets rays start above a surface, by about 1e-4 · (1 + the largest coordinate). In scenes
+    about as small as that, and in those far from the origin, rays miss what is near; light paths
+    miss other things than camera paths, so that the image differs from that of :monosp:`path` (by
+    up to 3 % in a quarter of the image, in a scene moved by a thousand times its size).
 
     All techniques are used whose number of vertices on the light path is 0 (a camera path runs into
     the light), 1 (a connection to a point that is chosen on a light) or more, and whose number on
     the camera path is 1 (a vertex of a light path is connected to the sensor) or more; but light
     paths do not run into the sensor (t = 0), which has no area, or hardly any. The weights are the
-    power heuristic over all of them, and know how many connections there are.
+    power heuristic over all of them; they take the number of connections into account.
 
     In a pass, the vertices of all light paths are shared by all camera paths. In spectral variants
     and with moving shapes, a camera path shares wavelengths and time with one light path, and is
     connected to that only.
 
     **Sensors and films.** A :monosp:`perspective` or :monosp:`thinlens` can be connected to; with
-    other sensors, and with films that sample a border, there is no light image.
+    other sensors, and with films that sample a border, there is no light image. Lights of the type
+    :monosp:`directionalarea`, which :monosp:`path` does not find, are seen here; spectral variants
+    refuse them.
 
     Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants, nor nesting in :monosp:`moment`.

@@ -82,7 +82,7 @@ class BidirectionalPathTracer:
                 break
         weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)
         subpaths = None
-        if rounds and self.connections > 0:
+        if rounds:
             subpaths = LightSubpaths(
                 scene, rounds[0] if len(rounds) == 1 else VertexCache(rounds, lanes), sums,
                 walk.query, self.connections, walk.max_depth,
