@@ -134,6 +134,10 @@ def _walk(scene, numbers, ray, count, active, mode):
     return found, active
 
 
+#: How often two vertices of subpaths are connected, for weights: not once, as all else.
+CONNECTIONS = 0.4
+
+
 def weights_of_techniques(
     scene: mi.Scene,
     paths: Paths,
@@ -143,7 +147,7 @@ def weights_of_techniques(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The weight of each technique, as the estimator computes it: [s, path], 0 where it cannot find
     the path; and which of the lanes have a path."""
-    sums, active = PartialSums(next_event), paths.active
+    sums, active = PartialSums(next_event, CONNECTIONS), paths.active
     weights = BidirectionalWeights(scene, sums, emits, sensor)
     ctx = mi.BSDFContext()
     vertices, emitted = paths.vertices, paths.emitted

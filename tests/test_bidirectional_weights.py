@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from bidirectional_paths import Paths, trace, weights_of_techniques
+from bidirectional_paths import CONNECTIONS, Paths, trace, weights_of_techniques
 from hard_cases import _octahedron, area, diffuse, rectangle, rgb, sensor, stage
 from statistical import some
 from test_light_tracer import EMITTERS, MATERIALS, T, _balls
@@ -52,7 +52,7 @@ def assert_they_add_up(
 SHAPES = ((1, 0), (2, 0), (1, 2))
 
 
-@pytest.mark.parametrize("name", some("rectangle", of=EMITTERS))
+@pytest.mark.parametrize("name", some("rectangle", "constant", of=EMITTERS))
 def test_weights_of_an_emitter_add_up(name: str) -> None:
     scene = mi.load_dict(stage(light=EMITTERS[name]()), optimize=False)
     for light, camera in SHAPES:
@@ -195,13 +195,16 @@ def _densities(name: str, paths: Paths, exists: np.ndarray, scene: mi.Scene) -> 
 
 
 @pytest.mark.parametrize(
-    "name", some("rectangle", of=["rectangle", "point", "directional", "constant"])
+    "name", some("rectangle", "constant", of=["rectangle", "point", "directional", "constant"])
 )
 def test_weights_are_those_of_the_densities(name: str) -> None:
     scene = mi.load_dict(stage(light=EMITTERS[name]()), optimize=False)
     for light, camera in SHAPES:
         found, exists, paths, _ = weights(scene, light, camera)
-        squares = _densities(name, paths, exists, scene) ** 2
+        densities = _densities(name, paths, exists, scene)
+        # But for hits (0), connections to lights (1) and to the sensor (the last)
+        densities[2:-1] *= CONNECTIONS
+        squares = densities**2
         error = np.abs(found - squares / squares.sum(axis=0))
         assert np.median(error) < 1e-4
         assert np.quantile(error, 0.99) < 5e-3, (light, camera, error.max(axis=1))
