@@ -169,6 +169,28 @@ def regions(images: np.ndarray) -> np.ndarray:
     return np.concatenate([whole, *quarters], axis=1)
 
 
+def assert_same_quarters(images: np.ndarray, expected: np.ndarray, precision: float) -> None:
+    """The image and its quarters have the expected means. Only renders of different seeds count as
+    independent: a light path brings light to many pixels.
+
+    Parameters:
+        images, expected: Of several seeds each: [seed, y, x, channel].
+        precision: Relative standard error of the difference of the image means, at most.
+    """
+    assert np.isfinite(images).all()
+    # Some single wavelengths have negative components
+    assert mi.is_spectral or images.min() >= 0
+    assert expected.any(), "a black image proves nothing"
+    means = [regions(x.mean(axis=-1, keepdims=True)) for x in (images, expected)]
+    z = z_welch(*means)
+    whole = [mean[:, 0] for mean in means]
+    error = np.sqrt(sum(w.var(ddof=1) / len(w) for w in whole)) / whole[1].mean()
+    ratio = whole[0].mean() / whole[1].mean()
+    # Five parts: a little more than THRESHOLD
+    assert np.abs(z).max() < THRESHOLD + 0.4, f"z = {z.round(2)}, ratio of the means {ratio:.4f}"
+    assert error <= precision, f"known to {error:.2%} only"
+
+
 def tiles(images: np.ndarray, size: int) -> np.ndarray:
     """Means over tiles of ``size`` × ``size`` pixels and all channels: [seed, tiles]. A sum over
     many pixels is near enough to a normal distribution for a t test; one pixel often is not."""

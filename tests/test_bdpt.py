@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import _delta_lights, _instances, film, rectangle, sensor, stage
-from statistical import REFERENCE_SEEDS, SEEDS, THRESHOLD, batches, load, some, z_welch
-from test_light_tracer import EMITTERS, MANY_SEEDS, MATERIALS, T, _balls, below_the_lamp, halves
+from statistical import REFERENCE_SEEDS, SEEDS, assert_same_quarters, batches, load, some
+from test_light_tracer import EMITTERS, MANY_SEEDS, MATERIALS, T, _balls, below_the_lamp
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -34,22 +34,7 @@ def assert_image_of_path(
     integrator = bdpt(max_depth, **(both or {}), **parameters)
     images = batches(scene, integrator, spp, SEEDS[:MANY_SEEDS])
     expected = batches(scene, other, 2 * spp, REFERENCE_SEEDS[:MANY_SEEDS])
-    assert np.isfinite(images).all()
-    # Some single wavelengths have negative components
-    assert mi.is_spectral or images.min() >= 0
-    assert expected.any(), "a black image proves nothing"
-    height, width = images.shape[1:3]
-    parts = [
-        np.stack([x[:, y, x_].mean(axis=(1, 2, 3)) for y in halves(height) for x_ in halves(width)]
-                 + [x.mean(axis=(1, 2, 3))], axis=1)
-        for x in (images, expected)
-    ]  # fmt: skip
-    z = z_welch(*parts)
-    whole = [p[:, -1] for p in parts]
-    error = np.sqrt(sum(w.var(ddof=1) / len(w) for w in whole)) / whole[1].mean()
-    ratio = whole[0].mean() / whole[1].mean()
-    assert np.abs(z).max() < THRESHOLD + 0.4, f"z = {z.round(2)}, ratio of the means {ratio:.4f}"
-    assert error <= precision, f"known to {error:.2%} only"
+    assert_same_quarters(images, expected, precision)
 
 
 @pytest.mark.parametrize("name", some("sphere", of=EMITTERS))

@@ -9,7 +9,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import area, bitmap, diffuse, film, lookat, rectangle, sensor, stage
-from statistical import REFERENCE_SEEDS, SEEDS, THRESHOLD, batches, some, z_welch
+from statistical import (
+    REFERENCE_SEEDS,
+    SEEDS,
+    THRESHOLD,
+    assert_same_quarters,
+    batches,
+    some,
+    z_welch,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -37,25 +45,7 @@ def assert_image_of_path(
     path = {"type": "path", **(reference or {}), "max_depth": max_depth, **parameters}
     images = batches(scene, light_tracer(max_depth, **parameters), spp, SEEDS[:MANY_SEEDS])
     expected = batches(scene, mi.load_dict(path), spp, REFERENCE_SEEDS[:MANY_SEEDS])
-    assert np.isfinite(images).all() and images.min() >= 0
-    assert expected.any(), "a black image proves nothing"
-    height, width = images.shape[1:3]
-    parts = [
-        np.stack([x[:, y, x_].mean(axis=(1, 2, 3)) for y in halves(height) for x_ in halves(width)]
-                 + [x.mean(axis=(1, 2, 3))], axis=1)
-        for x in (images, expected)
-    ]  # fmt: skip
-    z = z_welch(*parts)
-    whole = [p[:, -1] for p in parts]
-    error = np.sqrt(sum(w.var(ddof=1) / len(w) for w in whole)) / whole[1].mean()
-    ratio = whole[0].mean() / whole[1].mean()
-    # Five parts: a little more than THRESHOLD
-    assert np.abs(z).max() < THRESHOLD + 0.4, f"z = {z.round(2)}, ratio of the means {ratio:.4f}"
-    assert error <= precision, f"known to {error:.2%} only"
-
-
-def halves(size: int) -> tuple[slice, slice]:
-    return slice(None, size // 2), slice(size // 2, None)
+    assert_same_quarters(images, expected, precision)
 
 
 def below_the_lamp(plugin: str = "perspective", **changes: Any) -> dict[str, Any]:
