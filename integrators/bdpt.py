@@ -11,7 +11,8 @@ from mitsuba_ext import registry
 from mitsuba_ext.bidirectional.both_ends import FromBothEnds
 from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
-from mitsuba_ext.bidirectional.path_tracer import STRIDE, BidirectionalPathTracer
+from mitsuba_ext.bidirectional.light_walk import STRIDE
+from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
 from mitsuba_ext.composition.next_event import sampling_weights
 from mitsuba_ext.composition.slots import read_slot

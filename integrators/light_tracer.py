@@ -8,9 +8,9 @@ import mitsuba as mi
 
 from mitsuba_ext import registry
 from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.light_tracer import STRIDE, LightTracer
+from mitsuba_ext.bidirectional.light_tracer import LightTracer
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
-from mitsuba_ext.bidirectional.light_walk import LightWalk
+from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera import check_takes_splats

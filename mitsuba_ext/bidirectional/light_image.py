@@ -7,8 +7,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.estimator import Splats
+from ..transport.estimator import CameraRays, Splats
 from ..transport.heroes import Heroes
+from ..transport.numbers import Numbers
 from ..transport.path_decisions import SceneQuery
 from .light_vertices import LightVertices
 from .partial_sums import PartialSums, weight
@@ -16,70 +17,122 @@ from .scattering import evaluate, geometric_cosine
 from .sensor import ConnectableSensor, is_occluded
 
 
-def light_image(
-    scene: mi.Scene,
-    sensor: ConnectableSensor,
-    vertices: LightVertices,
-    seed: mi.UInt32 | None = None,
-    importance: Any = 1.0,
-    sums: PartialSums | None = None,
-    query: SceneQuery | None = None,
-    hides_emitters: bool = False,
-) -> tuple[Splats, mi.UInt32]:
-    """Connects each of the ``vertices``, of which there is at least one, to the sensor: in a kernel
-    of its own, which has a lane for each vertex.
+class LightImage:
+    """Connects vertices of light paths to the sensor: in a kernel of its own, which has a lane for
+    each vertex.
 
     There must be as many light paths as camera paths. Then what a pixel's splats bring, divided by
     the number of its camera samples, is their share of the pixel's radiance.
 
+    It draws one number where the sensor has an aperture, and no other.
+
     Parameters:
-        seed: A random number of each light path; with the depth of the vertex it makes the numbers
-            that choose a point of the aperture. ``None`` where the sensor needs none.
-        importance: What the sensor makes of radiance, for each light path (``CameraRays``).
+        scene: The scene.
+        sensor: What the vertices are connected to.
+        numbers: Where random numbers come from.
+        rays: The camera rays of the pass: a light path's splats are weighed as the sensor weighs
+            the radiance of the ray in its lane.
         sums: Computes MIS weights; without, all paths come from here.
         query: How a ray meets the scene.
         hides_emitters: Does the sensor look through area lights?
 
-    Returns:
-        The splats, and the shadow rays of each vertex.
+    Attributes:
+        shadow_count: Shadow rays traced.
     """
-    query = query or SceneQuery()
-    # Some lanes at least: very few would need other kernels
-    index = dr.arange(mi.UInt32, max(16, vertices.count))
-    active = index < dr.opaque(mi.UInt32, vertices.count)
-    vertex = vertices.gather(index, active)
-    si = vertices.interaction(query, vertex, active)
-    sample = mi.Point2f(0.5)
-    if seed is not None:
-        word = dr.gather(mi.UInt32, seed, vertex.lane, active)
-        sample = mi.Point2f(
-            mi.sample_tea_float32(word, 2 * vertex.depth),
-            mi.sample_tea_float32(word, 2 * vertex.depth + 1),
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sensor: ConnectableSensor,
+        numbers: Numbers,
+        rays: CameraRays,
+        sums: PartialSums | None = None,
+        query: SceneQuery | None = None,
+        hides_emitters: bool = False,
+    ) -> None:
+        self._scene, self._sensor, self._importance = scene, sensor, rays.importance
+        self._sums, self._query = sums, query or SceneQuery()
+        self._hides_emitters = hides_emitters
+        # With the depth of a vertex, it makes the numbers that choose a point of the aperture
+        self._seed = None
+        if sensor.needs_aperture_sample:
+            self._seed = mi.UInt32(numbers.next_1d() * 4294967040.0)
+            dr.schedule(self._seed)
+        dr.schedule(self._importance)
+        self._found: list[Splats] = []
+        self.shadow_count = mi.UInt32(0)
+
+    def add(self, vertices: LightVertices) -> None:
+        """Connects these vertices, of which there is at least one. It evaluates the result, so that
+        nothing needs them any more."""
+        found, tested = self._connect(vertices)
+        dr.eval(found, tested)
+        self._found.append(found)
+        self.shadow_count += dr.sum(tested)
+
+    @property
+    def splats(self) -> list[Splats]:
+        """What was found, as one set: however many there were, the film adds it by the same
+        kernel."""
+        if len(self._found) < 2:
+            return self._found
+        wavelengths = None
+        if self._found[0].wavelengths is not None:
+            wavelengths = _one_after_the_other([s.wavelengths for s in self._found])
+        return [
+            Splats(
+                _one_after_the_other([s.value for s in self._found]),
+                _one_after_the_other([s.position for s in self._found]),
+                wavelengths,
+                dr.concat([s.active for s in self._found]),
+            )
+        ]
+
+    def _connect(self, vertices: LightVertices) -> tuple[Splats, mi.UInt32]:
+        """The splats, and the shadow rays of each vertex."""
+        # Some lanes at least: very few would need other kernels
+        index = dr.arange(mi.UInt32, max(16, vertices.count))
+        active = index < dr.opaque(mi.UInt32, vertices.count)
+        vertex = vertices.gather(index, active)
+        si = vertices.interaction(self._query, vertex, active)
+        sample = mi.Point2f(0.5)
+        if self._seed is not None:
+            word = dr.gather(mi.UInt32, self._seed, vertex.lane, active)
+            sample = mi.Point2f(
+                mi.sample_tea_float32(word, 2 * vertex.depth),
+                mi.sample_tea_float32(word, 2 * vertex.depth + 1),
+            )
+        connection, lens_weight = self._sensor.connect(si, sample, active)
+        active = active & connection.active
+        if self._hides_emitters:
+            active &= si.shape.emitter() == None  # noqa: E711
+        to_camera = si.to_local(connection.d)
+        heroes = Heroes(self._scene)
+        value, reverse_pdf = evaluate(
+            heroes, vertex.hero_is_alone, si.bsdf(), si, to_camera, active
         )
-    connection, lens_weight = sensor.connect(si, sample, active)
-    active = active & connection.active
-    if hides_emitters:
-        active &= si.shape.emitter() == None  # noqa: E711
-    to_camera = si.to_local(connection.d)
-    heroes = Heroes(scene)
-    value, reverse_pdf = evaluate(
-        heroes, vertex.hero_is_alone, si.bsdf(), si, to_camera, active
-    )
-    value *= vertex.β * (connection.importance * lens_weight)
-    if sums is not None:
-        # The density with which a camera ray finds the vertex, per area
-        found = connection.importance * geometric_cosine(si, to_camera)
-        value *= weight(sums.others(found, vertex.sums, reverse_pdf))
-    # A connection that cannot contribute needs no shadow ray
-    active &= dr.max(dr.abs(value)) > 0
-    tested = mi.UInt32(dr.select(active, 1, 0))
-    active &= ~is_occluded(query, scene, si, connection, active, hides_emitters)
-    if not isinstance(importance, float):
-        is_single = dr.width(importance) == 1
-        if not is_single:
-            importance = dr.gather(type(importance), importance, vertex.lane, active)
-        value *= importance
-    finite = active & dr.all(dr.isfinite(value))
-    return Splats(
-        value, connection.position, vertices.wavelengths(vertex, active), finite
-    ), tested
+        value *= vertex.β * (connection.importance * lens_weight)
+        if self._sums is not None:
+            # The density with which a camera ray finds the vertex, per area
+            found = connection.importance * geometric_cosine(si, to_camera)
+            value *= weight(self._sums.others(found, vertex.sums, reverse_pdf))
+        # A connection that cannot contribute needs no shadow ray
+        active &= dr.max(dr.abs(value)) > 0
+        tested = mi.UInt32(dr.select(active, 1, 0))
+        active &= ~is_occluded(
+            self._query, self._scene, si, connection, active, self._hides_emitters
+        )
+        if not isinstance(self._importance, float):
+            importance = self._importance
+            if dr.width(importance) > 1:
+                importance = dr.gather(type(importance), importance, vertex.lane, active)
+            value *= importance
+        finite = active & dr.all(dr.isfinite(value))
+        return Splats(
+            value, connection.position, vertices.wavelengths(vertex, active), finite
+        ), tested
+
+
+def _one_after_the_other(vectors: list[Any]) -> Any:
+    components = zip(*vectors)
+    return type(vectors[0])(*(dr.concat(list(component)) for component in components))

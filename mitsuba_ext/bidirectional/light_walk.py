@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +18,12 @@ from .emission import LightEmission
 from .light_vertices import Layout, LightVertices, VertexStore
 from .partial_sums import PartialSums, Sums
 from .scattering import delta_correction, evaluate, geometric_cosine
+
+#: Vertices of a path that are stored at a time. Most paths have fewer.
+STRIDE = 4
+
+#: Rounds of a path, at most: it has been stuck where nothing absorbs light.
+_MOST_ROUNDS = 1 << 12
 
 
 @dataclass
@@ -53,8 +60,7 @@ class LightWalk:
     """Traces light paths: the mirror image of :class:`~mitsuba_ext.transport.walk.Walk`.
 
     Its vertices come in rounds: :meth:`begin` emits rays, each :meth:`advance` walks so many
-    vertices on and returns them. What follows after the last round is lost: the vertices of depths
-    1 to rounds · stride are there, and no others.
+    vertices on and returns them; :meth:`finish` walks to the ends of all paths.
 
     A path draws 6 numbers for the ray and 4 for each bounce.
 
@@ -138,6 +144,23 @@ class LightWalk:
         dr.eval(paths, store.words, store.is_taken)
         disperses = not isinstance(paths.hero_is_alone, tuple)
         return LightVertices(store, time, wavelengths, disperses), paths
+
+    def finish(
+        self,
+        scene: mi.Scene,
+        numbers: Numbers,
+        paths: LightPaths,
+        take: Callable[[LightVertices], None],
+    ) -> LightPaths:
+        """Walks on until no path is left. ``take`` is given the vertices of each round, unless
+        there is none: ``STRIDE`` of a path at most."""
+        for _ in range(_MOST_ROUNDS):
+            vertices, paths = self.advance(scene, numbers, paths, STRIDE)
+            if vertices.count > 0:
+                take(vertices)
+            if not dr.any(paths.active)[0]:
+                break
+        return paths
 
     @dr.syntax
     def _trace(self, scene, numbers, paths, store) -> tuple[Numbers, LightPaths]:

@@ -8,13 +8,13 @@ import drjit as dr
 import mitsuba as mi
 
 from ..movers import movers
-from ..transport.estimator import CameraRays, Sample, Splats
+from ..transport.estimator import CameraRays, Sample
 from ..transport.numbers import Numbers
 from ..transport.walk import Walk
 from .connections import LightSubpaths
 from .emission import LightEmission
-from .light_image import light_image
-from .light_vertices import VertexCache
+from .light_image import LightImage
+from .light_vertices import LightVertices, VertexCache
 from .light_walk import LightWalk
 from .partial_sums import PartialSums
 from .sensor import ConnectableSensor
@@ -23,10 +23,6 @@ from .weights import BidirectionalWeights
 #: Vertices of a light path, about, for MIS weights. The true number would make the weights depend
 #: on the samples (door_ajar: 11 % less variance than with 1).
 _VERTICES = 2.5
-
-#: Vertices of a light path that are stored at a time, and the most rounds of a path: it has been
-#: stuck where nothing absorbs light.
-STRIDE, MOST_ROUNDS = 4, 1 << 12
 
 
 @dataclass
@@ -52,34 +48,27 @@ class BidirectionalPathTracer:
         walk = self.walk
         count = dr.opaque(mi.Float, self.connections / _VERTICES)
         sums = PartialSums(walk.next_event, count)
-        seed = None
-        if self.sensor is not None and self.sensor.needs_aperture_sample:
-            seed = mi.UInt32(sampler.next_1d() * 4294967040.0)
+        image = None
+        if self.sensor is not None:
+            image = LightImage(
+                scene, self.sensor, sampler, rays, sums, walk.query, walk.hide_emitters
+            )
         light_walk = LightWalk(
             self.emission, walk.max_depth, walk.rr_depth, sums, query=walk.query
         )
         paths = light_walk.begin(scene, sampler, rays.ray.time, rays.ray.wavelengths, active)
         # What the rest of the pass reads again
-        dr.eval(paths, seed, rays)
+        dr.eval(paths, rays)
         lanes = dr.width(paths.active)
         rounds: list[VertexCache] = []
-        splats: list[Splats] = []
-        shadow_count = mi.UInt32(0)
-        for _ in range(MOST_ROUNDS):
-            vertices, paths = light_walk.advance(scene, sampler, paths, STRIDE)
-            if vertices.count > 0:
-                if self.sensor is not None:
-                    found, tested = light_image(
-                        scene, self.sensor, vertices, seed, rays.importance, sums, walk.query,
-                        walk.hide_emitters,
-                    )  # fmt: skip
-                    dr.eval(found, tested)
-                    splats.append(found)
-                    shadow_count += dr.sum(tested)
-                # Without the gaps, which take most of the memory
-                rounds.append(VertexCache([vertices], lanes))
-            if not dr.any(paths.active)[0]:
-                break
+
+        def take(vertices: LightVertices) -> None:
+            if image is not None:
+                image.add(vertices)
+            # Without the gaps, which take most of the memory
+            rounds.append(VertexCache([vertices], lanes))
+
+        paths = light_walk.finish(scene, sampler, paths, take)
         weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)
         subpaths = None
         if rounds:
@@ -91,7 +80,7 @@ class BidirectionalPathTracer:
         sample = replace(walk, weights=weights, subpaths=subpaths)(scene, sampler, rays, active)
         return replace(
             sample,
-            splats=splats,
+            splats=image.splats if image else [],
             scatter_count=sample.scatter_count + paths.scatter_count,
-            shadow_count=sample.shadow_count + shadow_count,
+            shadow_count=sample.shadow_count + (image.shadow_count if image else 0),
         )
