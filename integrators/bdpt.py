@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -14,13 +15,17 @@ from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.light_walk import STRIDE
 from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
+from mitsuba_ext.bidirectional.technique_images import TechniqueImages
+from mitsuba_ext.composition.light_paths import LightPathChoice
 from mitsuba_ext.composition.next_event import sampling_weights
-from mitsuba_ext.composition.slots import read_slot
+from mitsuba_ext.composition.slots import BIDIRECTIONAL_SLOTS, read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
-from mitsuba_ext.rendering.camera import check_takes_splats
+from mitsuba_ext.rendering.camera import check_takes_splats, film_extent
+from mitsuba_ext.transport.estimator import Estimator
+from mitsuba_ext.transport.path_decisions import NoConnections
 
-#: The decisions of camera paths that a scene can replace.
-_SLOTS = ("directions", "next_event", "roulette", "shadow_test")
+#: The decisions that a scene can replace, of camera paths and of light paths.
+_SLOTS = ("directions", "next_event", "roulette", "shadow_test", *BIDIRECTIONAL_SLOTS)
 
 #: Memory for what a pass stores, and about what a path takes besides the vertices that are stored
 #: at a time.
@@ -48,6 +53,21 @@ class BidirectionalIntegrator(WalkIntegrator):
        - |bool|
        - Connect light paths to the sensor as well (t = 1)? It finds caustics that are seen
          directly. (Default: true)
+     * - light_paths
+       - |string|
+       - :monosp:`always`, or :monosp:`auto`: a pilot finds whether they are worth their time; if
+         not, the rest of the samples are those of :monosp:`path` with the same decisions.
+         (Default: always)
+     * - sample_direct
+       - |bool|
+       - Connect camera paths to points that are chosen on lights (s = 1)? It is there to see what
+         the other techniques do alone: points and parallel light, seen in a mirror or through
+         glass, are black without. (Default: true)
+     * - technique_images
+       - |string|
+       - A file of the type OpenEXR that is to hold an image of each technique, with its weight and
+         without (layers :monosp:`weighted.s1_t2`, :monosp:`plain.s1_t2`; s vertices on the light
+         path, t on the camera path), of paths of up to 8 segments. (Default: none)
      * - next_event, directions, roulette, shadow_test
        - |string| or |decision|
        - Decisions of the camera paths, as in :class:`composed_path`. (Default: those of
@@ -104,10 +124,30 @@ class BidirectionalIntegrator(WalkIntegrator):
         super().__init__(props)
         self.connections = self.parameter(props, "connections", 1, minimum=1, maximum=1024)
         self.light_image = self.parameter(props, "light_image", True)
+        self.sample_direct = self.parameter(props, "sample_direct", True)
+        self.technique_images = self.parameter(props, "technique_images", "")
+        self.techniques: TechniqueImages | None = None
         self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in _SLOTS})
+        without_direct = ("next_event", "shadow_test", "light_paths")
+        without_images = ("light_paths",) if self.technique_images else ()
+        for key, refused in (
+            ("sample_direct", () if self.sample_direct else without_direct),
+            ("technique_images", without_images),
+        ):
+            for slot in self.slots.keys() & set(refused):
+                raise ValueError(
+                    f'"{self.name}": the parameter "{slot}" has no effect beside '
+                    f'"{key} = {getattr(self, key)}"; leave it out'
+                )
 
     def parameters(self) -> dict[str, Any]:
-        own = {"connections": self.connections, "light_image": self.light_image}
+        own = {
+            "connections": self.connections,
+            "light_image": self.light_image,
+            "sample_direct": self.sample_direct,
+            "technique_images": self.technique_images or "none",
+            "light_paths": "always",
+        }
         return {**own, **super().parameters()}
 
     @property
@@ -116,7 +156,7 @@ class BidirectionalIntegrator(WalkIntegrator):
 
     @property
     def most_lanes(self) -> int:
-        layout = Layout(len(mi.Spectrum()), True, True)
+        layout = Layout(len(mi.Spectrum()), 4, True)
         return _PASS_BYTES // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
 
     def estimators(self, scene: mi.Scene, sensor: mi.Sensor):
@@ -126,17 +166,37 @@ class BidirectionalIntegrator(WalkIntegrator):
             emission = LightEmission(scene)
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
+        film = sensor.film()
+        if self.technique_images:
+            self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
         target = ConnectableSensor(sensor) if self._has_light_image(sensor) else None
         correct = sampling_weights(scene) if emission.has_smooth_meshes else None
         return functools.partial(self._estimator, emission, target, correct)
 
-    def _estimator(self, emission, sensor, correct, **decisions: Any) -> BidirectionalPathTracer:
-        next_event = decisions.pop("next_event", None)
+    def _estimator(self, emission, sensor, correct, **decisions: Any) -> Estimator:
+        always = LightPathChoice(True, self.techniques)
+        choice: LightPathChoice = decisions.pop("light_paths", always)
         # Mitsuba's own density of points on meshes with interpolated normals is wrong
-        next_event = FromBothEnds(next_event) if next_event else correct
+        next_event = decisions.pop("next_event", correct)
+        if not self.sample_direct:
+            next_event = NoConnections()
+        elif choice.are_traced and next_event is not correct:
+            next_event = FromBothEnds(next_event)
         if next_event:
             decisions["next_event"] = next_event
-        return BidirectionalPathTracer(self.walk(**decisions), emission, sensor, self.connections)
+        walk = self.walk(**decisions)
+        if not choice.are_traced:
+            return walk
+        return BidirectionalPathTracer(walk, emission, sensor, self.connections, choice.observer)
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        self.techniques = None
+        if self.technique_images:
+            self.check_target("technique_images", self.technique_images)
+        image = super().render(scene, sensor, seed, spp, develop, evaluate)
+        if self.techniques is not None:
+            self.techniques.write(Path(self.technique_images), self.statistics.spp)
+        return image
 
     def _has_light_image(self, sensor: mi.Sensor) -> bool:
         if not self.light_image or not ConnectableSensor.can_connect(sensor):

@@ -93,7 +93,7 @@ class LightTracerIntegrator(WalkIntegrator):
 
     @property
     def most_lanes(self) -> int:
-        layout = Layout(len(mi.Spectrum()), False, True)
+        layout = Layout(len(mi.Spectrum()), 0, True)
         return _PASS_BYTES // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
 
     def schedule(self, scene, sensor, samples, seed) -> OneStage:

@@ -123,6 +123,15 @@ def test_dispersed_light_is_that_of_the_path_tracer(variant: str) -> None:
     assert_image_of_path(scene, 4, 256, 0.01, reference="composed_path")
 
 
+def test_shadow_rays_are_counted() -> None:
+    """At most one for each connection: to a light and to a light path from each of 3 vertices, and
+    to the sensor from each of 3."""
+    integrator = bdpt(4)
+    batches(mi.load_dict(stage(camera=below_the_lamp())), integrator, 16, [1])
+    rays = integrator.statistics.rays
+    assert rays["camera"] < rays["shadow"] < 9 * rays["camera"]
+
+
 def test_the_same_seed_gives_the_same_image() -> None:
     scene = mi.load_dict(stage(camera=sensor("thinlens", aperture_radius=0.1, focus_distance=4.0)))
     first, second = (batches(scene, bdpt(), 32, [7])[0] for _ in range(2))

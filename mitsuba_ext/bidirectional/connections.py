@@ -14,6 +14,7 @@ from ..transport.vertex import Vertex
 from .light_vertices import VertexCache
 from .partial_sums import PartialSums, Sums, weight
 from .scattering import adjoint_value, geometric_cosine, reverse_density
+from .technique_observer import TechniqueObserver
 
 
 @dataclass
@@ -63,6 +64,7 @@ class LightSubpaths(Subpaths):
         connections: Connections of each vertex.
         max_depth: Longest path in segments.
         own_lane: Is the light path that of the same lane?
+        observer: Is told what is found.
     """
 
     def __init__(
@@ -74,7 +76,9 @@ class LightSubpaths(Subpaths):
         connections: int,
         max_depth: int,
         own_lane: bool,
+        observer: TechniqueObserver | None = None,
     ) -> None:
+        self._observer = observer
         self._vertices, self._sums, self._query = vertices, sums, query
         self._connections, self._own_lane = connections, own_lane
         self._heroes = Heroes(scene)
@@ -130,16 +134,24 @@ class LightSubpaths(Subpaths):
         # ----- How else this path could have been found -----
         reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
         far_pdf = far_bsdf.pdf(self._ctx, far, back, active)
-        value *= joining_weight(
-            self._sums, End(si, wo, pdf, reverse, vertex.path.sums),
-            End(far, back, far_pdf, far_reverse, other.sums), squared_distance,
-        )  # fmt: skip
+        near_end = End(si, wo, pdf, reverse, vertex.path.sums)
+        far_end = End(far, back, far_pdf, far_reverse, other.sums)
+        mis = joining_weight(self._sums, near_end, far_end, squared_distance)
+        value *= mis
 
         # ----- Is anything in between? -----
         active &= (dr.max(dr.abs(value)) > 0) & dr.all(dr.isfinite(value))
         ds = dr.zeros(mi.DirectionSample3f, dr.width(active))
         ds.p, ds.d, ds.dist = far.p, d, distance
         visible = active & ~self._query.occluded(scene, si, ds, active)
+        if self._observer is not None:
+            found = pdf * geometric_cosine(far, back) / dr.select(active, squared_distance, 1)
+            by_camera = self._sums.by_camera(found, other.sums, far_reverse, other.depth == 1)
+            if not isinstance(by_camera, tuple):
+                by_camera /= self._sums.root(self._sums.count)
+            self._observer.joined(
+                other.depth + 1, vertex.depth + 2, value, mis, by_camera, visible
+            )
         return dr.select(visible, value, 0), dr.select(active, 1, 0)
 
     def _choose(self, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.UInt32, Any, mi.Bool]:

@@ -77,6 +77,7 @@ class LightEmission:
     Attributes:
         probability (numpy.ndarray): With which each emitter is chosen; shape [emitters].
         has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
+        has_beams (bool): Is there a light that sends parallel rays from a surface?
 
     Raises:
         NotImplementedError: Paths cannot start from one of the emitters.
@@ -96,10 +97,10 @@ class LightEmission:
         kind = self._pieces.kind
         is_surface = kind <= pieces.CYLINDER
         self._has_surfaces = bool(is_surface.any())
-        self._has_beams = bool((is_surface & self._delta_direction).any())
+        self.has_beams = bool((is_surface & self._delta_direction).any())
         self.has_smooth_meshes = bool((self._pieces.way == pieces.TO_BOTH_SIDES).any())
         self._kinds = set(kind.tolist())
-        if self._has_beams and mi.is_spectral:
+        if self.has_beams and mi.is_spectral:
             raise NotImplementedError(
                 'paths cannot start from the emitter "directionalarea" in spectral variants: it '
                 "chooses its wavelengths itself"
@@ -195,7 +196,7 @@ class LightEmission:
                 mi.Point2f(dr.select(is_smooth, x, v.x), v.y)
             )
             local = dr.select(is_back, mi.Vector3f(turned.x, turned.y, -turned.z), turned)
-        if self._has_beams:
+        if self.has_beams:
             is_beam = piece.parameter == float(pieces.AS_BEAM)
             local = dr.select(is_beam, mi.Vector3f(0, 0, 1), local)
         d, cosine = mi.Frame3f(si.n).to_world(local), dr.abs(local.z)
@@ -203,7 +204,7 @@ class LightEmission:
         si.wi = si.to_local(d)
         weight = emitter.eval(si, active) * dr.select(pdf > 0, cosine / pdf, 0)
         pdf = self._weighing_density(local.z, piece.parameter)
-        if self._has_beams:
+        if self.has_beams:
             pdf = dr.select(is_beam, 1, pdf)
             # Its radiance is not to be asked for, but the weight is that times the area
             beam = emitter.sample_ray(ray.time, mi.Float(0.5), u, v, active & is_beam)[1]

@@ -15,6 +15,7 @@ from .light_vertices import LightVertices
 from .partial_sums import PartialSums, weight
 from .scattering import evaluate, geometric_cosine
 from .sensor import ConnectableSensor, is_occluded
+from .technique_observer import TechniqueObserver
 
 
 class LightImage:
@@ -35,6 +36,7 @@ class LightImage:
         sums: Computes MIS weights; without, all paths come from here.
         query: How a ray meets the scene.
         hides_emitters: Does the sensor look through area lights?
+        observer: Is told what is found.
 
     Attributes:
         shadow_count: Shadow rays traced.
@@ -49,7 +51,9 @@ class LightImage:
         sums: PartialSums | None = None,
         query: SceneQuery | None = None,
         hides_emitters: bool = False,
+        observer: TechniqueObserver | None = None,
     ) -> None:
+        self._observer = observer
         self._scene, self._sensor, self._importance = scene, sensor, rays.importance
         self._sums, self._query = sums, query or SceneQuery()
         self._hides_emitters = hides_emitters
@@ -112,10 +116,15 @@ class LightImage:
             heroes, vertex.hero_is_alone, si.bsdf(), si, to_camera, active
         )
         value *= vertex.β * (connection.importance * lens_weight)
+        mis, by_camera = mi.Float(1), ()
         if self._sums is not None:
             # The density with which a camera ray finds the vertex, per area
             found = connection.importance * geometric_cosine(si, to_camera)
-            value *= weight(self._sums.others(found, vertex.sums, reverse_pdf))
+            mis = weight(self._sums.others(found, vertex.sums, reverse_pdf))
+            by_camera = self._sums.by_camera(
+                found, vertex.sums, reverse_pdf, vertex.depth == 1
+            )
+            value *= mis
         # A connection that cannot contribute needs no shadow ray
         active &= dr.max(dr.abs(value)) > 0
         tested = mi.UInt32(dr.select(active, 1, 0))
@@ -128,6 +137,10 @@ class LightImage:
                 importance = dr.gather(type(importance), importance, vertex.lane, active)
             value *= importance
         finite = active & dr.all(dr.isfinite(value))
+        if self._observer is not None:
+            self._observer.splatted(
+                vertex.depth + 1, connection.position, value, mis, by_camera, finite
+            )
         return Splats(
             value, connection.position, vertices.wavelengths(vertex, active), finite
         ), tested

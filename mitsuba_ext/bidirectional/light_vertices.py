@@ -18,29 +18,29 @@ _HERO_IS_ALONE = 1 << 31
 
 @dataclass
 class Layout:
-    """The words of a stored vertex: 14 to 18 in RGB variants.
+    """The words of a stored vertex: 14 to 20 in RGB variants.
 
     Attributes:
         spectrum: Words of a spectrum.
-        has_sums: Are partial sums of MIS weights stored?
+        sums: Words of the partial sums of MIS weights: 0, 2, or 4 (``Sums.by_camera``).
         has_instances: May a vertex lie on an instance?
     """
 
     spectrum: int
-    has_sums: bool
+    sums: int
     has_instances: bool
 
     @classmethod
-    def of(cls, scene: mi.Scene, has_sums: bool) -> Layout:
+    def of(cls, scene: mi.Scene, sums: int) -> Layout:
         # The scenes of moving shapes may hold instances
         has_instances = bool(movers(scene)) or any(
             shape.class_name() == "Instance" for shape in scene.shapes()
         )
-        return cls(dr.size_v(mi.Spectrum), has_sums, has_instances)
+        return cls(dr.size_v(mi.Spectrum), sums, has_instances)
 
     @property
     def words(self) -> int:
-        return 11 + self.spectrum + 2 * (self.has_sums + self.has_instances)
+        return 11 + self.spectrum + self.sums + 2 * self.has_instances
 
 
 class VertexStore:
@@ -79,8 +79,7 @@ class VertexStore:
         if not isinstance(hero_is_alone, tuple):
             mark |= dr.select(hero_is_alone, mi.UInt32(_HERO_IS_ALONE), 0)
         words = [*si.p, *d, *pi.prim_uv, _as_float(pi.prim_index), _as_float(pi.shape), *β]
-        if self.layout.has_sums:
-            words += [sums.dVCM, sums.dVC]
+        words += [sums.dVCM, sums.dVC, *sums.by_camera][: self.layout.sums]
         words += [_as_float(mark)]
         if self.layout.has_instances:
             words += [_as_float(pi.instance), _as_float(pi.shape_index)]
@@ -159,9 +158,12 @@ class LightVertices:
         w = dr.gather(
             mi.ArrayXf, self._words, slot, active, shape=(layout.words, dr.width(slot))
         )
-        sums, rest = Sums(mi.Float(0), mi.Float(0)), 10 + n
-        if layout.has_sums:
-            sums, rest = Sums(w[rest], w[rest + 1]), rest + 2
+        rest = 10 + n + layout.sums
+        sums = Sums(mi.Float(0), mi.Float(0))
+        if layout.sums > 0:
+            sums = Sums(w[10 + n], w[11 + n])
+        if layout.sums > 2:
+            sums.by_camera = mi.Vector2f(w[12 + n], w[13 + n])
         mark = dr.reinterpret_array(mi.UInt32, w[rest])
         instance, shape_index = None, None
         if layout.has_instances:

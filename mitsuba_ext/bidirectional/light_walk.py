@@ -84,7 +84,9 @@ class LightWalk:
 
     def layout(self, scene: mi.Scene) -> Layout:
         """Of the stored vertices."""
-        return Layout.of(scene, self.sums is not None)
+        sums = self.sums
+        words = 0 if sums is None else 4 if sums.follows_camera else 2
+        return Layout.of(scene, words)
 
     def begin(
         self,
@@ -229,6 +231,7 @@ class LightWalk:
         return Sums(
             dr.select(is_first, paths.sums.dVCM, later.dVCM),
             dr.select(is_first, paths.sums.dVC, later.dVC),
+            later.by_camera,
         )
 
     def _scatter(self, heroes, paths, bsdf, si, bs, weight, sums, active):
@@ -244,8 +247,9 @@ class LightWalk:
         weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
         if self.sums is not None:
             sums = self.sums.leave(
-                sums, geometric_cosine(si, bs.wo), bs.pdf, reverse_pdf, is_delta
-            )
+                sums, geometric_cosine(si, bs.wo), bs.pdf, reverse_pdf, is_delta,
+                paths.depth == 1,
+            )  # fmt: skip
         return dr.select(active, weight, 0), sums, hero_count, hero_is_alone
 
     def _survival(self, paths, si, bsdf, β, sampling_weight, depth, hero_is_alone, active):

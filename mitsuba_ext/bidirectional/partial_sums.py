@@ -29,10 +29,14 @@ class Sums:
             last two; at the first vertex, times the ratio of the densities with which a connection
             and emission find the point of the light.
         dVC: The sum over the techniques that connect earlier vertices of the subpath.
+        by_camera: For light paths, from the second vertex on, where :class:`PartialSums` follows
+            it: the two terms of dVC in which a camera path finds the whole path (s = 0 and 1), not
+            raised to the exponent.
     """
 
     dVCM: mi.Float
     dVC: mi.Float
+    by_camera: mi.Vector2f | tuple[()] = ()
 
 
 class PartialSums:
@@ -45,18 +49,28 @@ class PartialSums:
             connected (s, t ≥ 2), on average, in units of all of them. All other techniques are used
             once for each pair of paths.
         exponent: 1 for the balance heuristic, 2 for the power heuristic.
+        follows_camera: Is ``by_camera`` of :class:`Sums` wanted?
     """
 
     def __init__(
-        self, next_event: EmitterSampling, connections: mi.Float | float = 1.0, exponent: int = 2
+        self,
+        next_event: EmitterSampling,
+        connections: mi.Float | float = 1.0,
+        exponent: int = 2,
+        follows_camera: bool = False,
     ) -> None:
         self._next_event, self.exponent = next_event, exponent
+        self.follows_camera = follows_camera
         #: The count of the connections, in weights.
         self.count = self.ratio(mi.Float(connections))
 
     def ratio(self, x: mi.Float) -> mi.Float:
         """A ratio of densities, raised to the exponent."""
         return dr.square(x) if self.exponent == 2 else x
+
+    def root(self, ratio: mi.Float) -> mi.Float:
+        """The inverse of :meth:`ratio`."""
+        return dr.sqrt(ratio) if self.exponent == 2 else ratio
 
     def first(
         self, scene: mi.Scene, emitted: EmittedRay, si: mi.SurfaceInteraction3f, active: mi.Bool
@@ -73,6 +87,7 @@ class PartialSums:
         return Sums(
             self.ratio(connected * inverse),
             dr.select(is_delta, 0, self.ratio(leaves * inverse)),
+            dr.zeros(mi.Vector2f, dr.width(inverse)) if self.follows_camera else (),
         )
 
     def others(self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float) -> mi.Float:
@@ -118,7 +133,9 @@ class PartialSums:
         """From a vertex to the next one, ``si``, at this distance: solid angles become areas."""
         inverse = dr.rcp(dr.maximum(_cosine(si), 1e-12))
         return Sums(
-            sums.dVCM * self.ratio(squared_distance * inverse), sums.dVC * self.ratio(inverse)
+            sums.dVCM * self.ratio(squared_distance * inverse),
+            sums.dVC * self.ratio(inverse),
+            () if isinstance(sums.by_camera, tuple) else sums.by_camera * inverse,
         )
 
     def leave(
@@ -128,6 +145,7 @@ class PartialSums:
         pdf: mi.Float,
         reverse_pdf: mi.Float,
         is_delta: mi.Bool,
+        is_first: mi.Bool | bool = False,
     ) -> Sums:
         """A direction was sampled.
 
@@ -136,6 +154,7 @@ class PartialSums:
             pdf, reverse_pdf: Its density, and that of the opposite way through the vertex, per
                 solid angle.
             is_delta: Did a discrete distribution choose it? Then no other technique connects here.
+            is_first: Is this the first vertex after the light?
         """
         leaves = cosine * dr.select(pdf > 0, dr.rcp(pdf), 0)
         smooth = self.others(leaves, sums, reverse_pdf)
@@ -144,6 +163,27 @@ class PartialSums:
         return Sums(
             dr.select(is_delta, 0, dVCM),
             dr.select(is_delta, sums.dVC * self.ratio(cosine), smooth),
+            self._leave_by_camera(sums, cosine, leaves, reverse_pdf, is_delta, is_first),
+        )
+
+    def by_camera(
+        self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float, is_first: mi.Bool | bool
+    ) -> mi.Vector2f | tuple[()]:
+        """The ratios of the densities with which a camera path finds everything by itself (s = 0
+        and 1) to that of connecting to a light path's last vertex, as :meth:`others`, but not
+        raised to the exponent; ``()`` where they are not followed."""
+        if isinstance(sums.by_camera, tuple):
+            return ()
+        first = mi.Vector2f(reverse_pdf * self.root(sums.dVC), self.root(sums.dVCM))
+        return density * dr.select(is_first, first, reverse_pdf * sums.by_camera)
+
+    def _leave_by_camera(self, sums, cosine, leaves, reverse_pdf, is_delta, is_first):
+        smooth = self.by_camera(leaves, sums, reverse_pdf, is_first)
+        if isinstance(smooth, tuple):
+            return ()
+        hit = mi.Vector2f(self.root(sums.dVC), 0)
+        return dr.select(
+            is_delta, dr.select(is_first, hit, sums.by_camera) * cosine, smooth
         )
 
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 from ..movers import movers
 from ..transport.estimator import CameraRays, Sample
 from ..transport.numbers import Numbers
+from ..transport.observer import Observers
 from ..transport.walk import Walk
 from .connections import LightSubpaths
 from .emission import LightEmission
@@ -18,6 +19,7 @@ from .light_vertices import LightVertices, VertexCache
 from .light_walk import LightWalk
 from .partial_sums import PartialSums
 from .sensor import ConnectableSensor
+from .technique_observer import TechniqueObserver
 from .weights import BidirectionalWeights
 
 #: Vertices of a light path, about, for MIS weights. The true number would make the weights depend
@@ -35,24 +37,32 @@ class BidirectionalPathTracer:
         emission: Where light paths begin.
         sensor: What light paths are connected to; ``None`` if they are not.
         connections: To how many vertices of light paths each vertex of a camera path is connected.
+        observer: Is told what each technique finds, by the walk as well.
     """
 
     walk: Walk
     emission: LightEmission
     sensor: ConnectableSensor | None
     connections: int
+    observer: TechniqueObserver | None = None
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
     ) -> Sample:
         walk = self.walk
         count = dr.opaque(mi.Float, self.connections / _VERTICES)
-        sums = PartialSums(walk.next_event, count)
+        observer, follows_camera = self.observer, False
+        if observer is not None:
+            observer.start(rays)
+            walk = replace(walk, observer=Observers([walk.observer, observer]))
+            follows_camera = observer.compares_with_camera
+        sums = PartialSums(walk.next_event, count, follows_camera=follows_camera)
         image = None
         if self.sensor is not None:
             image = LightImage(
-                scene, self.sensor, sampler, rays, sums, walk.query, walk.hide_emitters
-            )
+                scene, self.sensor, sampler, rays, sums, walk.query, walk.hide_emitters,
+                observer,
+            )  # fmt: skip
         light_walk = LightWalk(
             self.emission, walk.max_depth, walk.rr_depth, sums, query=walk.query
         )
@@ -75,12 +85,15 @@ class BidirectionalPathTracer:
             subpaths = LightSubpaths(
                 scene, rounds[0] if len(rounds) == 1 else VertexCache(rounds, lanes), sums,
                 walk.query, self.connections, walk.max_depth,
-                mi.is_spectral or bool(movers(scene)),
+                mi.is_spectral or bool(movers(scene)), observer,
             )  # fmt: skip
         sample = replace(walk, weights=weights, subpaths=subpaths)(scene, sampler, rays, active)
-        return replace(
-            sample,
-            splats=image.splats if image else [],
-            scatter_count=sample.scatter_count + paths.scatter_count,
-            shadow_count=sample.shadow_count + (image.shadow_count if image else 0),
-        )
+        whole = replace(sample, scatter_count=sample.scatter_count + paths.scatter_count)
+        if image is not None:
+            # Counted as if the first lane had traced them
+            is_first = dr.arange(mi.UInt32, lanes) == 0
+            whole.splats = image.splats
+            whole.shadow_count = sample.shadow_count + dr.select(is_first, image.shadow_count, 0)
+        if observer is not None:
+            observer.traced(sample, whole)
+        return whole

@@ -11,6 +11,7 @@ from .camera_numbers import PURPOSES, WeightedNumbers
 from .connections import Connections
 from .decision_parameters import DecisionParameters, ParameterReader
 from .directions import Guided
+from .light_paths import LightPathsWhereTheyPay
 from .next_event import METHODS, LearnedLights, SpatialLights
 from .roulette import GuidedRoulette
 from .shadow_test import RejectedShadowRays
@@ -29,6 +30,13 @@ SLOTS: dict[str, dict[str, _Maker | None]] = {
     **{slot: {"sampler": None} for slot in PURPOSES},
 }
 
+#: The same of bidirectional integrators, which have some of the others as well.
+BIDIRECTIONAL_SLOTS: dict[str, dict[str, _Maker | None]] = {
+    "light_paths": {"always": None, "auto": lambda read: LightPathsWhereTheyPay()},
+}
+
+_ALL_SLOTS = {**SLOTS, **BIDIRECTIONAL_SLOTS}
+
 #: What can be nested into a slot, of this package.
 _PLUGINS: tuple[type[DecisionParameters], ...] = (
     Guided, LearnedLights, SpatialLights, Connections, RejectedShadowRays, WeightedNumbers,
@@ -42,7 +50,7 @@ def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameter
     Raises:
         TypeError, ValueError: It is none of these, or belongs into another slot.
     """
-    words = SLOTS[slot]
+    words = _ALL_SLOTS[slot]
     value = props.get(slot, next(iter(words)))
     parameters = getattr(value, "decision_parameters", None)
     if parameters is not None:
@@ -63,7 +71,8 @@ def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameter
 def _accepted(slot: str, value: object) -> str:
     """What to say of a value that a slot does not take."""
     found = value.class_name() if isinstance(value, mi.Object) else repr(value)
-    words = [*SLOTS[slot], *(PATTERNS if slot in PURPOSES else ())]
+    words = [*_ALL_SLOTS[slot], *(PATTERNS if slot in PURPOSES else ())]
     number = "a number, " if slot == "connections" else ""
-    nested = " or ".join(f'"{kind.name}"' for kind in _PLUGINS if slot in kind.slots)
-    return f"{found}; it must be one of {', '.join(words)}, {number}or a nested plugin: {nested}"
+    plugins = [f'"{kind.name}"' for kind in _PLUGINS if slot in kind.slots]
+    nested = f", {number}or a nested plugin: {' or '.join(plugins)}" if plugins else ""
+    return f"{found}; it must be one of {', '.join(words)}{nested}"

@@ -27,7 +27,7 @@ from . import learned_file
 from .camera_numbers import PURPOSES, samples_per_set
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 from .schedule import Schedule, pilot_samples
-from .slots import SLOTS
+from .slots import BIDIRECTIONAL_SLOTS, SLOTS
 
 
 class WalkIntegrator(StagedIntegrator):
@@ -92,7 +92,8 @@ class WalkIntegrator(StagedIntegrator):
         Raises:
             TypeError, ValueError: Two decisions do not go together, or the parameter is wrong.
         """
-        self.slots = {slot: slots[slot] for slot in SLOTS if slots.get(slot) is not None}
+        known = (*SLOTS, *BIDIRECTIONAL_SLOTS)
+        self.slots = {slot: slots[slot] for slot in known if slots.get(slot) is not None}
         for parameters in self.slots.values():
             parameters.check_together(self.name, self.slots)
         wishes = [p.pilot_spp for p in self.slots.values() if p.pilot_spp]
@@ -115,11 +116,22 @@ class WalkIntegrator(StagedIntegrator):
         given = {key: value for key, value in learning.items() if value not in (None, "")}
         return {**self._described_slots(), **given}
 
+    def check_target(self, key: str, file: str) -> None:
+        """
+        Raises:
+            ValueError: The file that the parameter ``key`` names cannot be written.
+        """
+        try:
+            check_target(Path(file))
+        except InputError as error:
+            raise ValueError(f'"{self.name}": "{key}": {error}') from None
+
     # ---- What the render asks for ----
 
     def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
         self.learners = {}
-        self._check_learned_file()
+        if self.save_learned:
+            self.check_target("save_learned", self.save_learned)
         if self.max_depth < 2 or self.load_learned:
             return []
         return pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
@@ -203,17 +215,6 @@ class WalkIntegrator(StagedIntegrator):
 
     def _described_slots(self) -> dict[str, str]:
         return {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
-
-    def _check_learned_file(self) -> None:
-        """
-        Raises:
-            ValueError: What is going to be learned cannot be written.
-        """
-        if self.save_learned:
-            try:
-                check_target(Path(self.save_learned))
-            except InputError as error:
-                raise ValueError(f'"{self.name}": "save_learned": {error}') from None
 
     def _query(self, scene: mi.Scene) -> SceneQuery:
         """How rays meet ``scene``. The output variables are Mitsuba's, which knows no motion."""

@@ -62,9 +62,19 @@ class PixelEstimates:
         return total / np.maximum(count, 1)
 
     def _scale(self, means: np.ndarray) -> mi.Float:
-        # An image that is black all over has no scale: all that is expected there is 0
-        square = means**2 + _FLOOR * (self._sum.sum() / max(self._count.sum(), 1)) ** 2
-        return mi.Float((1 / np.sqrt(np.maximum(square, 1e-30))).astype(np.float32))
+        mean = self._sum.sum() / max(self._count.sum(), 1)
+        return mi.Float(_inverse(means, mean).astype(np.float32))
+
+
+def relative_scale(image: np.ndarray) -> np.ndarray:
+    """1 / radiance of each pixel of an image, [y, x], and its neighbours."""
+    means = _box_sums(image) / _box_sums(np.ones_like(image))
+    return _inverse(means, image.mean())
+
+
+def _inverse(means: np.ndarray, mean: float) -> np.ndarray:
+    # An image that is black all over has no scale: all that is expected there is 0
+    return 1 / np.sqrt(np.maximum(means**2 + _FLOOR * mean**2, 1e-30))
 
 
 def _padded(x: np.ndarray, size: int) -> np.ndarray:

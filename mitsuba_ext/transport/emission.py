@@ -18,10 +18,10 @@ def emission(
     state: Any,
     weights: Weights,
     count: mi.Float | float = 1.0,
-) -> tuple[mi.Spectrum, mi.DirectionSample3f, mi.Float]:
+) -> tuple[mi.Spectrum, mi.Float, mi.DirectionSample3f, mi.Float]:
     """The radiance that ``si`` (or the environment, if nothing was hit) emits towards the vertex
-    before it, times the MIS weight of having been found by scattering; the direction from there,
-    and the density with which connections find it (0 where they cannot).
+    before it, times the MIS weight of having been found by scattering; this weight; the direction
+    from there, and the density with which connections find it (0 where they cannot).
 
     Parameters:
         next_event, state: The decision whose connections could have found the light as well, and
@@ -34,7 +34,7 @@ def emission(
     is_connectable = ~arrival.is_delta & (ds.emitter != None)  # noqa: E711
     pdf = next_event.density(state, scene, arrival.ref, si, ds, is_connectable)
     weight = weights.emission(scene, si, ds, path, count * pdf)
-    return ds.emitter.eval(si, arrival.pdf > 0) * weight, ds, pdf
+    return ds.emitter.eval(si, arrival.pdf > 0) * weight, weight, ds, pdf
 
 
 def can_be_hit(scene: mi.Scene) -> bool:

@@ -25,12 +25,13 @@ class Observer:
         path: PathState,
         ds: mi.DirectionSample3f,
         value: mi.Spectrum,
+        mis: mi.Float,
         pdf: mi.Float,
         active: mi.Bool,
     ) -> None:
         """``path`` may have run into a light, in the direction ``ds`` from its last vertex, and
-        gains ``value``, its MIS weight included. ``pdf`` is the density with which a connection
-        finds this direction; 0 where none can."""
+        gains ``value``, the MIS weight ``mis`` included. ``pdf`` is the density with which a
+        connection finds this direction; 0 where none can."""
 
     def vertex(self, vertex: Vertex, active: mi.Bool) -> None:
         """A path is about to connect ``vertex`` to lights."""

@@ -126,11 +126,13 @@ class Walk:
             # ----- How much does this vertex emit towards the previous one? -----
             if dr.hint(can_hit_emitters, mode="scalar"):
                 count = self.connections.weight(path.depth - 1)
-                emitted, hit, light_pdf = emission(
+                emitted, mis, hit, light_pdf = emission(
                     scene, si, path, self.next_event, next_event_state, self.weights, count
                 )
                 L = dr.fma(path.β, emitted, L)
-                self.observer.emission(path, hit, path.β * emitted, light_pdf, active)
+                self.observer.emission(
+                    path, hit, path.β * emitted, mis, light_pdf, active
+                )
 
             # ----- Should we continue tracing to reach one more vertex? -----
             active_next = (path.depth + 1 < self.max_depth) & si.is_valid()

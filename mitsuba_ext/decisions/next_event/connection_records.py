@@ -70,7 +70,7 @@ class ConnectionRecords(Observer):
         self._total = dr.zeros(mi.Float, self._lanes)
         dr.eval(self._row, self._square, self._more, self._total)
 
-    def emission(self, path, ds, value, pdf, active) -> None:
+    def emission(self, path, ds, value, mis, pdf, active) -> None:
         # A number that is not finite would hide those of the others in the sum
         active = active & self._is_recorded & (pdf > 0) & (path.arrival.pdf > 0)
         as_path = self._scene.pdf_emitter_direction(path.arrival.ref, ds, active)
