@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import area, diffuse, film, rectangle, stage
-from statistical import REFERENCE_SEEDS, SEEDS, THRESHOLD, batches, z_welch
+from statistical import REFERENCE_SEEDS, SEEDS, THRESHOLD, z_welch
 from test_light_tracer import MANY_SEEDS, T, below_the_lamp
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -54,26 +54,29 @@ def test_images_do_not_change_the_render(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_each_technique_finds_all_paths_of_a_length(tmp_path: Path) -> None:
-    """Without weights: in this scene, each technique can make every path."""
-    scene, seeds = _scene(), SEEDS[:MANY_SEEDS]
-    plain: dict[tuple[int, int], list] = {}
-    for seed in seeds:
-        _, integrator = _render(scene, seed, 256, technique_images=str(tmp_path / "all.exr"))
-        for technique, (_weighted, image) in integrator.techniques.images(256).items():
-            plain.setdefault(technique, []).append(image.mean())
+    """Without weights: in this scene, each technique can make every path. Together, with weights,
+    they make the image of ``path`` (``test_bdpt.py``)."""
+    scene, file = _scene(), str(tmp_path / "all.exr")
+
+    def means(seeds: range) -> dict[tuple[int, int], np.ndarray]:
+        """By technique: [seed, weighted or plain]."""
+        found: dict[tuple[int, int], list] = {}
+        for seed in seeds:
+            _, integrator = _render(scene, seed, 512, technique_images=file)
+            for technique, images in integrator.techniques.images(512).items():
+                found.setdefault(technique, []).append([image.mean() for image in images])
+        return {technique: np.array(values) for technique, values in found.items()}
+
+    found, others = means(SEEDS[:MANY_SEEDS]), means(REFERENCE_SEEDS[:MANY_SEEDS])
     for k in (2, 3, 4):
-        expected = [
-            batches(scene, mi.load_dict({"type": "path", "max_depth": depth}), 512, seeds)
-            for depth, seeds in ((k, REFERENCE_SEEDS[:MANY_SEEDS]), (k - 1, range(2001, 2009)))
-        ]
-        longer, shorter = (x[..., :3].mean(axis=(1, 2, 3)) for x in expected)
-        reference = longer - shorter[: len(longer)]
+        expected = sum(others[s, k + 1 - s][:, 0] for s in range(k + 1))
         for s in range(k + 1):
-            found = np.array(plain[s, k + 1 - s])
-            z = float(z_welch(found[:, None], reference[:, None])[0])
-            assert abs(z) < THRESHOLD, (s, k + 1 - s, found.mean() / reference.mean())
-            error = np.hypot(*(x.std() / len(x) ** 0.5 for x in (found, reference)))
-            assert error < 0.02 * reference.mean(), "known badly"
+            plain = found[s, k + 1 - s][:, 1]
+            z = float(z_welch(plain[:, None], expected[:, None])[0])
+            assert abs(z) < THRESHOLD, (s, k + 1 - s, plain.mean() / expected.mean())
+            error = np.hypot(*(x.std() / len(x) ** 0.5 for x in (plain, expected)))
+            # Vertices that are joined may be close to each other: such values are rare and large
+            assert error < 0.1 * expected.mean(), (s, k + 1 - s, "known badly")
 
 
 def test_what_has_no_effect_beside_them_is_refused(tmp_path: Path) -> None:
