@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -130,6 +131,19 @@ def test_shadow_rays_are_counted() -> None:
     batches(mi.load_dict(stage(camera=below_the_lamp())), integrator, 16, [1])
     rays = integrator.statistics.rays
     assert rays["camera"] < rays["shadow"] < 9 * rays["camera"]
+
+
+def test_a_pass_traces_each_walk_once() -> None:
+    """What is read while the camera walk waits for its evaluation would evaluate it twice."""
+    scene = mi.load_dict(stage(camera=below_the_lamp(film=film(32, 32))))
+    lanes = 16 * 32 * 32
+    bdpt(8).render(scene, spp=16)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        bdpt(8).render(scene, spp=16, seed=1)
+        kernels = [k for k in dr.kernel_history() if k.get("operation_count", 0) > 500]
+    # Emission, the first and the other rounds of the light walk, the camera walk
+    assert len({k["hash"] for k in kernels if k["size"] == lanes}) == 4
 
 
 def test_the_same_seed_gives_the_same_image() -> None:

@@ -74,23 +74,22 @@ class LightImage:
         self._found.append(found)
         self.shadow_count += dr.sum(tested)
 
-    @property
     def splats(self) -> list[Splats]:
-        """What was found, as one set: however many there were, the film adds it by the same
-        kernel."""
+        """What was found, as one set: however many there were, the film adds it by the same kernel.
+        It evaluates the result: whoever read it later would evaluate what waits until then."""
         if len(self._found) < 2:
             return self._found
         wavelengths = None
         if self._found[0].wavelengths is not None:
             wavelengths = _one_after_the_other([s.wavelengths for s in self._found])
-        return [
-            Splats(
-                _one_after_the_other([s.value for s in self._found]),
-                _one_after_the_other([s.position for s in self._found]),
-                wavelengths,
-                dr.concat([s.active for s in self._found]),
-            )
-        ]
+        joined = Splats(
+            _one_after_the_other([s.value for s in self._found]),
+            _one_after_the_other([s.position for s in self._found]),
+            wavelengths,
+            dr.concat([s.active for s in self._found]),
+        )
+        dr.eval(joined)
+        return [joined]
 
     def _connect(self, vertices: LightVertices) -> tuple[Splats, mi.UInt32]:
         """The splats, and the shadow rays of each vertex."""

@@ -47,7 +47,7 @@ class LightTracer:
         paths = walk.finish(scene, sampler, paths, image.add)
         return replace(
             sample,
-            splats=image.splats,
+            splats=image.splats(),
             scatter_count=sample.scatter_count + paths.scatter_count,
             shadow_count=image.shadow_count,
         )

@@ -79,6 +79,7 @@ class BidirectionalPathTracer:
             rounds.append(VertexCache([vertices], lanes))
 
         paths = light_walk.finish(scene, sampler, paths, take)
+        splats = image.splats() if image is not None else []
         weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)
         subpaths = None
         if rounds:
@@ -88,12 +89,15 @@ class BidirectionalPathTracer:
                 mi.is_spectral or bool(movers(scene)), observer,
             )  # fmt: skip
         sample = replace(walk, weights=weights, subpaths=subpaths)(scene, sampler, rays, active)
-        whole = replace(sample, scatter_count=sample.scatter_count + paths.scatter_count)
+        shadow_count = sample.shadow_count
         if image is not None:
             # Counted as if the first lane had traced them
             is_first = dr.arange(mi.UInt32, lanes) == 0
-            whole.splats = image.splats
-            whole.shadow_count = sample.shadow_count + dr.select(is_first, image.shadow_count, 0)
+            shadow_count = shadow_count + dr.select(is_first, image.shadow_count, 0)
+        scatter_count = sample.scatter_count + paths.scatter_count
+        whole = replace(
+            sample, splats=splats, scatter_count=scatter_count, shadow_count=shadow_count
+        )
         if observer is not None:
             observer.traced(sample, whole)
         return whole
