@@ -9,7 +9,7 @@ import pytest
 from statistical import load, one_thread
 
 from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.light_vertices import LightVertices, VertexCache
+from mitsuba_ext.bidirectional.light_vertices import LightVertices, PackedVertices, VertexCache
 from mitsuba_ext.bidirectional.light_walk import LightWalk
 from mitsuba_ext.bidirectional.partial_sums import PartialSums
 from mitsuba_ext.transport.path_decisions import EmitterSampling
@@ -48,7 +48,7 @@ def test_a_path_has_the_same_vertices_however_many_are_stored_at_a_time() -> Non
         parts = _rounds(scene, 2)
         assert len(parts) > 2
         # Joined at once, or each round by itself first
-        for rounds in (parts, [VertexCache([part], LANES) for part in _rounds(scene, 2)]):
+        for rounds in (parts, [PackedVertices(part) for part in _rounds(scene, 2)]):
             joined = VertexCache(rounds, LANES)
             assert joined.count == expected.count
             for a, b in zip(_words(joined), _words(expected)):

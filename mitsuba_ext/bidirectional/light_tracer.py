@@ -41,13 +41,14 @@ class LightTracer:
             scene, self.sensor, sampler, rays, query=walk.query,
             hides_emitters=self.directly.hide_emitters,
         )  # fmt: skip
-        paths = walk.begin(scene, sampler, rays.ray.time, rays.ray.wavelengths, active)
         # What the rest of the pass reads again
-        dr.eval(paths, sample, rays.ray.wavelengths)
-        paths = walk.finish(scene, sampler, paths, image.add)
+        dr.schedule(sample, rays.ray.wavelengths)
+        scatter_count = walk.run(
+            scene, sampler, rays.ray.time, rays.ray.wavelengths, active, image.add
+        )
         return replace(
             sample,
             splats=image.splats(),
-            scatter_count=sample.scatter_count + paths.scatter_count,
+            scatter_count=sample.scatter_count + scatter_count,
             shadow_count=image.shadow_count,
         )

@@ -208,9 +208,38 @@ class LightVertices:
         return values if dr.width(values) == 1 else dr.gather(type(values), values, lane, active)
 
 
-class VertexCache(LightVertices):
-    """The vertices of some rounds of a light walk, without gaps: those of a path follow each other.
-    Their places in the store are their numbers.
+class PackedVertices(LightVertices):
+    """Vertices without the gaps of a store, which take most of the memory. Their places are their
+    numbers.
+
+    Parameters:
+        vertices: What is packed. Their memory is given back.
+    """
+
+    def __init__(self, vertices: LightVertices) -> None:
+        self._share_paths_of(vertices)
+        self.count, words = vertices.count, self._layout.words
+        self._lane = vertices._lane_of(vertices.slot, mi.Bool(True))
+        packet = dr.gather(
+            mi.ArrayXf, vertices._words, vertices.slot, shape=(words, self.count)
+        )
+        self._words = dr.empty(mi.Float, self.count * words)
+        dr.scatter(self._words, packet, dr.arange(mi.UInt32, self.count))
+        dr.eval(self._words, self._lane)
+        vertices._words = vertices._lane = None
+        self.bytes = self.count * (4 * words + 4)
+
+    def _share_paths_of(self, vertices: LightVertices) -> None:
+        self._layout, self._disperses, self.stride = vertices._layout, vertices._disperses, 1
+        self._time, self._wavelengths = vertices._time, vertices._wavelengths
+
+    @property
+    def slot(self) -> mi.UInt32:
+        return dr.arange(mi.UInt32, self.count)
+
+
+class VertexCache(PackedVertices):
+    """The vertices of some rounds of a light walk: those of a path follow each other.
 
     Parameters:
         rounds: The vertices of each round. Their memory is given back.
@@ -221,25 +250,21 @@ class VertexCache(LightVertices):
     """
 
     def __init__(self, rounds: list[LightVertices], lanes: int) -> None:
-        last = rounds[-1]
-        self._layout, self._disperses, self.stride = last._layout, last._disperses, 1
-        self._time, self._wavelengths = last._time, last._wavelengths
-        numbers = []
-        for vertices in rounds:
-            number = dr.zeros(mi.UInt32, lanes)
-            lane = vertices._lane_of(vertices.slot, mi.Bool(True))
-            dr.scatter_add(number, mi.UInt32(1), lane)
-            numbers.append(number)
+        if len(rounds) == 1:
+            super().__init__(rounds[0])
+            self.number = _numbers(self._lane, lanes)
+            self.first = dr.cumsum(self.number) - self.number
+            return
+        self._share_paths_of(rounds[-1])
+        owners = [v._lane_of(v.slot, mi.Bool(True)) for v in rounds]
+        numbers = [_numbers(lane, lanes) for lane in owners]
         self.number = sum(numbers[1:], numbers[0])
         self.first = dr.cumsum(self.number) - self.number
-        self.count = sum(vertices.count for vertices in rounds)
-        self.slot = dr.arange(mi.UInt32, self.count)
-        words = self._layout.words
-        self._words = dr.empty(mi.Float, max(1, self.count) * words)
-        self._lane = dr.empty(mi.UInt32, max(1, self.count))
+        self.count, words = sum(vertices.count for vertices in rounds), self._layout.words
+        self._words = dr.empty(mi.Float, self.count * words)
+        self._lane = dr.empty(mi.UInt32, self.count)
         before = mi.UInt32(self.first)
-        for vertices, number in zip(rounds, numbers):
-            lane = vertices._lane_of(vertices.slot, mi.Bool(True))
+        for vertices, lane, number in zip(rounds, owners, numbers):
             # The first of this path in this round
             begin = dr.cumsum(number) - number
             index = dr.arange(mi.UInt32, vertices.count)
@@ -252,7 +277,14 @@ class VertexCache(LightVertices):
             before = before + number
             dr.eval(self._words, self._lane, before)
             vertices._words = vertices._lane = None
-        self.bytes = self.count * (4 * words + 8)
+        self.bytes = self.count * (4 * words + 4) + 8 * lanes
+
+
+def _numbers(lane: mi.UInt32, lanes: int) -> mi.UInt32:
+    """How many vertices each path has."""
+    number = dr.zeros(mi.UInt32, lanes)
+    dr.scatter_add(number, mi.UInt32(1), lane)
+    return number
 
 
 def _as_float(value: Any) -> mi.Float:

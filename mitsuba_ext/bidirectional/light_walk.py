@@ -15,12 +15,13 @@ from ..transport.numbers import Numbers
 from ..transport.path_decisions import Roulette, SceneQuery
 from ..transport.vertex import Arrival, PathState, Vertex
 from .emission import LightEmission
-from .light_vertices import Layout, LightVertices, VertexStore
+from .light_vertices import Layout, LightVertices, VertexStore, bytes_per_vertex
 from .partial_sums import PartialSums, Sums
 from .scattering import delta_correction, evaluate, geometric_cosine
 
-#: Vertices of a path that are stored at a time. Most paths have fewer.
-STRIDE = 4
+#: Vertices of a path that are stored at a time. Most paths have fewer. Films of many pixels store
+#: fewer at a time: one sample of each pixel must fit into this memory.
+STRIDE, _STORE_BYTES = 4, 1 << 29
 
 #: Rounds of a path, at most: it has been stuck where nothing absorbs light.
 _MOST_ROUNDS = 1 << 12
@@ -60,7 +61,7 @@ class LightWalk:
     """Traces light paths: the mirror image of :class:`~mitsuba_ext.transport.walk.Walk`.
 
     Its vertices come in rounds: :meth:`begin` emits rays, each :meth:`advance` walks so many
-    vertices on and returns them; :meth:`finish` walks to the ends of all paths.
+    vertices on and returns them; :meth:`run` walks to the ends of all paths.
 
     A path draws 6 numbers for the ray and 4 for each bounce.
 
@@ -125,7 +126,7 @@ class LightWalk:
     def advance(
         self, scene: mi.Scene, numbers: Numbers, paths: LightPaths, stride: int
     ) -> tuple[LightVertices, LightPaths]:
-        """Walks up to ``stride`` vertices on. It evaluates ``paths``, so that all rounds share a
+        """Walks up to ``stride`` vertices on. It evaluates ``paths``, so that rounds share a
         kernel.
 
         Returns:
@@ -147,22 +148,33 @@ class LightWalk:
         disperses = not isinstance(paths.hero_is_alone, tuple)
         return LightVertices(store, time, wavelengths, disperses), paths
 
-    def finish(
+    def run(
         self,
         scene: mi.Scene,
         numbers: Numbers,
-        paths: LightPaths,
+        time: mi.Float,
+        wavelengths: mi.Spectrum,
+        active: mi.Bool,
         take: Callable[[LightVertices], None],
-    ) -> LightPaths:
-        """Walks on until no path is left. ``take`` is given the vertices of each round, unless
-        there is none: ``STRIDE`` of a path at most."""
+    ) -> mi.UInt32:
+        """Traces light paths to their ends. ``take`` is given the vertices of each round, unless
+        there is none: ``STRIDE`` of a path at most. The other parameters are those of
+        :meth:`begin`.
+
+        Returns:
+            Rays traced in directions that a BSDF chose, by each path.
+        """
+        paths = self.begin(scene, numbers, time, wavelengths, active)
+        dr.eval(paths)
+        bytes_per_place = dr.width(paths.active) * bytes_per_vertex(self.layout(scene))
+        stride = min(STRIDE, max(1, _STORE_BYTES // bytes_per_place))
         for _ in range(_MOST_ROUNDS):
-            vertices, paths = self.advance(scene, numbers, paths, STRIDE)
+            vertices, paths = self.advance(scene, numbers, paths, stride)
             if vertices.count > 0:
                 take(vertices)
             if not dr.any(paths.active)[0]:
                 break
-        return paths
+        return paths.scatter_count
 
     @dr.syntax
     def _trace(self, scene, numbers, paths, store) -> tuple[Numbers, LightPaths]:

@@ -15,7 +15,7 @@ from ..transport.walk import Walk
 from .connections import LightSubpaths
 from .emission import LightEmission
 from .light_image import LightImage
-from .light_vertices import LightVertices, VertexCache
+from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
 from .partial_sums import PartialSums
 from .sensor import ConnectableSensor
@@ -66,25 +66,25 @@ class BidirectionalPathTracer:
         light_walk = LightWalk(
             self.emission, walk.max_depth, walk.rr_depth, sums, query=walk.query
         )
-        paths = light_walk.begin(scene, sampler, rays.ray.time, rays.ray.wavelengths, active)
         # What the rest of the pass reads again
-        dr.eval(paths, rays)
-        lanes = dr.width(paths.active)
-        rounds: list[VertexCache] = []
+        dr.schedule(rays)
+        lanes = dr.width(rays.ray)
+        rounds: list[LightVertices] = []
 
         def take(vertices: LightVertices) -> None:
             if image is not None:
                 image.add(vertices)
-            # Without the gaps, which take most of the memory
-            rounds.append(VertexCache([vertices], lanes))
+            rounds.append(PackedVertices(vertices))
 
-        paths = light_walk.finish(scene, sampler, paths, take)
+        scatter_count = light_walk.run(
+            scene, sampler, rays.ray.time, rays.ray.wavelengths, active, take
+        )
         splats = image.splats() if image is not None else []
         weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)
         subpaths = None
         if rounds:
             subpaths = LightSubpaths(
-                scene, rounds[0] if len(rounds) == 1 else VertexCache(rounds, lanes), sums,
+                scene, VertexCache(rounds, lanes), sums,
                 walk.query, self.connections, walk.max_depth,
                 mi.is_spectral or bool(movers(scene)), observer,
             )  # fmt: skip
@@ -94,7 +94,7 @@ class BidirectionalPathTracer:
             # Counted as if the first lane had traced them
             is_first = dr.arange(mi.UInt32, lanes) == 0
             shadow_count = shadow_count + dr.select(is_first, image.shadow_count, 0)
-        scatter_count = sample.scatter_count + paths.scatter_count
+        scatter_count += sample.scatter_count
         whole = replace(
             sample, splats=splats, scatter_count=scatter_count, shadow_count=shadow_count
         )
