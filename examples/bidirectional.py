@@ -1,4 +1,5 @@
-"""Compares ``path``, ``light_tracer`` and ``bdpt`` at equal samples, by variance and CPU time:
+"""Compares ``path``, ``light_tracer``, ``bdpt``, and ``bdpt`` with ``light_paths = auto`` (with its
+pilot) at equal samples, by variance and CPU time:
 
     .venv/bin/python examples/bidirectional.py caustic scenes/corridor.xml /somewhere/scene.xml
 
@@ -23,13 +24,19 @@ import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
 SCENES = Path(__file__).parents[1] / "scenes"
-INTEGRATORS = ("path", "light_tracer", "bdpt")
+INTEGRATORS = {
+    "path": {"type": "path"},
+    "light_tracer": {"type": "light_tracer"},
+    "bdpt": {"type": "bdpt"},
+    "auto": {"type": "bdpt", "light_paths": "auto"},
+}
 
 #: Share of the largest values that the error leaves out.
 TRIMMED = 0.001
 
 COLUMNS = ["scene", "`path`: seconds", "error", "`light_tracer`: time", "error", "efficiency"]
 COLUMNS += ["`bdpt`: time", "error", "efficiency", "all values", "mean"]
+COLUMNS += ["`auto`: time", "error", "efficiency"]
 
 
 def load(name: str, width: int, height: int) -> mi.Scene:
@@ -78,7 +85,8 @@ def main(names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tup
     for name in names:
         scene = load(name, *size)
         integrators = {
-            kind: mi.load_dict({"type": kind, "max_depth": max_depth}) for kind in INTEGRATORS
+            kind: mi.load_dict({**plugin, "max_depth": max_depth})
+            for kind, plugin in INTEGRATORS.items()
         }
         images: dict[str, list] = {kind: [] for kind in INTEGRATORS}
         seconds: dict[str, list] = {kind: [] for kind in INTEGRATORS}
@@ -106,11 +114,12 @@ def row(name: str, images: dict, seconds: dict, visible: np.ndarray) -> str:
     path = error(variances["path"].reshape(-1, 3), mean.reshape(-1, 3))
     cells = [Path(name).parent.name if Path(name).name == "scene.xml" else Path(name).stem]
     cells += [f"{np.median(seconds['path']):.1f}", f"{path:.2g}"]
-    for kind, pixels in (("light_tracer", visible), ("bdpt", everywhere)):
+    for kind, pixels in (("light_tracer", visible), ("bdpt", everywhere), ("auto", everywhere)):
         e = ratio(kind, pixels)
         cells += [f"{times[kind]:.2f}", f"{e:.2g}", f"{1 / e / times[kind]:.2g}"]
-    cells.append(f"{1 / ratio('bdpt', everywhere, 0.0) / times['bdpt']:.2g}")
-    cells.append(f"{means['path'].mean() / mean.mean():.3f}")
+        if kind == "bdpt":
+            cells.append(f"{1 / ratio(kind, pixels, 0.0) / times[kind]:.2g}")
+            cells.append(f"{means['path'].mean() / mean.mean():.3f}")
     return f"| {' | '.join(cells)} |"
 
 

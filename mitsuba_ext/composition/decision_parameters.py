@@ -113,6 +113,7 @@ class DecisionParameters:
         name: What a scene calls it: a plugin, or a word.
         slots: The slots of an integrator that it can fill.
         pilot_spp: Samples per pixel from which it would learn, by default; 0 if it does not learn.
+        pilot_paths: So many samples of the whole film are enough for it; 0 if it can use all.
         tries: Does what it learns in a first pilot make the next ones better?
         sample_cost: The time of a sample in units of that of a path, about.
     """
@@ -120,6 +121,7 @@ class DecisionParameters:
     name = ""
     slots: tuple[str, ...] = ()
     pilot_spp = 0
+    pilot_paths = 0
     tries = False
     sample_cost = 1
 

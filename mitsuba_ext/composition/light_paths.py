@@ -20,7 +20,7 @@ from .decision_parameters import DecisionParameters, Setting
 #: make equal seeds choose differently.
 _TIME_OF_A_RAY = 1.5
 
-#: Samples from which the choice is made, at least, unless the pilots have less.
+#: Samples from which the choice is made, unless the pilots have less.
 _ENOUGH = 1 << 16
 
 
@@ -37,7 +37,7 @@ class LightPathsWhereTheyPay(DecisionParameters):
 
     name = "auto"
     slots = ("light_paths",)
-    pilot_spp = 4
+    pilot_spp, pilot_paths = 8, _ENOUGH
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
         # Beams that leave a surface are found by light paths only

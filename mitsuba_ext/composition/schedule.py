@@ -46,6 +46,10 @@ def pilot_samples(
     learning = [p for p in slots.values() if p.pilot_spp and p.can_learn(scene, samples)]
     if not learning:
         return []
+    if all(parameters.pilot_paths for parameters in learning):
+        enough = max(parameters.pilot_paths for parameters in learning)
+        # Two of a pixel show their variance
+        samples = min(samples, max(2, -(-enough // pixel_count)))
     if samples < 3 or all(not parameters.tries for parameters in learning):
         return [samples]
     quarter = samples // 4 or 1
