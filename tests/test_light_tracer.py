@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hard_cases import area, bitmap, diffuse, film, lookat, rectangle, sensor, stage
 from statistical import (
+    MANY_SEEDS,
     REFERENCE_SEEDS,
     SEEDS,
     THRESHOLD,
@@ -20,9 +21,6 @@ from statistical import (
 )
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-#: A light path brings light to many pixels: their errors depend on each other.
-MANY_SEEDS = 8
 
 
 def T() -> mi.ScalarTransform4f:
