@@ -65,7 +65,7 @@ class LightTracerIntegrator(WalkIntegrator):
 
     Alpha and output variables are those of the camera rays. Participating media are ignored, as by
     :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized
-    variants, nor nesting in :monosp:`moment`.
+    variants, nor nesting in :monosp:`moment` and :monosp:`aov`.
 
     Source: J. Arvo, *Backward Ray Tracing*, SIGGRAPH course, 1986; E. Veach, *Robust Monte Carlo
     Methods for Light Transport Simulation*, PhD thesis, 1997, section 10.2 (t = 1); adjoint BSDFs:
@@ -122,7 +122,8 @@ class LightTracerIntegrator(WalkIntegrator):
     def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
         raise NotImplementedError(
             f'"{self.name}": light paths do not end where a ray begins: it cannot be nested in an '
-            f'integrator that asks for single samples, such as "moment"; "variance" can hold it'
+            f'integrator that asks for single samples, such as "moment" or "aov"; "variance" can '
+            f'hold it, and it has a parameter "aovs" of its own'
         )
 
     def _warn_of_hidden(self, scene: mi.Scene) -> None:

@@ -102,7 +102,9 @@ _UNLIKE_PATH = (
 _LIGHT_PATHS = tuple(case for case in HARD_CASES if case not in _UNLIKE_PATH)
 
 #: Behind mirrors, glass, masks and null surfaces, and on a film with a sampled border.
-_UNSEEN_FROM_LIGHTS = {"furnace_glass", "materials", "medium", "cropped_film"}
+_UNSEEN_FROM_LIGHTS = {
+    "furnace_glass", "furnace_isothermal", "materials", "medium", "cropped_film",
+}  # fmt: skip
 
 _SEVERAL_LIGHTS = ("delta_lights", "textured_two_sided_lights", "materials", "no_light")
 
@@ -239,7 +241,7 @@ TECHNIQUES: dict[str, Technique] = {
     # ``test_bdpt.py`` and ``test_light_tracer.py`` have emitters, materials and sensors
     "bdpt": Technique(
         "bdpt", is_plugin=True, makes_splats=True,
-        checks=Checks(["cornell_box"], furnaces=["furnace_lamps"], depths=[-1], cases=["no_light"]),
+        checks=Checks(["cornell_box"], cases=["no_light"]),
         thorough=Checks(
             ["mirrors_and_glass", "sunny_gloss", "window"], ["llvm_ad_spectral"], FURNACES,
             [2, -1], _LIGHT_PATHS,
@@ -247,7 +249,7 @@ TECHNIQUES: dict[str, Technique] = {
     ),
     "light_tracer": Technique(
         "light_tracer", is_plugin=True, makes_splats=True,
-        checks=Checks(furnaces=["furnace_lamps"], depths=[-1], cases=["no_light"]),
+        checks=Checks(cases=["no_light"]),
         thorough=Checks(
             ["rooms"], ["llvm_ad_spectral"],
             [name for name in FURNACES if name not in _UNSEEN_FROM_LIGHTS], [2, -1],

@@ -133,10 +133,17 @@ def test_the_same_seed_gives_the_same_image() -> None:
     np.testing.assert_allclose(first, second, rtol=1e-4, atol=1e-5 * first.mean())
 
 
-def test_it_cannot_be_nested_where_single_samples_are_asked_for() -> None:
-    moment = mi.load_dict({"type": "moment", "image": {"type": "bdpt"}})
-    with pytest.raises((NotImplementedError, RuntimeError), match="light paths"):
-        moment.render(mi.load_dict(stage()), spp=1)
+@pytest.mark.parametrize("shape", ["bsplinecurve", "sdfgrid"])
+def test_a_shape_whose_light_paths_cannot_leave_is_named(shape: str, tmp_path) -> None:
+    if shape == "sdfgrid":
+        values = np.linspace(-1, 1, 8, dtype=np.float32).reshape(2, 2, 2, 1)
+        lamp = {"type": shape, "grid": mi.TensorXf(values)}
+    else:
+        (tmp_path / "curve.txt").write_text("".join(f"{i} 0 3 0.1\n" for i in range(5)))
+        lamp = {"type": shape, "filename": str(tmp_path / "curve.txt")}
+    scene = mi.load_dict(stage(light={**lamp, "emitter": {"type": "area"}}))
+    with pytest.raises(NotImplementedError, match='"bdpt": .*give the light to a rectangle'):
+        bdpt().render(scene, spp=1)
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)

@@ -51,8 +51,9 @@ def test_every_furnace_is_in_the_table() -> None:
     [case for case in pairs("furnaces", "depths") if _has_answer(*case.values[:2])],
 )
 def test_furnace_has_the_exact_radiance(furnace: str, max_depth: int, name: str) -> None:
-    # Where nine of ten shadow rays are rejected, there is noise
+    # Where nine of ten shadow rays are rejected, there is noise; and where light paths miss things
     precision = 0.01 if TECHNIQUES[name].parameters.get("floor") else 0.002
+    precision = 0.02 if name == "light_tracer" else precision
     _check(furnace, TECHNIQUES[name], max_depth, precision)
 
 

@@ -302,9 +302,3 @@ def test_what_cannot_be_seen_is_said(capfd: pytest.CaptureFixture) -> None:
     light_tracer().render(mi.load_dict(stage()), spp=1)
     out = capfd.readouterr()
     assert (out.out + out.err).count("through glass") == 1
-
-
-def test_it_cannot_be_nested_where_single_samples_are_asked_for() -> None:
-    moment = mi.load_dict({"type": "moment", "image": {"type": "light_tracer"}})
-    with pytest.raises((NotImplementedError, RuntimeError), match="light paths"):
-        moment.render(mi.load_dict(stage()), spp=1)

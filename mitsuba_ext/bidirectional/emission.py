@@ -11,7 +11,6 @@ import numpy as np
 from ..bounds import scene_bounds
 from ..transport.numbers import Numbers
 from . import light_pieces as pieces
-from .emitter_choice import emitter_probabilities
 from .light_pieces import LightPieces, Piece
 
 #: The share of the rays of a mesh with interpolated normals that leave to the back of a triangle.
@@ -84,8 +83,8 @@ class LightEmission:
 
     def __init__(self, scene: mi.Scene) -> None:
         emitters = scene.emitters()
-        self.probability = emitter_probabilities(scene)
-        self._pieces = LightPieces(scene, self.probability)
+        self._pieces = LightPieces(scene)
+        self.probability = self._pieces.probability
         self._emitters = scene.emitters_dr()
         flags = np.array([int(e.flags()) for e in emitters])
         self._delta_position, self._delta_direction, self._infinite = (
@@ -108,7 +107,8 @@ class LightEmission:
         sphere = box.bounding_sphere() if box.valid() else mi.ScalarBoundingSphere3f(0.0, 1.0)
         self._centre, self._radius = mi.Point3f(sphere.center), mi.Float(_MARGIN * sphere.radius)
         dr.make_opaque(self._centre, self._radius)
-        density = 1 / np.maximum(self._pieces.area, 1e-300)
+        # Paths start from no other emitters
+        density = (self.probability > 0) / np.maximum(self._pieces.area, 1e-300)
         density[self._infinite] = 1 / (np.pi * (_MARGIN * sphere.radius) ** 2)
         density[self._delta_position] = 1
         self._tabulate(density)

@@ -11,6 +11,7 @@ from ..transport.estimator import CameraRays, Sample
 from ..transport.numbers import Numbers
 from ..transport.walk import Walk
 from .light_image import LightImage
+from .light_numbers import light_numbers
 from .light_walk import LightWalk
 from .sensor import ConnectableSensor
 
@@ -41,10 +42,11 @@ class LightTracer:
             scene, self.sensor, sampler, rays, query=walk.query,
             hides_emitters=self.directly.hide_emitters,
         )  # fmt: skip
-        paths = walk.begin(scene, sampler, rays.ray.time, rays.ray.wavelengths, active)
+        numbers = light_numbers(sampler, dr.width(rays.ray))
+        paths = walk.begin(scene, numbers, rays.ray.time, rays.ray.wavelengths, active)
         # What the rest of the pass reads again
         dr.eval(paths, sample, rays.ray.wavelengths)
-        paths = walk.finish(scene, sampler, paths, image.add)
+        paths = walk.finish(scene, numbers, paths, image.add)
         return replace(
             sample,
             splats=image.splats,

@@ -14,6 +14,7 @@ from ..transport.walk import Walk
 from .connections import LightSubpaths
 from .emission import LightEmission
 from .light_image import LightImage
+from .light_numbers import light_numbers
 from .light_vertices import LightVertices, VertexCache
 from .light_walk import LightWalk
 from .partial_sums import PartialSums
@@ -56,7 +57,8 @@ class BidirectionalPathTracer:
         light_walk = LightWalk(
             self.emission, walk.max_depth, walk.rr_depth, sums, query=walk.query
         )
-        paths = light_walk.begin(scene, sampler, rays.ray.time, rays.ray.wavelengths, active)
+        numbers = light_numbers(sampler, dr.width(rays.ray))
+        paths = light_walk.begin(scene, numbers, rays.ray.time, rays.ray.wavelengths, active)
         # What the rest of the pass reads again
         dr.eval(paths, rays)
         lanes = dr.width(paths.active)
@@ -68,7 +70,7 @@ class BidirectionalPathTracer:
             # Without the gaps, which take most of the memory
             rounds.append(VertexCache([vertices], lanes))
 
-        paths = light_walk.finish(scene, sampler, paths, take)
+        paths = light_walk.finish(scene, numbers, paths, take)
         weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)
         subpaths = None
         if rounds:
