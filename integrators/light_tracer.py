@@ -87,6 +87,7 @@ class LightTracerIntegrator(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.fill(props)
+        self._has_warned = False
 
     @property
     def sample_cost(self) -> int:
@@ -127,8 +128,11 @@ class LightTracerIntegrator(WalkIntegrator):
         )
 
     def _warn_of_hidden(self, scene: mi.Scene) -> None:
+        """Once: a time limit is kept by many renders."""
         hidden = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
-        if any(shape.bsdf() and int(shape.bsdf().flags()) & hidden for shape in scene.shapes()):
+        is_there = any(s.bsdf() and int(s.bsdf().flags()) & hidden for s in scene.shapes())
+        if is_there and not self._has_warned:
+            self._has_warned = True
             mi.Log(
                 mi.LogLevel.Warn,
                 f'"{self.name}": what the camera sees in mirrors, through glass, and through masks '
