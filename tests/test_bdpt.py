@@ -7,7 +7,17 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from hard_cases import _delta_lights, _instances, film, rectangle, sensor, stage
+from hard_cases import (
+    _delta_lights,
+    _instances,
+    _octahedron,
+    area,
+    diffuse,
+    film,
+    rectangle,
+    sensor,
+    stage,
+)
 from statistical import (
     MANY_SEEDS,
     REFERENCE_SEEDS,
@@ -50,6 +60,19 @@ def test_every_emitter_lights_the_scene_as_in_path(name: str) -> None:
     assert_image_of_path(stage(light=EMITTERS[name](), camera=below_the_lamp()))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bdpt", "light_tracer"])
+def test_a_lamp_with_interpolated_normals_sends_out_what_camera_rays_see(name: str) -> None:
+    """Where next event estimation of ``path`` errs."""
+    lamp = _octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0.0), emitter=area(5.0))
+    scene = mi.load_dict(stage(light=lamp, camera=below_the_lamp()), optimize=False)
+    by_hits = mi.load_dict({"type": "direct", "emitter_samples": 0, "bsdf_samples": 1})
+    integrator = mi.load_dict({"type": name, "max_depth": 2})
+    images = batches(scene, integrator, 512, SEEDS[:MANY_SEEDS])
+    expected = batches(scene, by_hits, 4096, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert_same_quarters(images, expected, 0.005)
+
+
 @pytest.mark.parametrize("name", some(of=MATERIALS))
 def test_a_material_reflects_light_as_in_path(name: str) -> None:
     assert_image_of_path(_balls(MATERIALS[name]()))
@@ -81,12 +104,26 @@ def test_a_sensor_sees_what_it_sees_with_path(name: str) -> None:
     assert_image_of_path(stage(camera=camera), precision=0.01)
 
 
+_HALF = {"type": "visibility_roulette", "slope": 0.0, "floor": 0.5}
+
 PARAMETERS = {
     "no light image": {"light_image": False},
     "three connections": {"connections": 3},
     "guided": {"directions": "guided"},
     "spatial": {"next_event": "spatial"},
-}
+    "linear": {"next_event": "linear"},
+    "half of the shadow rays": {"shadow_test": _HALF},
+    "all decisions": {
+        "directions": {"type": "guided_directions", "always_guide": True},
+        "next_event": {"type": "learned_lights", "grid": 8},
+        "shadow_test": _HALF, "connections": 2, "pilot_spp": 32,
+    },
+    "tiles": {
+        "directions": {"type": "guided_directions", "always_guide": True, "regions": "tiles",
+                       "tile": 5},
+        "next_event": {"type": "learned_lights", "target": "visibility", "grid": 4},
+    },
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", some(of=PARAMETERS))
