@@ -118,11 +118,6 @@ PARAMETERS = {
         "next_event": {"type": "learned_lights", "grid": 8},
         "shadow_test": _HALF, "connections": 2, "pilot_spp": 32,
     },
-    "tiles": {
-        "directions": {"type": "guided_directions", "always_guide": True, "regions": "tiles",
-                       "tile": 5},
-        "next_event": {"type": "learned_lights", "target": "visibility", "grid": 4},
-    },
 }  # fmt: skip
 
 
