@@ -73,7 +73,8 @@ class BidirectionalIntegrator(WalkIntegrator):
 
     In a pass, the vertices of all light paths are shared by all camera paths. In spectral variants
     and with moving shapes, a camera path shares wavelengths and time with one light path, and is
-    connected to that only.
+    connected to that only. Light paths have independent random numbers where the sampler is
+    :monosp:`ldsampler`, whose numbers depend on each other.
 
     **Sensors and films.** A :monosp:`perspective` or :monosp:`thinlens` can be connected to; with
     other sensors, and with films that sample a border, there is no light image. Lights of the type

@@ -61,7 +61,9 @@ class LightTracerIntegrator(WalkIntegrator):
     emitter of a light path is chosen by power and by :monosp:`sampling_weight`, half of the paths
     each. Surface and sky emit as :monosp:`path` sees it, also where Mitsuba's :monosp:`ptracer`
     errs: for turned spheres and environment maps, lights with interpolated normals, textured
-    lights, merged rectangles, normal and bump maps, filters at the film's edges.
+    lights, merged rectangles, normal and bump maps, filters at the film's edges. The paths have
+    independent random numbers where the sampler is :monosp:`ldsampler`, whose numbers depend on
+    each other.
 
     Alpha and output variables are those of the camera rays. Participating media are ignored, as by
     :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized

@@ -62,6 +62,26 @@ def test_every_emitter_lights_the_scene_as_in_path(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bdpt", "light_tracer"])
+def test_beams_and_lamps_of_any_texture_light_the_same_scene(name: str) -> None:
+    """Mitsuba cannot choose points of a checkerboard."""
+    down = T().translate([0.5, 0, 3]).rotate([1, 0, 0], 180).scale(0.5)
+    lights = {
+        "beam": rectangle(down, emitter={"type": "directionalarea"}),
+        "lamp": rectangle(down, T().translate([2, 0, 0]), bsdf=diffuse(0.0),
+                          emitter={"type": "area", "radiance": {"type": "checkerboard"}}),
+    }
+    integrator = mi.load_dict({"type": name, "max_depth": 3})
+    alone = [
+        batches(mi.load_dict(stage(light=light)), integrator, 512, [1]).mean()
+        for light in lights.values()
+    ]
+    both = batches(mi.load_dict(stage(light={}, **lights)), integrator, 512, [2]).mean()
+    assert min(alone) > 0.01 * both
+    assert both == pytest.approx(sum(alone), rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bdpt", "light_tracer"])
 def test_a_lamp_with_interpolated_normals_sends_out_what_camera_rays_see(name: str) -> None:
     """Where next event estimation of ``path`` errs."""
     lamp = _octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0.0), emitter=area(5.0))

@@ -95,7 +95,9 @@ class LightEmission:
         kind = self._pieces.kind
         is_surface = kind <= pieces.CYLINDER
         self._has_surfaces = bool(is_surface.any())
-        self._has_beams = bool((is_surface & self._delta_direction).any())
+        beams = np.flatnonzero(is_surface & self._delta_direction)
+        self._beams = [(int(index), emitters[index]) for index in beams]
+        self._has_beams = bool(self._beams)
         self.has_smooth_meshes = bool((self._pieces.way == pieces.TO_BOTH_SIDES).any())
         self._kinds = set(kind.tolist())
         if self._has_beams and mi.is_spectral:
@@ -205,10 +207,13 @@ class LightEmission:
         pdf = self._weighing_density(local.z, piece.parameter)
         if self._has_beams:
             pdf = dr.select(is_beam, 1, pdf)
-            # Its radiance is not to be asked for, but the weight is that times the area
-            beam = emitter.sample_ray(ray.time, mi.Float(0.5), u, v, active & is_beam)[1]
-            area = dr.rcp(self._row(piece.emitter, active).density)
-            weight = dr.select(is_beam, beam / area, weight)
+            density = self._row(piece.emitter, active).density
+            for index, light in self._beams:
+                # Its radiance is not to be asked for, but the weight is that times the area. Not
+                # by a pointer: the textures of other lights may be unable to do this
+                mine = active & (piece.emitter == index)
+                beam = light.sample_ray(ray.time, mi.Float(0.5), u, v, mine)[1]
+                weight = dr.select(mine, beam * density, weight)
             cosine = dr.select(is_beam, 1, cosine)
         return si, d, weight, pdf, cosine
 
