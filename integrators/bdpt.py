@@ -93,7 +93,8 @@ class BidirectionalIntegrator(WalkIntegrator):
 
     In a pass, the vertices of all light paths are shared by all camera paths. In spectral variants
     and with moving shapes, a camera path shares wavelengths and time with one light path, and is
-    connected to that only.
+    connected to that only. Light paths have independent random numbers where the sampler is
+    :monosp:`ldsampler`, whose numbers depend on each other.
 
     **Sensors and films.** A :monosp:`perspective` or :monosp:`thinlens` can be connected to; with
     other sensors, and with films that sample a border, there is no light image. Lights of the type
@@ -101,7 +102,8 @@ class BidirectionalIntegrator(WalkIntegrator):
     refuse them.
 
     Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
-    :monosp:`prb`), nor are scalar and polarized variants, nor nesting in :monosp:`moment`.
+    :monosp:`prb`), nor are scalar and polarized variants, nor nesting in :monosp:`moment` and
+    :monosp:`aov`.
 
     Source: E. Veach, *Robust Monte Carlo Methods for Light Transport Simulation*, PhD thesis, 1997,
     chapter 10; D. Cline, PhD thesis, 2007, sections 7.6 and 7.9; I. Georgiev, *Implementing Vertex
@@ -210,5 +212,6 @@ class BidirectionalIntegrator(WalkIntegrator):
     def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
         raise NotImplementedError(
             f'"{self.name}": light paths do not end where a ray begins: it cannot be nested in an '
-            f'integrator that asks for single samples, such as "moment"; "variance" can hold it'
+            f'integrator that asks for single samples, such as "moment" or "aov"; "variance" can '
+            f'hold it, and it has a parameter "aovs" of its own'
         )

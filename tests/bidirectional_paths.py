@@ -196,7 +196,10 @@ def weights_of_techniques(
     found = []
     first = vertices[0]
     is_delta_light = emitted.is_delta_position | emitted.is_delta_direction
-    si = scene.ray_intersect(first.from_light.spawn_ray(-emitted.ray.d), active)
+    # Along the same line: a ray that starts above the surface meets a curved light elsewhere, where
+    # the cosine is another one, by up to 20 % if it is small
+    back = mi.Ray3f(first.p - 1e-3 * emitted.ray.d, -emitted.ray.d)
+    si = scene.ray_intersect(back, active)
     ds = mi.DirectionSample3f(scene, si, mi.Interaction3f(first.from_camera))
     is_hit = active & ~is_delta_light & (ds.emitter == emitted.emitter)
     is_hit &= emitted.is_infinite | (dr.norm(si.p - emitted.start.p) < 1e-2)

@@ -274,6 +274,12 @@ def _degenerate_light() -> Scene:
     return stage(light=mesh(vertices, faces, bsdf=diffuse(0.0), emitter=area(5.0)))
 
 
+def _light_without_area() -> Scene:
+    """Beside the lamp: its triangle is a point."""
+    point = [[0.5, 0, 1.9]] * 3
+    return stage(nothing=mesh(point, [[0, 1, 2]], bsdf=diffuse(0.0), emitter=area(5.0)))
+
+
 def _medium() -> Scene:
     fog = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 2.0}
     cloud = {"type": "cube", "to_world": _translated(-0.4, 0, 0.6).scale(0.4), "interior": fog}
@@ -338,6 +344,7 @@ HARD_CASES: dict[str, HardCase] = {
     ),
     "degenerate_triangles": HardCase(_degenerate_triangles),
     "degenerate_light": HardCase(_degenerate_light),
+    "light_without_area": HardCase(_light_without_area),
     "instances": HardCase(_instances),
     "medium": HardCase(_medium),
     "film_of_one_pixel": HardCase(_film(1, 1), spp=65536, precision=0.03, seeds=6),

@@ -43,6 +43,9 @@ THRESHOLD = 4.0
 SEEDS = range(1, 17)
 REFERENCE_SEEDS = range(1001, 1017)
 
+#: So many seeds where a light path brings light to many pixels: their errors depend on each other.
+MANY_SEEDS = 8
+
 #: Relative rounding error that a mean of many floats may have.
 _ROUNDING = 2e-6
 
@@ -169,23 +172,28 @@ def regions(images: np.ndarray) -> np.ndarray:
     return np.concatenate([whole, *quarters], axis=1)
 
 
-def assert_same_quarters(images: np.ndarray, expected: np.ndarray, precision: float) -> None:
+def assert_same_quarters(
+    images: np.ndarray, expected: np.ndarray, precision: float, paired: bool = False
+) -> None:
     """The image and its quarters have the expected means. Only renders of different seeds count as
     independent: a light path brings light to many pixels.
 
     Parameters:
         images, expected: Of several seeds each: [seed, y, x, channel].
         precision: Relative standard error of the difference of the image means, at most.
+        paired: Have the images of a seed the same camera rays? Then the noise of what these see
+            directly cancels.
     """
     assert np.isfinite(images).all()
     # Some single wavelengths have negative components
     assert mi.is_spectral or images.min() >= 0
     assert expected.any(), "a black image proves nothing"
     means = [regions(x.mean(axis=-1, keepdims=True)) for x in (images, expected)]
+    ratio, scale = means[0][:, 0].mean() / means[1][:, 0].mean(), means[1][:, 0].mean()
+    if paired:
+        means = [means[0] - means[1], np.zeros_like(means[1])]
     z = z_welch(*means)
-    whole = [mean[:, 0] for mean in means]
-    error = np.sqrt(sum(w.var(ddof=1) / len(w) for w in whole)) / whole[1].mean()
-    ratio = whole[0].mean() / whole[1].mean()
+    error = np.sqrt(sum(mean[:, 0].var(ddof=1) / len(mean) for mean in means)) / scale
     # Five parts: a little more than THRESHOLD
     assert np.abs(z).max() < THRESHOLD + 0.4, f"z = {z.round(2)}, ratio of the means {ratio:.4f}"
     assert error <= precision, f"known to {error:.2%} only"
@@ -343,12 +351,15 @@ def assert_exact(
     uniform: bool = True,
     allowance: float = 0.0,
     precision: float = 0.02,
+    independent: bool = True,
 ) -> float:
     """The mean over ``pixels`` is ``exact``, and where each of them has that value (``uniform``),
     that of each tile of them too. Returns the relative standard error of the mean.
 
     Parameters:
         images: Of two seeds at least, with a box filter: [seed, height, width, channel].
+        independent: Do the errors of pixels not depend on each other? If they do, many seeds are
+            needed.
     """
     assert_images_are_sound(images)
     part = images[:, pixels[0], pixels[1]].mean(axis=3)
@@ -358,6 +369,8 @@ def assert_exact(
 
     def z(rows: slice, columns: slice) -> tuple[float, float]:
         values = part[:, rows, columns].reshape(len(part), -1)
+        if not independent:
+            values = values.mean(axis=1, keepdims=True)
         return z_of_means(values, exact, allowance=allowance)
 
     score, error = z(slice(None), slice(None))

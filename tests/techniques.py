@@ -61,6 +61,8 @@ class Technique:
             gradients and AOVs.
         draws_like_path: At the same seed, does it draw the same numbers as ``path``? Then images
             are compared, which has more power than comparing means.
+        makes_splats: Does one sample bring light to many pixels? Then the errors of pixels depend
+            on each other, and noise is estimated from many seeds.
         checks, thorough: Its tests.
     """
 
@@ -68,6 +70,7 @@ class Technique:
     parameters: dict[str, Any] = field(default_factory=dict)
     is_plugin: bool = False
     draws_like_path: bool = False
+    makes_splats: bool = False
     checks: Checks = Checks()
     thorough: Checks = Checks()
 
@@ -89,6 +92,19 @@ _LEARNERS = (
     "materials", "closed_box", "empty", "degenerate_light", "instances", "film_of_one_pixel",
     "cropped_film", "one_sample", "max_depth_0", "max_depth_unlimited", "hidden_environment",
 )  # fmt: skip
+
+#: ``path`` does not find beams, and errs where normals are interpolated; where rays start far above
+#: surfaces, light paths and camera paths miss different things; and a thousand lights take minutes.
+_UNLIKE_PATH = (
+    "directional_area_light", "smooth_normal_lamp", "scaled_by_1e-3", "moved_by_1e3_sizes",
+    "thousand_lights",
+)  # fmt: skip
+_LIGHT_PATHS = tuple(case for case in HARD_CASES if case not in _UNLIKE_PATH)
+
+#: Behind mirrors, glass, masks and null surfaces, and on a film with a sampled border.
+_UNSEEN_FROM_LIGHTS = {
+    "furnace_glass", "furnace_isothermal", "materials", "medium", "cropped_film",
+}  # fmt: skip
 
 _SEVERAL_LIGHTS = ("delta_lights", "textured_two_sided_lights", "materials", "no_light")
 
@@ -222,12 +238,35 @@ TECHNIQUES: dict[str, Technique] = {
         checks=Checks(["rooms"], furnaces=["furnace_lamps"], depths=[-1]),
         thorough=Checks(furnaces=["furnace_isothermal"], depths=[-1]),
     ),
+    # ``test_bdpt.py`` and ``test_light_tracer.py`` have emitters, materials and sensors
+    "bdpt": Technique(
+        "bdpt", is_plugin=True, makes_splats=True,
+        checks=Checks(["cornell_box"], cases=["no_light"]),
+        thorough=Checks(
+            ["mirrors_and_glass", "sunny_gloss", "window"], ["llvm_ad_spectral"], FURNACES,
+            [2, -1], _LIGHT_PATHS,
+        ),
+    ),
+    "light_tracer": Technique(
+        "light_tracer", is_plugin=True, makes_splats=True,
+        checks=Checks(cases=["no_light"]),
+        thorough=Checks(
+            ["rooms"], ["llvm_ad_spectral"],
+            [name for name in FURNACES if name not in _UNSEEN_FROM_LIGHTS], [2, -1],
+            [case for case in _LIGHT_PATHS if case not in _UNSEEN_FROM_LIGHTS],
+        ),
+    ),
 }  # fmt: skip
 
 #: The integrator to compare with.
 REFERENCE = Technique("path", draws_like_path=True)
 
 DEFAULTS = [name for name, technique in TECHNIQUES.items() if technique.is_plugin]
+#: Paths from lights take seconds to compile: their tests are slow.
+EACH_PLUGIN = [
+    pytest.param(name, marks=pytest.mark.slow) if TECHNIQUES[name].makes_splats else name
+    for name in DEFAULTS
+]
 FOLLOWERS = [name for name, technique in TECHNIQUES.items() if technique.draws_like_path]
 
 

@@ -8,9 +8,27 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hard_cases import _delta_lights, _instances, film, rectangle, sensor, stage
-from statistical import REFERENCE_SEEDS, SEEDS, assert_same_quarters, batches, load, some
-from test_light_tracer import EMITTERS, MANY_SEEDS, MATERIALS, T, _balls, below_the_lamp
+from hard_cases import (
+    _delta_lights,
+    _instances,
+    _octahedron,
+    area,
+    diffuse,
+    film,
+    rectangle,
+    sensor,
+    stage,
+)
+from statistical import (
+    MANY_SEEDS,
+    REFERENCE_SEEDS,
+    SEEDS,
+    assert_same_quarters,
+    batches,
+    load,
+    some,
+)
+from test_light_tracer import EMITTERS, MATERIALS, T, _balls, below_the_lamp
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -41,6 +59,39 @@ def assert_image_of_path(
 @pytest.mark.parametrize("name", some("sphere", of=EMITTERS))
 def test_every_emitter_lights_the_scene_as_in_path(name: str) -> None:
     assert_image_of_path(stage(light=EMITTERS[name](), camera=below_the_lamp()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bdpt", "light_tracer"])
+def test_beams_and_lamps_of_any_texture_light_the_same_scene(name: str) -> None:
+    """Mitsuba cannot choose points of a checkerboard."""
+    down = T().translate([0.5, 0, 3]).rotate([1, 0, 0], 180).scale(0.5)
+    lights = {
+        "beam": rectangle(down, emitter={"type": "directionalarea"}),
+        "lamp": rectangle(down, T().translate([2, 0, 0]), bsdf=diffuse(0.0),
+                          emitter={"type": "area", "radiance": {"type": "checkerboard"}}),
+    }
+    integrator = mi.load_dict({"type": name, "max_depth": 3})
+    alone = [
+        batches(mi.load_dict(stage(light=light)), integrator, 512, [1]).mean()
+        for light in lights.values()
+    ]
+    both = batches(mi.load_dict(stage(light={}, **lights)), integrator, 512, [2]).mean()
+    assert min(alone) > 0.01 * both
+    assert both == pytest.approx(sum(alone), rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bdpt", "light_tracer"])
+def test_a_lamp_with_interpolated_normals_sends_out_what_camera_rays_see(name: str) -> None:
+    """Where next event estimation of ``path`` errs."""
+    lamp = _octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0.0), emitter=area(5.0))
+    scene = mi.load_dict(stage(light=lamp, camera=below_the_lamp()), optimize=False)
+    by_hits = mi.load_dict({"type": "direct", "emitter_samples": 0, "bsdf_samples": 1})
+    integrator = mi.load_dict({"type": name, "max_depth": 2})
+    images = batches(scene, integrator, 512, SEEDS[:MANY_SEEDS])
+    expected = batches(scene, by_hits, 4096, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert_same_quarters(images, expected, 0.005)
 
 
 @pytest.mark.parametrize("name", some(of=MATERIALS))
@@ -74,12 +125,21 @@ def test_a_sensor_sees_what_it_sees_with_path(name: str) -> None:
     assert_image_of_path(stage(camera=camera), precision=0.01)
 
 
+_HALF = {"type": "visibility_roulette", "slope": 0.0, "floor": 0.5}
+
 PARAMETERS = {
     "no light image": {"light_image": False},
     "three connections": {"connections": 3},
     "guided": {"directions": "guided"},
     "spatial": {"next_event": "spatial"},
-}
+    "linear": {"next_event": "linear"},
+    "half of the shadow rays": {"shadow_test": _HALF},
+    "all decisions": {
+        "directions": {"type": "guided_directions", "always_guide": True},
+        "next_event": {"type": "learned_lights", "grid": 8},
+        "shadow_test": _HALF, "connections": 2, "pilot_spp": 32,
+    },
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", some(of=PARAMETERS))
@@ -104,10 +164,6 @@ def test_hidden_emitters_are_looked_through() -> None:
 @pytest.mark.slow
 def test_points_and_directions_of_light_agree() -> None:
     assert_image_of_path(_delta_lights(), precision=0.01)
-
-
-def test_without_lights_the_image_is_black() -> None:
-    assert not batches(mi.load_dict(stage(light={})), bdpt(), 4, [1]).any()
 
 
 @pytest.mark.slow
@@ -152,10 +208,17 @@ def test_the_same_seed_gives_the_same_image() -> None:
     np.testing.assert_allclose(first, second, rtol=1e-4, atol=1e-5 * first.mean())
 
 
-def test_it_cannot_be_nested_where_single_samples_are_asked_for() -> None:
-    moment = mi.load_dict({"type": "moment", "image": {"type": "bdpt"}})
-    with pytest.raises((NotImplementedError, RuntimeError), match="light paths"):
-        moment.render(mi.load_dict(stage()), spp=1)
+@pytest.mark.parametrize("shape", ["bsplinecurve", "sdfgrid"])
+def test_a_shape_whose_light_paths_cannot_leave_is_named(shape: str, tmp_path) -> None:
+    if shape == "sdfgrid":
+        values = np.linspace(-1, 1, 8, dtype=np.float32).reshape(2, 2, 2, 1)
+        lamp = {"type": shape, "grid": mi.TensorXf(values)}
+    else:
+        (tmp_path / "curve.txt").write_text("".join(f"{i} 0 3 0.1\n" for i in range(5)))
+        lamp = {"type": shape, "filename": str(tmp_path / "curve.txt")}
+    scene = mi.load_dict(stage(light={**lamp, "emitter": {"type": "area"}}))
+    with pytest.raises(NotImplementedError, match='"bdpt": .*give the light to a rectangle'):
+        bdpt().render(scene, spp=1)
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)

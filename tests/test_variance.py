@@ -34,7 +34,7 @@ FORMATS = {
 # ---- Mean and variance ----
 
 
-@pytest.mark.parametrize("nested", NESTED)
+@pytest.mark.parametrize("nested", [*NESTED, pytest.param("bdpt", marks=pytest.mark.slow)])
 def test_mean_and_variance_are_those_of_the_batches(nested):
     scene, inner = small_scene(9, 7), mi.load_dict({"type": nested})
     image = mi.render(scene, integrator=with_variance(nested), spp=32, seed=5).numpy()

@@ -11,7 +11,6 @@ import numpy as np
 from ..bounds import scene_bounds
 from ..transport.numbers import Numbers
 from . import light_pieces as pieces
-from .emitter_choice import emitter_probabilities
 from .light_pieces import LightPieces, Piece
 
 #: The share of the rays of a mesh with interpolated normals that leave to the back of a triangle.
@@ -77,7 +76,6 @@ class LightEmission:
     Attributes:
         probability (numpy.ndarray): With which each emitter is chosen; shape [emitters].
         has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
-        has_beams (bool): Is there a light that sends parallel rays from a surface?
 
     Raises:
         NotImplementedError: Paths cannot start from one of the emitters.
@@ -85,8 +83,8 @@ class LightEmission:
 
     def __init__(self, scene: mi.Scene) -> None:
         emitters = scene.emitters()
-        self.probability = emitter_probabilities(scene)
-        self._pieces = LightPieces(scene, self.probability)
+        self._pieces = LightPieces(scene)
+        self.probability = self._pieces.probability
         self._emitters = scene.emitters_dr()
         flags = np.array([int(e.flags()) for e in emitters])
         self._delta_position, self._delta_direction, self._infinite = (
@@ -97,10 +95,12 @@ class LightEmission:
         kind = self._pieces.kind
         is_surface = kind <= pieces.CYLINDER
         self._has_surfaces = bool(is_surface.any())
-        self.has_beams = bool((is_surface & self._delta_direction).any())
+        beams = np.flatnonzero(is_surface & self._delta_direction)
+        self._beams = [(int(index), emitters[index]) for index in beams]
+        self._has_beams = bool(self._beams)
         self.has_smooth_meshes = bool((self._pieces.way == pieces.TO_BOTH_SIDES).any())
         self._kinds = set(kind.tolist())
-        if self.has_beams and mi.is_spectral:
+        if self._has_beams and mi.is_spectral:
             raise NotImplementedError(
                 'paths cannot start from the emitter "directionalarea" in spectral variants: it '
                 "chooses its wavelengths itself"
@@ -109,7 +109,8 @@ class LightEmission:
         sphere = box.bounding_sphere() if box.valid() else mi.ScalarBoundingSphere3f(0.0, 1.0)
         self._centre, self._radius = mi.Point3f(sphere.center), mi.Float(_MARGIN * sphere.radius)
         dr.make_opaque(self._centre, self._radius)
-        density = 1 / np.maximum(self._pieces.area, 1e-300)
+        # Paths start from no other emitters
+        density = (self.probability > 0) / np.maximum(self._pieces.area, 1e-300)
         density[self._infinite] = 1 / (np.pi * (_MARGIN * sphere.radius) ** 2)
         density[self._delta_position] = 1
         self._tabulate(density)
@@ -196,7 +197,7 @@ class LightEmission:
                 mi.Point2f(dr.select(is_smooth, x, v.x), v.y)
             )
             local = dr.select(is_back, mi.Vector3f(turned.x, turned.y, -turned.z), turned)
-        if self.has_beams:
+        if self._has_beams:
             is_beam = piece.parameter == float(pieces.AS_BEAM)
             local = dr.select(is_beam, mi.Vector3f(0, 0, 1), local)
         d, cosine = mi.Frame3f(si.n).to_world(local), dr.abs(local.z)
@@ -204,12 +205,15 @@ class LightEmission:
         si.wi = si.to_local(d)
         weight = emitter.eval(si, active) * dr.select(pdf > 0, cosine / pdf, 0)
         pdf = self._weighing_density(local.z, piece.parameter)
-        if self.has_beams:
+        if self._has_beams:
             pdf = dr.select(is_beam, 1, pdf)
-            # Its radiance is not to be asked for, but the weight is that times the area
-            beam = emitter.sample_ray(ray.time, mi.Float(0.5), u, v, active & is_beam)[1]
-            area = dr.rcp(self._row(piece.emitter, active).density)
-            weight = dr.select(is_beam, beam / area, weight)
+            density = self._row(piece.emitter, active).density
+            for index, light in self._beams:
+                # Its radiance is not to be asked for, but the weight is that times the area. Not
+                # by a pointer: the textures of other lights may be unable to do this
+                mine = active & (piece.emitter == index)
+                beam = light.sample_ray(ray.time, mi.Float(0.5), u, v, mine)[1]
+                weight = dr.select(mine, beam * density, weight)
             cosine = dr.select(is_beam, 1, cosine)
         return si, d, weight, pdf, cosine
 

@@ -13,14 +13,14 @@ from ..lights.power import emitter_powers
 _BY_POWER = 0.5
 
 
-def emitter_probabilities(scene: mi.Scene) -> np.ndarray:
-    """With which each emitter is chosen. One that a camera path can hit is chosen even where its
-    ``sampling_weight`` is 0: such a path shows it too."""
+def emitter_probabilities(scene: mi.Scene, can_emit: np.ndarray) -> np.ndarray:
+    """With which each emitter is chosen, of those that ``can_emit``. One that a camera path can hit
+    is chosen even where its ``sampling_weight`` is 0: such a path shows it too."""
     emitters = scene.emitters()
     delta = int(mi.EmitterFlags.DeltaPosition) | int(mi.EmitterFlags.DeltaDirection)
     can_be_hit = np.array([not int(e.flags()) & delta for e in emitters])
     weight = np.array([float(e.sampling_weight()) for e in emitters])
-    weight = np.where((weight <= 0) & can_be_hit, 1.0, weight)
+    weight = np.where((weight <= 0) & can_be_hit, 1.0, weight) * can_emit
     power = emitter_powers(scene) * weight
     total = power.sum()
     if weight.sum() <= 0:

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..discrete_sampling import alias_tables
 from ..lights.division import emitter_shapes, has_interpolated_normals, triangles
+from .emitter_choice import emitter_probabilities
 
 # Kinds of pieces
 TRIANGLE, DISK, SPHERE, CYLINDER, POINT, SPOT, PROJECTOR, INFINITE = range(8)
@@ -29,19 +30,22 @@ TO_FRONT, TO_BOTH_SIDES, AS_BEAM = range(3)
 #: Words of a piece in its table.
 WORDS = 16
 
+#: No paths start from lights with less area than this: the density of their points is no float.
+_LEAST_AREA = 1e-37
+
 #: So much larger is the image plane of a projector than what its ``str()`` says in six digits.
 _MARGIN = 1 + 1e-5
 
 
 class LightPieces:
-    """The pieces of a scene's lights, each with its probability.
+    """The pieces of a scene's lights, each with its probability. The triangles of an emitter are
+    chosen in proportion to their area.
 
     Parameters:
         scene: A scene with at least one emitter.
-        probability: With which each emitter is chosen; shape [emitters]. The triangles of an
-            emitter are chosen in proportion to their area.
 
     Attributes:
+        probability (numpy.ndarray): With which each emitter is chosen; shape [emitters].
         area (numpy.ndarray): The area of each emitter's surface; 1 for those without surface.
         way (numpy.ndarray): How light leaves each emitter's surface.
         kind (numpy.ndarray): The kind of each emitter's pieces.
@@ -53,13 +57,13 @@ class LightPieces:
         NotImplementedError: Points on the shape of an area light cannot be sampled.
     """
 
-    def __init__(self, scene: mi.Scene, probability: np.ndarray) -> None:
+    def __init__(self, scene: mi.Scene) -> None:
         emitters, shapes = scene.emitters(), emitter_shapes(scene)
         count = len(emitters)
         self.area, self.way = np.ones(count), np.full(count, TO_FRONT)
         self.kind, self.parameter = np.full(count, INFINITE), np.zeros(count)
         self.axis = np.zeros((count, 3))
-        tables, weights, owners = [], [], []
+        tables, measures, owners = [], [], []
         for index, (emitter, shape) in enumerate(zip(emitters, shapes)):
             if shape is not None:
                 table, measure = self._surface(index, emitter, shape)
@@ -69,7 +73,8 @@ class LightPieces:
                 table, measure = _row(INFINITE), np.ones(1)
             tables.append(table)
             owners.append(np.full(len(table), index))
-            weights.append(probability[index] * measure / max(measure.sum(), 1e-300))
+            measures.append(measure / max(measure.sum(), 1e-300))
+        self.probability = emitter_probabilities(scene, self.area > _LEAST_AREA)
         table, owner = np.concatenate(tables), np.concatenate(owners)
         words = table.astype(np.float32)
         integers = words.view(np.uint32)
@@ -77,8 +82,10 @@ class LightPieces:
         integers[:, 13] = owner
         self._words = mi.Float(words.ravel())
         self.count = dr.opaque(mi.UInt32, len(table))
-        relative = np.concatenate(weights)
-        relative *= len(relative) / max(relative.sum(), 1e-300)
+        relative = self.probability[owner] * np.concatenate(measures)
+        if not relative.any():
+            relative[:] = 1
+        relative *= len(relative) / relative.sum()
         entry = dr.arange(mi.UInt32, len(relative))
         first, last = mi.UInt32(0), mi.UInt32(len(relative) - 1)
         threshold, alias = alias_tables(

@@ -11,6 +11,7 @@ from ..transport.estimator import CameraRays, Sample
 from ..transport.numbers import Numbers
 from ..transport.walk import Walk
 from .light_image import LightImage
+from .light_numbers import light_numbers
 from .light_walk import LightWalk
 from .sensor import ConnectableSensor
 
@@ -43,8 +44,9 @@ class LightTracer:
         )  # fmt: skip
         # What the rest of the pass reads again
         dr.schedule(sample, rays.ray.wavelengths)
+        numbers = light_numbers(sampler, dr.width(rays.ray))
         scatter_count = walk.run(
-            scene, sampler, rays.ray.time, rays.ray.wavelengths, active, image.add
+            scene, numbers, rays.ray.time, rays.ray.wavelengths, active, image.add
         )
         return replace(
             sample,

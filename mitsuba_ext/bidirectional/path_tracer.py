@@ -15,6 +15,7 @@ from ..transport.walk import Walk
 from .connections import LightSubpaths
 from .emission import LightEmission
 from .light_image import LightImage
+from .light_numbers import light_numbers
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
 from .partial_sums import PartialSums
@@ -76,8 +77,9 @@ class BidirectionalPathTracer:
                 image.add(vertices)
             rounds.append(PackedVertices(vertices))
 
+        numbers = light_numbers(sampler, lanes)
         scatter_count = light_walk.run(
-            scene, sampler, rays.ray.time, rays.ray.wavelengths, active, take
+            scene, numbers, rays.ray.time, rays.ray.wavelengths, active, take
         )
         splats = image.splats() if image is not None else []
         weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)

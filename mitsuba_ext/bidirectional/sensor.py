@@ -66,15 +66,17 @@ class ConnectableSensor:
         film = sensor.film()
         width, height = (int(n) for n in film.size())
         crop_width, crop_height = (int(n) for n in film.crop_size())
-        angle = float(dr.slice(mi.traverse(sensor)["x_fov"]))
+        # Not its methods: integrators of Mitsuba that nest ours pass a sensor without its class
+        parameters = mi.traverse(sensor)
+        angle = float(dr.slice(parameters["x_fov"]))
         crop = crop_width * crop_height / (width * height)
         #: Area of the crop window's image at the distance 1
         area = (2 * math.tan(math.radians(angle) / 2)) ** 2 * height / width * crop
         self._inverse_area = dr.opaque(mi.Float, 1 / area)
         self._size = dr.opaque(mi.Vector2f, [crop_width, crop_height])
         self._offset = mi.Vector2f(mi.ScalarVector2f(film.crop_offset()))
-        self._near = dr.opaque(mi.Float, sensor.near_clip())
-        self._far = dr.opaque(mi.Float, sensor.far_clip())
+        self._near = dr.opaque(mi.Float, parameters["near_clip"])
+        self._far = dr.opaque(mi.Float, parameters["far_clip"])
 
     @staticmethod
     def can_connect(sensor: mi.Sensor) -> bool:
