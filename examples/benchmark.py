@@ -1,6 +1,6 @@
 """Speed against error of our integrators and ``path``, on our scenes and on those of the papers.
 
-``make bench`` runs all of it (about 20 minutes on two cores), writes one report, and puts its
+``make bench`` runs all of it (more than an hour on two cores), writes one report, and puts its
 figures into the README; ``examples/benchmark.py open kitchen`` runs some scenes, and does not
 change the README. Runs that ``out/benchmark`` holds are not rendered again.
 """
@@ -62,7 +62,7 @@ def _with_interval(value: float, low: float | None, high: float | None, **_: Any
 @click.argument("names", nargs=-1)
 @click.option("--spp", default=128, show_default=True, help="Samples per pixel of each run.")
 @click.option("--seeds", default=3, show_default=True, help="Runs of each integrator.")
-@click.option("--reference-spp", default=4096, show_default=True, help="Of our scenes.")
+@click.option("--reference-spp", default=1024, show_default=True, help="Of our scenes.")
 @click.option("--integrator", "integrators", multiple=True, help="Instead of the standard ones.")
 @click.option("--out", type=click.Path(path_type=Path), default=ROOT / "out" / "benchmark")
 def main(
