@@ -132,7 +132,8 @@ class PathMoments(TechniqueObserver):
 
     def traced(self, camera: Sample, whole: Sample) -> None:
         brought = self._brightness(camera.L)
-        dr.eval(brought)
+        # All of it, since the film reads it too
+        dr.eval(camera, brought)
         pixel = self._pixel.numpy()
 
         def per_pixel(values: np.ndarray) -> np.ndarray:
