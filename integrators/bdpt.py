@@ -14,6 +14,7 @@ from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.light_walk import STRIDE
 from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
+from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
 from mitsuba_ext.composition.next_event import sampling_weights
 from mitsuba_ext.composition.slots import read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
@@ -48,6 +49,11 @@ class BidirectionalIntegrator(WalkIntegrator):
        - |bool|
        - Connect light paths to the sensor as well (t = 1)? It finds caustics that are seen
          directly. (Default: true)
+     * - lens_sampling
+       - |string|
+       - How a connection to a :monosp:`thinlens` chooses the point of the aperture, as in
+         :class:`light_tracer`: :monosp:`uniform`, or by :monosp:`visibility`. Needs the
+         light image. (Default: uniform)
      * - next_event, directions, roulette, shadow_test
        - |string| or |decision|
        - Decisions of the camera paths, as in :class:`composed_path`. (Default: those of
@@ -104,10 +110,19 @@ class BidirectionalIntegrator(WalkIntegrator):
         super().__init__(props)
         self.connections = self.parameter(props, "connections", 1, minimum=1, maximum=1024)
         self.light_image = self.parameter(props, "light_image", True)
+        self.lens_sampling = self.parameter(
+            props, "lens_sampling", "uniform", choices=LENS_SAMPLING
+        )
+        if self.lens_sampling != "uniform" and not self.light_image:
+            raise ValueError(
+                f'"{self.name}": the parameter "lens_sampling" needs "light_image"; leave it out'
+            )
         self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in _SLOTS})
 
     def parameters(self) -> dict[str, Any]:
         own = {"connections": self.connections, "light_image": self.light_image}
+        if self.light_image:
+            own["lens_sampling"] = self.lens_sampling
         return {**own, **super().parameters()}
 
     @property
@@ -126,7 +141,11 @@ class BidirectionalIntegrator(WalkIntegrator):
             emission = LightEmission(scene)
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
-        target = ConnectableSensor(sensor) if self._has_light_image(sensor) else None
+        target = None
+        if self._has_light_image(sensor):
+            target = connectable_sensor(
+                self.name, self.lens_sampling, scene, sensor, self._query(scene)
+            )
         correct = sampling_weights(scene) if emission.has_smooth_meshes else None
         return functools.partial(self._estimator, emission, target, correct)
 

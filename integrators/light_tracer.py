@@ -12,6 +12,7 @@ from mitsuba_ext.bidirectional.light_tracer import LightTracer
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
+from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera import check_takes_splats
 from mitsuba_ext.rendering.stages import OneStage
@@ -35,6 +36,11 @@ class LightTracerIntegrator(WalkIntegrator):
 
     .. pluginparameters::
 
+     * - lens_sampling
+       - |string|
+       - How a connection to a :monosp:`thinlens` chooses the point of the aperture:
+         :monosp:`uniform`, or by :monosp:`visibility`, from the parts of the lens that nothing
+         hides. (Default: uniform)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
@@ -85,7 +91,13 @@ class LightTracerIntegrator(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
+        self.lens_sampling = self.parameter(
+            props, "lens_sampling", "uniform", choices=LENS_SAMPLING
+        )
         self.fill(props)
+
+    def parameters(self) -> dict[str, Any]:
+        return {"lens_sampling": self.lens_sampling, **super().parameters()}
 
     @property
     def sample_cost(self) -> int:
@@ -107,7 +119,7 @@ class LightTracerIntegrator(WalkIntegrator):
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
         query = self._query(scene)
-        walk = None
+        target, walk = ConnectableSensor(sensor), None
         if scene.emitters() and self.max_depth > 1:
             self._warn_of_hidden(scene)
             try:
@@ -115,8 +127,9 @@ class LightTracerIntegrator(WalkIntegrator):
             except NotImplementedError as error:
                 raise NotImplementedError(f'"{self.name}": {error}') from None
             walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
+            target = connectable_sensor(self.name, self.lens_sampling, scene, sensor, query)
         directly = Walk(min(self.max_depth, 1), self.rr_depth, self.hide_emitters, query=query)
-        return OneStage(LightTracer(directly, walk, ConnectableSensor(sensor)))
+        return OneStage(LightTracer(directly, walk, target))
 
     def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
         raise NotImplementedError(

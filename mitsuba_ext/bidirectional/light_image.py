@@ -111,10 +111,12 @@ class LightImage:
         value, reverse_pdf = evaluate(
             heroes, vertex.hero_is_alone, si.bsdf(), si, to_camera, active
         )
-        value *= vertex.β * (connection.importance * lens_weight)
+        importance = connection.importance * lens_weight
+        value *= vertex.β * importance
         if self._sums is not None:
-            # The density with which a camera ray finds the vertex, per area
-            found = connection.importance * geometric_cosine(si, to_camera)
+            # The density with which a camera ray finds the vertex, per area, in units of the
+            # density of this point of the aperture
+            found = importance * geometric_cosine(si, to_camera)
             value *= weight(self._sums.others(found, vertex.sums, reverse_pdf))
         # A connection that cannot contribute needs no shadow ray
         active &= dr.max(dr.abs(value)) > 0
