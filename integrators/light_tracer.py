@@ -62,6 +62,13 @@ class LightTracerIntegrator(WalkIntegrator):
     film any :monosp:`hdrfilm`, with any filter and crop window, but without
     :monosp:`sample_border`.
 
+    **lens_sampling.** With :monosp:`visibility`, depth maps from 16 or 64 pieces of the aperture are
+    traced at the start of a render (600 000 rays at most), and a table (20 MiB at most) tells from
+    which pieces a place is seen. Connections prefer these; the mean stays the same. It helps where
+    things near the lens, out of focus, hide a part of it, and costs the time of the maps elsewhere;
+    with too little parallax to see it falls back to :monosp:`uniform`. With a sensor that has no
+    aperture it has no effect, and a warning says so.
+
     For each sample of a pixel there is one camera ray, which sees emitters, and one light path. The
     emitter of a light path is chosen by power and by :monosp:`sampling_weight`, half of the paths
     each. Surface and sky emit as :monosp:`path` sees it, also where Mitsuba's :monosp:`ptracer`
@@ -74,7 +81,7 @@ class LightTracerIntegrator(WalkIntegrator):
 
     Source: J. Arvo, *Backward Ray Tracing*, SIGGRAPH course, 1986; E. Veach, *Robust Monte Carlo
     Methods for Light Transport Simulation*, PhD thesis, 1997, section 10.2 (t = 1); adjoint BSDFs:
-    section 5.3 there.
+    section 5.3 there; J. J. Guo, PhD thesis, TU Delft, section 5.3.3, Algorithm 5 (aperture).
 
     .. tabs::
         .. code-tab:: xml

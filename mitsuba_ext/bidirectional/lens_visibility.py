@@ -31,6 +31,10 @@ _SLICES_PER_PIXEL = 2.0
 #: and by how much this square is larger than the cell.
 _TAPS, _WIDTH = 3, 2.0
 
+#: The powers of its inverse are the steps of a point set that is even in five dimensions (the root
+#: of x⁶ = x + 1; M. Roberts, *The Unreasonable Effectiveness of Quasirandom Sequences*, 2018).
+_STEP = 1.1347241384015194
+
 #: What is added to the number of these places that are seen: so few may err.
 _PRIOR = 0.3
 
@@ -65,8 +69,8 @@ class VisibilityLens(UniformLens):
     the probability q, its part of the estimate's second moment is v / q, and the sum of these is
     least with √v.
 
-    Source: thesis, section 5.3.3, Algorithm 5. It looks into the depth maps for each point, and
-    takes v for the probability.
+    Source: J. J. Guo, PhD thesis, TU Delft, section 5.3.3, Algorithm 5. It looks into the
+    depth maps for each point, and takes v for the probability.
 
     Attributes:
         shape (tuple[int, int, int]): Cells along x and y of the film, and slices.
@@ -185,9 +189,11 @@ class VisibilityLens(UniformLens):
         cell = mi.Point3f(x, rest % self._size.y, rest // self._size.y)
         # What is nearer than the next slice hides the cell; its own surface does not
         nearest = (cell.z + 2) / self._scale.z + self._offset.z
-        seen = mi.UInt32(0)
+        seen, random = mi.UInt32(0), [mi.sample_tea_float32(lane, i) for i in range(5)]
         for tap in range(_TAPS**2):
-            numbers = [mi.sample_tea_float32(lane, 5 * tap + i) for i in range(5)]
+            # Random, and spread evenly over the places
+            numbers = [x + tap * _STEP**-i for i, x in enumerate(random, 1)]
+            numbers = [x - dr.floor(x) for x in numbers]
             jitter = mi.Point2f(tap % _TAPS + numbers[0], tap // _TAPS + numbers[1]) / _TAPS
             jitter = 0.5 + _WIDTH * (jitter - 0.5)
             place = cell + mi.Vector3f(jitter.x, jitter.y, numbers[2])
