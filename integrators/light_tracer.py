@@ -62,12 +62,12 @@ class LightTracerIntegrator(WalkIntegrator):
     film any :monosp:`hdrfilm`, with any filter and crop window, but without
     :monosp:`sample_border`.
 
-    **lens_sampling.** With :monosp:`visibility`, depth maps from 16 or 64 pieces of the aperture are
-    traced at the start of a render (600 000 rays at most), and a table (20 MiB at most) tells from
-    which pieces a place is seen. Connections prefer these; the mean stays the same. It helps where
-    things near the lens, out of focus, hide a part of it, and costs the time of the maps elsewhere;
-    with too little parallax to see it falls back to :monosp:`uniform`. With a sensor that has no
-    aperture it has no effect, and a warning says so.
+    **lens_sampling.** With :monosp:`visibility`, depth maps from 16 or 64 pieces of the aperture
+    are traced at the start of a render (600 000 rays at most), and a table (20 MiB at most) tells
+    from which pieces a place is seen. Connections prefer these; the mean stays the same. It helps
+    where things near the lens, out of focus, hide a part of it, and costs the time of the maps
+    elsewhere; with too little parallax to see it falls back to :monosp:`uniform`. With a sensor
+    that has no aperture it has no effect, and a warning says so.
 
     For each sample of a pixel there is one camera ray, which sees emitters, and one light path. The
     emitter of a light path is chosen by power and by :monosp:`sampling_weight`, half of the paths
