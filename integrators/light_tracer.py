@@ -12,6 +12,7 @@ from mitsuba_ext.bidirectional.light_tracer import LightTracer
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
+from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera import check_takes_splats
 from mitsuba_ext.rendering.stages import OneStage
@@ -35,6 +36,11 @@ class LightTracerIntegrator(WalkIntegrator):
 
     .. pluginparameters::
 
+     * - lens_sampling
+       - |string|
+       - How a connection to a :monosp:`thinlens` chooses the point of the aperture:
+         :monosp:`uniform`, or by :monosp:`visibility`, from the parts of the lens that nothing
+         hides. (Default: uniform)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
@@ -57,6 +63,13 @@ class LightTracerIntegrator(WalkIntegrator):
     film any :monosp:`hdrfilm`, with any filter and crop window, but without
     :monosp:`sample_border`.
 
+    **lens_sampling.** With :monosp:`visibility`, depth maps from 16 or 64 pieces of the aperture
+    are traced at the start of a render (600 000 rays at most), and a table (20 MiB at most) tells
+    from which pieces a place is seen. Connections prefer these; the mean stays the same. It helps
+    where things near the lens, out of focus, hide a part of it, and costs the time of the maps
+    elsewhere; with too little parallax to see it falls back to :monosp:`uniform`. With a sensor
+    that has no aperture it has no effect, and a warning says so.
+
     For each sample of a pixel there is one camera ray, which sees emitters, and one light path. The
     emitter of a light path is chosen by power and by :monosp:`sampling_weight`, half of the paths
     each. Surface and sky emit as :monosp:`path` sees it, also where Mitsuba's :monosp:`ptracer`
@@ -71,7 +84,7 @@ class LightTracerIntegrator(WalkIntegrator):
 
     Source: J. Arvo, *Backward Ray Tracing*, SIGGRAPH course, 1986; E. Veach, *Robust Monte Carlo
     Methods for Light Transport Simulation*, PhD thesis, 1997, section 10.2 (t = 1); adjoint BSDFs:
-    section 5.3 there.
+    section 5.3 there; J. J. Guo, PhD thesis, TU Delft, section 5.3.3, Algorithm 5 (aperture).
 
     .. tabs::
         .. code-tab:: xml
@@ -88,8 +101,14 @@ class LightTracerIntegrator(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
+        self.lens_sampling = self.parameter(
+            props, "lens_sampling", "uniform", choices=LENS_SAMPLING
+        )
         self.fill(props)
         self._has_warned = False
+
+    def parameters(self) -> dict[str, Any]:
+        return {"lens_sampling": self.lens_sampling, **super().parameters()}
 
     @property
     def sample_cost(self) -> int:
@@ -111,7 +130,7 @@ class LightTracerIntegrator(WalkIntegrator):
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
         query = self._query(scene)
-        walk = None
+        target, walk = ConnectableSensor(sensor), None
         if scene.emitters() and self.max_depth > 1:
             self._warn_of_hidden(scene)
             try:
@@ -119,8 +138,9 @@ class LightTracerIntegrator(WalkIntegrator):
             except NotImplementedError as error:
                 raise NotImplementedError(f'"{self.name}": {error}') from None
             walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
+            target = connectable_sensor(self.name, self.lens_sampling, scene, sensor, query)
         directly = Walk(min(self.max_depth, 1), self.rr_depth, self.hide_emitters, query=query)
-        return OneStage(LightTracer(directly, walk, ConnectableSensor(sensor)))
+        return OneStage(LightTracer(directly, walk, target))
 
     def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
         raise NotImplementedError(

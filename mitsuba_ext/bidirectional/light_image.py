@@ -114,11 +114,13 @@ class LightImage:
         value, reverse_pdf = evaluate(
             heroes, vertex.hero_is_alone, si.bsdf(), si, to_camera, active
         )
-        value *= vertex.β * (connection.importance * lens_weight)
+        importance = connection.importance * lens_weight
+        value *= vertex.β * importance
         mis, by_camera = mi.Float(1), ()
         if self._sums is not None:
-            # The density with which a camera ray finds the vertex, per area
-            found = connection.importance * geometric_cosine(si, to_camera)
+            # The density with which a camera ray finds the vertex, per area, in units of the
+            # density of this point of the aperture
+            found = importance * geometric_cosine(si, to_camera)
             mis = weight(self._sums.others(found, vertex.sums, reverse_pdf))
             by_camera = self._sums.by_camera(
                 found, vertex.sums, reverse_pdf, vertex.depth == 1

@@ -50,6 +50,12 @@ class BidirectionalWeights(Weights):
     def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Sums:
         ref = dr.select(path.depth == 0, self._origin, path.arrival.ref.p)
         later = self.sums.arrive(path.sums, si, dr.squared_norm(si.p - ref))
+        if self._sensor is not None:
+            # With which a light path's vertex there would be connected to this point of the lens
+            is_first = path.depth == 0
+            lens = self._sensor.lens_density(self._origin, si.p, is_first & si.is_valid())
+            if not isinstance(lens, float):
+                later.dVCM *= dr.select(is_first, self.sums.ratio(lens), 1)
         # Where nothing was hit, densities stay those of directions
         return Sums(
             dr.select(si.is_valid(), later.dVCM, path.sums.dVCM),

@@ -1,0 +1,134 @@
+"""Depth maps of a scene, seen from pieces of the aperture of a thin lens."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.path_decisions import SceneQuery
+
+#: The numbers that choose the middle of the aperture.
+_MIDDLE = 0.5
+
+
+class DepthMaps:
+    """The inverse depth of what is seen through each piece of the aperture. The pieces have equal
+    areas: they are squares of the numbers that choose points of the aperture.
+
+    A pixel has one ray, from a random point of the piece through a random point of the pixel, at a
+    random time. A map takes 4 bytes for each pixel.
+
+    Where the middle of the aperture sees a point, and its inverse depth, are called the *place* of
+    the point: x and y in units of the film's size, and z.
+
+    Parameters:
+        scene: The scene.
+        sensor: A ``thinlens``.
+        query: How a ray meets the scene.
+        pieces: There are ``pieces``² of them.
+        most_pixels: Of a map along its longer edge. It has no more than the film.
+
+    Attributes:
+        shape (tuple[int, int]): Width and height.
+        places (mi.Point3f): Of everything that was seen, in any map.
+        nearest, farthest (float): Inverse depths of the nearest and the farthest of these.
+        margins (tuple[float, float]): How far the choice of the point of the aperture moves points
+            between these depths on the film, in x and y, from where its middle sees them.
+        parallax (float): By how much more a point at one of these depths is moved than one at the
+            other, between opposite points of the aperture; in units of the film's longer edge.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery, pieces: int, most_pixels: int
+    ) -> None:
+        self._sensor, self.pieces = sensor, pieces
+        size = [int(n) for n in sensor.film().crop_size()]
+        shrink = min(1.0, most_pixels / max(size))
+        self.shape = (max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink)))
+        axis = mi.Transform4f(sensor.world_transform()) @ mi.Vector3f(0, 0, 1)
+        self._axis = dr.normalize(axis)
+        dr.make_opaque(self._axis)
+        self._maps = self._trace(scene, query)
+        self.nearest = self.farthest = self.parallax = 0.0
+        self.margins = (0.0, 0.0)
+        if dr.width(self.places) > 0:
+            # Not equal: they are divided by their difference
+            self.nearest = 1.001 * float(dr.slice(dr.max(self.places.z)))
+            self.farthest = 0.999 * float(dr.slice(dr.min(self.places.z)))
+            self._measure(size)
+
+    def place(self, p: mi.Point3f) -> mi.Point3f:
+        """The place of a point; 0 where it is behind the lens."""
+        it = dr.zeros(mi.Interaction3f, dr.width(p))
+        it.p = p
+        ds, _ = self._sensor.sample_direction(it, mi.Point2f(_MIDDLE))
+        depth = dr.dot(p - ds.p, self._axis)
+        position = ds.uv / mi.ScalarVector2f(self._sensor.film().crop_size())
+        place = mi.Point3f(position.x, position.y, dr.rcp(depth))
+        return dr.select(depth > 0, place, 0)
+
+    def lens_numbers(self, piece: mi.UInt32, numbers: mi.Point2f) -> mi.Point2f:
+        """The numbers that choose the point of a piece at relative coordinates in [0, 1)²."""
+        corner = mi.Point2f(piece % self.pieces, piece // self.pieces)
+        return (corner + numbers) / self.pieces
+
+    def is_seen(
+        self, place: mi.Point3f, numbers: mi.Point2f, piece: mi.UInt32, nearest: mi.Float
+    ) -> mi.Bool:
+        """Is a point seen through a point of the aperture, in the map of its piece?
+
+        Parameters:
+            place: Of the point.
+            numbers: Choose the point of the aperture.
+            nearest: The inverse depth up to which nothing hides it.
+        """
+        seen = self._seen_from(place, numbers)
+        active = dr.all((seen >= 0) & (seen < 1))
+        width, height = self.shape
+        pixel = mi.Vector2u(dr.select(active, seen, 0) * mi.Vector2f(width, height))
+        pixel = dr.minimum(pixel, mi.Vector2u(width - 1, height - 1))
+        index = (piece * height + pixel.y) * width + pixel.x
+        return active & (dr.gather(mi.Float, self._maps, index, active) <= nearest)
+
+    def _seen_from(self, place: mi.Point3f, numbers: mi.Point2f) -> mi.Point2f:
+        """Where on the film a point is seen through a point of the aperture."""
+        ray, _ = self._sensor.sample_ray(
+            0, _MIDDLE, mi.Point2f(place.x, place.y), mi.Point2f(_MIDDLE)
+        )
+        distance = dr.rcp(place.z) - self._sensor.near_clip()
+        it = dr.zeros(mi.Interaction3f, dr.width(place))
+        it.p = ray.o + ray.d * (distance / dr.dot(ray.d, self._axis))
+        ds, _ = self._sensor.sample_direction(it, numbers)
+        return ds.uv / mi.ScalarVector2f(self._sensor.film().crop_size())
+
+    def _trace(self, scene: mi.Scene, query: SceneQuery) -> mi.Float:
+        """The maps, one after the other, row by row; 0 where nothing is seen."""
+        width, height = self.shape
+        lane = dr.arange(mi.UInt32, width * height * self.pieces**2)
+        numbers = [mi.sample_tea_float32(lane, i) for i in range(5)]
+        x, y, piece = lane % width, (lane // width) % height, lane // (width * height)
+        position = mi.Point2f(x + numbers[0], y + numbers[1]) / mi.Vector2f(width, height)
+        sensor = self._sensor
+        time = sensor.shutter_open() + numbers[4] * sensor.shutter_open_time()
+        lens = self.lens_numbers(piece, mi.Point2f(numbers[2], numbers[3]))
+        ray, _ = sensor.sample_ray(time, _MIDDLE, position, lens)
+        pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
+        is_hit = pi.is_valid()
+        place = self.place(ray(dr.select(is_hit, pi.t, 0)))
+        place.z = dr.select(is_hit, place.z, 0)
+        dr.eval(place)
+        self.places = dr.gather(mi.Point3f, place, dr.compress(place.z > 0))
+        return place.z
+
+    def _measure(self, size: list[int]) -> None:
+        """Margins and parallax. The edge of the aperture moves points from the middle of the film
+        as it moves all others."""
+        place = mi.Point3f(_MIDDLE, _MIDDLE, mi.Float([self.farthest, self.nearest]))
+        margins = []
+        for i in range(2):
+            edge = mi.Point2f(_MIDDLE)
+            edge[i] = 1
+            far, near = (float(x) - _MIDDLE for x in self._seen_from(place, edge)[i])
+            margins.append(max(abs(far), abs(near)))
+            self.parallax = max(self.parallax, 2 * abs(near - far) * size[i] / max(size))
+        self.margins = (margins[0], margins[1])

@@ -1,0 +1,211 @@
+"""Points of the aperture by visibility: light paths are connected to the part of the lens that, by
+depth maps, nothing hides."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.path_decisions import SceneQuery
+from .depth_maps import DepthMaps
+from .sensor import UniformLens
+
+#: Pieces along each edge of a square, and pixels along the longer edge of the maps at most: where
+#: the lens blurs little, and where it blurs much.
+_SHARP, _BLURRED = (4, 256), (8, 128)
+
+#: Parallax, in units of the film's longer edge, from which on the lens blurs much.
+_MUCH_PARALLAX = 0.1
+
+#: Cells · pieces, and slices, at most. A cell takes 4 bytes, and one that holds surfaces a byte
+#: more for each piece, and 5 while the table is computed: 100 MiB in the worst case.
+_MOST_ENTRIES, _MOST_SLICES = 1 << 24, 64
+
+#: Slices for each pixel of a map by which the lens moves the nearest thing more than the farthest.
+_SLICES_PER_PIXEL = 2.0
+
+#: Places around a cell, along each edge of a square, at which the maps are looked up for a piece;
+#: and by how much this square is larger than the cell.
+_TAPS, _WIDTH = 3, 2.0
+
+#: The powers of its inverse are the steps of a point set that is even in five dimensions (the root
+#: of x⁶ = x + 1; M. Roberts, *The Unreasonable Effectiveness of Quasirandom Sequences*, 2018).
+_STEP = 1.1347241384015194
+
+#: What is added to the number of these places that are seen: so few may err.
+_PRIOR = 0.3
+
+#: The table ends so far outside of the film, in units of its size.
+_WIDEST_MARGIN = 1.0
+
+#: With less parallax, in pixels of the film, all of the lens sees the same.
+_LEAST_PARALLAX = 2.0
+
+
+def visibility_lens(scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery) -> UniformLens:
+    """Chooses points of the aperture of a ``thinlens`` by visibility; uniformly, where nothing that
+    the sensor sees can hide something from a part of the lens only."""
+    parallax = DepthMaps(scene, sensor, query, pieces=2, most_pixels=64).parallax
+    if parallax * max(sensor.film().crop_size()) < _LEAST_PARALLAX:
+        return UniformLens()
+    pieces, most_pixels = _BLURRED if parallax > _MUCH_PARALLAX else _SHARP
+    lens = VisibilityLens(DepthMaps(scene, sensor, query, pieces, most_pixels))
+    mi.Log(mi.LogLevel.Info, f"Table of what the lens sees: {lens.bytes / 2**20:.1f} MiB")
+    return lens
+
+
+class VisibilityLens(UniformLens):
+    """Chooses points of the aperture by a table of what depth maps let through.
+
+    The view of the lens' middle is divided into cells: rectangles of the film, and slices of the
+    inverse depth, in which parallax is uniform. For each cell that holds surfaces, the table has
+    the probabilities with which its points are connected to each piece of the aperture. They are
+    positive: the maps may err, and the estimate stays unbiased.
+
+    A piece of which the share v is seen has a probability in proportion to √v. If it is chosen with
+    the probability q, its part of the estimate's second moment is v / q, and the sum of these is
+    least with √v.
+
+    Source: J. J. Guo, PhD thesis, TU Delft, section 5.3.3, Algorithm 5. It looks into the
+    depth maps for each point, and takes v for the probability.
+
+    Attributes:
+        shape (tuple[int, int, int]): Cells along x and y of the film, and slices.
+        bytes (int): Memory of the table.
+    """
+
+    is_uniform = False
+
+    def __init__(self, maps: DepthMaps) -> None:
+        self._maps, self._pieces, self._count = maps, maps.pieces, maps.pieces**2
+        margins = [min(_WIDEST_MARGIN, margin) for margin in maps.margins]
+        slices = math.ceil(_SLICES_PER_PIXEL * maps.parallax * max(maps.shape))
+        slices = max(4, min(_MOST_SLICES, slices))
+        self.shape = (*_cells(maps.shape, margins, _MOST_ENTRIES // (self._count * slices)), slices)
+        # From places to cells
+        scale = [n / (1 + 2 * margin) for n, margin in zip(self.shape, margins)]
+        self._offset = mi.Point3f(-margins[0], -margins[1], maps.farthest)
+        self._scale = mi.Vector3f(*scale, slices / (maps.nearest - maps.farthest))
+        self._size = mi.Vector3u(self.shape)
+        dr.make_opaque(self._offset, self._scale, self._size)
+        self._rows = self._occupied()
+        self._words = self._table()
+        self.bytes = 4 * (len(self._rows) + len(self._words))
+
+    def sample(self, sample, si, active):
+        weights, total = self._weights(si.p, active)
+        x, before = sample.x * mi.Float(total), mi.UInt32(0)
+        piece, start, chosen = mi.UInt32(0), mi.UInt32(0), weights[0]
+        for k, weight in enumerate(weights):
+            is_reached = mi.Float(before) <= x
+            piece = dr.select(is_reached, k, piece)
+            start = dr.select(is_reached, before, start)
+            chosen = dr.select(is_reached, weight, chosen)
+            before += weight
+        # What is left of the number
+        x = (x - mi.Float(start)) / mi.Float(chosen)
+        numbers = self._maps.lens_numbers(piece, mi.Point2f(x, sample.y))
+        return numbers, mi.Float(total) / mi.Float(self._count * chosen)
+
+    def density(self, sample, p, active):
+        weights, total = self._weights(p, active)
+        corner = mi.Vector2u(dr.clip(sample * self._pieces, 0, self._pieces - 1))
+        piece, chosen = corner.y * self._pieces + corner.x, mi.UInt32(0)
+        for k, weight in enumerate(weights):
+            chosen = dr.select(piece == k, weight, chosen)
+        return mi.Float(self._count * chosen) / mi.Float(total)
+
+    def _weights(self, p: mi.Point3f, active: mi.Bool) -> tuple[list[mi.UInt32], mi.UInt32]:
+        """The probabilities of the pieces for the point ``p``, times their sum: positive integers;
+        and the sum."""
+        place = self._maps.place(p)
+        cell, inside = self._cell(place)
+        active = active & (place.z > 0) & inside
+        row = dr.gather(mi.UInt32, self._rows, self._index(cell), active)
+        active &= row > 0
+        words = dr.gather(
+            mi.ArrayXu, self._words, row - 1, active, shape=(self._count // 4, dr.width(active))
+        )
+        weights = []
+        for i in range(self._count // 4):
+            word = dr.select(active, words[i], 0x01010101)
+            weights += [(word >> (8 * k)) & 255 for k in range(4)]
+        return weights, sum(weights[1:], weights[0])
+
+    def _cell(self, place: mi.Point3f, shift: mi.Point3f = 0) -> tuple[mi.Vector3u, mi.Bool]:
+        """The cell of a place, which is moved by ``shift`` cells, and whether it is in the table.
+        The first and the last slice reach to infinity and to the lens."""
+        cell = (place - self._offset) * self._scale + shift
+        last = mi.Point3f(self._size - 1)
+        cell.z = dr.clip(cell.z, 0, last.z)
+        inside = dr.all((cell >= 0) & (cell < last + 1))
+        return mi.Vector3u(dr.select(inside, cell, 0)), inside
+
+    def _index(self, cell: mi.Vector3u) -> mi.UInt32:
+        return (cell.z * self._size.y + cell.y) * self._size.x + cell.x
+
+    def _occupied(self) -> mi.UInt32:
+        """By cell, 1 + the row of the table for those that hold surfaces, and 0 for others."""
+        count = self.shape[0] * self.shape[1] * self.shape[2]
+        rows = dr.zeros(mi.UInt32, count)
+        # Surfaces may pass between two rays
+        for shift in itertools.product((-0.5, 0.5), repeat=3):
+            cell, inside = self._cell(self._maps.places, mi.Point3f(*shift))
+            dr.scatter(rows, mi.UInt32(1), self._index(cell), inside)
+        dr.eval(rows)
+        self._cells = dr.compress(rows > 0)
+        dr.scatter(rows, dr.arange(mi.UInt32, 1, len(self._cells) + 1), self._cells)
+        dr.eval(rows)
+        return rows
+
+    def _table(self) -> mi.UInt32:
+        """The weights of the cells that hold surfaces: a byte for each piece."""
+        rows = len(self._cells)
+        row = dr.arange(mi.UInt32, rows)
+        counts = dr.gather(mi.ArrayXu, self._seen(), row, shape=(self._count, rows))
+        likes = [dr.sqrt(mi.Float(counts[k]) + _PRIOR) for k in range(self._count)]
+        largest = likes[0]
+        for like in likes[1:]:
+            largest = dr.maximum(largest, like)
+        words = [mi.UInt32(0) for _ in range(self._count // 4)]
+        for k, like in enumerate(likes):
+            byte = mi.UInt32(dr.round(255 * like / largest))
+            words[k // 4] |= dr.maximum(byte, 1) << (8 * (k % 4))
+        table = dr.empty(mi.UInt32, rows * len(words))
+        dr.scatter(table, mi.ArrayXu(words), row)
+        dr.eval(table)
+        return table
+
+    def _seen(self) -> mi.UInt32:
+        """At how many places of a cell, and around it, points are seen from each piece:
+        [cell, piece]."""
+        lane = dr.arange(mi.UInt32, len(self._cells) * self._count)
+        piece = lane % self._count
+        index = dr.gather(mi.UInt32, self._cells, lane // self._count)
+        x, rest = index % self._size.x, index // self._size.x
+        cell = mi.Point3f(x, rest % self._size.y, rest // self._size.y)
+        # What is nearer than the next slice hides the cell; its own surface does not
+        nearest = (cell.z + 2) / self._scale.z + self._offset.z
+        seen, random = mi.UInt32(0), [mi.sample_tea_float32(lane, i) for i in range(5)]
+        for tap in range(_TAPS**2):
+            # Random, and spread evenly over the places
+            numbers = [x + tap * _STEP**-i for i, x in enumerate(random, 1)]
+            numbers = [x - dr.floor(x) for x in numbers]
+            jitter = mi.Point2f(tap % _TAPS + numbers[0], tap // _TAPS + numbers[1]) / _TAPS
+            jitter = 0.5 + _WIDTH * (jitter - 0.5)
+            place = cell + mi.Vector3f(jitter.x, jitter.y, numbers[2])
+            place = place / self._scale + self._offset
+            lens = self._maps.lens_numbers(piece, mi.Point2f(numbers[3], numbers[4]))
+            seen += dr.select(self._maps.is_seen(place, lens, piece, nearest), 1, 0)
+        dr.eval(seen)
+        return seen
+
+
+def _cells(shape: tuple[int, int], margins: list[float], most: int) -> tuple[int, int]:
+    """Cells along x and y: as large as pixels of the maps, or larger if there are too many."""
+    sizes = [n * (1 + 2 * margin) for n, margin in zip(shape, margins)]
+    shrink = min(1.0, math.sqrt(most / (sizes[0] * sizes[1])))
+    return max(1, int(sizes[0] * shrink)), max(1, int(sizes[1] * shrink))
