@@ -18,9 +18,10 @@ from mitsuba_ext.composition.next_event import sampling_weights
 from mitsuba_ext.composition.slots import read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera import check_takes_splats
+from mitsuba_ext.transport.path_decisions import SubpathSelection
 
 #: The decisions of camera paths that a scene can replace.
-_SLOTS = ("directions", "next_event", "roulette", "shadow_test")
+_SLOTS = ("directions", "next_event", "roulette", "shadow_test", "subpath_selection")
 
 #: Memory for what a pass stores, and about what a path takes besides the vertices that are stored
 #: at a time.
@@ -132,11 +133,14 @@ class BidirectionalIntegrator(WalkIntegrator):
 
     def _estimator(self, emission, sensor, correct, **decisions: Any) -> BidirectionalPathTracer:
         next_event = decisions.pop("next_event", None)
+        selection = decisions.pop("subpath_selection", SubpathSelection())
         # Mitsuba's own density of points on meshes with interpolated normals is wrong
         next_event = FromBothEnds(next_event) if next_event else correct
         if next_event:
             decisions["next_event"] = next_event
-        return BidirectionalPathTracer(self.walk(**decisions), emission, sensor, self.connections)
+        return BidirectionalPathTracer(
+            self.walk(**decisions), emission, sensor, self.connections, selection
+        )
 
     def _has_light_image(self, sensor: mi.Sensor) -> bool:
         if not self.light_image or not ConnectableSensor.can_connect(sensor):

@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.composition.slots import SLOTS, read_slot
+from mitsuba_ext.composition.slots import SLOTS, SLOTS_OF_PATHS, read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 
 
@@ -124,8 +124,8 @@ class ComposedPath(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in SLOTS})
+        self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in SLOTS_OF_PATHS})
 
     def parameters(self) -> dict[str, Any]:
-        defaults = {slot: next(iter(words)) for slot, words in SLOTS.items()}
+        defaults = {slot: next(iter(SLOTS[slot])) for slot in SLOTS_OF_PATHS}
         return {**defaults, **super().parameters()}

@@ -15,6 +15,9 @@ from .partial_sums import Sums
 #: Bit of the last word: only the hero wavelength is left of the path.
 _HERO_IS_ALONE = 1 << 31
 
+#: Bits of the last word that hold the depth, where the region follows.
+_DEPTH_BITS = 15
+
 
 @dataclass
 class Layout:
@@ -24,19 +27,21 @@ class Layout:
         spectrum: Words of a spectrum.
         has_sums: Are partial sums of MIS weights stored?
         has_instances: May a vertex lie on an instance?
+        has_region: Are vertices chosen by the region in which they lie?
     """
 
     spectrum: int
     has_sums: bool
     has_instances: bool
+    has_region: bool = False
 
     @classmethod
-    def of(cls, scene: mi.Scene, has_sums: bool) -> Layout:
+    def of(cls, scene: mi.Scene, has_sums: bool, has_region: bool = False) -> Layout:
         # The scenes of moving shapes may hold instances
         has_instances = bool(movers(scene)) or any(
             shape.class_name() == "Instance" for shape in scene.shapes()
         )
-        return cls(dr.size_v(mi.Spectrum), has_sums, has_instances)
+        return cls(dr.size_v(mi.Spectrum), has_sums, has_instances, has_region)
 
     @property
     def words(self) -> int:
@@ -78,9 +83,11 @@ class VertexStore:
         mark = mi.UInt32(depth)
         if not isinstance(hero_is_alone, tuple):
             mark |= dr.select(hero_is_alone, mi.UInt32(_HERO_IS_ALONE), 0)
+        if self.layout.has_region:
+            mark |= sums.region << _DEPTH_BITS
         words = [*si.p, *d, *pi.prim_uv, _as_float(pi.prim_index), _as_float(pi.shape), *β]
         if self.layout.has_sums:
-            words += [sums.dVCM, sums.dVC]
+            words += [sums.last, sums.dVC]
         words += [_as_float(mark)]
         if self.layout.has_instances:
             words += [_as_float(pi.instance), _as_float(pi.shape_index)]
@@ -163,6 +170,9 @@ class LightVertices:
         if layout.has_sums:
             sums, rest = Sums(w[rest], w[rest + 1]), rest + 2
         mark = dr.reinterpret_array(mi.UInt32, w[rest])
+        depth = mark & (_HERO_IS_ALONE - 1)
+        if layout.has_region:
+            depth, sums.region = _depth_and_region(mark)
         instance, shape_index = None, None
         if layout.has_instances:
             instance = _as_shape(w[rest + 1])
@@ -171,8 +181,8 @@ class LightVertices:
         return LightVertex(
             mi.Point3f(w[0], w[1], w[2]), mi.Vector3f(w[3], w[4], w[5]), mi.Point2f(w[6], w[7]),
             dr.reinterpret_array(mi.UInt32, w[8]), _as_shape(w[9]), instance, shape_index,
-            mi.Spectrum(*(w[10 + i] for i in range(n))), sums, mark & (_HERO_IS_ALONE - 1),
-            hero_is_alone, self._lane_of(slot, active),
+            mi.Spectrum(*(w[10 + i] for i in range(n))), sums, depth, hero_is_alone,
+            self._lane_of(slot, active),
         )  # fmt: skip
 
     def interaction(
@@ -251,6 +261,20 @@ class VertexCache(LightVertices):
             dr.eval(self._words, self._lane, before)
             vertices._words = vertices._lane = None
         self.bytes = self.count * (4 * words + 8)
+
+    @property
+    def region(self) -> mi.UInt32:
+        """The region in which each vertex lies, where the layout has it."""
+        layout = self._layout
+        place = 10 + layout.spectrum + 2 * layout.has_sums
+        index = dr.arange(mi.UInt32, self.count) * layout.words + place
+        mark = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, index))
+        return _depth_and_region(mark)[1]
+
+
+def _depth_and_region(mark: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+    """Of the last word of a vertex, which has 16 bits for the region."""
+    return mark & ((1 << _DEPTH_BITS) - 1), (mark & (_HERO_IS_ALONE - 1)) >> _DEPTH_BITS
 
 
 def _as_float(value: Any) -> mi.Float:

@@ -84,7 +84,8 @@ class LightWalk:
 
     def layout(self, scene: mi.Scene) -> Layout:
         """Of the stored vertices."""
-        return Layout.of(scene, self.sums is not None)
+        by_region = self.sums is not None and self.sums.selection is not None
+        return Layout.of(scene, self.sums is not None, by_region)
 
     def begin(
         self,
@@ -224,11 +225,13 @@ class LightWalk:
         """The partial sums at a vertex."""
         if self.sums is None:
             return paths.sums
-        later = self.sums.arrive(paths.sums, si, dr.square(si.t))
         is_first = paths.depth == 1
+        later = self.sums.arrive(paths.sums, si, dr.square(si.t), is_first, by_light=True)
         return Sums(
             dr.select(is_first, paths.sums.dVCM, later.dVCM),
             dr.select(is_first, paths.sums.dVC, later.dVC),
+            later.region,
+            later.count,
         )
 
     def _scatter(self, heroes, paths, bsdf, si, bs, weight, sums, active):

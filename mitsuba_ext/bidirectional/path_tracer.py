@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -10,6 +10,7 @@ import mitsuba as mi
 from ..movers import movers
 from ..transport.estimator import CameraRays, Sample
 from ..transport.numbers import Numbers
+from ..transport.path_decisions import SubpathSelection
 from ..transport.walk import Walk
 from .connections import LightSubpaths
 from .emission import LightEmission
@@ -18,6 +19,7 @@ from .light_vertices import LightVertices, VertexCache
 from .light_walk import LightWalk
 from .partial_sums import PartialSums
 from .sensor import ConnectableSensor
+from .vertex_choice import OwnVertexChoice, RegionChoice, VertexChoice
 from .weights import BidirectionalWeights
 
 #: Vertices of a light path, about, for MIS weights. The true number would make the weights depend
@@ -35,19 +37,26 @@ class BidirectionalPathTracer:
         emission: Where light paths begin.
         sensor: What light paths are connected to; ``None`` if they are not.
         connections: To how many vertices of light paths each vertex of a camera path is connected.
+        selection: Chooses these vertices, or the regions in which they lie. A path of other
+            wavelengths, or of another time, cannot be connected to: where such differ, the choice
+            is always uniform, among the vertices of the light path in the same lane.
     """
 
     walk: Walk
     emission: LightEmission
     sensor: ConnectableSensor | None
     connections: int
+    selection: SubpathSelection = field(default_factory=SubpathSelection)
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
     ) -> Sample:
         walk = self.walk
-        count = dr.opaque(mi.Float, self.connections / _VERTICES)
-        sums = PartialSums(walk.next_event, count)
+        own_lane = mi.is_spectral or bool(movers(scene))
+        selection = self.selection if self.selection.count > 0 and not own_lane else None
+        # Per vertex where a selection says how often that is chosen
+        count = self.connections if selection else self.connections / _VERTICES
+        sums = PartialSums(walk.next_event, dr.opaque(mi.Float, count), selection=selection)
         image = None
         if self.sensor is not None:
             image = LightImage(
@@ -72,10 +81,14 @@ class BidirectionalPathTracer:
         weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)
         subpaths = None
         if rounds:
+            vertices = rounds[0] if len(rounds) == 1 else VertexCache(rounds, lanes)
+            if selection is not None:
+                choice = RegionChoice(vertices, selection)
+            else:
+                choice = OwnVertexChoice(vertices) if own_lane else VertexChoice(vertices)
             subpaths = LightSubpaths(
-                scene, rounds[0] if len(rounds) == 1 else VertexCache(rounds, lanes), sums,
-                walk.query, self.connections, walk.max_depth,
-                mi.is_spectral or bool(movers(scene)),
+                scene, vertices, choice, sums, walk.query, self.connections, walk.max_depth,
+                walk.observer,
             )  # fmt: skip
         sample = replace(walk, weights=weights, subpaths=subpaths)(scene, sampler, rays, active)
         return replace(

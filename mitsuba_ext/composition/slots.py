@@ -14,6 +14,7 @@ from .directions import Guided
 from .next_event import METHODS, LearnedLights, SpatialLights
 from .roulette import GuidedRoulette
 from .shadow_test import RejectedShadowRays
+from .subpath_selection import LearnedSubpaths
 
 _Maker = Callable[[ParameterReader], DecisionParameters]
 
@@ -27,7 +28,11 @@ SLOTS: dict[str, dict[str, _Maker | None]] = {
     "connections": {"one": None},
     "shadow_test": {"always": None, "visibility_roulette": RejectedShadowRays},
     **{slot: {"sampler": None} for slot in PURPOSES},
+    "subpath_selection": {"uniform": None, "visibility": lambda read: LearnedSubpaths()},
 }
+
+#: The slots of a walk whose vertices are connected to no other subpaths.
+SLOTS_OF_PATHS = tuple(slot for slot in SLOTS if slot != "subpath_selection")
 
 #: What can be nested into a slot, of this package.
 _PLUGINS: tuple[type[DecisionParameters], ...] = (
