@@ -29,8 +29,7 @@ class PairRecords(Observer):
     Attributes:
         tests (np.ndarray): Connections, shape [camera region, light region].
         squares (np.ndarray): The sum of their squares.
-        samples (int): Paths.
-        error (float): Sum of their squared errors, relative to the pixel.
+        error (float): Sum of the squared errors of the paths, relative to the pixel.
     """
 
     def __init__(self, count: int, pixels: PixelEstimates) -> None:
@@ -42,7 +41,7 @@ class PairRecords(Observer):
         """Forgets the last pilot."""
         shape = self._count, self._count
         self.tests, self.squares = np.zeros(shape), np.zeros(shape)
-        self.samples, self.error = 0, 0.0
+        self.error = 0.0
 
     # ---- Observer of the walk ----
 
@@ -86,7 +85,6 @@ class PairRecords(Observer):
         squares = np.bincount(pair, square, size + 1)[:size]
         self.tests += tests.reshape(self._count, -1)
         self.squares += squares.reshape(self._count, -1)
-        self.samples += self._lanes
         self.error += float(error.numpy().sum(dtype=np.float64))
         self._lanes = 0
         self._pair = self._value = self._total = self._pixel = self._path = None

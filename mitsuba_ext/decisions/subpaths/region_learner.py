@@ -15,29 +15,24 @@ from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
 from .pair_records import PairRecords
 from .region_table import RegionTable
-import os
 
-#: Share of the choices that go by the number of vertices alone: no vertex is chosen more rarely than
-#: so often as it is with a uniform choice.
-_DEFENSIVE = float(os.environ.get('DEF', 0.1))
+#: Share of the choices that go by the number of vertices alone: no vertex is chosen more rarely
+#: than a tenth as often as by a uniform choice.
+_DEFENSIVE = 0.1
 
 #: The weight, in connections, of what is known of the pairs of larger regions.
-_PRIOR = float(os.environ.get('PRIOR', 4.0))
+_PRIOR = 1.0
 
 #: Connections of the pilots for each pair of regions, about; and regions, at most.
-_TESTS, _MOST_REGIONS = float(os.environ.get('TESTS', 4.0)), 1024
-_POWER = float(os.environ.get('POWER', 1.0))
+_TESTS, _MOST_REGIONS = 2.0, 768
 
 #: Recorded connections of a path, about.
 _CONNECTIONS = 3
 
-#: What choosing by regions costs, in units of the time of a path, and the efficiency that it must
-#: reach: from few samples, and in the end.
-_COST, _TRIAL_EFFICIENCY, _LEAST_EFFICIENCY = 0.15, 1.02, 1.05
-
-#: Share of all pilots' samples that decide, at least.
-_LEAST_SHARE = 0.2
-_ALWAYS = bool(int(os.environ.get('ALWAYS', 0)))
+#: By how much the variance must be lower, by the first pilot's promise, for learning to go on. The
+#: truth is about twice the promise, because MIS weights then rely on the connections; a sample
+#: takes 1.2 times as long.
+_LEAST_GAIN = 0.12
 
 
 @dataclass
@@ -62,7 +57,7 @@ class RegionLearner(Learner):
     of what connections bring to the image: BSDFs, distance, visibility, MIS weight, and the
     brightness of the pixel included.
 
-    Where the pilots show that a uniform choice is nearly as good, learning ends there.
+    Where the first pilot shows that a uniform choice is nearly as good, learning ends there.
 
     Parameters:
         light_vertices: Traces light paths.
@@ -82,7 +77,7 @@ class RegionLearner(Learner):
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> RegionTable | None:
         light = self._light_vertices()
-        self._summary = "light vertices: uniformly chosen, there are none"
+        self._summary = "light vertices: there are none to choose"
         if dr.width(p) == 0 or dr.width(light.p) == 0:
             return None
         most = min(_MOST_REGIONS, (self._pilot_samples * _CONNECTIONS / _TESTS) ** 0.5)
@@ -100,7 +95,7 @@ class RegionLearner(Learner):
         # Of all pilots: connections, and the sum of the squares that they would have if the region
         # had been chosen with certainty
         self._tests, self._squares = np.zeros((2, regions.count, regions.count))
-        self._records, self._is_tested = PairRecords(regions.count, self._pixels), False
+        self._records, self._gain = PairRecords(regions.count, self._pixels), None
         return self._table()
 
     # ---- Observer ----
@@ -128,28 +123,23 @@ class RegionLearner(Learner):
         self._tests += records.tests
         self._squares += records.squares * drawn**2
         self._probability = self._learned()
-        gain = self._gain(drawn)
-        is_trial = not is_last and (
-            not self._is_tested or records.samples < _LEAST_SHARE * self._pilot_samples
+        if self._gain is None:
+            self._gain = self._promise(drawn)
+        self._summary = (
+            f"{self._regions.count} regions of light vertices, at least about "
+            f"{max(0.0, self._gain):.0%} less variance"
         )
-        self._is_tested = True
-        regions = f"{self._regions.count} regions, {gain:.0%} less variance"
-        efficiency = 1 / (max(1 - gain, 1e-3) * (1 + _COST))
-        if not _ALWAYS and efficiency < (_TRIAL_EFFICIENCY if is_trial else _LEAST_EFFICIENCY):
+        if self._gain < _LEAST_GAIN:
             self._records = None
-            self._summary = f"light vertices: uniformly chosen, with {regions}"
+            self._summary = f"light vertices uniformly chosen: with {self._summary}"
             return SubpathSelection()
-        self._summary = f"light vertices: {regions}"
         records.restart()
         return self._table()
 
-    def _gain(self, drawn: np.ndarray) -> float:
-        """By how much, relatively, the variance is lower than with a uniform choice: as the last
-        pilot has shown, or, after the first, as what was learned from it promises."""
+    def _promise(self, drawn: np.ndarray) -> float:
+        """By how much, relatively, the new probabilities lower the variance of a pilot with the
+        probabilities ``drawn``, if its MIS weights stay."""
         squares = self._records.squares
-        if self._is_tested:
-            more = (squares * (drawn / self._uniform - 1)).sum()
-            return more / max(self._records.error + more, 1e-30)
         less = (squares * (1 - drawn / self._probability)).sum()
         return less / max(self._records.error, 1e-30)
 
@@ -170,7 +160,7 @@ class RegionLearner(Learner):
                 mean[rows, columns] = (squares[rows, columns] + prior) / (
                     tests[rows, columns] + _PRIOR
                 )
-        likes = self._power * np.sqrt(mean) ** _POWER
+        likes = self._power * np.sqrt(mean)
         total = likes.sum(axis=1, keepdims=True)
         likes = np.where(total > 0, likes / np.maximum(total, 1e-300), self._uniform)
         return (1 - _DEFENSIVE) * likes + _DEFENSIVE * self._uniform
@@ -197,7 +187,7 @@ class RegionLearner(Learner):
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> RegionTable:
         self._regions = NestedRegions.of_state(state)
         self._probability, self._vertices = state["probability"], state["vertices"]
-        self._summary = f"light vertices: {self._regions.count} regions"
+        self._summary = f"{self._regions.count} regions of light vertices"
         return self._table()
 
     def finish(self) -> None:
