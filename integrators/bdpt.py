@@ -87,8 +87,8 @@ class BidirectionalIntegrator(WalkIntegrator):
     to the brightness of the pixel, and a region is chosen in proportion to the root mean square of
     that. A tenth of the choices stays uniform. The MIS weights know how often each connection is
     made, so that the image is unbiased. Use it where most connections are blocked: in corridors,
-    and between rooms. A sample takes about a seventh longer; where the pilots show that this does
-    not pay, learning ends. In spectral variants and with moving shapes there is little to choose
+    and between rooms. A sample takes about a fifth longer; where the first pilot shows that little
+    is gained, learning ends. In spectral variants and with moving shapes there is little to choose
     from, and the selection stays uniform.
 
     **Sensors and films.** A :monosp:`perspective` or :monosp:`thinlens` can be connected to; with
