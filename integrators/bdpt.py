@@ -23,7 +23,7 @@ from mitsuba_ext.composition.slots import BIDIRECTIONAL_SLOTS, read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera import check_takes_splats, film_extent
 from mitsuba_ext.transport.estimator import Estimator
-from mitsuba_ext.transport.path_decisions import NoConnections
+from mitsuba_ext.transport.path_decisions import NoConnections, SubpathSelection
 
 #: The decisions that a scene can replace, of camera paths and of light paths.
 _SLOTS = ("directions", "next_event", "roulette", "shadow_test", *BIDIRECTIONAL_SLOTS)
@@ -54,6 +54,11 @@ class BidirectionalIntegrator(WalkIntegrator):
        - |bool|
        - Connect light paths to the sensor as well (t = 1)? It finds caustics that are seen
          directly. (Default: true)
+     * - subpath_selection
+       - |string|
+       - Which vertices of light paths these are: :monosp:`uniform`, or :monosp:`visibility` (those
+         in regions whose vertices were seen from here, and brought light, in pilots). (Default:
+         uniform)
      * - lens_sampling
        - |string|
        - How a connection to a :monosp:`thinlens` chooses the point of the aperture, as in
@@ -102,6 +107,16 @@ class BidirectionalIntegrator(WalkIntegrator):
     connected to that only. Light paths have independent random numbers where the sampler is
     :monosp:`ldsampler`, whose numbers depend on each other.
 
+    **Learned selection.** Surfaces are divided into regions, the smaller the more vertices they
+    have. Pilots (:monosp:`pilot_spp`, 16 by default, at most a quarter of all samples; they count
+    towards the image) measure what connections from each region to each other one bring, relative
+    to the brightness of the pixel, and a region is chosen in proportion to the root mean square of
+    that. A tenth of the choices stays uniform. The MIS weights know how often each connection is
+    made, so that the image is unbiased. Use it where most connections are blocked: in corridors,
+    and between rooms. A sample takes about a fifth longer; where the first pilot shows that little
+    is gained, learning ends. In spectral variants and with moving shapes there is little to choose
+    from, and the selection stays uniform.
+
     **Sensors and films.** A :monosp:`perspective` or :monosp:`thinlens` can be connected to; with
     other sensors, and with films that sample a border, there is no light image. Lights of the type
     :monosp:`directionalarea`, which :monosp:`path` does not find, are seen here; spectral variants
@@ -113,7 +128,9 @@ class BidirectionalIntegrator(WalkIntegrator):
 
     Source: E. Veach, *Robust Monte Carlo Methods for Light Transport Simulation*, PhD thesis, 1997,
     chapter 10; D. Cline, PhD thesis, 2007, sections 7.6 and 7.9; I. Georgiev, *Implementing Vertex
-    Connection and Merging*, technical report, 2012 (weights).
+    Connection and Merging*, technical report, 2012 (weights); J. Guo, M. Eisemann, E. Eisemann,
+    *Next Event Estimation++*, Computer Graphics Forum 39(7), 2020, section 4.3 (selection by
+    visibility; regions of surfaces, contributions, and counts in the weights are ours).
 
     .. tabs::
         .. code-tab:: xml
@@ -197,6 +214,7 @@ class BidirectionalIntegrator(WalkIntegrator):
     def _estimator(self, emission, sensor, correct, **decisions: Any) -> Estimator:
         always = LightPathChoice(True, self.techniques)
         choice: LightPathChoice = decisions.pop("light_paths", always)
+        selection = decisions.pop("subpath_selection", SubpathSelection())
         # Mitsuba's own density of points on meshes with interpolated normals is wrong
         next_event = decisions.pop("next_event", correct)
         if not self.sample_direct:
@@ -208,7 +226,9 @@ class BidirectionalIntegrator(WalkIntegrator):
         walk = self.walk(**decisions)
         if not choice.are_traced:
             return walk
-        return BidirectionalPathTracer(walk, emission, sensor, self.connections, choice.observer)
+        return BidirectionalPathTracer(
+            walk, emission, sensor, self.connections, selection, choice.observer
+        )
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         self.techniques = None

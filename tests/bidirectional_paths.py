@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +15,7 @@ from mitsuba_ext.bidirectional.scattering import geometric_cosine, reverse_densi
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
 from mitsuba_ext.bidirectional.weights import BidirectionalWeights
 from mitsuba_ext.transport.emission import emission
-from mitsuba_ext.transport.path_decisions import EmitterSampling, SceneQuery
+from mitsuba_ext.transport.path_decisions import EmitterSampling, SceneQuery, SubpathSelection
 from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex
 
 
@@ -144,16 +144,20 @@ def weights_of_techniques(
     emits: LightEmission,
     sensor: ConnectableSensor | None,
     next_event: EmitterSampling,
+    selection: SubpathSelection | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The weight of each technique, as the estimator computes it: [s, path], 0 where it cannot find
     the path; and which of the lanes have a path."""
-    sums, active = PartialSums(next_event, CONNECTIONS), paths.active
+    sums, active = PartialSums(next_event, CONNECTIONS, selection=selection), paths.active
     weights = BidirectionalWeights(scene, sums, emits, sensor)
     ctx = mi.BSDFContext()
     vertices, emitted = paths.vertices, paths.emitted
 
     # ----- Subpaths from the light -----
-    by_light = [sums.first(scene, emitted, vertices[0].from_light, active)]
+    si = vertices[0].from_light
+    first, at_first = sums.first(scene, emitted, si, active), mi.Bool(True)
+    arrived = sums.arrive(first, si, mi.Float(1), at_first, by_light=True)
+    by_light = [replace(first, region=arrived.region, count=arrived.count)]
     # Which techniques scatter only where their densities are not 0
     from_light, from_camera = [mi.Bool(True)], [mi.Bool(True), mi.Bool(True)]
     for a, b in zip(vertices, vertices[1:]):
@@ -164,7 +168,11 @@ def weights_of_techniques(
             by_light[-1], geometric_cosine(si, wo), pdf,
             reverse_density(ctx, a.bsdf, si, wo, active), a.is_delta,
         )  # fmt: skip
-        by_light.append(sums.arrive(left, b.from_light, dr.squared_norm(b.p - a.p)))
+        by_light.append(
+            sums.arrive(
+                left, b.from_light, dr.squared_norm(b.p - a.p), ~at_first, by_light=True
+            )
+        )
 
     # ----- Subpaths from the camera -----
     path = PathState(
@@ -239,7 +247,12 @@ def weights_of_techniques(
                 (a, a.from_light, a.from_camera.wi, by_light[i]),
             )
         ]  # fmt: skip
-        joined = joining_weight(sums, *ends, dr.squared_norm(b.p - a.p))
+        expected = 1.0
+        if selection is not None:
+            expected = selection.expected(
+                by_camera[i + 1].path.sums.region, by_light[i].region, active
+            )
+        joined = joining_weight(sums, *ends, dr.squared_norm(b.p - a.p), expected)
         found.append(dr.select(a.is_delta | b.is_delta, 0, joined))
 
     # ----- t = 1 -----

@@ -12,28 +12,34 @@ from hard_cases import _octahedron, area, diffuse, rectangle, rgb, sensor, stage
 from statistical import some
 from test_light_tracer import EMITTERS, MATERIALS, T, _balls
 
-from mitsuba_ext.bidirectional.both_ends import FromBothEnds
+from mitsuba_ext.bidirectional.both_ends import FromBothEnds, from_both_ends
 from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
 from mitsuba_ext.composition.decision_parameters import Setting
 from mitsuba_ext.composition.next_event import sampling_weights
 from mitsuba_ext.decisions.next_event.light_table import LightTable
+from mitsuba_ext.decisions.subpaths.region_table import RegionTable
 from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.regions.nested_regions import NestedRegions
 from mitsuba_ext.regions.surface_rows import SurfaceRows
-from mitsuba_ext.transport.path_decisions import EmitterSampling
+from mitsuba_ext.transport.path_decisions import EmitterSampling, SubpathSelection
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
 def weights(
-    scene: mi.Scene, light: int, camera: int, next_event: EmitterSampling | None = None
+    scene: mi.Scene,
+    light: int,
+    camera: int,
+    next_event: EmitterSampling | None = None,
+    selection: SubpathSelection | None = None,
 ) -> tuple[np.ndarray, np.ndarray, Paths, LightEmission]:
     """Of paths with so many vertices: [s, path] for those that exist."""
     emission, eye = LightEmission(scene), scene.sensors()[0]
     connectable = ConnectableSensor(eye) if ConnectableSensor.can_connect(eye) else None
     paths = trace(scene, emission, eye, light, camera)
     found, exists = weights_of_techniques(
-        scene, paths, emission, connectable, next_event or EmitterSampling()
+        scene, paths, emission, connectable, next_event or EmitterSampling(), selection
     )
     return found[:, exists], exists, paths, emission
 
@@ -129,6 +135,29 @@ def test_both_ends_agree_on_rows_that_tell_sides_of_surfaces(bsdf: str) -> None:
     assert_they_add_up(weights(scene, 1, 1, FromBothEnds(table))[0])
 
 
+def any_table(*paths: Paths) -> RegionTable:
+    """Regions where these paths have vertices, on both sides of surfaces, and any probabilities."""
+    vertices = [v for each in paths for v in each.vertices]
+    p, n = (np.concatenate([np.array(getattr(v, a)) for v in vertices], axis=1) for a in "pn")
+    p, n = np.concatenate([p, p], axis=1), np.concatenate([n, -n], axis=1)
+    regions = NestedRegions(mi.Point3f(p), mi.Normal3f(n), most=60)
+    rng = np.random.default_rng(3)
+    probability = rng.uniform(0.01, 1, (regions.count, regions.count)) ** 3
+    probability /= probability.sum(axis=1, keepdims=True)
+    return RegionTable(regions, probability, rng.uniform(0.01, 0.2, regions.count))
+
+
+@pytest.mark.parametrize(
+    "bsdf", some("rough glass", of=["rough glass", "twosided plastic", "normalmap", "principled"])
+)
+def test_weights_of_light_vertices_that_are_chosen_by_regions_add_up(bsdf: str) -> None:
+    pane = rectangle(T().translate([0, 0, 0.9]).rotate([1, 0, 0], 25), bsdf=MATERIALS[bsdf]())
+    scene = mi.load_dict(stage(pane=pane, **_lights()), optimize=False)
+    selection = any_table(*(weights(scene, *shape)[2] for shape in ((2, 1), (1, 2))))
+    for light, camera in ((1, 1), (2, 1), (1, 2)):
+        assert_they_add_up(weights(scene, light, camera, selection=selection)[0])
+
+
 # ---- Densities of diffuse paths, computed once more ----
 
 
@@ -194,16 +223,26 @@ def _densities(name: str, paths: Paths, exists: np.ndarray, scene: mi.Scene) -> 
     )
 
 
+@pytest.mark.parametrize("by_regions", [False, True])
 @pytest.mark.parametrize(
     "name", some("rectangle", "constant", of=["rectangle", "point", "directional", "constant"])
 )
-def test_weights_are_those_of_the_densities(name: str) -> None:
+def test_weights_are_those_of_the_densities(name: str, by_regions: bool) -> None:
     scene = mi.load_dict(stage(light=EMITTERS[name]()), optimize=False)
+    selection = any_table(weights(scene, 1, 2)[2]) if by_regions else None
     for light, camera in SHAPES:
-        found, exists, paths, _ = weights(scene, light, camera)
+        found, exists, paths, _ = weights(scene, light, camera, selection=selection)
         densities = _densities(name, paths, exists, scene)
         # But for hits (0), connections to lights (1) and to the sensor (the last)
         densities[2:-1] *= CONNECTIONS
+        if selection is not None:
+            # Technique s connects the vertices s − 2 and s − 1
+            vertices = paths.vertices
+            for s, (a, b) in enumerate(zip(vertices, vertices[1:]), start=2):
+                ends = (from_both_ends(si) for si in (b.from_camera, a.from_light))
+                regions = (selection.region(si, mi.Bool(True)) for si in ends)
+                expected = np.array(selection.expected(*regions, mi.Bool(True)))
+                densities[s] *= expected[exists]
         squares = densities**2
         error = np.abs(found - squares / squares.sum(axis=0))
         assert np.median(error) < 1e-4

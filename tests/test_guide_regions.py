@@ -215,9 +215,9 @@ def test_larger_regions_contain_the_smaller_ones(surfaces: SurfaceRegions) -> No
     p, n = _points(20_000)
     labels, side = _labels(surfaces, p, n), np.where(n[2] > 0, 1, -1)
     extents, inside = [], []
-    for level in range(len(surfaces._levels)):
+    for level in range(len(surfaces._regions.levels)):
         numbers = surfaces._numbers(level)[labels]
-        size = surfaces._levels[level].stop - surfaces._levels[level].start
+        size = surfaces._regions.levels[level].stop - surfaces._regions.levels[level].start
         members = [numbers == number for number in range(size)]
         assert all(LEAST <= chosen.sum() for chosen in members)
         extents.append(max(np.ptp(p[:, chosen], axis=1).max() for chosen in members))
@@ -253,14 +253,14 @@ def test_a_region_without_samples_has_the_density_of_the_one_around_it(
     # Of a region and all smaller ones in it
     count = np.bincount(region.numpy(), minlength=surfaces.count)
     for smaller in reversed(range(1, surfaces.count)):
-        count[surfaces._parent[smaller]] += count[smaller]
+        count[surfaces._regions.parent[smaller]] += count[smaller]
     empty = np.flatnonzero(count == 0)
     assert len(empty) > 10
     place = mi.Point2f(0.2, 0.6)
     for tree in empty[:: len(empty) // 10]:
         found, around = (
             trees.density(mi.UInt32(int(t)), place, mi.Bool(True))[0].numpy()[0]
-            for t in (tree, surfaces._parent[tree])
+            for t in (tree, surfaces._regions.parent[tree])
         )
         assert found == around
     assert trees.density(mi.UInt32(0), place, mi.Bool(True))[0].numpy()[0] > 1.5

@@ -10,10 +10,19 @@ import mitsuba as mi
 from ..transport.path_decisions import EmitterSampling
 
 
+def from_both_ends(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+    """A vertex as if it were seen at right angles to the surface: from the side from which a BSDF
+    that does not transmit is seen by camera and light alike, and from the front of others."""
+    flags = si.bsdf().flags()
+    transmits = mi.has_flag(flags, mi.BSDFFlags.Transmission)
+    is_behind = (si.wi.z < 0) & mi.has_flag(flags, mi.BSDFFlags.BackSide) & ~transmits
+    si = mi.SurfaceInteraction3f(si)
+    si.wi = mi.Vector3f(0, 0, dr.select(is_behind, mi.Float(-1), 1))
+    return si
+
+
 class FromBothEnds(EmitterSampling):
-    """Asks a next event decision about a vertex as if it were seen at right angles to the surface:
-    from the side from which a BSDF that does not transmit is seen by camera and light alike, and
-    from the front of others.
+    """Asks a next event decision about vertices as :func:`from_both_ends` shows them.
 
     A decision may distinguish the two sides of a surface. A camera path and a light path reach the
     vertex from different directions, behind transmission from different sides. Only if both are
@@ -31,12 +40,7 @@ class FromBothEnds(EmitterSampling):
         return self._decision.begin(sampler, ray)
 
     def visit(self, state, scene, si, active) -> Any:
-        flags = si.bsdf().flags()
-        transmits = mi.has_flag(flags, mi.BSDFFlags.Transmission)
-        is_behind = (si.wi.z < 0) & mi.has_flag(flags, mi.BSDFFlags.BackSide) & ~transmits
-        si = mi.SurfaceInteraction3f(si)
-        si.wi = mi.Vector3f(0, 0, dr.select(is_behind, mi.Float(-1), 1))
-        return self._decision.visit(state, scene, si, active)
+        return self._decision.visit(state, scene, from_both_ends(si), active)
 
     def sample(self, place, scene, numbers, si, active):
         return self._decision.sample(place, scene, numbers, si, active)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..transport.heroes import Heroes
+from ..transport.observer import Observer
 from ..transport.path_decisions import SceneQuery, Subpaths
 from ..transport.vertex import Vertex
 from .light_vertices import VertexCache
 from .partial_sums import PartialSums, Sums, weight
 from .scattering import adjoint_value, geometric_cosine, reverse_density
 from .technique_observer import TechniqueObserver
+from .vertex_choice import VertexChoice
 
 
 @dataclass
@@ -37,79 +38,83 @@ class End:
 
 
 def joining_weight(
-    sums: PartialSums, one: End, other: End, squared_distance: mi.Float
+    sums: PartialSums,
+    one: End,
+    other: End,
+    squared_distance: mi.Float,
+    expected: mi.Float | float = 1.0,
 ) -> mi.Float:
-    """The MIS weight of joining two subpaths."""
+    """The MIS weight of joining two subpaths. ``expected`` is what the selection of light vertices
+    expects, if there is one."""
     inverse = dr.rcp(squared_distance)
     to_one = other.pdf * geometric_cosine(one.si, one.wo) * inverse
     to_other = one.pdf * geometric_cosine(other.si, other.wo) * inverse
     others = sums.others(to_one, one.sums, one.reverse_pdf)
     others += sums.others(to_other, other.sums, other.reverse_pdf)
-    return weight(others / sums.count)
+    return weight(others / (sums.count * sums.ratio(expected)))
 
 
 class LightSubpaths(Subpaths):
     """Connects each vertex of a camera path to vertices of light paths that are chosen at random.
 
-    A path of other wavelengths, or of another time, cannot be connected to: where such differ, the
-    choice is among the vertices of the light path in the same lane; otherwise among those of all
-    paths.
-
     Parameters:
         scene: The scene.
         vertices: Of the light paths, of which there are as many as camera paths. There is at least
             one vertex.
+        choice: Chooses among them.
         sums: Computes the partial sums of the MIS weights.
         query: How a ray meets the scene.
         connections: Connections of each vertex.
         max_depth: Longest path in segments.
-        own_lane: Is the light path that of the same lane?
-        observer: Is told what is found.
+        observer: Is told of connections to vertices that are chosen by regions.
+        techniques: Is told what is found.
     """
 
     def __init__(
         self,
         scene: mi.Scene,
         vertices: VertexCache,
+        choice: VertexChoice,
         sums: PartialSums,
         query: SceneQuery,
         connections: int,
         max_depth: int,
-        own_lane: bool,
-        observer: TechniqueObserver | None = None,
+        observer: Observer,
+        techniques: TechniqueObserver | None = None,
     ) -> None:
-        self._observer = observer
-        self._vertices, self._sums, self._query = vertices, sums, query
-        self._connections, self._own_lane = connections, own_lane
+        self._vertices, self._choice, self._sums, self._query = vertices, choice, sums, query
+        self._connections, self._observer, self._techniques = connections, observer, techniques
         self._heroes = Heroes(scene)
         self._ctx = self._heroes.context()
         self._max_depth = dr.opaque(mi.UInt32, max_depth)
-        self._lanes = len(vertices.first)
-        self._lane = dr.arange(mi.UInt32, self._lanes)
-        self._count = dr.opaque(mi.UInt32, vertices.count)
         self._share = dr.opaque(mi.Float, 1 / connections)
-        self._mean = dr.opaque(mi.Float, vertices.count / self._lanes)
 
     @dr.syntax
     def gather(self, scene, sampler, vertex, active):
         total, shadow_count = mi.Spectrum(0), mi.UInt32(0)
         if dr.hint(self._connections == 1, mode="scalar"):
-            total, shadow_count = self._connect(scene, sampler.next_2d(), vertex, active)
+            total, shadow_count = self._connect(
+                scene, self._choice.numbers(sampler), vertex, active
+            )
         else:
             index = mi.UInt32(0)
             while index < self._connections:
-                value, tested = self._connect(scene, sampler.next_2d(), vertex, active)
+                value, tested = self._connect(
+                    scene, self._choice.numbers(sampler), vertex, active
+                )
                 total += value
                 shadow_count += tested
                 index += 1
         return total, shadow_count
 
     def _connect(
-        self, scene: mi.Scene, sample: mi.Point2f, vertex: Vertex, active: mi.Bool
+        self, scene: mi.Scene, numbers: tuple[mi.Point2f, ...], vertex: Vertex, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.UInt32]:
-        """One connection, to a vertex that ``sample`` chooses."""
-        index, factor, active = self._choose(sample, active)
-        other = self._vertices.at(index, active)
+        """One connection, to a vertex that ``numbers`` choose."""
+        considered = active
+        chosen = self._choice.choose(numbers, vertex, active)
+        active, factor = chosen.active, chosen.factor * self._share
+        other = self._vertices.at(chosen.index, active)
         # The path's segments: those of both subpaths, and one in between
         active &= vertex.depth + other.depth + 2 <= self._max_depth
         si, far = vertex.si, self._vertices.interaction(self._query, other, active)
@@ -136,7 +141,9 @@ class LightSubpaths(Subpaths):
         far_pdf = far_bsdf.pdf(self._ctx, far, back, active)
         near_end = End(si, wo, pdf, reverse, vertex.path.sums)
         far_end = End(far, back, far_pdf, far_reverse, other.sums)
-        mis = joining_weight(self._sums, near_end, far_end, squared_distance)
+        mis = joining_weight(
+            self._sums, near_end, far_end, squared_distance, chosen.expected
+        )
         value *= mis
 
         # ----- Is anything in between? -----
@@ -144,26 +151,17 @@ class LightSubpaths(Subpaths):
         ds = dr.zeros(mi.DirectionSample3f, dr.width(active))
         ds.p, ds.d, ds.dist = far.p, d, distance
         visible = active & ~self._query.occluded(scene, si, ds, active)
-        if self._observer is not None:
+        value = dr.select(visible, value, 0)
+        if self._techniques is not None:
             found = pdf * geometric_cosine(far, back) / dr.select(active, squared_distance, 1)
             by_camera = self._sums.by_camera(found, other.sums, far_reverse, other.depth == 1)
             if not isinstance(by_camera, tuple):
-                by_camera /= self._sums.root(self._sums.count)
-            self._observer.joined(
+                by_camera /= self._sums.root(self._sums.count) * chosen.expected
+            self._techniques.joined(
                 other.depth + 1, vertex.depth + 2, value, mis, by_camera, visible
             )
-        return dr.select(visible, value, 0), dr.select(active, 1, 0)
-
-    def _choose(self, sample: mi.Point2f, active: mi.Bool) -> tuple[mi.UInt32, Any, mi.Bool]:
-        """The number of a vertex, the weight of the connection, and where there is one to choose.
-
-        There may be more vertices than numbers of 24 bits, so that the choice takes two of them."""
-        bits = (mi.UInt32(sample.x * 65536) << 16) | mi.UInt32(sample.y * 65536)
-        first, number, weight = mi.UInt32(0), self._count, self._mean * self._share
-        if self._own_lane:
-            first = dr.gather(mi.UInt32, self._vertices.first, self._lane, active)
-            number = dr.gather(mi.UInt32, self._vertices.number, self._lane, active)
-            weight = mi.Float(number) * self._share
-        index = first + mi.UInt32((mi.UInt64(bits) * mi.UInt64(number)) >> 32)
-        return index, weight, active & (number > 0)
-
+        if chosen.region is not None:
+            self._observer.subpath(
+                vertex, chosen.region, chosen.probability, value, considered
+            )
+        return value, dr.select(active, 1, 0)

@@ -15,6 +15,9 @@ from .partial_sums import Sums
 #: Bit of the last word: only the hero wavelength is left of the path.
 _HERO_IS_ALONE = 1 << 31
 
+#: Bits of the last word that hold the depth, where the region follows.
+_DEPTH_BITS = 15
+
 
 @dataclass
 class Layout:
@@ -24,19 +27,21 @@ class Layout:
         spectrum: Words of a spectrum.
         sums: Words of the partial sums of MIS weights: 0, 2, or 4 (``Sums.by_camera``).
         has_instances: May a vertex lie on an instance?
+        has_region: Are vertices chosen by the region in which they lie?
     """
 
     spectrum: int
     sums: int
     has_instances: bool
+    has_region: bool = False
 
     @classmethod
-    def of(cls, scene: mi.Scene, sums: int) -> Layout:
+    def of(cls, scene: mi.Scene, sums: int, has_region: bool = False) -> Layout:
         # The scenes of moving shapes may hold instances
         has_instances = bool(movers(scene)) or any(
             shape.class_name() == "Instance" for shape in scene.shapes()
         )
-        return cls(dr.size_v(mi.Spectrum), sums, has_instances)
+        return cls(dr.size_v(mi.Spectrum), sums, has_instances, has_region)
 
     @property
     def words(self) -> int:
@@ -78,8 +83,10 @@ class VertexStore:
         mark = mi.UInt32(depth)
         if not isinstance(hero_is_alone, tuple):
             mark |= dr.select(hero_is_alone, mi.UInt32(_HERO_IS_ALONE), 0)
+        if self.layout.has_region:
+            mark |= sums.region << _DEPTH_BITS
         words = [*si.p, *d, *pi.prim_uv, _as_float(pi.prim_index), _as_float(pi.shape), *β]
-        words += [sums.dVCM, sums.dVC, *sums.by_camera][: self.layout.sums]
+        words += [sums.last, sums.dVC, *sums.by_camera][: self.layout.sums]
         words += [_as_float(mark)]
         if self.layout.has_instances:
             words += [_as_float(pi.instance), _as_float(pi.shape_index)]
@@ -165,6 +172,9 @@ class LightVertices:
         if layout.sums > 2:
             sums.by_camera = mi.Vector2f(w[12 + n], w[13 + n])
         mark = dr.reinterpret_array(mi.UInt32, w[rest])
+        depth = mark & (_HERO_IS_ALONE - 1)
+        if layout.has_region:
+            depth, sums.region = _depth_and_region(mark)
         instance, shape_index = None, None
         if layout.has_instances:
             instance = _as_shape(w[rest + 1])
@@ -173,8 +183,8 @@ class LightVertices:
         return LightVertex(
             mi.Point3f(w[0], w[1], w[2]), mi.Vector3f(w[3], w[4], w[5]), mi.Point2f(w[6], w[7]),
             dr.reinterpret_array(mi.UInt32, w[8]), _as_shape(w[9]), instance, shape_index,
-            mi.Spectrum(*(w[10 + i] for i in range(n))), sums, mark & (_HERO_IS_ALONE - 1),
-            hero_is_alone, self._lane_of(slot, active),
+            mi.Spectrum(*(w[10 + i] for i in range(n))), sums, depth, hero_is_alone,
+            self._lane_of(slot, active),
         )  # fmt: skip
 
     def interaction(
@@ -279,12 +289,26 @@ class VertexCache(PackedVertices):
             vertices._words = vertices._lane = None
         self.bytes = self.count * (4 * words + 4) + 8 * lanes
 
+    @property
+    def region(self) -> mi.UInt32:
+        """The region in which each vertex lies, where the layout has it."""
+        layout = self._layout
+        place = 10 + layout.spectrum + layout.sums
+        index = dr.arange(mi.UInt32, self.count) * layout.words + place
+        mark = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, index))
+        return _depth_and_region(mark)[1]
+
 
 def _numbers(lane: mi.UInt32, lanes: int) -> mi.UInt32:
     """How many vertices each path has."""
     number = dr.zeros(mi.UInt32, lanes)
     dr.scatter_add(number, mi.UInt32(1), lane)
     return number
+
+
+def _depth_and_region(mark: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+    """Of the last word of a vertex, which has 16 bits for the region."""
+    return mark & ((1 << _DEPTH_BITS) - 1), (mark & (_HERO_IS_ALONE - 1)) >> _DEPTH_BITS
 
 
 def _as_float(value: Any) -> mi.Float:

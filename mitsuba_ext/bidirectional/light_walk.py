@@ -86,8 +86,9 @@ class LightWalk:
     def layout(self, scene: mi.Scene) -> Layout:
         """Of the stored vertices."""
         sums = self.sums
-        words = 0 if sums is None else 4 if sums.follows_camera else 2
-        return Layout.of(scene, words)
+        if sums is None:
+            return Layout.of(scene, 0)
+        return Layout.of(scene, 4 if sums.follows_camera else 2, sums.selection is not None)
 
     def begin(
         self,
@@ -238,12 +239,14 @@ class LightWalk:
         """The partial sums at a vertex."""
         if self.sums is None:
             return paths.sums
-        later = self.sums.arrive(paths.sums, si, dr.square(si.t))
         is_first = paths.depth == 1
+        later = self.sums.arrive(paths.sums, si, dr.square(si.t), is_first, by_light=True)
         return Sums(
             dr.select(is_first, paths.sums.dVCM, later.dVCM),
             dr.select(is_first, paths.sums.dVC, later.dVC),
             later.by_camera,
+            later.region,
+            later.count,
         )
 
     def _scatter(self, heroes, paths, bsdf, si, bs, weight, sums, active):

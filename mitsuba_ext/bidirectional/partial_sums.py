@@ -9,12 +9,13 @@ exponent.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.path_decisions import EmitterSampling
+from ..transport.path_decisions import EmitterSampling, SubpathSelection
+from .both_ends import from_both_ends
 
 if TYPE_CHECKING:
     from .emission import EmittedRay
@@ -32,11 +33,21 @@ class Sums:
         by_camera: For light paths, from the second vertex on, where :class:`PartialSums` follows
             it: the two terms of dVC in which a camera path finds the whole path (s = 0 and 1), not
             raised to the exponent.
+        region, count: Where the vertices that are connected are chosen by regions (elsewhere
+            ``()``): the region of the last vertex; and what multiplies ``dVCM`` where the
+            technique that connects the last two is such a connection.
     """
 
     dVCM: mi.Float
     dVC: mi.Float
     by_camera: mi.Vector2f | tuple[()] = ()
+    region: Any = ()
+    count: Any = ()
+
+    @property
+    def last(self) -> mi.Float:
+        """``dVCM``, times the count of connections that are chosen by regions."""
+        return self.dVCM if isinstance(self.count, tuple) else self.dVCM * self.count
 
 
 class PartialSums:
@@ -50,6 +61,8 @@ class PartialSums:
             once for each pair of paths.
         exponent: 1 for the balance heuristic, 2 for the power heuristic.
         follows_camera: Is ``by_camera`` of :class:`Sums` wanted?
+        selection: Chooses the vertices of light paths by regions; what it expects for a pair of
+            regions multiplies ``connections``. ``None`` where all vertices are alike.
     """
 
     def __init__(
@@ -58,8 +71,9 @@ class PartialSums:
         connections: mi.Float | float = 1.0,
         exponent: int = 2,
         follows_camera: bool = False,
+        selection: SubpathSelection | None = None,
     ) -> None:
-        self._next_event, self.exponent = next_event, exponent
+        self._next_event, self.exponent, self.selection = next_event, exponent, selection
         self.follows_camera = follows_camera
         #: The count of the connections, in weights.
         self.count = self.ratio(mi.Float(connections))
@@ -84,11 +98,21 @@ class PartialSums:
         leaves = dr.select(emitted.is_infinite, 1, emitted.cosine / dr.square(si.t))
         connected *= dr.select(is_delta, 1, leaves)
         inverse = dr.select(arrives > 0, dr.rcp(arrives), 0)
-        return Sums(
+        sums = self.begin(
             self.ratio(connected * inverse),
             dr.select(is_delta, 0, self.ratio(leaves * inverse)),
-            dr.zeros(mi.Vector2f, dr.width(inverse)) if self.follows_camera else (),
         )
+        if self.follows_camera:
+            sums.by_camera = dr.zeros(mi.Vector2f, dr.width(inverse))
+        return sums
+
+    def begin(self, dVCM: mi.Float, dVC: mi.Float) -> Sums:
+        """The sums where a subpath begins."""
+        if self.selection is None:
+            return Sums(dVCM, dVC)
+        lanes = dr.width(dVCM)
+        region, count = dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, 1, lanes)
+        return Sums(dVCM, dVC, region=region, count=count)
 
     def others(self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float) -> mi.Float:
         """Where a subpath's last vertex is connected to something: the ratios, to that technique,
@@ -99,7 +123,7 @@ class PartialSums:
                 (per area, where the technique itself has density 1).
             reverse_pdf: Of going on from there to the subpath's vertex before, per solid angle.
         """
-        return self.ratio(density) * (sums.dVCM + self.ratio(reverse_pdf) * sums.dVC)
+        return self.ratio(density) * (sums.last + self.ratio(reverse_pdf) * sums.dVC)
 
     def _connection_density(self, scene, emitted, si, active) -> mi.Float:
         """With which a connection from ``si`` finds the point of the light: per solid angle, or
@@ -128,14 +152,33 @@ class PartialSums:
         return dr.select(is_beam, 0, dr.select(is_delta, probability, density))
 
     def arrive(
-        self, sums: Sums, si: mi.SurfaceInteraction3f, squared_distance: mi.Float
+        self,
+        sums: Sums,
+        si: mi.SurfaceInteraction3f,
+        squared_distance: mi.Float,
+        is_first: mi.Bool,
+        by_light: bool,
     ) -> Sums:
-        """From a vertex to the next one, ``si``, at this distance: solid angles become areas."""
+        """From a vertex to the next one, ``si``, at this distance: solid angles become areas.
+
+        Parameters:
+            is_first: Is it the first vertex of the subpath?
+            by_light: Is the subpath that of a light?
+        """
         inverse = dr.rcp(dr.maximum(_cosine(si), 1e-12))
+        region, count = (), ()
+        if self.selection is not None:
+            region = self.selection.region(from_both_ends(si), si.is_valid())
+            ends = (region, sums.region) if by_light else (sums.region, region)
+            expected = self.selection.expected(*ends, si.is_valid() & ~is_first)
+            # What connects the first vertex to the end of the path is no such connection
+            count = dr.select(is_first, 1, self.ratio(expected))
         return Sums(
             sums.dVCM * self.ratio(squared_distance * inverse),
             sums.dVC * self.ratio(inverse),
             () if isinstance(sums.by_camera, tuple) else sums.by_camera * inverse,
+            region,
+            count,
         )
 
     def leave(
@@ -164,6 +207,8 @@ class PartialSums:
             dr.select(is_delta, 0, dVCM),
             dr.select(is_delta, sums.dVC * self.ratio(cosine), smooth),
             self._leave_by_camera(sums, cosine, leaves, reverse_pdf, is_delta, is_first),
+            sums.region,
+            sums.count,
         )
 
     def by_camera(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +11,7 @@ from ..movers import movers
 from ..transport.estimator import CameraRays, Sample
 from ..transport.numbers import Numbers
 from ..transport.observer import Observers
+from ..transport.path_decisions import SubpathSelection
 from ..transport.walk import Walk
 from .connections import LightSubpaths
 from .emission import LightEmission
@@ -21,6 +22,7 @@ from .light_walk import LightWalk
 from .partial_sums import PartialSums
 from .sensor import ConnectableSensor
 from .technique_observer import TechniqueObserver
+from .vertex_choice import OwnVertexChoice, RegionChoice, VertexChoice
 from .weights import BidirectionalWeights
 
 #: Vertices of a light path, about, for MIS weights. The true number would make the weights depend
@@ -38,6 +40,9 @@ class BidirectionalPathTracer:
         emission: Where light paths begin.
         sensor: What light paths are connected to; ``None`` if they are not.
         connections: To how many vertices of light paths each vertex of a camera path is connected.
+        selection: Chooses these vertices, or the regions in which they lie. A path of other
+            wavelengths, or of another time, cannot be connected to: where such differ, the choice
+            is always uniform, among the vertices of the light path in the same lane.
         observer: Is told what each technique finds, by the walk as well.
     """
 
@@ -45,19 +50,26 @@ class BidirectionalPathTracer:
     emission: LightEmission
     sensor: ConnectableSensor | None
     connections: int
+    selection: SubpathSelection = field(default_factory=SubpathSelection)
     observer: TechniqueObserver | None = None
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
     ) -> Sample:
         walk = self.walk
-        count = dr.opaque(mi.Float, self.connections / _VERTICES)
+        own_lane = mi.is_spectral or bool(movers(scene))
+        selection = self.selection if self.selection.count > 0 and not own_lane else None
+        # Per vertex where a selection says how often that is chosen
+        count = self.connections if selection else self.connections / _VERTICES
         observer, follows_camera = self.observer, False
         if observer is not None:
             observer.start(rays)
             walk = replace(walk, observer=Observers([walk.observer, observer]))
             follows_camera = observer.compares_with_camera
-        sums = PartialSums(walk.next_event, count, follows_camera=follows_camera)
+        sums = PartialSums(
+            walk.next_event, dr.opaque(mi.Float, count), follows_camera=follows_camera,
+            selection=selection,
+        )  # fmt: skip
         image = None
         if self.sensor is not None:
             image = LightImage(
@@ -85,10 +97,14 @@ class BidirectionalPathTracer:
         weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)
         subpaths = None
         if rounds:
+            vertices = VertexCache(rounds, lanes)
+            if selection is not None:
+                choice = RegionChoice(vertices, selection)
+            else:
+                choice = OwnVertexChoice(vertices) if own_lane else VertexChoice(vertices)
             subpaths = LightSubpaths(
-                scene, VertexCache(rounds, lanes), sums,
-                walk.query, self.connections, walk.max_depth,
-                mi.is_spectral or bool(movers(scene)), observer,
+                scene, vertices, choice, sums, walk.query, self.connections, walk.max_depth,
+                walk.observer, observer,
             )  # fmt: skip
         sample = replace(walk, weights=weights, subpaths=subpaths)(scene, sampler, rays, active)
         shadow_count = sample.shadow_count

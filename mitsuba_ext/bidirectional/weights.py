@@ -42,17 +42,19 @@ class BidirectionalWeights(Weights):
 
     def begin(self, ray: mi.Ray3f) -> Sums:
         if self._sensor is None:
-            return Sums(mi.Float(0), mi.Float(0))
+            return self.sums.begin(mi.Float(0), mi.Float(0))
         self._origin, pdf = self._sensor.origin(ray)
         # As many light paths as camera paths
-        return Sums(self.sums.ratio(dr.rcp(pdf)), dr.zeros(mi.Float, dr.width(pdf)))
+        return self.sums.begin(self.sums.ratio(dr.rcp(pdf)), dr.zeros(mi.Float, dr.width(pdf)))
 
     def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Sums:
-        ref = dr.select(path.depth == 0, self._origin, path.arrival.ref.p)
-        later = self.sums.arrive(path.sums, si, dr.squared_norm(si.p - ref))
+        is_first = path.depth == 0
+        ref = dr.select(is_first, self._origin, path.arrival.ref.p)
+        later = self.sums.arrive(
+            path.sums, si, dr.squared_norm(si.p - ref), is_first, by_light=False
+        )
         if self._sensor is not None:
             # With which a light path's vertex there would be connected to this point of the lens
-            is_first = path.depth == 0
             lens = self._sensor.lens_density(self._origin, si.p, is_first & si.is_valid())
             if not isinstance(lens, float):
                 later.dVCM *= dr.select(is_first, self.sums.ratio(lens), 1)
@@ -60,6 +62,8 @@ class BidirectionalWeights(Weights):
         return Sums(
             dr.select(si.is_valid(), later.dVCM, path.sums.dVCM),
             dr.select(si.is_valid(), later.dVC, path.sums.dVC),
+            later.region,
+            later.count,
         )
 
     def emission(self, scene, si, ds, path, pdf) -> mi.Float:

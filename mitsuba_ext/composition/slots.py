@@ -15,6 +15,7 @@ from .light_paths import LightPathsWhereTheyPay
 from .next_event import METHODS, LearnedLights, SpatialLights
 from .roulette import GuidedRoulette
 from .shadow_test import RejectedShadowRays
+from .subpath_selection import LearnedSubpaths
 
 _Maker = Callable[[ParameterReader], DecisionParameters]
 
@@ -32,6 +33,7 @@ SLOTS: dict[str, dict[str, _Maker | None]] = {
 
 #: The same of bidirectional integrators, which have some of the others as well.
 BIDIRECTIONAL_SLOTS: dict[str, dict[str, _Maker | None]] = {
+    "subpath_selection": {"uniform": None, "visibility": lambda read: LearnedSubpaths()},
     "light_paths": {"always": None, "auto": lambda read: LightPathsWhereTheyPay()},
 }
 

@@ -52,6 +52,18 @@ class Observer:
         and throughput: what the path gains where the light is ``visible``; ``pdf`` is the density
         with which scattering finds the direction."""
 
+    def subpath(
+        self,
+        vertex: Vertex,
+        region: mi.UInt32,
+        probability: mi.Float,
+        value: mi.Spectrum,
+        active: mi.Bool,
+    ) -> None:
+        """``vertex`` was connected to a vertex of another subpath, in a region that was chosen with
+        this probability, and the path gains ``value``: 0 also where there was no vertex to choose,
+        or something is in between."""
+
     def direction(
         self,
         vertex: Vertex,
@@ -95,6 +107,10 @@ class Observers(Observer):
     def connection(self, *arguments: Any) -> None:
         for observer in self._observers:
             observer.connection(*arguments)
+
+    def subpath(self, *arguments: Any) -> None:
+        for observer in self._observers:
+            observer.subpath(*arguments)
 
     def direction(self, *arguments: Any) -> None:
         for observer in self._observers:

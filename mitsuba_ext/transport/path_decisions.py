@@ -239,6 +239,35 @@ class Weights:
         return vertex.path.sums
 
 
+class SubpathSelection:
+    """Which vertices of other subpaths a vertex is connected to: uniformly chosen ones. What
+    replaces it chooses a region of surfaces first, then one of the vertices that lie there,
+    uniformly; then its methods are asked.
+
+    Attributes:
+        count: Number of regions; 0 where there are none.
+    """
+
+    count = 0
+
+    def region(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
+        """The region of a vertex of either subpath; ``si.wi`` tells the side of the surface."""
+        raise NotImplementedError
+
+    def choose(
+        self, sample: mi.Point2f, region: mi.UInt32, active: mi.Bool
+    ) -> tuple[mi.UInt32, mi.Float]:
+        """The region from which a vertex in ``region`` gets its partner, and the probability of
+        choosing that one."""
+        raise NotImplementedError
+
+    def expected(self, region: mi.UInt32, chosen: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """For MIS weights: how often, on average, a vertex in ``region`` is connected to a certain
+        one in the region ``chosen``, in units of the number of other subpaths: probability of
+        choosing the region / vertices of a subpath there."""
+        raise NotImplementedError
+
+
 class Subpaths:
     """Connects vertices to those of subpaths that another walk has stored. A walk needs none."""
 

@@ -6,26 +6,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...regions.surface_sides import lit_normal, region
-from ...regions.voxel_sides import SIDES, VoxelSides, voxel_coordinates
+from ...regions.nested_regions import NestedRegions
+from ...regions.surface_sides import lit_normal
 from .path_records import PathRecords
 from .sample_trees import SampleTrees
 from .tree_builder import UNIFORM, Samples, TreeBuilder
-
-#: Voxels along each axis, level by level: the voxels of a level divide those of the level before.
-_GRIDS = (4, 8, 16, 32)
 
 #: The weight, in samples, of the surrounding region as the prior of a region's mean radiance.
 _PRIOR = 32
 
 
 class SurfaceRegions:
-    """Regions are pairs of a voxel of the box in which paths scatter and a side of its surfaces.
+    """A tree for each of some regions of surfaces (:class:`NestedRegions`).
 
-    Region 0 is the whole scene. Regions of large voxels follow, then those of the smaller voxels
-    inside of them; a region exists only where paths scatter often enough. The last number stands
-    for mirrors and glass, whose directions do not depend on the sample: its tree has no splits. At
-    each bounce, a path uses the tree of the region in which it scatters.
+    The last number stands for mirrors and glass, whose directions do not depend on the sample: its
+    tree has no splits. At each bounce, a path uses the tree of the region in which it scatters.
 
     Parameters:
         p, n: Vertices where paths scatter, and normals on the side that is lit; not empty.
@@ -36,52 +31,19 @@ class SurfaceRegions:
     """
 
     def __init__(self, p: mi.Point3f, n: mi.Normal3f, least: float) -> None:
-        bbox = region(p)
-        finest = _GRIDS[-1]
-        scale = finest / mi.Vector3f(bbox.max - bbox.min)
-        self._origin, self._scale = np.array(bbox.min), np.array(scale).ravel()
-        self._pairs = VoxelSides(mi.Point3f(bbox.min), scale, finest)
-        pair, inside = (x.numpy() for x in self._pairs.number(p, n, mi.Bool(True)))
-        voxel, side = np.divmod(pair[inside], SIDES)
-        cell = np.stack(voxel_coordinates(voxel, finest))
+        self._set(NestedRegions(p, n, least))
 
-        table = np.zeros((1, 1, 1, SIDES), np.uint32)
-        self._levels, parents, self.count = [slice(0, 1)], [np.zeros(1, np.uint32)], 1
-        for grid in _GRIDS:
-            for axis in range(3):
-                table = table.repeat(grid // table.shape[axis], axis)
-            x, y, z = cell * grid // finest
-            seen, times = np.unique(
-                np.ravel_multi_index((z, y, x, side), table.shape), return_counts=True
-            )
-            seen = seen[times >= least]
-            parents.append(table.flat[seen])
-            table.flat[seen] = self.count + np.arange(len(seen))
-            self._levels.append(slice(self.count, self.count + len(seen)))
-            self.count += len(seen)
-        self._parent = np.concatenate(parents)
-        self._table = mi.UInt32(table.ravel())
+    def _set(self, regions: NestedRegions) -> None:
+        self._regions, self.count = regions, regions.count
         self._specular = dr.opaque(mi.UInt32, self.count)
-        dr.eval(self._table)
 
     def state(self) -> dict[str, np.ndarray]:
         """What the walk needs of the regions, as arrays."""
-        return {
-            "origin": self._origin,
-            "scale": self._scale,
-            "table": self._table.numpy(),
-            "count": np.array(self.count),
-        }
+        return self._regions.state()
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Takes over the regions that :meth:`state` has made arrays of."""
-        self._origin, self._scale = state["origin"], state["scale"]
-        self._pairs = VoxelSides(
-            mi.Point3f(self._origin), mi.Vector3f(self._scale), _GRIDS[-1]
-        )
-        self._table, self.count = mi.UInt32(state["table"]), int(state["count"])
-        self._specular = dr.opaque(mi.UInt32, self.count)
-        dr.eval(self._table)
+        self._set(NestedRegions.of_state(state))
 
     # ---- During the walk ----
 
@@ -103,8 +65,7 @@ class SurfaceRegions:
 
     def label(self, si: mi.SurfaceInteraction3f, pixel, active: mi.Bool) -> mi.UInt32:
         """The region by which a sample is recorded."""
-        pair, inside = self._pairs.number(si.p, lit_normal(si), active)
-        region = dr.gather(mi.UInt32, self._table, pair, inside)
+        region = self._regions.number(si.p, lit_normal(si), active)
         is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
         return dr.select(is_smooth, region, self._specular)
 
@@ -119,12 +80,12 @@ class SurfaceRegions:
         samples, region = samples.merged(records.region)
         builder = TreeBuilder()
         roots = np.full(self.count + 1, UNIFORM, np.uint32)
-        for level, regions in enumerate(self._levels):
+        for level, regions in enumerate(self._regions.levels):
             size = regions.stop - regions.start
             if size == 0:
                 continue
             tree = dr.gather(mi.UInt32, mi.UInt32(self._numbers(level)), region)
-            expected = mi.UInt32(roots[self._parent[regions]]) if level > 0 else None
+            expected = mi.UInt32(roots[self._regions.parent[regions]]) if level > 0 else None
             first = builder.add(samples, tree, size, expected)
             roots[regions] = first + np.arange(size)
         return builder, mi.UInt32(roots), None
@@ -138,15 +99,15 @@ class SurfaceRegions:
             np.bincount(region, x, self.count + 1)
             for x in (records.value.numpy(), records.throughput.numpy(), np.ones(len(region)))
         )
-        for regions in reversed(self._levels[1:]):
+        for regions in reversed(self._regions.levels[1:]):
             for x in (value, throughput, count):
-                np.add.at(x, self._parent[regions], x[regions])
+                np.add.at(x, self._regions.parent[regions], x[regions])
         radiance = np.full(self.count + 1, -1.0)
-        for level, regions in enumerate(self._levels):
+        for level, regions in enumerate(self._regions.levels):
             prior, expected = 0.0, 0.0
             if level > 0:
                 prior = _PRIOR * throughput[regions] / np.maximum(count[regions], 1)
-                expected = radiance[self._parent[regions]]
+                expected = radiance[self._regions.parent[regions]]
             radiance[regions] = (value[regions] + prior * expected) / np.maximum(
                 throughput[regions] + prior, 1e-30
             )
@@ -156,10 +117,10 @@ class SurfaceRegions:
         """For each region, the number of the region of a level in which it lies; a number too large
         if there is none."""
         numbers = np.full(self.count + 1, self.count, np.uint32)
-        regions = self._levels[level]
+        regions = self._regions.levels[level]
         numbers[regions] = np.arange(regions.stop - regions.start)
-        for smaller in self._levels[level + 1 :]:
-            numbers[smaller] = numbers[self._parent[smaller]]
+        for smaller in self._regions.levels[level + 1 :]:
+            numbers[smaller] = numbers[self._regions.parent[smaller]]
         return numbers
 
     def __str__(self) -> str:

@@ -69,7 +69,7 @@ class LightTable(EmitterSampling):
 
     def __init__(self, rows: Rows, cells: LightCells, weights: mi.Float) -> None:
         self.rows, self.cells = rows, cells
-        self._table = _table(weights, rows.count, cells.count)
+        self._table = alias_rows(weights, rows.count, cells.count)
         # Opaque: scenes that differ in it only share their kernels
         self._count = dr.opaque(mi.UInt32, cells.count)
 
@@ -117,7 +117,7 @@ class LightTable(EmitterSampling):
         return dr.select(active, pdf * probability, 0)
 
 
-def _table(weights: mi.Float, rows: int, count: int) -> mi.Float:
+def alias_rows(weights: mi.Float, rows: int, count: int) -> mi.Float:
     """Builds the alias tables of all rows. An entry has its threshold, the cell of its alias, its
     own probability and that of the alias; a draw reads these four with one access to memory."""
     table = dr.empty(mi.Float, 4 * rows * count)

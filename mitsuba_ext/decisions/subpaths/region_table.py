@@ -1,0 +1,48 @@
+"""Choosing light vertices by a table of regions."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...regions.nested_regions import NestedRegions
+from ...regions.surface_sides import lit_normal
+from ...transport.path_decisions import SubpathSelection
+from ..next_event.light_table import alias_rows
+
+
+class RegionTable(SubpathSelection):
+    """Chooses a region with the probabilities of the region of the camera vertex.
+
+    Parameters:
+        regions: Of camera vertices and light vertices.
+        probability: For each region of a camera vertex, the probability of each region of light
+            vertices, all positive; shape [regions, regions].
+        vertices: The expected number of vertices of a light path in each region, positive.
+    """
+
+    def __init__(
+        self, regions: NestedRegions, probability: np.ndarray, vertices: np.ndarray
+    ) -> None:
+        self._regions, self.count = regions, regions.count
+        self._table = alias_rows(
+            mi.Float(probability.ravel().astype(np.float32)), self.count, self.count
+        )
+        self._expected = mi.Float((probability / vertices).ravel().astype(np.float32))
+        # Opaque: scenes that differ in it only share their kernels
+        self._size = dr.opaque(mi.UInt32, self.count)
+        dr.eval(self._expected)
+
+    def region(self, si, active):
+        return self._regions.number(si.p, lit_normal(si), active)
+
+    def choose(self, sample, region, active):
+        chosen = dr.minimum(mi.UInt32(sample.x * mi.Float(self._size)), self._size - 1)
+        entry = dr.gather(mi.Vector4f, self._table, region * self._size + chosen, active)
+        is_taken = sample.y < entry[0]
+        chosen = dr.select(is_taken, chosen, dr.reinterpret_array(mi.UInt32, entry[1]))
+        return chosen, dr.select(is_taken, entry[2], entry[3])
+
+    def expected(self, region, chosen, active):
+        return dr.gather(mi.Float, self._expected, region * self._size + chosen, active)
