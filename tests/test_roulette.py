@@ -11,7 +11,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import area, diffuse, film, lookat, rectangle, sensor
-from statistical import REFERENCE_SEEDS, SEEDS, assert_same_pixels_on_average, two_halves
+from statistical import (
+    REFERENCE_SEEDS,
+    SEEDS,
+    assert_same_pixels_on_average,
+    some,
+    two_halves,
+)
 from techniques import TECHNIQUES
 
 from mitsuba_ext.decisions.directions.surface_regions import SurfaceRegions
@@ -187,7 +193,7 @@ def _lamp_to_the_ceiling() -> mi.Scene:
     return _room(lamp=rectangle(place, bsdf=diffuse(0.0), emitter=area(10.0)))
 
 
-@pytest.mark.parametrize("max_depth", [8, -1])
+@pytest.mark.parametrize("max_depth", some(8, of=[8, -1]))
 @pytest.mark.parametrize("make", [_lamp_in_glass, _lamp_to_the_ceiling])
 def test_learned_roulette_is_unbiased(make, max_depth: int) -> None:
     scene = make()
