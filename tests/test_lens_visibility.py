@@ -154,14 +154,13 @@ def test_memory_is_bounded() -> None:
 
 def assert_image_of_path(
     plugin: str, scene: dict[str, Any], spp: int = 512, precision: float = 0.01,
-    **parameters: Any,
+    reference: str = "path", **parameters: Any,
 ) -> None:  # fmt: skip
     scene = mi.load_dict(scene, optimize=False)
     common = {"max_depth": 3, **parameters}
     integrator = mi.load_dict({"type": plugin, "lens_sampling": "visibility", **common})
-    path = "composed_path" if plugin == "composed_path" else "path"
     images = batches(scene, integrator, spp, SEEDS[:MANY_SEEDS])
-    expected = batches(scene, mi.load_dict({"type": path, **common}), spp,
+    expected = batches(scene, mi.load_dict({"type": reference, **common}), spp,
                        REFERENCE_SEEDS[:MANY_SEEDS])  # fmt: skip
     assert_same_quarters(images, expected, precision)
 
@@ -204,6 +203,17 @@ def test_a_table_that_is_wrong_everywhere_changes_no_mean(
 @pytest.mark.parametrize("plugin", ["light_tracer", "bdpt"])
 def test_variants_show_the_image_of_path(variant: str, plugin: str) -> None:
     assert_image_of_path(plugin, behind_bars())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plugin", ["light_tracer", "bdpt"])
+def test_shapes_move_before_the_lens_as_in_the_path_tracer(plugin: str) -> None:
+    plate = rectangle(T().translate([-0.3, -3, 1]).rotate([1, 0, 0], 90).scale([0.1, 1, 1]),
+                      bsdf={"type": "twosided", "bsdf": diffuse(0.3)})  # fmt: skip
+    moving = {"type": "moving", "translate": [0.6, 0, 0], "plate": plate}
+    scene = behind_bars(camera={"shutter_open": 0.0, "shutter_close": 1.0}, bars=False,
+                        moving=moving)  # fmt: skip
+    assert_image_of_path(plugin, scene, reference="composed_path")
 
 
 @pytest.mark.slow
