@@ -15,7 +15,7 @@ from test_bdpt import assert_image_of_path, bdpt
 from test_light_tracer import T, below_the_lamp
 
 from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.light_vertices import VertexCache
+from mitsuba_ext.bidirectional.light_vertices import PackedVertices, VertexCache
 from mitsuba_ext.bidirectional.light_walk import LightWalk
 from mitsuba_ext.bidirectional.partial_sums import PartialSums, Sums
 from mitsuba_ext.bidirectional.vertex_choice import RegionChoice
@@ -158,10 +158,10 @@ def _table_and_vertices(adversarial: bool) -> tuple[RegionTable, VertexCache]:
     def vertices(selection: RegionTable | None) -> VertexCache:
         walk = LightWalk(LightEmission(scene), 5, 5,
                          PartialSums(EmitterSampling(), selection=selection))  # fmt: skip
-        rounds: list[VertexCache] = []
-        paths = walk.begin(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths,
-                           dr.full(mi.Bool, True, lanes))  # fmt: skip
-        walk.finish(scene, numbers, paths, lambda v: rounds.append(VertexCache([v], lanes)))
+        rounds: list[PackedVertices] = []
+        walk.run(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths,
+                 dr.full(mi.Bool, True, lanes),
+                 lambda vertices: rounds.append(PackedVertices(vertices)))  # fmt: skip
         return VertexCache(rounds, lanes)
 
     some_vertices = vertices(None)

@@ -62,8 +62,8 @@ class BidirectionalWeights(Weights):
         return Sums(
             dr.select(si.is_valid(), later.dVCM, path.sums.dVCM),
             dr.select(si.is_valid(), later.dVC, path.sums.dVC),
-            later.region,
-            later.count,
+            region=later.region,
+            count=later.count,
         )
 
     def emission(self, scene, si, ds, path, pdf) -> mi.Float:
