@@ -63,7 +63,7 @@ class BidirectionalIntegrator(WalkIntegrator):
        - |string|
        - How a connection to a :monosp:`thinlens` chooses the point of the aperture, as in
          :class:`light_tracer`: :monosp:`uniform`, or by :monosp:`visibility`. Needs the
-         light image. (Default: uniform)
+         light image. It gained nothing where it was measured. (Default: uniform)
      * - light_paths
        - |string|
        - :monosp:`always`, or :monosp:`auto`: a pilot finds whether they are worth their time; if
