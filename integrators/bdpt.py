@@ -168,9 +168,14 @@ class BidirectionalIntegrator(WalkIntegrator):
         ):
             for slot in self.slots.keys() & set(refused):
                 raise ValueError(
-                    f'"{self.name}": the parameter "{slot}" has no effect beside '
+                    f'"{self.name}": the parameter "{slot}" cannot be combined with '
                     f'"{key} = {getattr(self, key)}"; leave it out'
                 )
+        if self.technique_images and not self.technique_images.endswith(".exr"):
+            raise ValueError(
+                f'"{self.name}": "technique_images" is "{self.technique_images}"; the name of the '
+                f'file must end with ".exr"'
+            )
 
     def parameters(self) -> dict[str, Any]:
         own = {
@@ -237,6 +242,12 @@ class BidirectionalIntegrator(WalkIntegrator):
         image = super().render(scene, sensor, seed, spp, develop, evaluate)
         if self.techniques is not None:
             self.techniques.write(Path(self.technique_images), self.statistics.spp)
+        elif self.technique_images:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'"{self.name}": without lights, or with "max_depth" below 2, there are no light '
+                f'paths: "{self.technique_images}" is not written.',
+            )
         return image
 
     def _has_light_image(self, sensor: mi.Sensor) -> bool:

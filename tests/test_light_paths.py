@@ -24,11 +24,19 @@ def test_light_paths_are_kept_where_they_find_caustics() -> None:
     assert integrator.statistics.learned.startswith("light paths pay")
 
 
-def test_light_paths_are_dropped_under_an_open_sky() -> None:
+@pytest.mark.parametrize("ball", [{"type": "diffuse"}, {"type": "conductor"}])
+def test_light_paths_are_dropped_under_an_open_sky(ball: dict[str, Any]) -> None:
+    """Also where some light comes by way of a mirror: ``path`` runs into the sky."""
     integrator = _auto()
-    scene = mi.load_dict(stage(light=EMITTERS["constant"](), camera=below_the_lamp()))
-    mi.render(scene, integrator=integrator, spp=256)
+    scene = {**_balls(ball), "light": EMITTERS["constant"]()}
+    mi.render(mi.load_dict(scene, optimize=False), integrator=integrator, spp=256)
     assert integrator.statistics.learned.startswith("light paths do not pay")
+
+
+def test_without_lights_there_is_nothing_to_choose() -> None:
+    integrator = _auto()
+    assert not batches(mi.load_dict(stage(light={})), integrator, 4, [1]).any()
+    assert integrator.statistics.learned == ""
 
 
 def test_light_that_path_cannot_find_keeps_light_paths() -> None:

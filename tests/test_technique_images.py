@@ -79,13 +79,25 @@ def test_each_technique_finds_all_paths_of_a_length(tmp_path: Path) -> None:
             assert error < 0.1 * expected.mean(), (s, k + 1 - s, "known badly")
 
 
-def test_what_has_no_effect_beside_them_is_refused(tmp_path: Path) -> None:
+def test_what_cannot_be_combined_with_them_is_refused(tmp_path: Path) -> None:
     for parameters in (
         {"technique_images": str(tmp_path / "a.exr"), "light_paths": "auto"},
         {"sample_direct": False, "next_event": "power"},
     ):
-        with pytest.raises((ValueError, RuntimeError), match="has no effect beside"):
+        with pytest.raises((ValueError, RuntimeError), match="cannot be combined with"):
             mi.load_dict({"type": "bdpt", **parameters})
+
+
+def test_another_kind_of_file_is_refused() -> None:
+    with pytest.raises((ValueError, RuntimeError), match="must end with"):
+        mi.load_dict({"type": "bdpt", "technique_images": "a.png"})
+
+
+def test_without_lights_no_file_is_written(tmp_path: Path) -> None:
+    file = tmp_path / "a.exr"
+    scene = mi.load_dict(stage(light={}))
+    image, _ = _render(scene, 1, 1, technique_images=str(file), subpath_selection="visibility")
+    assert not image.any() and not file.exists()
 
 
 def test_a_file_that_cannot_be_written_is_named_before_the_render(tmp_path: Path) -> None:
