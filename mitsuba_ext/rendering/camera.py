@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.estimator import CameraRays, Sample, Splats
+from ..transport.numbers import Numbers
 from .camera_samples import CameraSamples
 
 
@@ -84,28 +85,28 @@ class CameraNumbers:
 
 
 def draw_numbers(
-    sensor: mi.Sensor, sampler: mi.Sampler, lanes: Lanes, samples: CameraSamples
+    sensor: mi.Sensor, sampler: Numbers, lanes: Lanes | None, samples: CameraSamples
 ) -> CameraNumbers:
     """Numbers in the order in which ``mi.SamplingIntegrator`` draws them, so that the same seed
-    gives the same rays as Mitsuba's own integrators. ``samples`` says which come from elsewhere."""
+    gives the same rays as Mitsuba's own integrators. ``samples`` says which come from elsewhere:
+    only these need to know the ``lanes``."""
     numbers = CameraNumbers(sampler.next_2d(), mi.Point2f(0.5), mi.Float(0), mi.Float(0))
-    pixel, index = lanes.pixel, lanes.index
     if sensor.needs_aperture_sample():
         if samples.aperture is None:
             numbers.aperture = sampler.next_2d()
         else:
-            numbers.aperture, numbers.weight = samples.aperture.draw(pixel, index)
+            numbers.aperture, numbers.weight = samples.aperture.draw(lanes.pixel, lanes.index)
     if sensor.shutter_open_time() > 0:
         if samples.time is None:
             numbers.time = sampler.next_1d()
         else:
-            numbers.time, weight = samples.time.draw(pixel, index)
+            numbers.time, weight = samples.time.draw(lanes.pixel, lanes.index)
             numbers.weight *= weight
     if mi.is_spectral:
         if samples.wavelength is None:
             numbers.wavelength = sampler.next_1d()
         else:
-            numbers.wavelength, hero, all_four = samples.wavelength.draw(pixel, index)
+            numbers.wavelength, hero, all_four = samples.wavelength.draw(lanes.pixel, lanes.index)
             numbers.weight *= all_four
             numbers.hero_weight = hero / all_four
     return numbers
@@ -206,12 +207,16 @@ def _channels(
     film: mi.Film, L: mi.Spectrum, wavelengths: mi.Spectrum | None, alpha: mi.Float
 ) -> list[mi.Float]:
     """The colour channels of a film, and alpha where it has that."""
-    if mi.is_spectral:
-        rgb = mi.spectrum_to_srgb(L, wavelengths)
-    else:
-        rgb = mi.Color3f(L.x) if mi.is_monochromatic else L
+    rgb = to_rgb(L, wavelengths)
     has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
     return [rgb.x, rgb.y, rgb.z, *([alpha] if has_alpha else [])]
+
+
+def to_rgb(L: mi.Spectrum, wavelengths: mi.Spectrum | None) -> mi.Color3f:
+    """Radiance as the colour that films store."""
+    if mi.is_spectral:
+        return mi.spectrum_to_srgb(L, wavelengths)
+    return mi.Color3f(L.x) if mi.is_monochromatic else L
 
 
 def develop(film: mi.Film, develop: bool, evaluate: bool) -> mi.TensorXf:

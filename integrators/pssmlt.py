@@ -1,0 +1,110 @@
+"""Metropolis light transport in the space of primary samples."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.chains.metropolis import MetropolisIntegrator
+from mitsuba_ext.chains.render import ChainSettings
+from mitsuba_ext.chains.small_steps import SmallSteps
+
+
+@registry.plugin
+class PrimarySampleMetropolis(MetropolisIntegrator):
+    r"""
+    .. _integrator-pssmlt:
+
+    Primary sample space Metropolis light transport (:monosp:`pssmlt`)
+    ------------------------------------------------------------------
+
+    Markov chains change the random numbers of a path tracer, and stay where much light is found.
+
+    .. pluginparameters::
+
+     * - direct_samples
+       - |int|
+       - Camera samples per pixel for visible lights and direct light, which :monosp:`path` finds
+         well; the chains find the rest. −1 leaves all light to the chains. (Default: 16)
+     * - p_large
+       - |float|
+       - The probability of a large step, which draws all numbers anew. (Default: 0.3)
+     * - luminance_samples
+       - |int|
+       - Independent samples, at least, that estimate the brightness of the image, and from which
+         chains start. (Default: 100000)
+     * - mutation_size_low, mutation_size_high
+       - |float|
+       - By how much small steps change a number, at least and at most. (Default: 1/1024, 1/64)
+     * - kelemen_style_weights
+       - |bool|
+       - Use large steps as independent samples besides, weighted by the balance heuristic: it
+         reduces the noise of dark pixels. (Default: true)
+     * - chains
+       - |int|
+       - Chains, which run in parallel; there are no more than mutations. (Default: 16384)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`MetropolisIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         next_event.
+
+    ``spp`` is the number of mutations per pixel.
+
+    **Use it when** light comes by ways that few paths take, but where paths that take them have
+    neighbours that do: caustics of lamps that are not too small, light through a gap. **Not when**
+    :monosp:`path` converges well, or for noise that must look even: neighbouring pixels depend on
+    each other, and a chain that has found a rare bright path stays there for long, which shows as a
+    spot. Errors between renders of different seeds tell the truth (:class:`variance`).
+
+    The statistics hold the rates of acceptance.
+
+    Source: C. Kelemen, L. Szirmay-Kalos, G. Antal, F. Csonka, *A Simple and Robust Mutation
+    Strategy for the Metropolis Light Transport Algorithm*, Eurographics 2002; D. Cline, PhD thesis,
+    2007, section 7.13. Parameters: Mitsuba 0.6.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="pssmlt">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'pssmlt',
+            'max_depth': 8
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.p_large = self.parameter(props, "p_large", 0.3, minimum=0.0, maximum=1.0)
+        self.luminance_samples = self.parameter(
+            props, "luminance_samples", 100_000, minimum=1, maximum=1 << 26
+        )
+        self.kelemen_style_weights = self.parameter(props, "kelemen_style_weights", True)
+        low = self.parameter(props, "mutation_size_low", 1 / 1024, minimum=1e-6, maximum=0.5)
+        high = self.parameter(props, "mutation_size_high", 1 / 64, minimum=1e-6, maximum=0.5)
+        if low > high:
+            raise ValueError(
+                f'"{self.name}": "mutation_size_low" is {low}; it must not be larger than '
+                f'"mutation_size_high", which is {high}'
+            )
+        self.steps = SmallSteps(low, high)
+
+    def settings(self) -> ChainSettings:
+        return ChainSettings(
+            self.chains, self.luminance_samples, self.p_large, self.steps,
+            self.kelemen_style_weights,
+        )  # fmt: skip
+
+    def parameters(self) -> dict[str, Any]:
+        return {
+            **super().parameters(),
+            "p_large": self.p_large,
+            "luminance_samples": self.luminance_samples,
+            "mutation_size_low": self.steps.low,
+            "mutation_size_high": self.steps.high,
+            "kelemen_style_weights": self.kelemen_style_weights,
+        }

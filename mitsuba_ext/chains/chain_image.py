@@ -1,0 +1,46 @@
+"""The image that chains add their visits to."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from .target import Contribution
+
+
+class ChainImage:
+    """Two image blocks: visits of chains, whose factor is known in the end, and uniform samples.
+
+    Parameters:
+        film: It must be prepared, and accept splats.
+    """
+
+    def __init__(self, film: mi.Film) -> None:
+        self._film = film
+        self._visits, self._uniform = film.create_block(), film.create_block()
+        for block in (self._visits, self._uniform):
+            # Positions of lanes have nothing to do with each other
+            block.set_coalesce(False)
+
+    def add(self, found: Contribution, weight: mi.Float) -> None:
+        """Adds ``weight`` visits."""
+        self._put(self._visits, found, weight)
+
+    def add_uniform(self, found: Contribution, weight: mi.Float) -> None:
+        """Adds uniform samples with this weight."""
+        self._put(self._uniform, found, weight)
+
+    def _put(self, block: mi.ImageBlock, found: Contribution, weight: mi.Float) -> None:
+        value = found.value * weight
+        # Neither alpha, nor weight, nor other variables: they come from camera rays
+        others = [mi.Float(0)] * (block.channel_count() - 3)
+        block.put(found.position, [value.x, value.y, value.z, *others], weight > 0)
+
+    def tensors(self) -> list[mi.TensorXf]:
+        """What a launch evaluates."""
+        return [self._visits.tensor(), self._uniform.tensor()]
+
+    def write(self, visit_factor: float, uniform_factor: float) -> None:
+        """Adds the image to the film, which holds camera samples."""
+        visits, uniform = self.tensors()
+        tensor = visits * visit_factor + uniform * uniform_factor
+        self._film.put_block(mi.ImageBlock(tensor, offset=self._visits.offset()))
