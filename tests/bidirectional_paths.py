@@ -261,7 +261,6 @@ def weights_of_techniques(
         origin, pdf = sensor.origin(paths.camera_ray)
         wo = last.from_camera.wi
         density = pdf / dr.squared_norm(last.p - origin) * geometric_cosine(last.from_light, wo)
-        density /= sensor.lens_density(origin, last.p, active)
         reverse = reverse_density(ctx, last.bsdf, last.from_light, wo, active)
         seen = weight(sums.others(density, by_light[-1], reverse))
         found.append(dr.select(last.is_delta, 0, seen))
