@@ -1,28 +1,30 @@
-"""Compares ``lens_sampling`` by visibility with uniform sampling where things near the lens, out of
-focus, hide a part of it:
+"""Compares ``lens_sampling`` of ``light_tracer`` by visibility with uniform sampling, where things
+near the lens, out of focus, hide a part of it:
 
     .venv/bin/python examples/lens_sampling.py edge bars night_classroom
 
 Writes one row of Markdown for each scene and region: all pixels; and those in which 10 to 50 %, and
 50 to 90 %, of the camera rays meet something nearer than half the focus distance. ``unblocked`` is
 the share of the shadow rays to the lens that find nothing in between, for splats in the region. The
-gain is uniform variance / variance of a pixel between seeds (divided by mean² + 0.01 · (mean of the
-image)², without the largest 0.1 % of the values); the efficiency is the gain / (CPU time / uniform
-CPU time), with the depth maps and the table, and without the compilation of kernels.
+gain is the ratio of the errors of ``examples/equal_samples.py``, that of uniform sampling first;
+time is CPU time relative to uniform sampling, with the depth maps and the table. The efficiency is
+gain / time.
 """
 
 from __future__ import annotations
 
-import time
-
 import click
 import numpy as np
-from bidirectional import error, load
-
-import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
-
-import drjit as dr  # isort: skip
-import mitsuba as mi  # isort: skip
+from equal_samples import (
+    camera_rays,
+    error,
+    load,
+    options,
+    print_header,
+    print_row,
+    render_in_turns,
+    title,
+)
 
 from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
@@ -30,21 +32,27 @@ from mitsuba_ext.bidirectional.sensor import is_occluded
 from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
 from mitsuba_ext.transport.path_decisions import SceneQuery
 
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
+
 COLUMNS = ["scene", "pixels", "share", "unblocked: uniform", "visibility"]
-PLUGINS = ("light_tracer", "bdpt")
-for plugin in PLUGINS:
-    COLUMNS += [f"`{plugin}`: gain", "time", "efficiency"]
+COLUMNS += ["gain", "time", "efficiency"]
+
+INTEGRATORS = {
+    kind: {"type": "light_tracer", "lens_sampling": kind} for kind in LENS_SAMPLING
+}
 
 #: Regions: how many of a pixel's camera rays meet something near.
 REGIONS = {"all": (0.0, 1.01), "10 to 50 %": (0.1, 0.5), "50 to 90 %": (0.5, 0.9)}
 
 
-def room(near: list[tuple[float, float]], width: int, height: int) -> mi.Scene:
+def room(near: list[tuple[float, float]], size: tuple[int, int]) -> mi.Scene:
     """A ball in a room, in focus. Panels before the lens, 2 high and of these x and widths, hide a
     part of it."""
     to = mi.ScalarTransform4f
     white = {"type": "twosided", "bsdf": {"type": "diffuse"}}
     view = to().look_at(origin=[0, -4, 1], target=[0, 0, 1], up=[0, 0, 1])
+    width, height = size
     film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb",
             "rfilter": {"type": "box"}}  # fmt: skip
     lamp = {"type": "area", "radiance": 8.0}
@@ -78,12 +86,7 @@ def hidden(scene: mi.Scene) -> np.ndarray:
     """The share of each pixel's camera rays that meet something near: [height, width]."""
     sensor = scene.sensors()[0]
     width, height = sensor.film().crop_size()
-    lane = dr.arange(mi.UInt32, width * height * 64)
-    u = [mi.sample_tea_float32(lane, i) for i in range(4)]
-    pixel = lane // 64
-    position = mi.Point2f(pixel % width + u[0], pixel // width + u[1])
-    ray, _ = sensor.sample_ray(0, 0.5, position / mi.Point2f(width, height), mi.Point2f(u[2], u[3]))
-    near = scene.ray_intersect(ray).t < 0.5 * sensor.focus_distance()
+    near = scene.ray_intersect(camera_rays(scene, 64)).t < 0.5 * sensor.focus_distance()
     return np.array(near).reshape(height, width, 64).mean(axis=2)
 
 
@@ -114,51 +117,29 @@ def unblocked(scene: mi.Scene, share: np.ndarray, max_depth: int) -> dict[str, l
 
 
 @click.command()
-@click.argument("names", nargs=-1, required=True)
-@click.option("--max-depth", default=6)
-@click.option("--spp", default=64)
-@click.option("--seeds", default=6)
-@click.option("--size", type=(int, int), default=(160, 90), help="Width and height of the film.")
+@options
 def main(names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple) -> None:
     """Compares on the scenes NAMES: files, ours by their names, or edge, bars, nothing near."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
-    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
+    print_header(COLUMNS)
     for name in names:
-        scene = room(ROOMS[name], *size) if name in ROOMS else load(name, *size)
+        scene = room(ROOMS[name], size) if name in ROOMS else load(name, size)
         share = hidden(scene)
         reached = unblocked(scene, share, max_depth)
-        results = {plugin: compare(scene, plugin, max_depth, spp, seeds) for plugin in PLUGINS}
+        renders = render_in_turns(scene, INTEGRATORS, max_depth, spp, seeds)
+        uniform, other = (renders[kind] for kind in LENS_SAMPLING)
+        mean, slower = (uniform.mean + other.mean) / 2, other.time / uniform.time
         for region, (low, high) in REGIONS.items():
             pixels = (share >= low) & (share < high)
             if pixels.sum() < 20:
                 continue
-            cells = [name, region, f"{pixels.mean():.3f}", *(f"{r:.3f}" for r in reached[region])]
-            for variances, mean, slower in results.values():
-                gain = error(variances[0][pixels], mean[pixels])
-                gain /= error(variances[1][pixels], mean[pixels])
-                cells += [f"{gain:.2f}", f"{slower:.2f}", f"{gain / slower:.2f}"]
-            print(f"| {' | '.join(cells)} |", flush=True)
-
-
-def compare(scene: mi.Scene, plugin: str, max_depth: int, spp: int, seeds: int) -> tuple:
-    """Variances of the pixels for each way to sample the lens, their mean, and the ratio of the CPU
-    times."""
-    integrators = [
-        mi.load_dict({"type": plugin, "max_depth": max_depth, "lens_sampling": kind})
-        for kind in LENS_SAMPLING
-    ]
-    images, seconds = [[], []], [[], []]
-    for seed in range(seeds + 1):  # the first compiles the kernels
-        for i, integrator in enumerate(integrators):
-            start = time.process_time()
-            image = mi.render(scene, integrator=integrator, seed=1 + 7919 * seed, spp=spp)
-            image = np.array(image, dtype=np.float64)
-            if seed > 0:
-                images[i].append(image)
-                seconds[i].append(time.process_time() - start)
-    variances = [np.var(x, axis=0, ddof=1) for x in images]
-    return variances, np.mean(images, axis=(0, 1)), min(seconds[1]) / min(seconds[0])
+            gain = error(uniform.variance[pixels], mean[pixels])
+            gain /= error(other.variance[pixels], mean[pixels])
+            print_row([
+                title(name), region, f"{pixels.mean():.3f}", *(f"{r:.3f}" for r in reached[region]),
+                f"{gain:.2f}", f"{slower:.2f}", f"{gain / slower:.2f}",
+            ])  # fmt: skip
 
 
 if __name__ == "__main__":

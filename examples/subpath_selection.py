@@ -3,59 +3,37 @@
     .venv/bin/python examples/subpath_selection.py corridor night_classroom /somewhere/scene.xml
 
 Writes one row of Markdown for each scene: root mean square error and CPU time (learning included),
-relative to the uniform selection; the time to an equal error (error² · time); and what was learned.
-Errors are those of ``examples/bidirectional.py``; times are the shortest of all seeds.
+relative to the uniform selection; the time to an equal error (error² · time); and what was learned
+with the last seed. Errors are those of ``examples/equal_samples.py``, times are the median of the
+seeds.
 """
 
 from __future__ import annotations
 
-import time
-from pathlib import Path
-
 import click
-import numpy as np
-from bidirectional import error, load
-
-import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
+from equal_samples import error, load, options, print_header, print_row, render_in_turns, title
 
 import mitsuba as mi  # isort: skip
 
 SELECTIONS = ("uniform", "visibility")
+INTEGRATORS = {kind: {"type": "bdpt", "subpath_selection": kind} for kind in SELECTIONS}
 
 
 @click.command()
-@click.argument("names", nargs=-1, required=True)
-@click.option("--max-depth", default=8)
-@click.option("--spp", default=64)
-@click.option("--seeds", default=4)
-@click.option("--size", type=(int, int), default=(128, 72), help="Width and height of the film.")
+@options
 def main(names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple) -> None:
     """Compares the selections on the scenes NAMES."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
-    print("| scene | error | time | time to equal error | |\n|---|---|---|---|---|")
+    print_header(["scene", "error", "time", "time to equal error", "learned"])
     for name in names:
-        scene = load(name, *size)
-        integrators = [
-            mi.load_dict({"type": "bdpt", "max_depth": max_depth, "subpath_selection": s})
-            for s in SELECTIONS
-        ]
-        images, seconds = ([], []), ([], [])
-        for seed in range(seeds + 1):  # the first compiles the kernels
-            for i, integrator in enumerate(integrators):
-                start = time.process_time()
-                image = mi.render(scene, integrator=integrator, seed=1 + 7919 * seed, spp=spp)
-                image = np.array(image, dtype=np.float64)
-                if seed > 0:
-                    images[i].append(image)
-                    seconds[i].append(time.process_time() - start)
-        mean = np.mean(images[0] + images[1], axis=0).reshape(-1, 3)
-        squares = [error(np.var(x, axis=0, ddof=1).reshape(-1, 3), mean) for x in images]
-        ratio, duration = squares[1] / squares[0], min(seconds[1]) / min(seconds[0])
-        learned = integrators[1].statistics.learned
-        label = Path(name).parent.name if Path(name).name == "scene.xml" else Path(name).stem
-        cells = [label, *(f"{x:.2f}" for x in (ratio**0.5, duration, ratio * duration)), learned]
-        print(f"| {' | '.join(cells)} |", flush=True)
+        renders = render_in_turns(load(name, size), INTEGRATORS, max_depth, spp, seeds)
+        uniform, learned = (renders[kind] for kind in SELECTIONS)
+        mean = (uniform.mean + learned.mean) / 2
+        square = error(learned.variance, mean) / error(uniform.variance, mean)
+        slower = learned.time / uniform.time
+        ratios = (f"{x:.2f}" for x in (square**0.5, slower, square * slower))
+        print_row([title(name), *ratios, learned.learned[-1]])
 
 
 if __name__ == "__main__":

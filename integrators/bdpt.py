@@ -16,7 +16,6 @@ from mitsuba_ext.bidirectional.light_walk import STRIDE
 from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
 from mitsuba_ext.bidirectional.technique_images import TechniqueImages
-from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
 from mitsuba_ext.composition.light_paths import LightPathChoice
 from mitsuba_ext.composition.next_event import sampling_weights
 from mitsuba_ext.composition.slots import BIDIRECTIONAL_SLOTS, read_slot
@@ -59,11 +58,6 @@ class BidirectionalIntegrator(WalkIntegrator):
        - Which vertices of light paths these are: :monosp:`uniform`, or :monosp:`visibility` (those
          in regions whose vertices were seen from here, and brought light, in pilots). (Default:
          uniform)
-     * - lens_sampling
-       - |string|
-       - How a connection to a :monosp:`thinlens` chooses the point of the aperture, as in
-         :class:`light_tracer`: :monosp:`uniform`, or by :monosp:`visibility`. Needs the
-         light image. It gained nothing where it was measured. (Default: uniform)
      * - light_paths
        - |string|
        - :monosp:`always`, or :monosp:`auto`: a pilot finds whether they are worth their time; if
@@ -149,13 +143,6 @@ class BidirectionalIntegrator(WalkIntegrator):
         super().__init__(props)
         self.connections = self.parameter(props, "connections", 1, minimum=1, maximum=1024)
         self.light_image = self.parameter(props, "light_image", True)
-        self.lens_sampling = self.parameter(
-            props, "lens_sampling", "uniform", choices=LENS_SAMPLING
-        )
-        if self.lens_sampling != "uniform" and not self.light_image:
-            raise ValueError(
-                f'"{self.name}": the parameter "lens_sampling" needs "light_image"; leave it out'
-            )
         self.sample_direct = self.parameter(props, "sample_direct", True)
         self.technique_images = self.parameter(props, "technique_images", "")
         self.techniques: TechniqueImages | None = None
@@ -178,16 +165,14 @@ class BidirectionalIntegrator(WalkIntegrator):
             )
 
     def parameters(self) -> dict[str, Any]:
-        own = {
+        return {
             "connections": self.connections,
             "light_image": self.light_image,
             "sample_direct": self.sample_direct,
             "technique_images": self.technique_images or "none",
             "light_paths": "always",
+            **super().parameters(),
         }
-        if self.light_image:
-            own["lens_sampling"] = self.lens_sampling
-        return {**own, **super().parameters()}
 
     @property
     def sample_cost(self) -> int:
@@ -208,11 +193,7 @@ class BidirectionalIntegrator(WalkIntegrator):
         film = sensor.film()
         if self.technique_images:
             self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
-        target = None
-        if self._has_light_image(sensor):
-            target = connectable_sensor(
-                self.name, self.lens_sampling, scene, sensor, self._query(scene)
-            )
+        target = ConnectableSensor(sensor) if self._has_light_image(sensor) else None
         correct = sampling_weights(scene) if emission.has_smooth_meshes else None
         return functools.partial(self._estimator, emission, target, correct)
 

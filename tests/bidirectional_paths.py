@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.bidirectional.connections import End, joining_weight
+from mitsuba_ext.bidirectional.connections import End, joining_by_camera, joining_weight
 from mitsuba_ext.bidirectional.emission import EmittedRay, LightEmission
 from mitsuba_ext.bidirectional.partial_sums import PartialSums, weight
 from mitsuba_ext.bidirectional.scattering import geometric_cosine, reverse_density
@@ -145,10 +145,12 @@ def weights_of_techniques(
     sensor: ConnectableSensor | None,
     next_event: EmitterSampling,
     selection: SubpathSelection | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The weight of each technique, as the estimator computes it: [s, path], 0 where it cannot find
-    the path; and which of the lanes have a path."""
-    sums, active = PartialSums(next_event, CONNECTIONS, selection=selection), paths.active
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As the estimator computes them: the weight of each technique, [s, path], 0 where it cannot
+    find the path; which of the lanes have a path; and for all techniques but the first two the
+    ratios of the densities of these to its own, [s − 2, 2, path]."""
+    sums = PartialSums(next_event, CONNECTIONS, follows_camera=True, selection=selection)
+    active = paths.active
     weights = BidirectionalWeights(scene, sums, emits, sensor)
     ctx = mi.BSDFContext()
     vertices, emitted = paths.vertices, paths.emitted
@@ -166,7 +168,7 @@ def weights_of_techniques(
         from_light.append(from_light[-1] & (pdf > 0))
         left = sums.leave(
             by_light[-1], geometric_cosine(si, wo), pdf,
-            reverse_density(ctx, a.bsdf, si, wo, active), a.is_delta,
+            reverse_density(ctx, a.bsdf, si, wo, active), a.is_delta, a is vertices[0],
         )  # fmt: skip
         by_light.append(
             sums.arrive(
@@ -238,6 +240,7 @@ def weights_of_techniques(
     found.append(dr.select(first.is_delta, 0, connected))
 
     # ----- s, t ≥ 2 -----
+    ratios = []
     for i, (a, b) in enumerate(zip(vertices, vertices[1:])):
         ends = [
             End(si, wo, v.bsdf.pdf(ctx, si, wo, active),
@@ -254,6 +257,8 @@ def weights_of_techniques(
             )
         joined = joining_weight(sums, *ends, dr.squared_norm(b.p - a.p), expected)
         found.append(dr.select(a.is_delta | b.is_delta, 0, joined))
+        factor = 1 / (CONNECTIONS * expected)
+        ratios.append(joining_by_camera(sums, *ends, dr.squared_norm(b.p - a.p), i == 0, factor))
 
     # ----- t = 1 -----
     if sensor is not None:
@@ -261,15 +266,17 @@ def weights_of_techniques(
         origin, pdf = sensor.origin(paths.camera_ray)
         wo = last.from_camera.wi
         density = pdf / dr.squared_norm(last.p - origin) * geometric_cosine(last.from_light, wo)
-        density /= sensor.lens_density(origin, last.p, active)
         reverse = reverse_density(ctx, last.bsdf, last.from_light, wo, active)
         seen = weight(sums.others(density, by_light[-1], reverse))
         found.append(dr.select(last.is_delta, 0, seen))
+        ratios.append(sums.by_camera(density, by_light[-1], reverse, len(vertices) == 1))
     # from_camera: for s = 0, 1, …, t = 1; from_light: for s = 2, …
     can = [from_camera[s] & (from_light[s - 2] if s > 1 else True) for s in range(len(found))]
     found = [dr.select(active & c, w, 0) for c, w in zip(can, found)]
-    dr.eval(found, active)
+    dr.eval(found, ratios, active)
     shape = np.array(active).shape
-    return np.stack([np.broadcast_to(np.array(w, dtype=np.float64), shape) for w in found]), (
-        np.array(active)
+    return (
+        np.stack([np.broadcast_to(np.array(w, dtype=np.float64), shape) for w in found]),
+        np.array(active),
+        np.array([np.array(r, dtype=np.float64) for r in ratios]),
     )

@@ -35,13 +35,27 @@ def weights(
     selection: SubpathSelection | None = None,
 ) -> tuple[np.ndarray, np.ndarray, Paths, LightEmission]:
     """Of paths with so many vertices: [s, path] for those that exist."""
+    found, exists, _, paths, emission = weights_and_ratios(
+        scene, light, camera, next_event, selection
+    )
+    return found[:, exists], exists, paths, emission
+
+
+def weights_and_ratios(
+    scene: mi.Scene,
+    light: int,
+    camera: int,
+    next_event: EmitterSampling | None = None,
+    selection: SubpathSelection | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Paths, LightEmission]:
+    """What :func:`weights_of_techniques` returns, of such paths, the paths, and the emission."""
     emission, eye = LightEmission(scene), scene.sensors()[0]
     connectable = ConnectableSensor(eye) if ConnectableSensor.can_connect(eye) else None
     paths = trace(scene, emission, eye, light, camera)
-    found, exists = weights_of_techniques(
+    found = weights_of_techniques(
         scene, paths, emission, connectable, next_event or EmitterSampling(), selection
     )
-    return found[:, exists], exists, paths, emission
+    return *found, paths, emission
 
 
 def assert_they_add_up(
@@ -156,6 +170,53 @@ def test_weights_of_light_vertices_that_are_chosen_by_regions_add_up(bsdf: str) 
     selection = any_table(*(weights(scene, *shape)[2] for shape in ((2, 1), (1, 2))))
     for light, camera in ((1, 1), (2, 1), (1, 2)):
         assert_they_add_up(weights(scene, light, camera, selection=selection)[0])
+
+
+# ---- Densities with which camera paths find what light paths find ----
+
+
+def assert_camera_ratios(
+    scene: mi.Scene, light: int, camera: int, selection: SubpathSelection | None = None
+) -> None:
+    """Light paths know the densities of the first two techniques, in units of their own: the roots
+    of the ratios of the weights."""
+    found, exists, ratios, _, _ = weights_and_ratios(scene, light, camera, selection=selection)
+    found, ratios = found[:, exists], ratios[..., exists]
+    assert len(ratios) == len(found) - 2
+    compared = 0
+    for own, ratio in zip(found[2:], ratios):
+        for by_camera, q in zip(found[:2], ratio):
+            # What camera paths cannot find
+            assert not q[(by_camera == 0) & (own > 0)].any()
+            is_clear = (own > 1e-3) & (by_camera > 1e-3)
+            if is_clear.any():
+                expected = np.sqrt(by_camera[is_clear] / own[is_clear])
+                assert np.quantile(np.abs(q[is_clear] / expected - 1), 0.98) < 1e-2
+            compared += is_clear.sum()
+    assert compared >= 20
+
+
+@pytest.mark.parametrize("name", some("rectangle", "constant", of=EMITTERS))
+def test_light_paths_know_how_camera_paths_find_an_emitter(name: str) -> None:
+    scene = mi.load_dict(stage(light=EMITTERS[name]()), optimize=False)
+    for shape in SHAPES:
+        assert_camera_ratios(scene, *shape)
+
+
+@pytest.mark.parametrize("name", some("glass", "mask", of=[*MATERIALS, *SPECULAR]))
+def test_light_paths_know_how_camera_paths_find_light_by_way_of_a_material(name: str) -> None:
+    """A sky: camera paths that meet a mirror or glass run into it."""
+    scene = {**_balls({**MATERIALS, **SPECULAR}[name]()), "light": EMITTERS["constant"]()}
+    scene = mi.load_dict(scene, optimize=False)
+    for shape in ((2, 1), (3, 1), (1, 2)):
+        assert_camera_ratios(scene, *shape)
+
+
+def test_ratios_of_camera_paths_count_connections_that_are_chosen_by_regions() -> None:
+    scene = mi.load_dict(stage(**_lights()), optimize=False)
+    selection = any_table(*(weights(scene, *shape)[2] for shape in ((2, 1), (1, 2))))
+    for shape in ((1, 1), (2, 1), (1, 2)):
+        assert_camera_ratios(scene, *shape, selection)
 
 
 # ---- Densities of diffuse paths, computed once more ----

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import pytest
-from hard_cases import rgb, stage
+from hard_cases import area, diffuse, rectangle, rgb, stage
 from statistical import REFERENCE_SEEDS, SEEDS, assert_same_quarters, batches, load, some
 from test_bdpt import bdpt
-from test_light_tracer import EMITTERS, MANY_SEEDS, _balls, below_the_lamp
+from test_light_tracer import EMITTERS, MANY_SEEDS, T, _balls, below_the_lamp
+
+from mitsuba_ext.bidirectional import path_tracer
+from mitsuba_ext.bidirectional.path_moments import PathMoments
+from mitsuba_ext.bidirectional.vertex_choice import Chosen, VertexChoice
+from mitsuba_ext.composition import light_paths
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -58,16 +65,31 @@ def test_the_choice_does_not_change_the_mean(light: str) -> None:
     assert_same_quarters(images, expected, 0.01)
 
 
-@pytest.mark.parametrize("name", some("rectangle", of=["rectangle", "constant", "sphere"]))
-def test_the_variance_of_path_is_predicted(name: str) -> None:
+def _below_a_ceiling(bsdf: dict[str, Any]) -> dict[str, Any]:
+    """All light comes by way of the ceiling."""
+    down = T().translate([0, 0, 2.5]).rotate([1, 0, 0], 180).scale(30)
+    lamp = rectangle(T().translate([-0.3, 0, 2.1]).scale(0.7), bsdf=diffuse(0.0), emitter=area(5.0))
+    return stage(light=lamp, camera=below_the_lamp(), ceiling=rectangle(down, bsdf=bsdf))
+
+
+def assert_variance_of_path_is_predicted(scene: dict[str, Any], **parameters: Any) -> None:
     """From what all techniques find, and measured between seeds of ``path``."""
-    scene = mi.load_dict(stage(light=EMITTERS[name](), camera=below_the_lamp()), optimize=False)
-    integrator = _auto(max_depth=4, pilot_spp=64)
+    scene = mi.load_dict(scene, optimize=False)
+    integrator = _auto(max_depth=4, pilot_spp=64, **parameters)
     mi.render(scene, integrator=integrator, spp=256)
     predicted = integrator.learners["light_paths"].estimate.by_camera.mean()
     seeds = batches(scene, mi.load_dict({"type": "path", "max_depth": 4}), 16, range(24))
     measured = 16 * seeds.mean(axis=-1).var(axis=0, ddof=1).mean()
     assert predicted == pytest.approx(measured, rel=0.15)
+
+
+@pytest.mark.parametrize("name", some("rectangle", of=["rectangle", "constant", "sphere"]))
+def test_the_variance_of_path_is_predicted(name: str) -> None:
+    assert_variance_of_path_is_predicted(stage(light=EMITTERS[name](), camera=below_the_lamp()))
+
+
+def test_the_variance_of_path_is_predicted_where_connections_find_all_light() -> None:
+    assert_variance_of_path_is_predicted(_below_a_ceiling(diffuse()), light_image=False)
 
 
 def test_a_restored_choice_needs_no_pilot(tmp_path) -> None:
@@ -77,3 +99,62 @@ def test_a_restored_choice_needs_no_pilot(tmp_path) -> None:
     restored = _auto(load_learned=file)
     mi.render(scene, integrator=restored, spp=4)
     assert restored.statistics.learned == "light paths do not pay"
+
+
+# ---- What light paths know of camera paths ----
+
+
+#: Paths that are found with s vertices by light paths, and in no other way but by camera paths
+#: alone: s, the scene, and parameters. Without a light image, t is 2.
+ALONE = {
+    "splats": (2, lambda: stage(camera=below_the_lamp()), {"max_depth": 2}),
+    "connections": (2, lambda: stage(camera=below_the_lamp()),
+                    {"max_depth": 3, "light_image": False}),
+    "splats by a mirror": (3, lambda: _below_a_ceiling({"type": "conductor"}), {"max_depth": 3}),
+    "connections by a mirror": (3, lambda: _below_a_ceiling({"type": "conductor"}),
+                                {"max_depth": 4, "light_image": False}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_weights_are_those_of_the_densities_that_light_paths_know(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where camera paths alone are the only other techniques, and the number of vertices of a light
+    path is the one that weights assume."""
+    length, scene, parameters = ALONE[name]
+    counts = []
+
+    class Recorder(PathMoments):
+        """Counts paths, by whether the weight is the expected one."""
+
+        def start(self, rays) -> None:
+            super().start(rays)
+            self.count = dr.zeros(mi.UInt32, 2)
+            dr.eval(self.count)
+            counts.append(self.count)
+
+        def joined(self, s, t, value, mis, by_camera, active) -> None:
+            self._compare(s, mis, by_camera, active)
+            super().joined(s, t, value, mis, by_camera, active)
+
+        def splatted(self, s, position, value, mis, by_camera, active) -> None:
+            self._compare(s, mis, by_camera, active)
+            super().splatted(s, position, value, mis, by_camera, active)
+
+        def _compare(self, s, mis, by_camera, active) -> None:
+            error = dr.abs(mis * (1 + dr.squared_norm(by_camera)) - 1)
+            index = dr.select((s == length) & (error < 2e-3), mi.UInt32(0), 1)
+            dr.scatter_add(self.count, mi.UInt32(1), index, active & (mis < 0.99))
+
+    choose = VertexChoice.choose
+
+    def as_assumed(self, *arguments) -> Chosen:
+        return replace(choose(self, *arguments), factor=mi.Float(path_tracer._VERTICES))
+
+    monkeypatch.setattr(VertexChoice, "choose", as_assumed)
+    monkeypatch.setattr(light_paths, "PathMoments", Recorder)
+    integrator = _auto(pilot_spp=64, **parameters)
+    mi.render(mi.load_dict(scene(), optimize=False), integrator=integrator, spp=256)
+    right, wrong = (sum(int(count[i]) for count in counts) for i in (0, 1))
+    assert right > 200 and wrong < 1e-3 * right

@@ -10,13 +10,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import diffuse, rectangle, stage
+from scipy import stats
 
 from mitsuba_ext.composition.decision_parameters import Setting
 from mitsuba_ext.decisions.next_event.light_table import LightTable, OneRow
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.lights.weights import power_weights
 from mitsuba_ext.transport.estimator import CameraRays
-from mitsuba_ext.transport.numbers import NumberTable, StoredNumbers
+from mitsuba_ext.transport.numbers import NumberTable, StoredNumbers, hashed_2d
 from mitsuba_ext.transport.path_decisions import DirectionSamples, Roulette, ShadowTest
 from mitsuba_ext.transport.walk import Walk
 
@@ -169,3 +170,26 @@ def test_numbers_beyond_the_stored_ones_are_zero() -> None:
     np.testing.assert_allclose(numbers.next_1d().numpy(), [0.5, 0.6])
     np.testing.assert_array_equal(numbers.next_2d().numpy(), 0)
     np.testing.assert_array_equal(numbers.index.numpy(), 5)
+
+
+# ---- Hashed numbers ----
+
+
+@pytest.mark.parametrize("words", ["random", "consecutive"])
+def test_pairs_of_hashed_numbers_are_uniform(words: str) -> None:
+    """Those of one index, and first or second numbers of consecutive indices."""
+    count, bins = 1 << 22, 64
+    word = dr.arange(mi.UInt32, count)
+    if words == "random":
+        rng = np.random.default_rng(1)
+        word = mi.UInt32(rng.integers(0, 1 << 32, count, dtype=np.uint32))
+    p_values = []
+    for index in (1, 2, 3, 7):
+        here, next_one = (np.array(hashed_2d(word, mi.UInt32(i))) for i in (index, index + 1))
+        assert here.min() >= 0 and here.max() < 1
+        for x, y in (here, (here[0], next_one[0]), (here[1], next_one[1])):
+            cell = (x * bins).astype(int) * bins + (y * bins).astype(int)
+            found, expected = np.bincount(cell, minlength=bins**2), count / bins**2
+            chi2 = ((found - expected) ** 2 / expected).sum()
+            p_values.append(stats.chi2.sf(chi2, bins**2 - 1))
+    assert min(p_values) > 1e-4 / len(p_values)

@@ -54,6 +54,22 @@ def joining_weight(
     return weight(others / (sums.count * sums.ratio(expected)))
 
 
+def joining_by_camera(
+    sums: PartialSums,
+    one: End,
+    other: End,
+    squared_distance: mi.Float,
+    is_first: mi.Bool | bool,
+    factor: mi.Float | float,
+) -> mi.Vector2f | tuple[()]:
+    """:meth:`PartialSums.by_camera` of joining the subpath of a camera, which ends with ``one``, to
+    that of a light, of which ``other`` is the last vertex, and the first where ``is_first``.
+    ``factor`` is 1 / (how often they are connected): in truth, not as MIS weights assume."""
+    to_other = one.pdf * geometric_cosine(other.si, other.wo) * dr.rcp(squared_distance)
+    ratios = sums.by_camera(to_other, other.sums, other.reverse_pdf, is_first)
+    return () if isinstance(ratios, tuple) else ratios * factor
+
+
 class LightSubpaths(Subpaths):
     """Connects each vertex of a camera path to vertices of light paths that are chosen at random.
 
@@ -153,10 +169,9 @@ class LightSubpaths(Subpaths):
         visible = active & ~self._query.occluded(scene, si, ds, active)
         value = dr.select(visible, value, 0)
         if self._techniques is not None:
-            found = pdf * geometric_cosine(far, back) / dr.select(active, squared_distance, 1)
-            by_camera = self._sums.by_camera(found, other.sums, far_reverse, other.depth == 1)
-            if not isinstance(by_camera, tuple):
-                by_camera /= self._sums.root(self._sums.count) * chosen.expected
+            by_camera = joining_by_camera(
+                self._sums, near_end, far_end, squared_distance, other.depth == 1, factor
+            )
             self._techniques.joined(
                 other.depth + 1, vertex.depth + 2, value, mis, by_camera, visible
             )

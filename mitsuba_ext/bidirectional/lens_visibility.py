@@ -77,8 +77,6 @@ class VisibilityLens(UniformLens):
         bytes (int): Memory of the table.
     """
 
-    is_uniform = False
-
     def __init__(self, maps: DepthMaps) -> None:
         self._maps, self._pieces, self._count = maps, maps.pieces, maps.pieces**2
         margins = [min(_WIDEST_MARGIN, margin) for margin in maps.margins]
@@ -109,14 +107,6 @@ class VisibilityLens(UniformLens):
         x = (x - mi.Float(start)) / mi.Float(chosen)
         numbers = self._maps.lens_numbers(piece, mi.Point2f(x, sample.y))
         return numbers, mi.Float(total) / mi.Float(self._count * chosen)
-
-    def density(self, sample, p, active):
-        weights, total = self._weights(p, active)
-        corner = mi.Vector2u(dr.clip(sample * self._pieces, 0, self._pieces - 1))
-        piece, chosen = corner.y * self._pieces + corner.x, mi.UInt32(0)
-        for k, weight in enumerate(weights):
-            chosen = dr.select(piece == k, weight, chosen)
-        return mi.Float(self._count * chosen) / mi.Float(total)
 
     def _weights(self, p: mi.Point3f, active: mi.Bool) -> tuple[list[mi.UInt32], mi.UInt32]:
         """The probabilities of the pieces for the point ``p``, times their sum: positive integers;

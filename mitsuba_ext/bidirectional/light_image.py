@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ..transport.estimator import CameraRays, Splats
 from ..transport.heroes import Heroes
-from ..transport.numbers import Numbers
+from ..transport.numbers import Numbers, hashed_2d
 from ..transport.path_decisions import SceneQuery
 from .light_vertices import LightVertices
 from .partial_sums import PartialSums, weight
@@ -101,10 +101,7 @@ class LightImage:
         sample = mi.Point2f(0.5)
         if self._seed is not None:
             word = dr.gather(mi.UInt32, self._seed, vertex.lane, active)
-            sample = mi.Point2f(
-                mi.sample_tea_float32(word, 2 * vertex.depth),
-                mi.sample_tea_float32(word, 2 * vertex.depth + 1),
-            )
+            sample = hashed_2d(word, vertex.depth)
         connection, lens_weight = self._sensor.connect(si, sample, active)
         active = active & connection.active
         if self._hides_emitters:

@@ -39,13 +39,7 @@ class SensorConnection:
 
 
 class UniformLens:
-    """Chooses points of the aperture: uniformly.
-
-    Attributes:
-        is_uniform: Are all points alike? Then nobody asks for their density.
-    """
-
-    is_uniform = True
+    """Chooses points of the aperture: uniformly."""
 
     def sample(
         self, sample: mi.Point2f, si: mi.SurfaceInteraction3f, active: mi.Bool
@@ -53,12 +47,6 @@ class UniformLens:
         """The numbers that choose a point of the aperture for a connection to ``si``, and the
         weight of the connection (1 / density of the numbers)."""
         return sample, 1.0
-
-    def density(
-        self, sample: mi.Point2f, p: mi.Point3f, active: mi.Bool
-    ) -> mi.Float | float:
-        """The density with which :meth:`sample` gives these numbers for a point ``p``."""
-        return 1.0
 
 
 class ConnectableSensor:
@@ -87,9 +75,6 @@ class ConnectableSensor:
         self._inverse_area = dr.opaque(mi.Float, 1 / area)
         self._size = dr.opaque(mi.Vector2f, [crop_width, crop_height])
         self._offset = mi.Vector2f(mi.ScalarVector2f(film.crop_offset()))
-        self._radius = 0.0
-        if self.needs_aperture_sample:
-            self._radius = float(dr.slice(parameters["aperture_radius"]))
         self._near = dr.opaque(mi.Float, parameters["near_clip"])
         self._far = dr.opaque(mi.Float, parameters["far_clip"])
 
@@ -131,20 +116,6 @@ class ConnectableSensor:
         axis = mi.Transform4f(self._sensor.world_transform()) @ mi.Vector3f(0, 0, 1)
         inverse = dr.rcp(dr.maximum(dr.dot(ray.d, dr.normalize(axis)), 1e-6))
         return ray.o - ray.d * (self._near * inverse), self._inverse_area * inverse**3
-
-    def lens_density(
-        self, origin: mi.Point3f, p: mi.Point3f, active: mi.Bool
-    ) -> mi.Float | float:
-        """The density with which a connection to ``p`` chooses this point of the aperture, in units
-        of that with which camera rays do. Both are uniform (1) unless the lens prefers points."""
-        if self._lens.is_uniform:
-            return 1.0
-        to_world = mi.Transform4f(self._sensor.world_transform())
-        offset = origin - to_world @ mi.Point3f(0)
-        x, y = (dr.dot(offset, to_world @ mi.Vector3f(*v)) for v in ((1, 0, 0), (0, 1, 0)))
-        disk = mi.Point2f(x, y) / self._radius
-        numbers = mi.warp.uniform_disk_to_square_concentric(disk)
-        return self._lens.density(numbers, p, active)
 
 
 def is_occluded(

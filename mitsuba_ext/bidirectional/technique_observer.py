@@ -17,8 +17,9 @@ class TechniqueObserver(Observer):
 
     Attributes:
         compares_with_camera: Does it want to know with what density camera paths find by themselves
-            what others find? It is :meth:`PartialSums.by_camera`, here ``by_camera``, and costs
-            two words of each stored vertex.
+            what others find? It is :meth:`PartialSums.by_camera`, here ``by_camera``, in units of
+            the density of the technique that found it, connections counted. It costs two words of
+            each stored vertex.
     """
 
     compares_with_camera = False

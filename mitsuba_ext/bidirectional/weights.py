@@ -53,11 +53,6 @@ class BidirectionalWeights(Weights):
         later = self.sums.arrive(
             path.sums, si, dr.squared_norm(si.p - ref), is_first, by_light=False
         )
-        if self._sensor is not None:
-            # With which a light path's vertex there would be connected to this point of the lens
-            lens = self._sensor.lens_density(self._origin, si.p, is_first & si.is_valid())
-            if not isinstance(lens, float):
-                later.dVCM *= dr.select(is_first, self.sums.ratio(lens), 1)
         # Where nothing was hit, densities stay those of directions
         return Sums(
             dr.select(si.is_valid(), later.dVCM, path.sums.dVCM),

@@ -12,6 +12,23 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
+#: With 4, Mitsuba's default, the first numbers of consecutive indices depend on each other.
+_ROUNDS = 6
+
+
+def hashed_2d(word: mi.UInt32, index: mi.UInt32) -> mi.Point2f:
+    """Two numbers in [0, 1) for any two integers, by a hash of these.
+
+    Both come from one block of the cipher. The pair of ``mi.sample_tea_float32(word, 2 * index)``
+    and ``mi.sample_tea_float32(word, 2 * index + 1)`` is not uniform.
+
+    Source: F. Zafar, M. Olano, A. Curtis, *GPU Random Numbers via the Tiny Encryption Algorithm*,
+    High Performance Graphics, 2010.
+    """
+    x, y = mi.sample_tea_32(word, index, _ROUNDS)
+    # As many bits as a number has
+    return mi.Point2f(x >> 8, y >> 8) * 2.0**-24
+
 
 class Numbers(Protocol):
     """What an estimator asks of a sampler."""
