@@ -9,18 +9,15 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.bidirectional.both_ends import FromBothEnds
-from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.light_walk import STRIDE
 from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
-from mitsuba_ext.bidirectional.sensor import ConnectableSensor
 from mitsuba_ext.bidirectional.technique_images import TechniqueImages
 from mitsuba_ext.composition.light_paths import LightPathChoice
-from mitsuba_ext.composition.next_event import sampling_weights
+from mitsuba_ext.composition.light_side import LightSide
 from mitsuba_ext.composition.slots import BIDIRECTIONAL_SLOTS, read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
-from mitsuba_ext.rendering.camera import check_takes_splats, film_extent
+from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.transport.estimator import Estimator
 from mitsuba_ext.transport.path_decisions import NoConnections, SubpathSelection
 
@@ -186,34 +183,30 @@ class BidirectionalIntegrator(WalkIntegrator):
     def estimators(self, scene: mi.Scene, sensor: mi.Sensor):
         if not scene.emitters() or self.max_depth < 2:
             return self.walk
-        try:
-            emission = LightEmission(scene)
-        except NotImplementedError as error:
-            raise NotImplementedError(f'"{self.name}": {error}') from None
+        side = LightSide.of(self.name, scene, sensor, self.light_image)
         film = sensor.film()
         if self.technique_images:
             self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
-        target = ConnectableSensor(sensor) if self._has_light_image(sensor) else None
-        correct = sampling_weights(scene) if emission.has_smooth_meshes else None
-        return functools.partial(self._estimator, emission, target, correct)
+        return functools.partial(self._estimator, side)
 
-    def _estimator(self, emission, sensor, correct, **decisions: Any) -> Estimator:
+    def _estimator(self, side: LightSide, **decisions: Any) -> Estimator:
         always = LightPathChoice(True, self.techniques)
         choice: LightPathChoice = decisions.pop("light_paths", always)
         selection = decisions.pop("subpath_selection", SubpathSelection())
-        # Mitsuba's own density of points on meshes with interpolated normals is wrong
-        next_event = decisions.pop("next_event", correct)
+        next_event = decisions.pop("next_event", None)
         if not self.sample_direct:
             next_event = NoConnections()
-        elif choice.are_traced and next_event is not correct:
-            next_event = FromBothEnds(next_event)
+        elif choice.are_traced:
+            next_event = side.next_event(next_event)
+        else:
+            next_event = next_event or side.correct
         if next_event:
             decisions["next_event"] = next_event
         walk = self.walk(**decisions)
         if not choice.are_traced:
             return walk
         return BidirectionalPathTracer(
-            walk, emission, sensor, self.connections, selection, choice.observer
+            walk, side.emission, side.sensor, self.connections, selection, choice.observer
         )
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
@@ -230,15 +223,6 @@ class BidirectionalIntegrator(WalkIntegrator):
                 f'paths: "{self.technique_images}" is not written.',
             )
         return image
-
-    def _has_light_image(self, sensor: mi.Sensor) -> bool:
-        if not self.light_image or not ConnectableSensor.can_connect(sensor):
-            return False
-        try:
-            check_takes_splats(sensor.film())
-        except NotImplementedError:
-            return False
-        return True
 
     def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
         raise NotImplementedError(

@@ -36,6 +36,7 @@ class LightImage:
         sums: Computes MIS weights; without, all paths come from here.
         query: How a ray meets the scene.
         hides_emitters: Does the sensor look through area lights?
+        least_depth: Segments of a light path from which on it is connected.
         observer: Is told what is found.
 
     Attributes:
@@ -51,8 +52,10 @@ class LightImage:
         sums: PartialSums | None = None,
         query: SceneQuery | None = None,
         hides_emitters: bool = False,
+        least_depth: int = 1,
         observer: TechniqueObserver | None = None,
     ) -> None:
+        self._least_depth = least_depth
         self._observer = observer
         self._scene, self._sensor, self._importance = scene, sensor, rays.importance
         self._sums, self._query = sums, query or SceneQuery()
@@ -87,6 +90,7 @@ class LightImage:
             _one_after_the_other([s.position for s in self._found]),
             wavelengths,
             dr.concat([s.active for s in self._found]),
+            dr.concat([s.sample for s in self._found]),
         )
         dr.eval(joined)
         return [joined]
@@ -104,6 +108,8 @@ class LightImage:
             sample = hashed_2d(word, vertex.depth)
         connection, lens_weight = self._sensor.connect(si, sample, active)
         active = active & connection.active
+        if self._least_depth > 1:
+            active &= vertex.depth >= self._least_depth
         if self._hides_emitters:
             active &= si.shape.emitter() == None  # noqa: E711
         to_camera = si.to_local(connection.d)
@@ -140,7 +146,7 @@ class LightImage:
                 vertex.depth + 1, connection.position, value, mis, by_camera, finite
             )
         return Splats(
-            value, connection.position, vertices.wavelengths(vertex, active), finite
+            value, connection.position, vertices.wavelengths(vertex, active), finite, vertex.lane
         ), tested
 
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ..garbage import garbage_left_alone
 from ..transport.heroes import Heroes
-from ..transport.numbers import Numbers
+from ..transport.numbers import Numbers, schedule_state
 from ..transport.path_decisions import Roulette, SceneQuery
 from ..transport.vertex import Arrival, PathState, Vertex
 from .emission import LightEmission
@@ -133,8 +133,7 @@ class LightWalk:
         Returns:
             The vertices whose BSDF has a smooth part, and the paths that are still on their way.
         """
-        if isinstance(numbers, mi.Sampler):
-            numbers.schedule_state()
+        schedule_state(numbers)
         # Fresh copies: kernels would otherwise differ in which of the inputs are the same array
         dr.make_opaque(paths)
         dr.eval(paths)
@@ -143,8 +142,7 @@ class LightWalk:
         with garbage_left_alone():
             numbers, paths = self._trace(scene, numbers, paths, store)
         # With the rest: the walk would be traced again for where the sampler has got to
-        if isinstance(numbers, mi.Sampler):
-            numbers.schedule_state()
+        schedule_state(numbers)
         dr.eval(paths, store.words, store.is_taken)
         disperses = not isinstance(paths.hero_is_alone, tuple)
         return LightVertices(store, time, wavelengths, disperses), paths

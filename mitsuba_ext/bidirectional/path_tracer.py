@@ -9,10 +9,11 @@ import mitsuba as mi
 
 from ..movers import movers
 from ..transport.estimator import CameraRays, Sample
-from ..transport.numbers import Numbers
+from ..transport.numbers import BothEnds, Numbers
 from ..transport.observer import Observers
 from ..transport.path_decisions import SubpathSelection
 from ..transport.walk import Walk
+from ..transport.without_direct import WithoutDirect
 from .connections import LightSubpaths
 from .emission import LightEmission
 from .light_image import LightImage
@@ -44,6 +45,9 @@ class BidirectionalPathTracer:
             wavelengths, or of another time, cannot be connected to: where such differ, the choice
             is always uniform, among the vertices of the light path in the same lane.
         observer: Is told what each technique finds, by the walk as well.
+        is_alone: Must the sample in a lane not depend on other lanes? Then camera paths are
+            connected to the light path in the same lane only.
+        skips_direct: Are paths of one and two segments left out?
     """
 
     walk: Walk
@@ -52,12 +56,14 @@ class BidirectionalPathTracer:
     connections: int
     selection: SubpathSelection = field(default_factory=SubpathSelection)
     observer: TechniqueObserver | None = None
+    is_alone: bool = False
+    skips_direct: bool = False
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
     ) -> Sample:
         walk = self.walk
-        own_lane = mi.is_spectral or bool(movers(scene))
+        own_lane = self.is_alone or mi.is_spectral or bool(movers(scene))
         selection = self.selection if self.selection.count > 0 and not own_lane else None
         # Per vertex where a selection says how often that is chosen
         count = self.connections if selection else self.connections / _VERTICES
@@ -74,7 +80,7 @@ class BidirectionalPathTracer:
         if self.sensor is not None:
             image = LightImage(
                 scene, self.sensor, sampler, rays, sums, walk.query, walk.hide_emitters,
-                observer,
+                2 if self.skips_direct else 1, observer,
             )  # fmt: skip
         light_walk = LightWalk(
             self.emission, walk.max_depth, walk.rr_depth, sums, query=walk.query
@@ -95,6 +101,8 @@ class BidirectionalPathTracer:
         )
         splats = image.splats() if image is not None else []
         weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)
+        if self.skips_direct:
+            weights = WithoutDirect(weights)
         subpaths = None
         if rounds:
             vertices = VertexCache(rounds, lanes)
@@ -106,6 +114,8 @@ class BidirectionalPathTracer:
                 scene, vertices, choice, sums, walk.query, self.connections, walk.max_depth,
                 walk.observer, observer,
             )  # fmt: skip
+        if isinstance(sampler, BothEnds):
+            sampler = sampler.camera
         sample = replace(walk, weights=weights, subpaths=subpaths)(scene, sampler, rays, active)
         shadow_count = sample.shadow_count
         if image is not None:

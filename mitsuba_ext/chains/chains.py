@@ -1,4 +1,4 @@
-"""Metropolis chains of primary samples, one in each lane."""
+"""What all kinds of chains have in common."""
 
 from __future__ import annotations
 
@@ -9,19 +9,16 @@ import mitsuba as mi
 
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
-from .numbers import NumberVector, ProposedNumbers, StratifiedNumbers, generator
+from .numbers import generator, stream
 from .small_steps import SmallSteps
-from .target import Contribution, ImageTarget
+from .target import ImageTarget
 
-#: Mutations of each chain between two looks at the clock, and for Ctrl-C.
-LAUNCH = 16
+#: Numbers of a state that a chain remembers, for each end of its path: 20 bounces, about. A path
+#: that draws more draws those anew for each proposal, which is a large step in them.
+MOST_NUMBERS = 128
 
-#: Numbers of a state that a chain remembers: 20 bounces, about. A path that draws more draws those
-#: anew for each proposal, which is a large step in them.
-_MOST_NUMBERS = 128
-
-#: So many streams of random numbers, which must differ, does a render need.
-BOOTSTRAP_STREAM, CHAIN_STREAM = 0, 1
+#: Streams of random numbers, which differ from those of the bootstrap.
+CAMERA, LIGHT = 3, 4
 
 
 @dataclass
@@ -31,8 +28,8 @@ class Counts:
     Attributes:
         large, accepted_large, accepted_small: Large steps, and accepted steps of each kind.
         large_target: The sum of the target function over all proposals of large steps.
-        scatter, shadow, connections, black: See :class:`~mitsuba_ext.transport.estimator.Sample`;
-            proposals that are black.
+        scatter, shadow, connections: See :class:`~mitsuba_ext.transport.estimator.Sample`.
+        black: Proposals that add nothing to the image.
     """
 
     large: mi.UInt32
@@ -44,9 +41,44 @@ class Counts:
     connections: mi.UInt32
     black: mi.UInt32
 
+    @classmethod
+    def none(cls, lanes: int) -> Counts:
+        kinds = [mi.UInt32] * 3 + [mi.Float] + [mi.UInt32] * 4
+        return cls(*(dr.zeros(kind, lanes) for kind in kinds))
+
+    def plus(self, is_large, is_accepted, target, sample) -> Counts:
+        """With one more proposal."""
+        return Counts(
+            self.large + dr.select(is_large, 1, 0),
+            self.accepted_large + dr.select(is_large & is_accepted, 1, 0),
+            self.accepted_small + dr.select(~is_large & is_accepted, 1, 0),
+            self.large_target + dr.select(is_large, target, 0),
+            self.scatter + sample.scatter_count,
+            self.shadow + sample.shadow_count,
+            self.connections + sample.connection_count,
+            self.black + dr.select(target > 0, 0, 1),
+        )
+
+
+@dataclass(frozen=True)
+class ChainRules:
+    """How chains move.
+
+    Attributes:
+        large_step: The probability of a large step.
+        steps: How numbers are moved by the others.
+        uniform_weight: Probability of a large step · mean of the target function, by which uniform
+            samples count in the balance heuristic; 0 if they are not used.
+    """
+
+    large_step: float
+    steps: SmallSteps
+    uniform_weight: float
+
 
 class Chains:
-    r"""Chains that sample vectors of numbers in proportion to a target function.
+    r"""Metropolis chains that sample vectors of numbers in proportion to a target function, one in
+    each lane.
 
     With :math:`I` the target function, :math:`a` the probability of accepting a proposal
     :math:`v` of the state :math:`u`, the expected visits are added to the image: :math:`a` of
@@ -61,139 +93,57 @@ class Chains:
     Parameters:
         target: What is sampled.
         image: Where visits are added.
-        large_step: The probability of a large step.
-        steps: How numbers are moved by the others.
-        uniform_weight: Large step probability · mean of the target function, by which uniform
-            samples count in the balance heuristic; 0 if they are not used.
+        rules: How chains move.
+        bootstrap: Samples from which they start.
+        seed: Of the random numbers.
+        count: How many chains there are.
+
+    Attributes:
+        count: How many there are.
+        done: Mutations of each.
     """
+
+    #: Mutations of each chain between two looks at the clock, and for Ctrl-C.
+    launch = 16
 
     def __init__(
         self,
         target: ImageTarget,
         image: ChainImage,
-        large_step: float,
-        steps: SmallSteps,
-        uniform_weight: float,
+        rules: ChainRules,
+        bootstrap: Bootstrap,
+        seed: int,
+        count: int,
     ) -> None:
-        self._target, self._image, self._steps = target, image, steps
-        self._large_step = dr.opaque(mi.Float, large_step)
-        self._uses_uniform = uniform_weight > 0
-        self._uniform_weight = dr.opaque(mi.Float, uniform_weight)
-        self.done = 0
-
-    def begin(self, bootstrap: Bootstrap, seed: int, count: int) -> None:
-        """Starts ``count`` chains at samples of the bootstrap."""
-        self.count = count
-        self._values = dr.zeros(mi.Float, _MOST_NUMBERS * count)
-        winners = bootstrap.choose(count)
-        self._state, self._known = self._replay(bootstrap.numbers(winners))
+        self._target, self._image, self._rules = target, image, rules
+        self._large_step = dr.opaque(mi.Float, rules.large_step)
+        self._uses_uniform = rules.uniform_weight > 0
+        self._uniform_weight = dr.opaque(mi.Float, rules.uniform_weight)
+        self.count, self.done = count, 0
+        lane = dr.arange(mi.UInt32, count)
+        streams = [CAMERA, LIGHT] if target.has_light_paths else [CAMERA]
+        self._rngs = [generator(stream(seed, number), lane) for number in streams]
         self._weight = dr.zeros(mi.Float, count)
-        self._rng = generator(mi.sample_tea_32(mi.UInt32(seed), CHAIN_STREAM)[0][0],
-                              dr.arange(mi.UInt32, count))
-        dr.eval(self._state, self._known, self._weight, self._rng, self._values)
+        self._begin(bootstrap, bootstrap.choose(count))
 
-    @dr.syntax
-    def _replay(self, numbers: StratifiedNumbers) -> tuple[Contribution, mi.UInt32]:
-        """The state that these numbers stand for, which it stores."""
-        again = StratifiedNumbers(
-            mi.PCG32(numbers.rng), mi.UInt32(numbers.index), numbers.corner, numbers.cells
-        )
-        found, _sample = self._target(numbers)
-        known = dr.minimum(numbers.index, _MOST_NUMBERS)
-        lane = dr.arange(mi.UInt32, self.count)
-        index = dr.zeros(mi.UInt32, self.count)
-        while index < known:
-            dr.scatter(self._values, again.next_1d(), index * self.count + lane)
-            index += 1
-        return found, known
+    def _begin(self, bootstrap: Bootstrap, winners: mi.UInt32) -> None:
+        """Makes these samples the states of the chains."""
+        raise NotImplementedError
 
     def advance(self, steps: int) -> Counts:
-        """Makes ``steps`` mutations of each chain, in one kernel."""
-        counts = self._advance(dr.opaque(mi.UInt32, steps))
-        dr.eval(
-            self._state, self._known, self._weight, self._rng, self._values, counts,
-            self._image.tensors(),
-        )  # fmt: skip
-        self.done += steps
-        return counts
-
-    @dr.syntax
-    def _advance(self, steps: mi.UInt32) -> Counts:
-        count = dr.opaque(mi.UInt32, self.count)
-        lane = dr.arange(mi.UInt32, self.count)
-        rng, state = mi.PCG32(self._rng), self._state
-        known, weight = mi.UInt32(self._known), mi.Float(self._weight)
-        counts = Counts(*(dr.zeros(t, self.count) for t in (
-            mi.UInt32, mi.UInt32, mi.UInt32, mi.Float, mi.UInt32, mi.UInt32, mi.UInt32, mi.UInt32,
-        )))  # fmt: skip
-        vector = dr.alloc_local(mi.Float, _MOST_NUMBERS, value=dr.zeros(mi.Float))
-        index = dr.zeros(mi.UInt32, self.count)
-        while index < known:
-            vector[index] = dr.gather(mi.Float, self._values, index * count + lane)
-            index += 1
-
-        step = dr.zeros(mi.UInt32, self.count)
-        while step < steps:
-            # ----- Propose -----
-            is_large = rng.next_float32() < self._large_step
-            threshold = rng.next_float32()
-            moved = dr.select(is_large, 0, known)
-            before = mi.PCG32(rng)
-            vector_now = NumberVector(vector, self._steps)
-            numbers = ProposedNumbers(rng, dr.zeros(mi.UInt32, self.count), moved, vector_now)
-            proposal, sample = self._target(numbers)
-            rng = numbers.rng
-
-            # ----- Accept or reject -----
-            # Whatever is proposed is better than a state that has nothing to add
-            a = dr.select(
-                state.target > proposal.target, proposal.target / state.target, mi.Float(1)
-            )
-            is_accepted = threshold < a
-
-            # ----- Add what is left behind to the image -----
-            left = dr.select(is_accepted, state, proposal)
-            visits = dr.select(is_accepted, weight + (1 - a), a)
-            self._image.add(left, visits * self._share(left))
-            weight = dr.select(is_accepted, a, weight + (1 - a))
-            if dr.hint(self._uses_uniform, mode="scalar"):
-                self._image.add_uniform(proposal, dr.select(is_large, self._share(proposal), 0))
-            state = dr.select(is_accepted, proposal, state)
-
-            # ----- Remember the numbers of the new state: the same again -----
-            again = ProposedNumbers(before, dr.zeros(mi.UInt32, self.count), moved, vector_now)
-            drawn = dr.minimum(numbers.index, _MOST_NUMBERS)
-            index = dr.select(is_accepted, mi.UInt32(0), drawn)
-            while index < drawn:
-                vector[index] = again.next_1d()
-                index += 1
-            known = dr.select(is_accepted, drawn, known)
-
-            counts = Counts(
-                counts.large + dr.select(is_large, 1, 0),
-                counts.accepted_large + dr.select(is_large & is_accepted, 1, 0),
-                counts.accepted_small + dr.select(~is_large & is_accepted, 1, 0),
-                counts.large_target + dr.select(is_large, proposal.target, 0),
-                counts.scatter + sample.scatter_count,
-                counts.shadow + sample.shadow_count,
-                counts.connections + sample.connection_count,
-                counts.black + dr.select(proposal.target > 0, 0, 1),
-            )
-            step += 1
-
-        index = dr.zeros(mi.UInt32, self.count)
-        while index < known:
-            dr.scatter(self._values, vector[index], index * count + lane)
-            index += 1
-        self._rng, self._state, self._known, self._weight = rng, state, known, weight
-        return counts
-
-    def _share(self, found: Contribution) -> mi.Float:
-        """The weight of a visit."""
-        return dr.select(found.target > 0, dr.rcp(found.target + self._uniform_weight), 0)
+        """Makes ``steps`` mutations of each chain."""
+        raise NotImplementedError
 
     def end(self) -> None:
-        """Adds the states of all chains to the image. They may go on."""
-        self._image.add(self._state, self._weight * self._share(self._state))
-        self._weight = dr.zeros(mi.Float, self.count)
-        dr.eval(self._image.tensors(), self._weight)
+        """Adds the states to the image. The chains may go on."""
+        raise NotImplementedError
+
+    def _share(self, target: mi.Float) -> mi.Float:
+        """The weight of a visit."""
+        return dr.select(target > 0, dr.rcp(target + self._uniform_weight), 0)
+
+
+def acceptance(state: mi.Float, proposal: mi.Float) -> mi.Float:
+    """The probability of accepting a proposal, by the values of the target function. Whatever is
+    proposed is better than a state that adds nothing to the image."""
+    return dr.select(state > proposal, proposal / state, mi.Float(1))

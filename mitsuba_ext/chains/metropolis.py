@@ -12,7 +12,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..bidirectional.path_tracer import BidirectionalPathTracer
 from ..composition.decision_parameters import DecisionParameters, Setting
+from ..composition.light_side import LightSide
 from ..composition.slots import read_slot
 from ..composition.walk_integrator import WalkIntegrator
 from ..rendering.batches import sample_count
@@ -23,9 +25,9 @@ from ..rendering.stages import OneStage
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.path_decisions import Weights
 from ..transport.walk import Walk
+from ..transport.without_direct import WithoutDirect
 from .render import ChainRender, ChainSettings
 from .target import ImageTarget
-from .without_direct import WithoutDirect
 
 #: The largest share of the time limit for camera samples.
 _CAMERA_SHARE = 0.25
@@ -73,6 +75,7 @@ class MetropolisIntegrator(WalkIntegrator):
                 f'"{self.name}": "direct_samples" is 0; it must be positive, or -1 to leave direct '
                 f"light to the chains"
             )
+        self.bidirectional = self.parameter(props, "bidirectional", True)
         self.chains = self.parameter(props, "chains", 1 << 14, minimum=1, maximum=1 << 20)
         self.fill(props, next_event=self._unlearned(props, "next_event"))
 
@@ -91,6 +94,7 @@ class MetropolisIntegrator(WalkIntegrator):
 
     def parameters(self) -> dict[str, Any]:
         return {
+            "bidirectional": self.bidirectional,
             "direct_samples": self.direct_samples,
             "chains": self.chains,
             **super().parameters(),
@@ -115,15 +119,26 @@ class MetropolisIntegrator(WalkIntegrator):
         return replace(self.walk(query=self._query(setting.scene), **decisions),
                        max_depth=max_depth)
 
-    def _chain_estimator(self, setting: Setting) -> Walk | None:
+    def _target(self, setting: Setting) -> ImageTarget | None:
         """What chains sample; ``None`` where they have nothing to find."""
+        scene, sensor = setting.scene, setting.sensor
         least = 3 if self._finds_direct else 1
-        if not setting.scene.emitters() or self.max_depth < least:
+        if not scene.emitters() or self.max_depth < least:
             return None
-        weights = Weights()
-        if self._finds_direct:
-            weights = WithoutDirect(weights)
-        return self._walk(setting, self.max_depth, weights=weights)
+        if not self.bidirectional or self.max_depth < 2:
+            weights = WithoutDirect(Weights()) if self._finds_direct else Weights()
+            walk = self._walk(setting, self.max_depth, weights=weights)
+            return ImageTarget(scene, sensor, walk, setting.spp)
+        side = LightSide.of(self.name, scene, sensor)
+        walk = self._walk(setting, self.max_depth)
+        chosen = self.slots.get("next_event")
+        next_event = side.next_event(walk.next_event if chosen else None)
+        if next_event:
+            walk = replace(walk, next_event=next_event)
+        tracer = BidirectionalPathTracer(
+            walk, side.emission, side.sensor, 1, is_alone=True, skips_direct=self._finds_direct
+        )
+        return ImageTarget(scene, sensor, tracer, setting.spp, has_light_paths=True)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         start = time.perf_counter()
@@ -135,11 +150,10 @@ class MetropolisIntegrator(WalkIntegrator):
         spp = self._check_spp(spp, sensor)
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else int(seed)
         setting = Setting(scene, sensor, seed, self.max_depth, self.rr_depth, spp)
-        estimator = self._chain_estimator(setting)
-        self._render_camera_samples(scene, sensor, seed, estimator is not None)
+        target = self._target(setting)
+        self._render_camera_samples(scene, sensor, seed, target is not None)
         statistics, camera_spp = self.statistics, self.statistics.spp
-        if estimator is not None and not self.is_cancelled:
-            target = ImageTarget(scene, sensor, estimator, spp)
+        if target is not None and not self.is_cancelled:
             chains = ChainRender(
                 self, target, self.settings(), seed, spp, camera_spp, statistics, start
             )
@@ -147,7 +161,7 @@ class MetropolisIntegrator(WalkIntegrator):
                 chains.run(interrupt)
         statistics.seconds = time.perf_counter() - start
         image = develop_film(sensor.film(), develop, evaluate)
-        if estimator is not None and statistics.interrupted and not self.is_cancelled:
+        if target is not None and statistics.interrupted and not self.is_cancelled:
             raise KeyboardInterrupt
         return image
 

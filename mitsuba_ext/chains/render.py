@@ -16,8 +16,10 @@ from ..rendering.render import RenderStatistics, kernel_cache_misses
 from ..rendering.time_budget import TimeBudget
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
-from .chains import LAUNCH, Chains, Counts
+from .chains import ChainRules, Chains, Counts
+from .looped import LoopedChains
 from .small_steps import SmallSteps
+from .stepped import SteppedChains
 from .target import ImageTarget
 
 
@@ -97,10 +99,9 @@ class ChainRender:
             return
         image = ChainImage(self._film)
         uniform_weight = settings.large_step * bootstrap.mean if settings.uses_uniform else 0.0
-        chains = Chains(
-            self._target, image, settings.large_step, settings.steps, uniform_weight
-        )
-        chains.begin(bootstrap, self._seed, count)
+        rules = ChainRules(settings.large_step, settings.steps, uniform_weight)
+        kind = SteppedChains if self._target.has_light_paths else LoopedChains
+        chains = kind(self._target, image, rules, bootstrap, self._seed, count)
         try:
             self._advance(chains, -(-total // count), interrupt)
         finally:
@@ -116,7 +117,7 @@ class ChainRender:
             if interrupt.is_set() or integrator.is_cancelled:
                 return
             begin, misses = time.perf_counter(), kernel_cache_misses()
-            length = min(LAUNCH, budget.longest, budget.samples - chains.done)
+            length = min(chains.launch, budget.longest, budget.samples - chains.done)
             self._count(chains.advance(length), length * width)
             dr.sync_thread()
             seconds = time.perf_counter() - begin

@@ -9,24 +9,48 @@ import mitsuba as mi
 
 from ..rendering.camera import Lanes, camera_rays, draw_numbers, film_extent, to_rgb
 from ..rendering.camera_samples import CameraSamples
-from ..transport.estimator import Estimator, Sample
+from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.numbers import Numbers
 
 
 @dataclass
 class Contribution:
-    """What a vector of numbers adds to the image.
+    """What a vector of numbers adds to the image at one place.
 
     Attributes:
         position: Where on the film.
         value: The colour, if the film were one pixel.
-        target: What chains sample in proportion to: the luminance of ``value``. Negative
-            components, which spectral variants have, count by their absolute value.
+        target: The luminance of ``value``. Negative components, which spectral variants have, count
+            by their absolute value.
     """
 
     position: mi.Point2f
     value: mi.Color3f
     target: mi.Float
+
+    @classmethod
+    def of(cls, position: mi.Point2f, value: mi.Color3f) -> Contribution:
+        """With its luminance. What is not finite counts as black: it is no place to stay."""
+        target = mi.luminance(dr.abs(value))
+        is_sound = dr.isfinite(target)
+        return cls(position, dr.select(is_sound, value, 0), dr.select(is_sound, target, 0))
+
+
+@dataclass
+class Found:
+    """What vectors of numbers, one in each lane, add to the image.
+
+    Attributes:
+        target: What chains sample in proportion to: the sum of the luminances of all contributions.
+        parts: The contributions, in arrays of any width.
+        lanes: For each of the parts, the lanes to which its contributions belong.
+        sample: The estimator's.
+    """
+
+    target: mi.Float
+    parts: list[Contribution]
+    lanes: list[mi.UInt32]
+    sample: Sample
 
 
 @dataclass
@@ -36,16 +60,42 @@ class ImageTarget:
 
     Parameters:
         scene, sensor: What is rendered.
-        estimator: Of the radiance. It must not need pixels of its own for each lane.
+        estimator: Of the radiance. The sample in a lane must not depend on other lanes.
         spp: Samples per pixel of the whole render, for ray differentials.
+        has_light_paths: Does the estimator trace light paths, which draw numbers of their own?
     """
 
     scene: mi.Scene
     sensor: mi.Sensor
     estimator: Estimator
     spp: int
+    has_light_paths: bool = False
 
     def __call__(self, numbers: Numbers) -> tuple[Contribution, Sample]:
+        """What the camera path finds, and the whole sample."""
+        rays = self._rays(numbers)
+        sample = self.estimator(self.scene, numbers, rays, mi.Bool(True))
+        value = to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
+        return Contribution.of(rays.position, value), sample
+
+    def evaluate(self, numbers: Numbers) -> Found:
+        """Everything, evaluated; also the place that ``numbers`` have reached."""
+        camera, sample = self(numbers)
+        lane = dr.arange(mi.UInt32, dr.width(camera.target))
+        parts, lanes = [camera], [lane]
+        for splats in sample.splats:
+            value = to_rgb(splats.value, splats.wavelengths)
+            parts.append(Contribution.of(splats.position, dr.select(splats.active, value, 0)))
+            lanes.append(splats.sample)
+        dr.eval(numbers, parts, lanes, sample)
+        target = camera.target
+        if sample.splats:
+            target = mi.Float(target)
+            for part, lane in zip(parts[1:], lanes[1:]):
+                dr.scatter_add(target, part.target, lane)
+        return Found(target, parts, lanes, sample)
+
+    def _rays(self, numbers: Numbers) -> CameraRays:
         film = self.sensor.film()
         width, height = film_extent(film)
         drawn = draw_numbers(self.sensor, numbers, None, CameraSamples())
@@ -56,12 +106,4 @@ class ImageTarget:
         drawn.film = place - mi.Point2f(corner)
         pixel = mi.UInt32(corner.y * width + corner.x)
         lanes = Lanes(pixel, corner + mi.Point2i(film.crop_offset()), mi.UInt32(0))
-        rays = camera_rays(self.sensor, lanes, drawn, self.spp)
-        sample = self.estimator(self.scene, numbers, rays, mi.Bool(True))
-        value = to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
-        target = mi.luminance(dr.abs(value))
-        # A path that cannot be evaluated is no place to stay
-        is_sound = dr.isfinite(target)
-        return Contribution(
-            rays.position, dr.select(is_sound, value, 0), dr.select(is_sound, target, 0)
-        ), sample
+        return camera_rays(self.sensor, lanes, drawn, self.spp)

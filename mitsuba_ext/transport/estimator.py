@@ -43,12 +43,14 @@ class Splats:
         position: Where on the film, in pixels of its crop window plus that window's offset.
         wavelengths: Of ``value``, in spectral variants.
         active: Which lanes have something to add.
+        sample: The number of the camera ray whose sample they belong to.
     """
 
     value: mi.Spectrum
     position: mi.Point2f
     wavelengths: mi.Spectrum | None
     active: mi.Bool
+    sample: mi.UInt32
 
 
 @dataclass

@@ -40,6 +40,34 @@ class Numbers(Protocol):
         """The next two."""
 
 
+@dataclass
+class BothEnds:
+    """Numbers of a path that begins at both ends: the light's part does not move those of the
+    camera's part when it draws more or fewer of them.
+
+    Attributes:
+        camera, light: The numbers of each part.
+    """
+
+    camera: Numbers
+    light: Numbers
+
+    def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
+        return self.camera.next_1d(active)
+
+    def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
+        return self.camera.next_2d(active)
+
+
+def schedule_state(numbers: Numbers) -> None:
+    """Schedules the place that ``numbers`` have reached with what is evaluated next: it would be
+    traced again otherwise."""
+    if isinstance(numbers, mi.Sampler):
+        numbers.schedule_state()
+    else:
+        dr.schedule(numbers)
+
+
 # Not a dataclass: loops only read it, and it has not the width of their state
 class NumberTable:
     """A vector of numbers for each lane.

@@ -1,10 +1,10 @@
-"""What is left for chains where camera rays find the direct light."""
+"""Leaves out direct light, where something else finds it."""
 
 from __future__ import annotations
 
 import drjit as dr
 
-from ..transport.path_decisions import Weights
+from .path_decisions import Weights
 
 
 class WithoutDirect(Weights):

@@ -1,0 +1,95 @@
+"""Chains around an estimator that is one kernel."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .chains import MOST_NUMBERS, Chains, Counts, acceptance
+from .numbers import LocalNumbers, ProposedNumbers, RecordedNumbers
+
+
+class LoopedChains(Chains):
+    """All mutations of a launch are one traced loop around the estimator. What it finds has one
+    place on the film: no splats. See :class:`Chains`."""
+
+    def _begin(self, bootstrap, winners):
+        record = RecordedNumbers(
+            dr.zeros(mi.Float, MOST_NUMBERS * self.count), self.count, self._rules.steps
+        )
+        numbers = bootstrap.numbers(winners, [record, record])
+        self._state, _sample = self._target(numbers)
+        self._known = dr.minimum(numbers.index, MOST_NUMBERS)
+        self._values = record.written
+        dr.eval(self._state, self._known, self._values)
+
+    def advance(self, steps):
+        counts = self._advance(dr.opaque(mi.UInt32, steps))
+        dr.eval(
+            self._state, self._known, self._weight, self._rngs, self._values, counts,
+            self._image.tensors(),
+        )  # fmt: skip
+        self.done += steps
+        return counts
+
+    @dr.syntax
+    def _advance(self, steps: mi.UInt32) -> Counts:
+        count, none = dr.opaque(mi.UInt32, self.count), dr.zeros(mi.UInt32, self.count)
+        lane = dr.arange(mi.UInt32, self.count)
+        rng, state = mi.PCG32(self._rngs[0]), self._state
+        known, weight = mi.UInt32(self._known), mi.Float(self._weight)
+        counts = Counts.none(self.count)
+        vector = dr.alloc_local(mi.Float, MOST_NUMBERS, value=dr.zeros(mi.Float))
+        index = mi.UInt32(none)
+        while index < known:
+            vector[index] = dr.gather(mi.Float, self._values, index * count + lane)
+            index += 1
+
+        step = mi.UInt32(none)
+        while step < steps:
+            # ----- Propose -----
+            is_large = rng.next_float32() < self._large_step
+            threshold = rng.next_float32()
+            moved = dr.select(is_large, 0, known)
+            before = mi.PCG32(rng)
+            numbers_now = LocalNumbers(vector, self._rules.steps)
+            numbers = ProposedNumbers(rng, mi.UInt32(none), moved, numbers_now)
+            proposal, sample = self._target(numbers)
+            rng = numbers.rng
+
+            # ----- Accept or reject -----
+            a = acceptance(state.target, proposal.target)
+            is_accepted = threshold < a
+            counts = counts.plus(is_large, is_accepted, proposal.target, sample)
+
+            # ----- Add what is left behind to the image -----
+            left = dr.select(is_accepted, state, proposal)
+            visits = dr.select(is_accepted, weight + (1 - a), a)
+            self._image.add(left, visits * self._share(left.target))
+            if dr.hint(self._uses_uniform, mode="scalar"):
+                share = self._share(proposal.target)
+                self._image.add_uniform(proposal, dr.select(is_large, share, 0))
+            weight = dr.select(is_accepted, a, weight + (1 - a))
+            state = dr.select(is_accepted, proposal, state)
+
+            # ----- Remember the numbers of the new state: the same again -----
+            again = ProposedNumbers(before, mi.UInt32(none), moved, numbers_now)
+            drawn = dr.minimum(numbers.index, MOST_NUMBERS)
+            index = dr.select(is_accepted, mi.UInt32(0), drawn)
+            while index < drawn:
+                vector[index] = again.next_1d()
+                index += 1
+            known = dr.select(is_accepted, drawn, known)
+            step += 1
+
+        index = mi.UInt32(none)
+        while index < known:
+            dr.scatter(self._values, vector[index], index * count + lane)
+            index += 1
+        self._rngs, self._state, self._known, self._weight = [rng], state, known, weight
+        return counts
+
+    def end(self):
+        self._image.add(self._state, self._weight * self._share(self._state.target))
+        self._weight = dr.zeros(mi.Float, self.count)
+        dr.eval(self._image.tensors(), self._weight)

@@ -1,0 +1,65 @@
+"""What light paths need to know of a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+
+from ..bidirectional.both_ends import FromBothEnds
+from ..bidirectional.emission import LightEmission
+from ..bidirectional.sensor import ConnectableSensor
+from ..rendering.camera import check_takes_splats
+from ..transport.path_decisions import EmitterSampling
+from .next_event import sampling_weights
+
+
+@dataclass
+class LightSide:
+    """The light's end of paths.
+
+    Attributes:
+        emission: Where light paths begin.
+        sensor: What they are connected to; ``None`` if they are not.
+        correct: The choice of lights for camera paths in the place of Mitsuba's own, whose density
+            of points is wrong on meshes with interpolated normals; ``None`` where it is right.
+    """
+
+    emission: LightEmission
+    sensor: ConnectableSensor | None
+    correct: EmitterSampling | None
+
+    @classmethod
+    def of(
+        cls, plugin: str, scene: mi.Scene, sensor: mi.Sensor, has_image: bool = True
+    ) -> LightSide:
+        """Of a scene with lights.
+
+        Parameters:
+            plugin: What errors call the plugin.
+            has_image: Are light paths connected to the sensor, if it and its film allow that?
+
+        Raises:
+            NotImplementedError: A light cannot emit light paths.
+        """
+        try:
+            emission = LightEmission(scene)
+        except NotImplementedError as error:
+            raise NotImplementedError(f'"{plugin}": {error}') from None
+        target = ConnectableSensor(sensor) if has_image and _can_connect(sensor) else None
+        correct = sampling_weights(scene) if emission.has_smooth_meshes else None
+        return cls(emission, target, correct)
+
+    def next_event(self, chosen: EmitterSampling | None) -> EmitterSampling | None:
+        """How camera paths choose lights, beside light paths; ``None`` for Mitsuba's choice."""
+        return self.correct if chosen is None else FromBothEnds(chosen)
+
+
+def _can_connect(sensor: mi.Sensor) -> bool:
+    if not ConnectableSensor.can_connect(sensor):
+        return False
+    try:
+        check_takes_splats(sensor.film())
+    except NotImplementedError:
+        return False
+    return True
