@@ -20,14 +20,11 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
     Primary sample space Metropolis light transport (:monosp:`pssmlt`)
     ------------------------------------------------------------------
 
-    Markov chains change the random numbers of a path tracer, and stay where much light is found.
+    Markov chains change the random numbers of a bidirectional path tracer (or of :monosp:`path`),
+    and stay where much light is found.
 
     .. pluginparameters::
 
-     * - direct_samples
-       - |int|
-       - Camera samples per pixel for visible lights and direct light, which :monosp:`path` finds
-         well; the chains find the rest. −1 leaves all light to the chains. (Default: 16)
      * - p_large
        - |float|
        - The probability of a large step, which draws all numbers anew. (Default: 0.3)
@@ -42,13 +39,14 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
        - |bool|
        - Use large steps as independent samples besides, weighted by the balance heuristic: it
          reduces the noise of dark pixels. (Default: true)
-     * - chains
-       - |int|
-       - Chains, which run in parallel; there are no more than mutations. (Default: 16384)
+     * - two_stage
+       - |bool|
+       - Estimate the brightness of parts of the image first, and spread mutations evenly over them
+         instead of by brightness? (Default: false)
      * - (Common parameters)
        - |several|
-       - Those of :class:`MetropolisIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
-         next_event.
+       - Those of :class:`MetropolisIntegrator`: bidirectional, direct_samples, chains, next_event,
+         max_depth, rr_depth, hide_emitters, timeout, aovs.
 
     ``spp`` is the number of mutations per pixel.
 
@@ -84,6 +82,7 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
             props, "luminance_samples", 100_000, minimum=1, maximum=1 << 26
         )
         self.kelemen_style_weights = self.parameter(props, "kelemen_style_weights", True)
+        self.two_stage = self.parameter(props, "two_stage", False)
         low = self.parameter(props, "mutation_size_low", 1 / 1024, minimum=1e-6, maximum=0.5)
         high = self.parameter(props, "mutation_size_high", 1 / 64, minimum=1e-6, maximum=0.5)
         if low > high:
@@ -96,7 +95,7 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
     def settings(self) -> ChainSettings:
         return ChainSettings(
             self.chains, self.luminance_samples, self.p_large, self.steps,
-            self.kelemen_style_weights,
+            self.kelemen_style_weights, self.two_stage,
         )  # fmt: skip
 
     def parameters(self) -> dict[str, Any]:
@@ -107,4 +106,5 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
             "mutation_size_low": self.steps.low,
             "mutation_size_high": self.steps.high,
             "kelemen_style_weights": self.kelemen_style_weights,
+            "two_stage": self.two_stage,
         }

@@ -34,14 +34,15 @@ class Bootstrap:
     Attributes:
         count: How many there are: a square.
         mean: The mean of the target function.
+        found: What they found.
     """
 
     def __init__(self, target: ImageTarget, seed: int, count: int) -> None:
         self._seed, self._has_light = seed, target.has_light_paths
         self._cells = math.isqrt(count - 1) + 1
         self.count = self._cells**2
-        values = target.evaluate(self.numbers(dr.arange(mi.UInt32, self.count))).target.numpy()
-        self._sums = np.cumsum(values.astype(np.float64))
+        self.found = target.evaluate(self.numbers(dr.arange(mi.UInt32, self.count)))
+        self._sums = np.cumsum(self.found.target.numpy().astype(np.float64))
         self.mean = float(self._sums[-1]) / self.count
 
     def numbers(self, index: mi.UInt32, records: Sequence[StateNumbers] = ()) -> Numbers:

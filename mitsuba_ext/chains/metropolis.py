@@ -52,6 +52,18 @@ class MetropolisIntegrator(WalkIntegrator):
 
     .. pluginparameters::
 
+     * - bidirectional
+       - |bool|
+       - Do chains sample the paths of :class:`bdpt` (else those of :monosp:`path`)? A mutation then
+         costs about four times as much, and caustics of small lamps are found. (Default: true)
+     * - direct_samples
+       - |int|
+       - Camera samples per pixel for visible lights and direct light, which :monosp:`path` finds
+         well; the chains find the rest. −1 leaves all light to the chains. (Default: 16)
+     * - chains
+       - |int|
+       - Chains, which run in parallel; there are no more than mutations. 0 stands for as many as
+         suit the render: 16384, and more if each then makes 64 mutations. (Default: 0)
      * - next_event
        - |string| or |decision|
        - How points on lights are chosen, as in :class:`composed_path`; by a choice that learns
@@ -62,7 +74,8 @@ class MetropolisIntegrator(WalkIntegrator):
 
     Attributes:
         direct_samples: Camera samples per pixel; −1 where chains find all light.
-        chains: Chains that run in parallel.
+        bidirectional: Do chains sample paths from both ends?
+        chains: Chains that run in parallel; 0 for as many as suit the render.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -76,7 +89,7 @@ class MetropolisIntegrator(WalkIntegrator):
                 f"light to the chains"
             )
         self.bidirectional = self.parameter(props, "bidirectional", True)
-        self.chains = self.parameter(props, "chains", 1 << 14, minimum=1, maximum=1 << 20)
+        self.chains = self.parameter(props, "chains", 0, minimum=0, maximum=1 << 20)
         self.fill(props, next_event=self._unlearned(props, "next_event"))
 
     def _unlearned(self, props: mi.Properties, slot: str) -> DecisionParameters | None:

@@ -17,10 +17,20 @@ from ..rendering.time_budget import TimeBudget
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
 from .chains import ChainRules, Chains, Counts
+from .even_tiles import EvenTiles
 from .looped import LoopedChains
+from .numbers import stream
 from .small_steps import SmallSteps
 from .stepped import SteppedChains
 from .target import ImageTarget
+
+#: Chains, without and with light paths, at most; and at least. Mutations of a chain, about, below
+#: these bounds.
+_MOST_CHAINS = {False: 1 << 16, True: 1 << 18}
+_FEWEST_CHAINS, _LENGTH = 1 << 14, 64
+
+#: Stream of random numbers, besides those of the bootstrap and of the chains.
+_FIRST_STAGE = 5
 
 
 @dataclass(frozen=True)
@@ -28,11 +38,12 @@ class ChainSettings:
     """The parameters of a Metropolis render.
 
     Attributes:
-        chains: Chains, at most; there are no more than mutations.
+        chains: Chains, at most; there are no more than mutations. 0 for as many as suit the render.
         bootstrap: Samples from which they start, at least.
         large_step: The probability of a large step.
         steps: How numbers are moved by the others.
         uses_uniform: Are large steps used as uniform samples besides?
+        is_even: Do a first stage's samples spread the visits evenly over the film?
     """
 
     chains: int
@@ -40,6 +51,7 @@ class ChainSettings:
     large_step: float
     steps: SmallSteps
     uses_uniform: bool
+    is_even: bool = False
 
 
 class Stoppable(Protocol):
@@ -89,8 +101,13 @@ class ChainRender:
         begin = time.perf_counter()
         statistics.interrupted = True
         total = self._spp * self._pixel_count
-        count = min(settings.chains, total)
+        count = min(settings.chains or _suitable(total, self._target), total)
         samples = max(settings.bootstrap, count)
+        if settings.is_even:
+            first = Bootstrap(self._target, stream(self._seed, _FIRST_STAGE), samples)
+            if first.mean > 0:
+                self._target.weights = EvenTiles(self._film, first.found)
+            del first
         bootstrap = Bootstrap(self._target, self._seed, samples)
         statistics.learning_seconds += time.perf_counter() - begin
         if bootstrap.mean == 0:
@@ -151,6 +168,13 @@ class ChainRender:
             f"{_share(counts['accepted_small'], small)} of small steps"
         )
         statistics.spp = round(mutations / self._pixel_count)
+
+
+def _suitable(mutations: int, target: ImageTarget) -> int:
+    """A number of chains. Longer chains forget better where they began; more of them keep the
+    processor busy, above all where each mutation is several kernels."""
+    most = _MOST_CHAINS[target.has_light_paths]
+    return min(max(mutations // _LENGTH, _FEWEST_CHAINS), most)
 
 
 def _share(part: float, whole: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -20,20 +21,13 @@ class Contribution:
     Attributes:
         position: Where on the film.
         value: The colour, if the film were one pixel.
-        target: The luminance of ``value``. Negative components, which spectral variants have, count
-            by their absolute value.
+        target: The luminance of ``value`` (negative components, which spectral variants have, count
+            by their absolute value), times the weight of the place on the film.
     """
 
     position: mi.Point2f
     value: mi.Color3f
     target: mi.Float
-
-    @classmethod
-    def of(cls, position: mi.Point2f, value: mi.Color3f) -> Contribution:
-        """With its luminance. What is not finite counts as black: it is no place to stay."""
-        target = mi.luminance(dr.abs(value))
-        is_sound = dr.isfinite(target)
-        return cls(position, dr.select(is_sound, value, 0), dr.select(is_sound, target, 0))
 
 
 @dataclass
@@ -53,6 +47,13 @@ class Found:
     sample: Sample
 
 
+class PlaceWeights(Protocol):
+    """How much the target function prefers places on the film."""
+
+    def at(self, position: mi.Point2f) -> mi.Float:
+        """The weight of a place; positive."""
+
+
 @dataclass
 class ImageTarget:
     """Makes a camera ray of the first numbers, anywhere on the film, and an estimate of its
@@ -63,6 +64,7 @@ class ImageTarget:
         estimator: Of the radiance. The sample in a lane must not depend on other lanes.
         spp: Samples per pixel of the whole render, for ray differentials.
         has_light_paths: Does the estimator trace light paths, which draw numbers of their own?
+        weights: Of places on the film; ``None`` where all count the same.
     """
 
     scene: mi.Scene
@@ -70,13 +72,14 @@ class ImageTarget:
     estimator: Estimator
     spp: int
     has_light_paths: bool = False
+    weights: PlaceWeights | None = None
 
     def __call__(self, numbers: Numbers) -> tuple[Contribution, Sample]:
         """What the camera path finds, and the whole sample."""
         rays = self._rays(numbers)
         sample = self.estimator(self.scene, numbers, rays, mi.Bool(True))
         value = to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
-        return Contribution.of(rays.position, value), sample
+        return self._contribution(rays.position, value), sample
 
     def evaluate(self, numbers: Numbers) -> Found:
         """Everything, evaluated; also the place that ``numbers`` have reached."""
@@ -85,7 +88,7 @@ class ImageTarget:
         parts, lanes = [camera], [lane]
         for splats in sample.splats:
             value = to_rgb(splats.value, splats.wavelengths)
-            parts.append(Contribution.of(splats.position, dr.select(splats.active, value, 0)))
+            parts.append(self._contribution(splats.position, dr.select(splats.active, value, 0)))
             lanes.append(splats.sample)
         dr.eval(numbers, parts, lanes, sample)
         target = camera.target
@@ -94,6 +97,14 @@ class ImageTarget:
             for part, lane in zip(parts[1:], lanes[1:]):
                 dr.scatter_add(target, part.target, lane)
         return Found(target, parts, lanes, sample)
+
+    def _contribution(self, position: mi.Point2f, value: mi.Color3f) -> Contribution:
+        """What is not finite counts as black: it is no place to stay."""
+        target = mi.luminance(dr.abs(value))
+        is_sound = dr.isfinite(target)
+        if self.weights is not None:
+            target *= self.weights.at(position)
+        return Contribution(position, dr.select(is_sound, value, 0), dr.select(is_sound, target, 0))
 
     def _rays(self, numbers: Numbers) -> CameraRays:
         film = self.sensor.film()
