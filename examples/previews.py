@@ -28,15 +28,19 @@ PICTURES = {
     "flint": 1024,
     "caustic": 256,
     "glass_lamp": 96,
+    "ring": 512,
+    "pool": 4096,
+    "keyhole": 4096,
+    "shaded_lamp": 256,
     "corridor": 64,
     "night_classroom": 128,
 }
 
 #: Scenes for light paths, and the integrator that renders them; all others have "neepp".
-LIGHT_PATHS = dict.fromkeys(["caustic", "glass_lamp", "corridor"], "bdpt")
+LIGHT_PATHS = dict.fromkeys(["caustic", "glass_lamp", "corridor", "ring", "shaded_lamp"], "bdpt")
 
 #: Scenes that are not 16 : 9.
-WIDTHS = {"cornell_box": 216, "caustic": 240, "glass_lamp": 240}
+WIDTHS = {"cornell_box": 216, "caustic": 240, "glass_lamp": 240, "ring": 240, "shaded_lamp": 240}
 
 #: Scenes that need a spectral variant.
 SPECTRAL = {"flint"}
