@@ -242,7 +242,7 @@ HARD_CASES: dict[str, HardCase] = {
     "mirror_ring": HardCase(mirror_ring, precision=0.03),
     "floor_under_water": HardCase(floor_under_water, precision=0.03),
     "light_through_a_hole": HardCase(light_through_a_hole, spp=2048, max_depth=6, precision=0.03),
-    "bulb_under_a_shade": HardCase(bulb_under_a_shade, max_depth=8, precision=0.03),
+    "bulb_under_a_shade": HardCase(bulb_under_a_shade, spp=2048, max_depth=8, precision=0.03),
     "grazing_camera": HardCase(lambda: _grazing(1e-3), precision=0.03),
     "closed_box": HardCase(_closed_box),
     "empty": HardCase(lambda: {"type": "scene", "sensor": sensor()}, is_black=True),

@@ -56,11 +56,11 @@ def bulb_under_a_shade() -> Scene:
     centre = [-0.3, 0, 1.5]
     glass = {"type": "dielectric", "int_ior": "bk7", "ext_ior": "air"}
     air = {"type": "dielectric", "int_ior": "air", "ext_ior": "bk7"}
-    shade = {"type": "cylinder", "p0": [-0.3, 0, 1.25], "p1": [-0.3, 0, 1.75], "radius": 0.35,
+    shade = {"type": "cylinder", "p0": [-0.3, 0, 1.2], "p1": [-0.3, 0, 1.8], "radius": 0.45,
              "bsdf": {"type": "twosided", "bsdf": diffuse(0.8)}}  # fmt: skip
     shell = {
         f"shell_{side}": {"type": "sphere", "center": centre, "radius": radius, "bsdf": bsdf}
-        for side, radius, bsdf in (("outside", 0.2, glass), ("inside", 0.18, air))
+        for side, radius, bsdf in (("outside", 0.3, glass), ("inside", 0.27, air))
     }
-    lamp = {"type": "sphere", "center": centre, "radius": 0.12, "bsdf": diffuse(0.0)}
-    return stage(light={**lamp, "emitter": area(20.0)}, shade=shade, **shell)
+    lamp = {"type": "sphere", "center": centre, "radius": 0.2, "bsdf": diffuse(0.0)}
+    return stage(light={**lamp, "emitter": area(8.0)}, shade=shade, **shell)
