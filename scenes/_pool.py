@@ -9,8 +9,8 @@ from _geometry import Floats, Mesh, box, join, quad
 HALF_X, HALF_Y, FLOOR, LEVEL = 1.2, 0.9, -0.55, -0.07
 #: How far the water reaches into the walls, so that no light passes between them.
 OVERLAP = 0.02
-#: The amplitudes of all waves are in this ratio to the squares of their lengths: each bends light
-#: to a focus at the same depth.
+#: The amplitude of a wave over the square of its length, in 1/m: then all waves focus light at the
+#: same depth.
 STEEPNESS = 0.04
 
 

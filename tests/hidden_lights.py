@@ -1,4 +1,4 @@
-"""Small relatives of the scenes ring, pool, keyhole and shaded_lamp: no shadow ray reaches the
+"""Small relatives of the scenes ring, pool, keyhole and shaded_lamp: no shadow ray finds the
 light that they are about. Their lamps are large, so that ``path`` converges."""
 
 from __future__ import annotations
