@@ -28,10 +28,10 @@ PICTURES = {
     "flint": 1024,
     "caustic": 256,
     "glass_lamp": 96,
-    "ring": 1024,
+    "ring": 768,
     "pool": 2800,
     "keyhole": 2000,
-    "shaded_lamp": 400,
+    "shaded_lamp": 192,
     "corridor": 64,
     "night_classroom": 128,
 }
