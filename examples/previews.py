@@ -1,4 +1,4 @@
-"""Renders the pictures of the README: ``.venv/bin/python examples/previews.py`` (30 minutes)."""
+"""Renders the pictures of the README: ``.venv/bin/python examples/previews.py`` (40 minutes)."""
 
 from __future__ import annotations
 
@@ -28,15 +28,23 @@ PICTURES = {
     "flint": 1024,
     "caustic": 256,
     "glass_lamp": 96,
+    "ring": 768,
+    "pool": 2800,
+    "keyhole": 2000,
+    "shaded_lamp": 192,
     "corridor": 64,
     "night_classroom": 128,
 }
 
-#: Scenes for light paths, and the integrator that renders them; all others have "neepp".
-LIGHT_PATHS = dict.fromkeys(["caustic", "glass_lamp", "corridor"], "bdpt")
+#: Scenes that are rendered by light paths, or in which nothing can be learned about visibility; all
+#: others have "neepp".
+INTEGRATORS = {
+    **dict.fromkeys(["caustic", "glass_lamp", "corridor", "ring", "shaded_lamp"], "bdpt"),
+    **dict.fromkeys(["pool", "keyhole"], "composed_path"),
+}
 
 #: Scenes that are not 16 : 9.
-WIDTHS = {"cornell_box": 216, "caustic": 240, "glass_lamp": 240}
+WIDTHS = {"cornell_box": 216, "caustic": 240, "glass_lamp": 240, "ring": 240, "shaded_lamp": 240}
 
 #: Scenes that need a spectral variant.
 SPECTRAL = {"flint"}
@@ -52,7 +60,7 @@ def main(names: tuple[str, ...]) -> None:
     for name in names or PICTURES:
         mi.set_variant("llvm_ad_spectral" if name in SPECTRAL else "llvm_ad_rgb")
         spp = PICTURES[name]
-        width, integrator = WIDTHS.get(name, 320), LIGHT_PATHS.get(name, "neepp")
+        width, integrator = WIDTHS.get(name, 320), INTEGRATORS.get(name, "neepp")
         scene = mi.load_file(
             str(SCENES / f"{name}.xml"), width=width, height=180, integrator=integrator
         )

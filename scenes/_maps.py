@@ -45,6 +45,16 @@ def checker() -> Floats:
     return np.where(((x // 8 + y // 8) % 2 == 0)[..., None], [0.55, 0.5, 0.44], [0.12, 0.14, 0.17])
 
 
+def tiles() -> Floats:
+    """Glazed tiles in blues, 128 x 128: eight tiles a side, with bright joints."""
+    draw = np.random.Generator(np.random.PCG64(11))
+    y, x = np.mgrid[0:128, 0:128]
+    tone = draw.random((8, 8))[y // 16, x // 16, None]
+    shade = (0.85 + 0.3 * draw.random((8, 8)))[y // 16, x // 16, None]
+    tile = shade * (tone * np.array([0.36, 0.7, 0.72]) + (1 - tone) * np.array([0.2, 0.55, 0.68]))
+    return np.where(((x % 16 == 0) | (y % 16 == 0))[..., None], [0.75, 0.77, 0.75], tile)
+
+
 def sky(
     colours: tuple, elevation_of_sun: float, u: float, sun: tuple, glow: tuple, sharpness: float
 ) -> Floats:

@@ -36,6 +36,10 @@ def tableware() -> dict[str, Mesh]:
     shade = [(0.2, 0), (0.12, 0.22), (0.118, 0.22), (0.198, 0)]
     dish = [(0, 0), (0.09, 0), (0.13, 0.014), (0.132, 0.017), (0.085, 0.007), (0, 0.006)]
     planter = [(0, 0), (0.13, 0), (0.17, 0.32), (0.155, 0.32), (0.15, 0.28), (0, 0.28)]
+    # A table lamp: its foot with the socket, and a shade with rounded rims, to be hung at its top
+    foot = [(0, 0), (0.085, 0), (0.09, 0.012), (0.03, 0.03), (0.045, 0.08), (0.055, 0.14)]
+    foot += [(0.03, 0.21), (0.012, 0.235), (0.016, 0.245), (0.016, 0.29), (0, 0.29)]
+    hood = [(0.16, 0), (0.0905, 0.2), (0.09, 0.2015), (0.0895, 0.2), (0.158, 0), (0.159, -0.0015)]
     return {
         "vase": lathe(rounded(vase)),
         "bowl": lathe(rounded(bowl), 48),
@@ -43,7 +47,28 @@ def tableware() -> dict[str, Mesh]:
         "shade": lathe(shade),
         "dish": lathe(rounded(dish)),
         "planter": lathe(rounded(planter, 1)),
+        "lamp_foot": lathe(rounded(foot), 48),
+        "lamp_shade": lathe([*hood, hood[0]], 64),
     }
+
+
+def ring() -> dict[str, Mesh]:
+    """A ring of outer radius 1 around the origin, 0.8 high, its edges rounded; it stands on z = 0.
+
+    The many vertices along its inside keep the interpolated normals there exactly horizontal.
+    """
+    inside, outside, height, edge = 0.88, 1.0, 0.8, 0.035
+    corner = np.radians(np.linspace(0, 90, 6))
+    quarter = edge * np.stack([np.sin(corner), 1 - np.cos(corner)], axis=1)
+    middle = (inside + outside) / 2
+    bottom = [(middle, 0), *((outside - edge, 0) + quarter)]
+    top = [(r, height - z) for r, z in bottom[::-1]]
+    outer = [*bottom, (outside, height / 2), *top]
+    inner = [(2 * middle - r, z) for r, z in outer[::-1]]
+    flat = [(inside, z) for z in (height - 2 * edge, height / 2, 2 * edge)]
+    half = len(inner) // 2
+    profile = [*outer, *inner[1:half], *flat, *inner[half + 1 : -1], outer[0]]
+    return {"ring": lathe(profile, 192)}
 
 
 def prism() -> dict[str, Mesh]:

@@ -1,12 +1,13 @@
 """The walls of the scenes' rooms, with their doorways and windows.
 
-The house of rooms.xml and many_lamps.xml, the room of window.xml, one face of a furnace.
+The house of rooms.xml and many_lamps.xml, the room of window.xml, one face of a furnace, the wall
+of keyhole.xml.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from _geometry import Mesh, block, box, join, perforated, quad
+from _geometry import Floats, Mesh, block, box, join, perforated, quad
 
 # The house of rooms.xml and many_lamps.xml: rooms of 4 x 4 m and 2.7 m, walls 0.14 m thick
 COLUMNS, ROWS, ROOM, HEIGHT, WALL = 4, 3, 4.0, 2.7, 0.14
@@ -132,3 +133,55 @@ def window_room() -> dict[str, Mesh]:
     first = np.arange(48)[:, None] * 2
     faces = np.concatenate([first + [0, 2, 3], first + [0, 3, 1]])
     return {"window_walls": walls, "window_frame": join(*bars), "curtain": Mesh(strip, faces)}
+
+
+# ---- The wall of keyhole.xml ----
+
+
+def keyhole_outline() -> Floats:
+    """A circle above a foot, 28 cm high, counter-clockwise; the origin sees all of it."""
+    neck = np.radians(-55)  # where the foot leaves the arc
+    angles = np.linspace(neck, np.pi - neck, 40)
+    arc = 0.085 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.concatenate([[(-0.07, -0.2), (0.07, -0.2)], arc])
+
+
+def around_keyhole(outer: Floats, z: float) -> Mesh:
+    """The plane at height z, facing +z, between the keyhole and an outline with as many points."""
+    inner = keyhole_outline()
+    count = len(inner)
+    points = np.concatenate([inner, outer])
+    positions = np.column_stack([points, np.full(2 * count, z)])
+    i = np.arange(count)
+    j = (i + 1) % count
+    faces = np.concatenate([np.stack([i, i + count, j + count], 1), np.stack([i, j + count, j], 1)])
+    return Mesh(positions, faces)
+
+
+def prism_shell(outline: Floats, low: float, high: float) -> Mesh:
+    """The side of a prism, facing outwards if the outline is counter-clockwise."""
+    count = len(outline)
+    rings = [np.column_stack([outline, np.full(count, z)]) for z in (low, high)]
+    i = np.arange(count)
+    j = (i + 1) % count
+    faces = np.concatenate([np.stack([i, j, j + count], 1), np.stack([i, j + count, i + count], 1)])
+    return Mesh(np.concatenate(rings), faces)
+
+
+def keyhole() -> dict[str, Mesh]:
+    """A wall of 6 x 3 m, 0.1 m thick, and a plate of 2 mm on its side z > 0; the origin is in the
+    middle of the keyhole."""
+    hole = keyhole_outline()
+    reach = np.array([3.0, 1.5]) / np.maximum(np.abs(hole), 1e-9)
+    far = hole * reach.min(axis=1, keepdims=True)
+    # The two points nearest to each corner of the wall would cut it off
+    for corner in np.array([(x, y) for x in (-3.0, 3.0) for y in (-1.5, 1.5)]):
+        far[np.argmin(np.linalg.norm(far - corner, axis=1))] = corner
+    front, back = around_keyhole(far, 0.05), around_keyhole(far, -0.05)
+    back = Mesh(back.positions, back.faces[:, ::-1])
+    reveal = prism_shell(hole[::-1], -0.05, 0.05)
+    angle = np.arctan2(hole[:, 1] + 0.05, hole[:, 0])
+    oval = np.stack([0.14 * np.cos(angle), 0.23 * np.sin(angle) - 0.05], axis=1)
+    plate = join(around_keyhole(oval, 0.054), prism_shell(oval, 0.05, 0.054))
+    plate = join(plate, prism_shell(hole[::-1], 0.05, 0.054))
+    return {"keyhole_wall": join(front, back, reveal), "keyhole_plate": plate}

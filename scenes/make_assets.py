@@ -13,9 +13,10 @@ from pathlib import Path
 
 from _geometry import icosphere, torus_knot, write_ply
 from _lamps import lamps
-from _maps import checker, clear_sky, painting, planks, sunny_sky, write_exr
-from _things import cupboard, door, fittings, furniture, plant, pot, prism, school, tableware
-from _walls import house, wall_with_holes, window_room
+from _maps import checker, clear_sky, painting, planks, sunny_sky, tiles, write_exr
+from _pool import pool, water
+from _things import cupboard, door, fittings, furniture, plant, pot, prism, ring, school, tableware
+from _walls import house, keyhole, wall_with_holes, window_room
 
 
 def main() -> None:
@@ -26,8 +27,8 @@ def main() -> None:
     leaf_and_knob = door()
     flat = furniture() | house() | {"door": leaf_and_knob["door"]}
     flat |= {"gem": icosphere(1), "wall_with_holes": wall_with_holes()}
-    smooth["knob"] = leaf_and_knob["knob"]
-    flat |= cupboard() | fittings() | window_room() | prism() | school()
+    smooth |= ring() | {"knob": leaf_and_knob["knob"], "water": water()}
+    flat |= cupboard() | fittings() | window_room() | prism() | school() | pool() | keyhole()
     for name in ("stand", "curtain"):
         smooth[name] = flat.pop(name)
     for name, mesh in smooth.items():
@@ -38,6 +39,7 @@ def main() -> None:
         "planks": planks(),
         "painting": painting(),
         "checker": checker(),
+        "tiles": tiles(),
         "sunny_sky": sunny_sky(),
         "clear_sky": clear_sky(),
     }

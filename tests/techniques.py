@@ -103,7 +103,8 @@ _LIGHT_PATHS = tuple(case for case in HARD_CASES if case not in _UNLIKE_PATH)
 
 #: Behind mirrors, glass, masks and null surfaces, and on a film with a sampled border.
 _UNSEEN_FROM_LIGHTS = {
-    "furnace_glass", "furnace_isothermal", "materials", "medium", "cropped_film",
+    "furnace_glass", "furnace_isothermal", "materials", "medium", "cropped_film", "mirror_ring",
+    "floor_under_water",
 }  # fmt: skip
 
 _SEVERAL_LIGHTS = ("delta_lights", "textured_two_sided_lights", "materials", "no_light")
