@@ -8,8 +8,7 @@ import mitsuba as mi
 
 from mitsuba_ext import registry
 from mitsuba_ext.chains.metropolis import MetropolisIntegrator
-from mitsuba_ext.chains.render import ChainSettings
-from mitsuba_ext.chains.small_steps import SmallSteps
+from mitsuba_ext.chains.visits import ChainSettings, MetropolisRender
 
 
 @registry.plugin
@@ -39,13 +38,18 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
        - |bool|
        - Use large steps as independent samples besides, weighted by the balance heuristic: it
          reduces the noise of dark pixels. (Default: true)
+     * - chains
+       - |int|
+       - Chains, which run in parallel; there are no more than mutations. 0 stands for as many as
+         suit the render: 16384 (65536 with light paths), and more if each then makes 64 mutations.
+         (Default: 0)
      * - two_stage
        - |bool|
        - Estimate the brightness of parts of the image first, and spread mutations evenly over them
          instead of by brightness? (Default: false)
      * - (Common parameters)
        - |several|
-       - Those of :class:`MetropolisIntegrator`: bidirectional, direct_samples, chains, next_event,
+       - Those of :class:`MetropolisIntegrator`: bidirectional, direct_samples, next_event,
          max_depth, rr_depth, hide_emitters, timeout, aovs.
 
     ``spp`` is the number of mutations per pixel.
@@ -78,29 +82,23 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.p_large = self.parameter(props, "p_large", 0.3, minimum=0.0, maximum=1.0)
-        self.luminance_samples = self.parameter(
-            props, "luminance_samples", 100_000, minimum=1, maximum=1 << 26
-        )
+        self.luminance_samples = self.read_luminance_samples(props)
         self.kelemen_style_weights = self.parameter(props, "kelemen_style_weights", True)
         self.two_stage = self.parameter(props, "two_stage", False)
-        low = self.parameter(props, "mutation_size_low", 1 / 1024, minimum=1e-6, maximum=0.5)
-        high = self.parameter(props, "mutation_size_high", 1 / 64, minimum=1e-6, maximum=0.5)
-        if low > high:
-            raise ValueError(
-                f'"{self.name}": "mutation_size_low" is {low}; it must not be larger than '
-                f'"mutation_size_high", which is {high}'
-            )
-        self.steps = SmallSteps(low, high)
+        self.steps = self.read_steps(props)
+        self.chains = self.parameter(props, "chains", 0, minimum=0, maximum=1 << 20)
 
-    def settings(self) -> ChainSettings:
-        return ChainSettings(
+    def chain_render(self, *render: Any) -> MetropolisRender:
+        settings = ChainSettings(
             self.chains, self.luminance_samples, self.p_large, self.steps,
             self.kelemen_style_weights, self.two_stage,
         )  # fmt: skip
+        return MetropolisRender(settings, *render)
 
     def parameters(self) -> dict[str, Any]:
         return {
             **super().parameters(),
+            "chains": self.chains,
             "p_large": self.p_large,
             "luminance_samples": self.luminance_samples,
             "mutation_size_low": self.steps.low,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +12,10 @@ import numpy as np
 from ..transport.numbers import BothEnds, Numbers
 from .numbers import ProposedNumbers, StateNumbers, StratifiedNumbers, generator, stream
 from .small_steps import SmallSteps
-from .target import ImageTarget
+from .target import Found, ImageTarget
+
+#: Samples that are evaluated at a time, without and with light paths: what these find is stored.
+_MOST_LANES = {False: 1 << 20, True: 1 << 18}
 
 #: Streams of random numbers, which differ from those of the chains.
 _CAMERA, _LIGHT, _CHOICE = 0, 1, 2
@@ -30,20 +33,38 @@ class Bootstrap:
         target: What is sampled.
         seed: Of the random numbers.
         count: How many samples there are at least.
+        take: Is given what they find, a part of the samples at a time.
 
     Attributes:
         count: How many there are: a square.
         mean: The mean of the target function.
-        found: What they found.
     """
 
-    def __init__(self, target: ImageTarget, seed: int, count: int) -> None:
+    def __init__(
+        self,
+        target: ImageTarget,
+        seed: int,
+        count: int,
+        take: Callable[[Found], None] | None = None,
+    ) -> None:
         self._seed, self._has_light = seed, target.has_light_paths
         self._cells = math.isqrt(count - 1) + 1
         self.count = self._cells**2
-        self.found = target.evaluate(self.numbers(dr.arange(mi.UInt32, self.count)))
-        self._sums = np.cumsum(self.found.target.numpy().astype(np.float64))
+        # Parts of equal width: they share kernels
+        parts = -(-self.count // _MOST_LANES[target.has_light_paths])
+        width, values = -(-self.count // parts), []
+        for part in range(parts):
+            index = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, part * width)
+            found = target.evaluate(self.numbers(index), index < dr.opaque(mi.UInt32, self.count))
+            values.append(found.target.numpy())
+            if take is not None:
+                take(found)
+        values = np.concatenate(values)[: self.count]
+        self._sums = np.cumsum(values.astype(np.float64))
         self.mean = float(self._sums[-1]) / self.count
+        # Rounding must not choose a black sample
+        self._last = int(np.searchsorted(self._sums, self._sums[-1]))
+        self._offset = float(mi.sample_tea_float32(mi.UInt32(seed), _CHOICE)[0])
 
     def numbers(self, index: mi.UInt32, records: Sequence[StateNumbers] = ()) -> Numbers:
         """The numbers of these samples; ``records`` are told what is drawn, by camera paths and by
@@ -60,7 +81,14 @@ class Bootstrap:
     def choose(self, count: int) -> mi.UInt32:
         """The indices of ``count`` samples, in proportion to the target function. One random offset
         for all of them keeps the numbers of choices near their expectation."""
-        offset = float(mi.sample_tea_float32(mi.UInt32(self._seed), _CHOICE)[0])
-        places = (np.arange(count) + offset) / count * self._sums[-1]
+        return self._at((np.arange(count) + self._offset) / count * self._sums[-1])
+
+    def choose_by_energy(self, energy: float) -> mi.UInt32:
+        """The indices of samples, each as often as its value of the target function holds this
+        ``energy``, on average."""
+        count = int(np.floor(self._sums[-1] / energy - self._offset)) + 1
+        return self._at((np.arange(count) + self._offset) * energy)
+
+    def _at(self, places: np.ndarray) -> mi.UInt32:
         index = np.searchsorted(self._sums, places, side="right")
-        return mi.UInt32(np.minimum(index, self.count - 1).astype(np.uint32))
+        return mi.UInt32(np.minimum(index, self._last).astype(np.uint32))

@@ -68,7 +68,8 @@ class ChainRules:
         large_step: The probability of a large step.
         steps: How numbers are moved by the others.
         uniform_weight: Probability of a large step · mean of the target function, by which uniform
-            samples count in the balance heuristic; 0 if they are not used.
+            samples count in the balance heuristic; 0 if they are not used. Where the target
+            function is what luminance is beyond a bound, the bound.
     """
 
     large_step: float
@@ -94,9 +95,9 @@ class Chains:
         target: What is sampled.
         image: Where visits are added.
         rules: How chains move.
-        bootstrap: Samples from which they start.
+        bootstrap, winners: Samples, and at which of these each chain starts.
         seed: Of the random numbers.
-        count: How many chains there are.
+        energy: By how much a visit counts.
 
     Attributes:
         count: How many there are.
@@ -112,19 +113,22 @@ class Chains:
         image: ChainImage,
         rules: ChainRules,
         bootstrap: Bootstrap,
+        winners: mi.UInt32,
         seed: int,
-        count: int,
+        energy: float = 1.0,
     ) -> None:
         self._target, self._image, self._rules = target, image, rules
+        count = len(winners)
         self._large_step = dr.opaque(mi.Float, rules.large_step)
-        self._uses_uniform = rules.uniform_weight > 0
+        self._uses_uniform = rules.large_step > 0 and rules.uniform_weight > 0
         self._uniform_weight = dr.opaque(mi.Float, rules.uniform_weight)
+        self._energy = dr.opaque(mi.Float, energy)
         self.count, self.done = count, 0
         lane = dr.arange(mi.UInt32, count)
         streams = [CAMERA, LIGHT] if target.has_light_paths else [CAMERA]
         self._rngs = [generator(stream(seed, number), lane) for number in streams]
         self._weight = dr.zeros(mi.Float, count)
-        self._begin(bootstrap, bootstrap.choose(count))
+        self._begin(bootstrap, winners)
 
     def _begin(self, bootstrap: Bootstrap, winners: mi.UInt32) -> None:
         """Makes these samples the states of the chains."""
@@ -140,7 +144,7 @@ class Chains:
 
     def _share(self, target: mi.Float) -> mi.Float:
         """The weight of a visit."""
-        return dr.select(target > 0, dr.rcp(target + self._uniform_weight), 0)
+        return dr.select(target > 0, self._energy / (target + self._uniform_weight), 0)
 
 
 def acceptance(state: mi.Float, proposal: mi.Float) -> mi.Float:

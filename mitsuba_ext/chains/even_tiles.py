@@ -27,20 +27,28 @@ class EvenTiles:
 
     Parameters:
         film: Its crop window is divided.
-        found: Samples of the whole film. The chains must start from others.
+        samples: How many will be taken of the whole film. The chains must start from others.
     """
 
-    def __init__(self, film: mi.Film, found: Found) -> None:
+    def __init__(self, film: mi.Film, samples: int) -> None:
         width, height = film_extent(film)
         self._offset = mi.ScalarPoint2f(film.crop_offset())
-        tiles = max(1.0, dr.width(found.target) / _SAMPLES)
+        tiles = max(1.0, samples / _SAMPLES)
         self._side = max(1.0, math.sqrt(width * height / tiles))
         self._columns = math.ceil(width / self._side)
         self._rows = math.ceil(height / self._side)
-        sums = dr.zeros(mi.Float, self._columns * self._rows)
+        self._sums = dr.zeros(mi.Float, self._columns * self._rows)
+        self._inverse = dr.full(mi.Float, 1, dr.width(self._sums))
+
+    def take(self, found: Found) -> None:
+        """Learns from some of the samples."""
         for part in found.parts:
-            dr.scatter_add(sums, part.target, self._tile(part.position), part.target > 0)
-        self._inverse = dr.rcp(dr.maximum(sums / dr.mean(sums), _FLOOR))
+            tile = self._tile(part.position)
+            dr.scatter_add(self._sums, part.target, tile, part.target > 0)
+        dr.eval(self._sums)
+        mean = dr.mean(self._sums)
+        relative = dr.select(mean > 0, self._sums / mean, 1)
+        self._inverse = dr.rcp(dr.maximum(relative, _FLOOR))
         dr.eval(self._inverse)
 
     def at(self, position: mi.Point2f) -> mi.Float:

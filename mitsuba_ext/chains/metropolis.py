@@ -26,7 +26,8 @@ from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.path_decisions import Weights
 from ..transport.walk import Walk
 from ..transport.without_direct import WithoutDirect
-from .render import ChainRender, ChainSettings
+from .render import ChainRender
+from .small_steps import SmallSteps
 from .target import ImageTarget
 
 #: The largest share of the time limit for camera samples.
@@ -54,16 +55,13 @@ class MetropolisIntegrator(WalkIntegrator):
 
      * - bidirectional
        - |bool|
-       - Do chains sample the paths of :class:`bdpt` (else those of :monosp:`path`)? A mutation then
-         costs about four times as much, and caustics of small lamps are found. (Default: true)
+       - Do chains sample the paths of :class:`bdpt`, else those of :monosp:`path`? A mutation of
+         the former takes about three times as long, and finds caustics of small lamps.
+         (Default: true)
      * - direct_samples
        - |int|
        - Camera samples per pixel for visible lights and direct light, which :monosp:`path` finds
          well; the chains find the rest. −1 leaves all light to the chains. (Default: 16)
-     * - chains
-       - |int|
-       - Chains, which run in parallel; there are no more than mutations. 0 stands for as many as
-         suit the render: 16384, and more if each then makes 64 mutations. (Default: 0)
      * - next_event
        - |string| or |decision|
        - How points on lights are chosen, as in :class:`composed_path`; by a choice that learns
@@ -75,7 +73,6 @@ class MetropolisIntegrator(WalkIntegrator):
     Attributes:
         direct_samples: Camera samples per pixel; −1 where chains find all light.
         bidirectional: Do chains sample paths from both ends?
-        chains: Chains that run in parallel; 0 for as many as suit the render.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -89,7 +86,6 @@ class MetropolisIntegrator(WalkIntegrator):
                 f"light to the chains"
             )
         self.bidirectional = self.parameter(props, "bidirectional", True)
-        self.chains = self.parameter(props, "chains", 0, minimum=0, maximum=1 << 20)
         self.fill(props, next_event=self._unlearned(props, "next_event"))
 
     def _unlearned(self, props: mi.Properties, slot: str) -> DecisionParameters | None:
@@ -101,15 +97,33 @@ class MetropolisIntegrator(WalkIntegrator):
             )
         return parameters
 
-    def settings(self) -> ChainSettings:
-        """The parameters of the chains."""
+    def read_luminance_samples(self, props: mi.Properties) -> int:
+        """The parameter ``luminance_samples``."""
+        return self.parameter(props, "luminance_samples", 100_000, minimum=1, maximum=1 << 26)
+
+    def read_steps(self, props: mi.Properties) -> SmallSteps:
+        """The parameters ``mutation_size_low`` and ``mutation_size_high``.
+
+        Raises:
+            ValueError: The lowest is larger than the highest.
+        """
+        low = self.parameter(props, "mutation_size_low", 1 / 1024, minimum=1e-6, maximum=0.5)
+        high = self.parameter(props, "mutation_size_high", 1 / 64, minimum=1e-6, maximum=0.5)
+        if low > high:
+            raise ValueError(
+                f'"{self.name}": "mutation_size_low" is {low}; it must not be larger than '
+                f'"mutation_size_high", which is {high}'
+            )
+        return SmallSteps(low, high)
+
+    def chain_render(self, *render: Any) -> ChainRender:
+        """The render of the chains, of which the parameters are those of :class:`ChainRender`."""
         raise NotImplementedError
 
     def parameters(self) -> dict[str, Any]:
         return {
             "bidirectional": self.bidirectional,
             "direct_samples": self.direct_samples,
-            "chains": self.chains,
             **super().parameters(),
         }
 
@@ -167,9 +181,7 @@ class MetropolisIntegrator(WalkIntegrator):
         self._render_camera_samples(scene, sensor, seed, target is not None)
         statistics, camera_spp = self.statistics, self.statistics.spp
         if target is not None and not self.is_cancelled:
-            chains = ChainRender(
-                self, target, self.settings(), seed, spp, camera_spp, statistics, start
-            )
+            chains = self.chain_render(self, target, seed, spp, camera_spp, statistics, start)
             with deferred_interrupt() as interrupt:
                 chains.run(interrupt)
         statistics.seconds = time.perf_counter() - start

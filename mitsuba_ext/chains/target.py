@@ -65,6 +65,7 @@ class ImageTarget:
         spp: Samples per pixel of the whole render, for ray differentials.
         has_light_paths: Does the estimator trace light paths, which draw numbers of their own?
         weights: Of places on the film; ``None`` where all count the same.
+        bound: The target function is what the sum of luminances is beyond it.
     """
 
     scene: mi.Scene
@@ -73,17 +74,17 @@ class ImageTarget:
     spp: int
     has_light_paths: bool = False
     weights: PlaceWeights | None = None
+    bound: float = 0.0
 
     def __call__(self, numbers: Numbers) -> tuple[Contribution, Sample]:
-        """What the camera path finds, and the whole sample."""
-        rays = self._rays(numbers)
-        sample = self.estimator(self.scene, numbers, rays, mi.Bool(True))
-        value = to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
-        return self._contribution(rays.position, value), sample
+        """What the camera path finds, with the target function of that, and the whole sample."""
+        camera, sample = self._camera(numbers, mi.Bool(True))
+        camera.target = self._beyond_bound(camera.target)
+        return camera, sample
 
-    def evaluate(self, numbers: Numbers) -> Found:
+    def evaluate(self, numbers: Numbers, active: mi.Bool | bool = True) -> Found:
         """Everything, evaluated; also the place that ``numbers`` have reached."""
-        camera, sample = self(numbers)
+        camera, sample = self._camera(numbers, mi.Bool(active))
         lane = dr.arange(mi.UInt32, dr.width(camera.target))
         parts, lanes = [camera], [lane]
         for splats in sample.splats:
@@ -96,7 +97,20 @@ class ImageTarget:
             target = mi.Float(target)
             for part, lane in zip(parts[1:], lanes[1:]):
                 dr.scatter_add(target, part.target, lane)
+        target = self._beyond_bound(target)
+        dr.eval(target)
         return Found(target, parts, lanes, sample)
+
+    def _camera(self, numbers: Numbers, active: mi.Bool) -> tuple[Contribution, Sample]:
+        rays = self._rays(numbers)
+        sample = self.estimator(self.scene, numbers, rays, active)
+        value = to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
+        return self._contribution(rays.position, dr.select(active, value, 0)), sample
+
+    def _beyond_bound(self, luminance: mi.Float) -> mi.Float:
+        if self.bound == 0:
+            return luminance
+        return dr.maximum(luminance - dr.opaque(mi.Float, self.bound), 0)
 
     def _contribution(self, position: mi.Point2f, value: mi.Color3f) -> Contribution:
         """What is not finite counts as black: it is no place to stay."""

@@ -1,0 +1,107 @@
+"""Energy redistribution path tracing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.chains.metropolis import MetropolisIntegrator
+from mitsuba_ext.chains.redistribution import RedistributionRender, RedistributionSettings
+
+
+@registry.plugin
+class EnergyRedistribution(MetropolisIntegrator):
+    r"""
+    .. _integrator-erpt:
+
+    Energy redistribution path tracing (:monosp:`erpt`)
+    ---------------------------------------------------
+
+    Takes independent samples, and spreads what outliers among them have too much by short Markov
+    chains.
+
+    .. pluginparameters::
+
+     * - outliers
+       - |float|
+       - Samples so many times as bright as their part of the image are outliers: what they have
+         beyond that goes to chains; everything else is plain Monte Carlo. 0 gives all energy to
+         chains, as the original does. (Default: 10)
+     * - mutations_per_pixel
+       - |int|
+       - Mutations per pixel, if all energy were redistributed. Of the share that is, the same
+         share of mutations is made. (Default: 200)
+     * - chain_length
+       - |int|
+       - Mutations of a chain. (Default: 100)
+     * - luminance_samples
+       - |int|
+       - Independent samples, at least, that measure the brightness of the image and of its parts
+         first. (Default: 100000)
+     * - mutation_size_low, mutation_size_high
+       - |float|
+       - By how much mutations change a number, at least and at most. (Default: 1/1024, 1/64)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`MetropolisIntegrator`: bidirectional, direct_samples, next_event,
+         max_depth, rr_depth, hide_emitters, timeout, aovs.
+
+    ``spp`` is the number of independent samples per pixel.
+
+    **Use it when** an image of :monosp:`path` or :class:`bdpt` is fine but for bright spots that
+    need very many samples: caustics, small lamps behind glass. **Not when** there are none: it then
+    is :class:`bdpt` (or :monosp:`path`) at a somewhat higher price.
+
+    Chains change the random numbers of a sample by small steps (:class:`pssmlt`), and deposit the
+    same energy at each place that they visit. They begin at independent samples, so that there is
+    no start-up bias, whatever their length.
+
+    Source: D. Cline, PhD thesis, 2007, chapter 8; D. Cline, J. Talbot, P. Egbert, *Energy
+    Redistribution Path Tracing*, ACM Transactions on Graphics 24(3), 2005; B. Bitterli, W. Jarosz,
+    *Selectively Metropolised Monte Carlo Light Transport Simulation*, ACM Transactions on Graphics
+    38(6), 2019.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="erpt">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'erpt',
+            'max_depth': 8
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.outliers = self.parameter(props, "outliers", 10.0, minimum=0.0)
+        self.mutations_per_pixel = self.parameter(
+            props, "mutations_per_pixel", 200, minimum=1, maximum=1 << 24
+        )
+        self.chain_length = self.parameter(
+            props, "chain_length", 100, minimum=1, maximum=1 << 20
+        )
+        self.luminance_samples = self.read_luminance_samples(props)
+        self.steps = self.read_steps(props)
+
+    def chain_render(self, *render: Any) -> RedistributionRender:
+        settings = RedistributionSettings(
+            self.chain_length, self.mutations_per_pixel, self.outliers, self.luminance_samples,
+            self.steps,
+        )  # fmt: skip
+        return RedistributionRender(settings, *render)
+
+    def parameters(self) -> dict[str, Any]:
+        return {
+            **super().parameters(),
+            "outliers": self.outliers,
+            "mutations_per_pixel": self.mutations_per_pixel,
+            "chain_length": self.chain_length,
+            "luminance_samples": self.luminance_samples,
+            "mutation_size_low": self.steps.low,
+            "mutation_size_high": self.steps.high,
+        }

@@ -1,0 +1,139 @@
+"""Renders with short chains that spread the energy of bright samples: energy redistribution."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .bootstrap import Bootstrap
+from .chain_image import ChainImage
+from .chains import ChainRules
+from .even_tiles import EvenTiles
+from .numbers import stream
+from .render import FIRST_STAGE, ChainRender
+from .small_steps import SmallSteps
+from .target import Found
+
+#: Samples of a batch, at most, and with a time limit. Each batch has chains of its own, which take
+#: long where they are few.
+_BATCH, _TIMED_BATCH = 1 << 22, 1 << 19
+
+#: Chains of a batch, at most. Where more were wanted, each carries more energy.
+_MOST_CHAINS = 1 << 17
+
+#: Streams of random numbers of batches, besides all others: this one and the next ones.
+_BATCHES = 16
+
+
+@dataclass(frozen=True)
+class RedistributionSettings:
+    """The parameters of a render by energy redistribution.
+
+    Attributes:
+        chain_length: Mutations of a chain.
+        mutations: Mutations per pixel, if all energy were redistributed.
+        outliers: Samples so many times as bright as their neighbourhood lose what they have beyond
+            that to chains. 0 redistributes all energy.
+        luminance_samples: Samples that measure brightness first.
+        steps: How numbers are moved.
+    """
+
+    chain_length: int
+    mutations: int
+    outliers: float
+    luminance_samples: int
+    steps: SmallSteps
+
+
+class RedistributionRender(ChainRender):
+    """Takes independent samples. From the energy that is beyond a bound, chains of a fixed length
+    start, and deposit equal shares of it where they go. ``spp`` are samples per pixel.
+
+    The number of chains of a sample is that of the multiples of a common energy, shifted by a
+    random offset, between the sums of energies before and after it: right on average, so that
+    nothing is lost.
+
+    Source: D. Cline, PhD thesis, 2007, chapter 8 (equal deposition flow, section 8.3.2); B.
+    Bitterli, W. Jarosz, *Selectively Metropolised Monte Carlo Light Transport Simulation*, ACM
+    Transactions on Graphics 38(6), 2019 (chains for outliers only).
+
+    Parameters:
+        settings: How.
+    """
+
+    def __init__(self, settings: RedistributionSettings, *render: Any) -> None:
+        super().__init__(*render)
+        self._settings = settings
+        self._samples, self._batches, self._redistributed, self._energy = 0, 0, 0.0, 0.0
+
+    def run(self, interrupt: threading.Event) -> None:
+        settings, statistics, target = self._settings, self._statistics, self._target
+        begin = time.perf_counter()
+        statistics.interrupted = True
+        seed = stream(self._seed, FIRST_STAGE)
+        tiles = EvenTiles(self._film, settings.luminance_samples)
+        first = Bootstrap(target, seed, settings.luminance_samples, tiles.take)
+        statistics.learning_seconds += time.perf_counter() - begin
+        bound = 0.0
+        if settings.outliers > 0 and first.mean > 0:
+            target.weights = tiles
+            target.bound = bound = settings.outliers * first.mean
+        image = ChainImage(self._film)
+        rules = ChainRules(0.0, settings.steps, bound)
+        # Energy of a deposit, in units of the target function of a sample
+        deposit = self._spp * first.mean / settings.mutations
+        total = self._spp * self._pixel_count
+        size = min(total, _TIMED_BATCH if self._integrator.timeout > 0 else _BATCH)
+
+        def act(most: int) -> int:
+            self._batch(image, rules, size, deposit)
+            return 1
+
+        try:
+            is_done = self._repeat(-(-total // size), size, interrupt, act)
+            statistics.interrupted = not is_done
+        finally:
+            if self._batches > 0:
+                factor = self._pixel_count * self._camera_spp / self._samples
+                image.write(factor, factor)
+                self._report(round(self._samples / self._pixel_count))
+                share = self._redistributed / self._energy if self._energy else 0.0
+                statistics.learned = f"{share:.1%} of the energy was redistributed; {self._rates()}"
+
+    def _batch(self, image: ChainImage, rules: ChainRules, size: int, deposit: float) -> None:
+        settings, target = self._settings, self._target
+        seed = stream(self._seed, _BATCHES + self._batches)
+
+        def take(found: Found) -> None:
+            """Adds what is within the bound to the image."""
+            kept = mi.Float(dr.select(found.target > 0, 0, 1))
+            if target.bound > 0:
+                kept = dr.rcp(1 + found.target / target.bound)
+            dr.eval(kept)
+            for part, lanes in zip(found.parts, found.lanes):
+                image.add_uniform(part, dr.gather(mi.Float, kept, lanes, part.target > 0))
+                self._energy += float(dr.sum(mi.Float64(part.target))[0])
+            dr.eval(image.tensors())
+
+        samples = Bootstrap(target, seed, size, take)
+        self._batches += 1
+        self._samples += samples.count
+        self._statistics.rays["camera"] += samples.count
+        energy = samples.mean * samples.count
+        self._redistributed += energy
+        spacing = max(deposit * settings.chain_length, energy / _MOST_CHAINS)
+        winners = samples.choose_by_energy(spacing)
+        if len(winners) == 0:
+            return
+        chains = self._kind(
+            target, image, rules, samples, winners, seed, spacing / settings.chain_length
+        )
+        while chains.done < settings.chain_length:
+            length = min(chains.launch, settings.chain_length - chains.done)
+            self._count(chains.advance(length), length * chains.count)
+        chains.end()
