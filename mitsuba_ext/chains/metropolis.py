@@ -33,8 +33,9 @@ from .target import ImageTarget
 #: The largest share of the time limit for camera samples.
 _CAMERA_SHARE = 0.25
 
-#: Camera samples per pixel that only find alpha and output variables.
-_ALPHA_SAMPLES = 16
+#: Camera samples per pixel, at least (as in Mitsuba 0.6), and their share of ``spp``: a sample of
+#: direct light takes a fraction of the time of a mutation.
+_CAMERA_SAMPLES, _DIRECT_SHARE = 16, 0.25
 
 
 @dataclass
@@ -61,7 +62,8 @@ class MetropolisIntegrator(WalkIntegrator):
      * - direct_samples
        - |int|
        - Camera samples per pixel for visible lights and direct light, which :monosp:`path` finds
-         well; the chains find the rest. −1 leaves all light to the chains. (Default: 16)
+         well; the chains find the rest. 0 stands for a quarter of ``spp``, and 16 at least; −1
+         leaves all light to the chains. (Default: 0)
      * - next_event
        - |string| or |decision|
        - How points on lights are chosen, as in :class:`composed_path`; by a choice that learns
@@ -71,20 +73,16 @@ class MetropolisIntegrator(WalkIntegrator):
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
 
     Attributes:
-        direct_samples: Camera samples per pixel; −1 where chains find all light.
+        direct_samples: Camera samples per pixel; 0 for as many as suit the render, −1 where chains
+            find all light.
         bidirectional: Do chains sample paths from both ends?
     """
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.direct_samples = self.parameter(
-            props, "direct_samples", 16, minimum=-1, maximum=1 << 20
+            props, "direct_samples", 0, minimum=-1, maximum=1 << 20
         )
-        if self.direct_samples == 0:
-            raise ValueError(
-                f'"{self.name}": "direct_samples" is 0; it must be positive, or -1 to leave direct '
-                f"light to the chains"
-            )
         self.bidirectional = self.parameter(props, "bidirectional", True)
         self.fill(props, next_event=self._unlearned(props, "next_event"))
 
@@ -129,7 +127,7 @@ class MetropolisIntegrator(WalkIntegrator):
 
     @property
     def _finds_direct(self) -> bool:
-        return self.direct_samples > 0
+        return self.direct_samples >= 0
 
     def schedule(self, scene, sensor, samples, seed) -> OneStage:
         """Of the camera samples."""
@@ -178,7 +176,7 @@ class MetropolisIntegrator(WalkIntegrator):
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else int(seed)
         setting = Setting(scene, sensor, seed, self.max_depth, self.rr_depth, spp)
         target = self._target(setting)
-        self._render_camera_samples(scene, sensor, seed, target is not None)
+        self._render_camera_samples(scene, sensor, seed, spp, target is not None)
         statistics, camera_spp = self.statistics, self.statistics.spp
         if target is not None and not self.is_cancelled:
             chains = self.chain_render(self, target, seed, spp, camera_spp, statistics, start)
@@ -200,15 +198,18 @@ class MetropolisIntegrator(WalkIntegrator):
             )
         return spp or sample_count(sensor, 0)
 
-    def _render_camera_samples(self, scene, sensor, seed: int, has_chains: bool) -> None:
-        """Leaves them in the film, and their statistics in ``self.statistics``."""
+    def _render_camera_samples(self, scene, sensor, seed, spp: int, has_chains: bool) -> None:
+        """Leaves them in the film, and their statistics in ``self.statistics``; ``spp`` is that of
+        the render."""
         report, timeout = self.progress, self.timeout
         if has_chains:
             self.progress = None
             self.timeout = timeout * _CAMERA_SHARE
-        spp = self.direct_samples if self._finds_direct else _ALPHA_SAMPLES
+        count = _CAMERA_SAMPLES
+        if self._finds_direct:
+            count = self.direct_samples or max(count, int(_DIRECT_SHARE * spp))
         try:
-            super().render(scene, sensor, seed, spp, develop=False, evaluate=False)
+            super().render(scene, sensor, seed, count, develop=False, evaluate=False)
         finally:
             self.progress, self.timeout = report, timeout
 
