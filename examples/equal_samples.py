@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
+from mitsuba_ext.decisions.pixel_estimates import relative_scale
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -110,10 +110,24 @@ def camera_rays(scene: mi.Scene, count: int) -> mi.RayDifferential3f:
     return sensor.sample_ray_differential(0.0, 0.5, position, mi.Point2f(u[2], u[3]))[0]
 
 
-def error(variance: np.ndarray, mean: np.ndarray, trimmed: float = TRIMMED) -> float:
-    """The variance of a pixel, divided by mean² + 0.01 · (mean of all)², without the largest 0.1 %
-    of the values, on average. The arrays have a value for each pixel and channel."""
-    values = np.sort((variance / (mean**2 + 0.01 * mean.mean() ** 2)).ravel())
+def error(
+    variance: np.ndarray,
+    image: np.ndarray,
+    pixels: np.ndarray | slice = slice(None),
+    trimmed: float = TRIMMED,
+) -> float:
+    """The variance of a pixel, divided by mean² + 0.01 · (mean of the image)², without the largest
+    0.1 % of the values, on average over pixels and channels.
+
+    The mean is that of ``image`` over 9x9 pixels: a spike would hide in the mean of its own pixel,
+    and the integrator whose images make the mean would have less error than the others.
+
+    Parameters:
+        variance, image: [height, width, channel].
+        pixels: Which of them count: [height, width].
+    """
+    scale = np.stack([relative_scale(x) for x in np.moveaxis(image, -1, 0)], axis=-1)
+    values = np.sort((variance * scale**2)[pixels].ravel())
     return float(values[: len(values) - int(np.ceil(trimmed * len(values)))].mean())
 
 

@@ -134,8 +134,7 @@ def main(names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tup
             pixels = (share >= low) & (share < high)
             if pixels.sum() < 20:
                 continue
-            gain = error(uniform.variance[pixels], mean[pixels])
-            gain /= error(other.variance[pixels], mean[pixels])
+            gain = error(uniform.variance, mean, pixels) / error(other.variance, mean, pixels)
             print_row([
                 title(name), region, f"{pixels.mean():.3f}", *(f"{r:.3f}" for r in reached[region]),
                 f"{gain:.2f}", f"{slower:.2f}", f"{gain / slower:.2f}",

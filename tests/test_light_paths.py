@@ -88,7 +88,12 @@ def test_the_variance_of_path_is_predicted(name: str) -> None:
     assert_variance_of_path_is_predicted(stage(light=EMITTERS[name](), camera=below_the_lamp()))
 
 
-def test_the_variance_of_path_is_predicted_where_connections_find_all_light() -> None:
+@pytest.mark.parametrize("vertices", [2.5, 8.0])
+def test_the_variance_of_path_is_predicted_whatever_weights_connections_have(
+    vertices: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All light is indirect, and MIS weights assume so many vertices of a light path."""
+    monkeypatch.setattr(path_tracer, "_VERTICES", vertices)
     assert_variance_of_path_is_predicted(_below_a_ceiling(diffuse()), light_image=False)
 
 
