@@ -87,7 +87,8 @@ class Chains:
         self._values = dr.zeros(mi.Float, _MOST_NUMBERS * count)
         winners = bootstrap.choose(count)
         self._state, self._known = self._replay(bootstrap.numbers(winners))
-        self._weight = dr.zeros(mi.Float, count)
+        # Not a literal: the first launch would need a kernel of its own
+        self._weight = dr.opaque(mi.Float, 0, count)
         self._rng = generator(mi.sample_tea_32(mi.UInt32(seed), CHAIN_STREAM)[0][0],
                               dr.arange(mi.UInt32, count))
         dr.eval(self._state, self._known, self._weight, self._rng, self._values)
@@ -195,5 +196,5 @@ class Chains:
     def end(self) -> None:
         """Adds the states of all chains to the image. They may go on."""
         self._image.add(self._state, self._weight * self._share(self._state))
-        self._weight = dr.zeros(mi.Float, self.count)
+        self._weight = dr.opaque(mi.Float, 0, self.count)
         dr.eval(self._image.tensors(), self._weight)

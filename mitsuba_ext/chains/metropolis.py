@@ -138,6 +138,7 @@ class MetropolisIntegrator(WalkIntegrator):
         estimator = self._chain_estimator(setting)
         self._render_camera_samples(scene, sensor, seed, estimator is not None)
         statistics, camera_spp = self.statistics, self.statistics.spp
+        is_interrupted = False
         if estimator is not None and not self.is_cancelled:
             target = ImageTarget(scene, sensor, estimator, spp)
             chains = ChainRender(
@@ -145,9 +146,10 @@ class MetropolisIntegrator(WalkIntegrator):
             )
             with deferred_interrupt() as interrupt:
                 chains.run(interrupt)
+            is_interrupted = interrupt.is_set()
         statistics.seconds = time.perf_counter() - start
         image = develop_film(sensor.film(), develop, evaluate)
-        if estimator is not None and statistics.interrupted and not self.is_cancelled:
+        if is_interrupted:
             raise KeyboardInterrupt
         return image
 
