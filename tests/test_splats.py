@@ -9,8 +9,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import film, sensor, stage
-from statistical import assert_same_image, batches
+from statistical import THRESHOLD, assert_same_image, batches, z_exact
 
+from mitsuba_ext.rendering.filter_weights import mean_weights
 from mitsuba_ext.transport.estimator import Splats
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -53,10 +54,23 @@ _CROP = {"crop_offset_x": 5, "crop_offset_y": 3, "crop_width": 13, "crop_height"
 @pytest.mark.parametrize("changes", [{}, _GAUSSIAN, _CROP, {**_GAUSSIAN, **_CROP}],
                          ids=["box", "gaussian", "cropped", "gaussian-cropped"])  # fmt: skip
 def test_splats_at_their_own_place_are_the_image(changes: dict[str, Any], sampler: str) -> None:
+    """Divided by the mean of the filter weights, not by those of the samples."""
     scene = _scene(sampler, **changes)
     ours, image = (batches(scene, _integrator(shift), 16, [4])[0] for shift in ((0, 0), None))
     assert image.mean() > 0
-    assert_same_image(ours, image, share=1.0)
+    film = scene.sensors()[0].film()
+    weights = np.array(film.develop(raw=True))[..., -1:]
+    assert_same_image(ours, image * weights / (16 * mean_weights(film)[..., None]), share=1.0)
+
+
+def test_splats_are_right_on_average_with_one_camera_sample() -> None:
+    """Also with a filter whose weights depend on where that falls in its pixel: dividing by them
+    would be 6 % too bright."""
+    camera = sensor(film=film(24, 20, **_GAUSSIAN))
+    scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "camera": camera})
+    images = batches(scene, _integrator((3, 0)), 1, range(1, 33))
+    z, error = z_exact(images[:, 3:-3, 6:-3].mean(axis=(1, 2, 3)), 1.0)
+    assert abs(z) < THRESHOLD and error < 0.005
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"], indirect=True)

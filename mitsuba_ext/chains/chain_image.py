@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from ..rendering.filter_weights import put_splats
 from .target import Contribution
 
 
@@ -39,8 +40,8 @@ class ChainImage:
         """What a launch evaluates."""
         return [self._visits.tensor(), self._uniform.tensor()]
 
-    def write(self, visit_factor: float, uniform_factor: float) -> None:
-        """Adds the image to the film, which holds camera samples."""
+    def write(self, visit_factor: float, uniform_factor: float, camera_spp: int) -> None:
+        """Adds the image to the film, which holds ``camera_spp`` camera samples per pixel."""
         visits, uniform = self.tensors()
         tensor = visits * visit_factor + uniform * uniform_factor
-        self._film.put_block(mi.ImageBlock(tensor, offset=self._visits.offset()))
+        put_splats(self._film, tensor, self._visits.offset(), camera_spp)

@@ -100,7 +100,7 @@ class RedistributionRender(ChainRender):
         finally:
             if self._batches > 0:
                 factor = self._pixel_count * self._camera_spp / self._samples
-                image.write(factor, factor)
+                image.write(factor, factor, self._camera_spp)
                 self._report(round(self._samples / self._pixel_count))
                 share = self._redistributed / self._energy if self._energy else 0.0
                 statistics.learned = f"{share:.1%} of the energy was redistributed; {self._rates()}"

@@ -103,7 +103,7 @@ class SteppedChains(Chains):
 
     def end(self):
         self._add(self._parts, self._lanes, self._weight * self._share(self._state))
-        self._weight = dr.zeros(mi.Float, self.count)
+        self._weight = dr.opaque(mi.Float, 0, self.count)
         dr.eval(self._image.tensors(), self._weight)
 
 

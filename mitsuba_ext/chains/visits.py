@@ -98,7 +98,7 @@ class MetropolisRender(ChainRender):
         mean = (bootstrap.mean * bootstrap.count + counts["large_target"]) / uniform
         mutations = chains.done * chains.count
         per_mutation = self._pixel_count * self._camera_spp / mutations
-        image.write(mean * per_mutation, bootstrap.mean * per_mutation)
+        image.write(mean * per_mutation, bootstrap.mean * per_mutation, self._camera_spp)
         self._report(round(mutations / self._pixel_count))
         self._statistics.learned = self._rates()
 

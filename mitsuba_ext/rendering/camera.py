@@ -161,8 +161,8 @@ def sample_rays(
 def put(
     film: mi.Film, block: mi.ImageBlock, rays: CameraRays, sample: Sample, aovs: list[mi.Float]
 ) -> None:
-    """Puts samples into an image block, in the channels that the film asks for. ``aovs`` has one
-    value per channel that the integrator announced to ``film.prepare``."""
+    """Puts samples into an image block, in the channels that the film asks for, but for their
+    splats. ``aovs`` has one value per channel that the integrator announced to ``film.prepare``."""
     L = sample.L * rays.importance * rays.weight
     alpha = dr.select(sample.valid, mi.Float(rays.weight), 0)
     aovs = [value * rays.weight for value in aovs]
@@ -176,8 +176,6 @@ def put(
         block.put(
             rays.position, [*_channels(film, L, wavelengths, alpha), mi.Float(1.0), *aovs]
         )
-    for splats in sample.splats:
-        _put_splats(film, block, splats, len(aovs))
 
 
 def check_takes_splats(film: mi.Film) -> None:
@@ -192,15 +190,12 @@ def check_takes_splats(film: mi.Film) -> None:
         )
 
 
-def _put_splats(
-    film: mi.Film, block: mi.ImageBlock, splats: Splats, aov_count: int
-) -> None:
-    """Adds splats to the same block, without a weight: the film divides by the filter weights of
-    the camera samples, of which there are as many as light paths, also at the film's edges."""
+def put_splats(film: mi.Film, block: mi.ImageBlock, splats: Splats) -> None:
+    """Puts splats into a block of their own, without weights (``filter_weights.py``)."""
     check_takes_splats(film)
-    channels = _channels(film, splats.value, splats.wavelengths, mi.Float(0))
-    zeros = [mi.Float(0)] * (1 + aov_count)
-    block.put(splats.position, [*channels, *zeros], splats.active)
+    rgb = to_rgb(splats.value, splats.wavelengths)
+    others = [mi.Float(0)] * (block.channel_count() - 3)
+    block.put(splats.position, [rgb.x, rgb.y, rgb.z, *others], splats.active)
 
 
 def _channels(

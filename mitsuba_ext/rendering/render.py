@@ -20,6 +20,7 @@ import mitsuba as mi
 
 from ..transport import heroes
 from . import camera
+from .filter_weights import put_splats
 from .interrupts import deferred_interrupt
 from .plan import Planned, plan_render
 from .stages import Schedule, Stage
@@ -150,7 +151,7 @@ class _Job:
         self.budget = TimeBudget(
             integrator.timeout, self.start, self.plan.pixel_count, pilot_spp
         )
-        self.block = self.film.create_block()
+        self.block, self.splats = self.film.create_block(), None
         # One kernel for all passes: coalescing is decided once
         self.block.set_coalesce(self.block.coalesce() and self.plan.longest_pass >= 4)
 
@@ -228,11 +229,16 @@ class _Job:
             raise self.integrator.no_gradients()
         aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
         camera.put(self.film, self.block, rays, sample, aovs)
+        for splats in sample.splats:
+            if self.splats is None:
+                self.splats = self.film.create_block()
+                self.splats.set_coalesce(False)
+            camera.put_splats(self.film, self.splats, splats)
         self._count(sample)
         if self.plan.structured:
             sampler.advance()
             sampler.schedule_state()
-        dr.eval(self.block.tensor(), self.tally)
+        dr.eval(self.block.tensor(), self.splats and self.splats.tensor(), self.tally)
         self.statistics.compile_seconds += time.perf_counter() - begin
         dr.sync_thread()
 
@@ -266,6 +272,9 @@ class _Job:
     def fill_film(self) -> None:
         """Hands the samples of the finished passes to the film."""
         self.film.put_block(self.block)
+        if self.splats is not None and self.statistics.spp > 0:
+            tensor, offset = self.splats.tensor(), self.splats.offset()
+            put_splats(self.film, tensor, offset, self.statistics.spp)
 
     def finish(self) -> None:
         statistics = self.statistics

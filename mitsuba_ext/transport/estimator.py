@@ -43,14 +43,14 @@ class Splats:
         position: Where on the film, in pixels of its crop window plus that window's offset.
         wavelengths: Of ``value``, in spectral variants.
         active: Which lanes have something to add.
-        sample: The number of the camera ray whose sample they belong to.
+        sample: The number of the camera ray to whose sample each belongs, for chains.
     """
 
     value: mi.Spectrum
     position: mi.Point2f
     wavelengths: mi.Spectrum | None
     active: mi.Bool
-    sample: mi.UInt32
+    sample: mi.UInt32 | None = None
 
 
 @dataclass

@@ -1,0 +1,41 @@
+"""The filter weights by which a film divides its pixels."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+#: Intervals of the table of a filter's integral.
+_TABLE = 1 << 14
+
+
+def put_splats(film: mi.Film, splats: mi.TensorXf, offset: mi.ScalarPoint2i, spp: int) -> None:
+    """Adds splats to a film that holds ``spp`` camera samples per pixel, and no splats yet.
+
+    The film divides by the sum of the filter weights of its camera samples. That is a random
+    number, whose inverse is too large on average: by 6 % for one sample and a gaussian filter. So
+    splats are multiplied by the sum, and divided by its mean.
+    """
+    if not film.rfilter().is_box_filter():
+        channel = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
+        weights = np.array(film.develop(raw=True))[..., channel]
+        ratio = weights / (spp * mean_weights(film))
+        splats = splats * mi.TensorXf(ratio[..., None].astype(np.float32))
+    film.put_block(mi.ImageBlock(splats, offset=offset))
+
+
+def mean_weights(film: mi.Film) -> np.ndarray:
+    """The mean of the filter weights that one camera sample in each pixel adds to each pixel:
+    [y, x]. Pixels at the edges get less, because there are no samples outside of the film."""
+    rfilter = film.rfilter()
+    radius = rfilter.radius()
+    edges = np.linspace(-radius, radius, _TABLE + 1)
+    values = rfilter.eval(mi.Float(0.5 * (edges[1:] + edges[:-1]))).numpy().astype(np.float64)
+    integral = np.concatenate([[0], np.cumsum(values)]) * (2 * radius / _TABLE)
+
+    def along(size: int) -> np.ndarray:
+        centre = np.arange(size) + 0.5
+        return np.interp(size - centre, edges, integral) - np.interp(-centre, edges, integral)
+
+    width, height = film.crop_size()
+    return along(height)[:, None] * along(width)
