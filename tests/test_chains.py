@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -14,9 +16,11 @@ from scipy import stats
 from statistical import THRESHOLD, sidak, z_exact
 
 from mitsuba_ext.chains.bootstrap import Bootstrap
-from mitsuba_ext.chains.chains import Chains, Counts
+from mitsuba_ext.chains.chains import ChainRules, Chains, Counts
+from mitsuba_ext.chains.looped import LoopedChains
 from mitsuba_ext.chains.small_steps import SmallSteps
-from mitsuba_ext.chains.target import Contribution, ImageTarget
+from mitsuba_ext.chains.stepped import SteppedChains
+from mitsuba_ext.chains.target import Contribution, Found, ImageTarget
 from mitsuba_ext.rendering.filter_weights import mean_weights
 from mitsuba_ext.transport.estimator import Sample
 from mitsuba_ext.transport.numbers import NumberTable, StoredNumbers
@@ -103,6 +107,24 @@ class _Histogram:
         return [self.visits, self.uniform, self.total]
 
 
+@dataclass
+class _Target:
+    """Stands in for the target function of an image."""
+
+    function: Callable[[Any], tuple[Contribution, Sample]]
+    has_light_paths = False
+
+    def __call__(self, numbers: Any) -> tuple[Contribution, Sample]:
+        return self.function(numbers)
+
+    def evaluate(self, numbers: Any, active: mi.Bool | bool = True) -> Found:
+        found, sample = self.function(numbers)
+        found.target = dr.select(active, found.target, 0)
+        lane = dr.arange(mi.UInt32, dr.width(found.target))
+        dr.eval(numbers, found, lane, sample)
+        return Found(found.target, [found], [lane], sample)
+
+
 def _found(x: mi.Float, y: mi.Float, target: mi.Float) -> tuple[Contribution, Sample]:
     zero = dr.zeros(mi.UInt32, dr.width(x))
     sample = Sample(mi.Color3f(target), mi.Bool(True), zero, zero, zero)
@@ -179,13 +201,15 @@ def _run(
     kelemen: bool = False,
     count: int = 1024,
     bootstrap: int = 4096,
+    kind: type[Chains] = LoopedChains,
 ) -> tuple[Chains, _Histogram, np.ndarray]:
     """Chains after so many mutations, what they saw, and their estimate of the integrals."""
+    target = _Target(target)
     samples = Bootstrap(target, seed, bootstrap)
     image = _Histogram()
     weight = large_step * samples.mean if kelemen else 0.0
-    chains = Chains(target, image, large_step, SmallSteps(1 / 64, 1 / 4), weight)
-    chains.begin(samples, seed, count)
+    rules = ChainRules(large_step, SmallSteps(1 / 64, 1 / 4), weight)
+    chains = kind(target, image, rules, samples, samples.choose(count), seed)
     image.counts = [chains.advance(min(16, steps - done)) for done in range(0, steps, 16)]
     chains.end()
     sums = (image.visits.numpy() + image.uniform.numpy()).reshape(_BINS, _BINS)
@@ -250,6 +274,23 @@ def test_all_mutations_are_in_the_image(name: str) -> None:
     assert image.total.numpy()[0] == pytest.approx(43 * 1024, rel=1e-5), "they may go on"
 
 
+@pytest.mark.parametrize("name", TARGETS)
+def test_both_forms_of_chains_end_in_the_same_state(name: str) -> None:
+    """Bit for bit: as one loop, and as one call of the estimator for each mutation."""
+    looped, stepped = (
+        _run(TARGETS[name][0], 9, 24, kelemen=True, kind=kind)
+        for kind in (LoopedChains, SteppedChains)
+    )
+    numbers = stepped[0]._values[0], stepped[0]._known[0], stepped[0]._state
+    expected = looped[0]._values, looped[0]._known, looped[0]._state.target
+    known = np.tile(expected[1].numpy(), (len(expected[0]) // 1024, 1))
+    used = (np.arange(len(known))[:, None] < known).ravel()
+    for ours, theirs in zip(numbers[1:], expected[1:]):
+        np.testing.assert_array_equal(ours.numpy(), theirs.numpy())
+    np.testing.assert_array_equal(numbers[0].numpy()[used], expected[0].numpy()[used])
+    np.testing.assert_allclose(stepped[2], looped[2], rtol=1e-3, atol=1e-6)
+
+
 def test_every_proposal_is_accepted_where_the_target_is_constant() -> None:
     def constant(numbers: Any) -> tuple[Contribution, Sample]:
         x, y = numbers.next_2d()
@@ -291,8 +332,9 @@ class _NoImage:
 def test_a_stored_state_is_what_its_numbers_stand_for(steps: int) -> None:
     """Bit for bit: a chain forgets nothing of a path that it may come from."""
     target, count = _walk_target(), 2048
-    chains = Chains(target, _NoImage(), 0.3, SmallSteps(), 0.0)
-    chains.begin(Bootstrap(target, 7, 4096), 7, count)
+    samples = Bootstrap(target, 7, 4096)
+    rules = ChainRules(0.3, SmallSteps(), 0.0)
+    chains = LoopedChains(target, _NoImage(), rules, samples, samples.choose(count), 7)
     for _ in range(steps):
         chains.advance(1)
     numbers = StoredNumbers.begin(NumberTable(chains._values, count), count)
@@ -310,18 +352,19 @@ def test_a_stored_state_is_what_its_numbers_stand_for(steps: int) -> None:
 
 
 def test_samples_of_the_bootstrap_lie_in_one_cell_each() -> None:
-    samples = Bootstrap(_hill, 3, 900)
+    samples = Bootstrap(_Target(_hill), 3, 900)
     numbers = samples.numbers(dr.arange(mi.UInt32, samples.count))
     place, others = numbers.next_2d(), numbers.next_2d()
     cells = np.floor(place.numpy() * math.isqrt(samples.count)).astype(int)
     assert samples.count == 900 and len(set(map(tuple, cells.T))) == 900
     assert stats.kstest(others.numpy().ravel(), "uniform").pvalue > _UNLIKELY
-    assert Bootstrap(_hill, 3, 901).count == 31**2 and Bootstrap(_hill, 3, 1).count == 1
+    counts = [Bootstrap(_Target(_hill), 3, count).count for count in (901, 1)]
+    assert counts == [31**2, 1]
 
 
 def test_samples_are_chosen_in_proportion_to_the_target() -> None:
     """As often as expected, up to one; black ones never."""
-    samples, count = Bootstrap(_ramp, 3, 1000), 5000
+    samples, count = Bootstrap(_Target(_ramp), 3, 1000), 5000
     found, _ = _ramp(samples.numbers(dr.arange(mi.UInt32, samples.count)))
     expected = found.target.numpy() / found.target.numpy().sum() * count
     chosen = np.bincount(samples.choose(count).numpy(), minlength=samples.count)
@@ -331,7 +374,7 @@ def test_samples_are_chosen_in_proportion_to_the_target() -> None:
 
 def test_the_mean_of_the_bootstrap_is_that_of_the_target() -> None:
     for name, (target, exact) in TARGETS.items():
-        means = np.array([Bootstrap(target, seed, 100).mean for seed in range(1, 65)])
+        means = np.array([Bootstrap(_Target(target), seed, 100).mean for seed in range(1, 65)])
         z, error = z_exact(means, exact.sum())
         assert abs(z) < THRESHOLD and error < 0.01, (name, z, error)
 
