@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
+from ..arrays import joined
 from ..transport.estimator import CameraRays, Splats
 from ..transport.heroes import Heroes
 from ..transport.numbers import Numbers, hashed_2d
@@ -82,18 +81,7 @@ class LightImage:
         It evaluates the result: whoever read it later would evaluate what waits until then."""
         if len(self._found) < 2:
             return self._found
-        wavelengths = None
-        if self._found[0].wavelengths is not None:
-            wavelengths = _one_after_the_other([s.wavelengths for s in self._found])
-        joined = Splats(
-            _one_after_the_other([s.value for s in self._found]),
-            _one_after_the_other([s.position for s in self._found]),
-            wavelengths,
-            dr.concat([s.active for s in self._found]),
-            dr.concat([s.sample for s in self._found]),
-        )
-        dr.eval(joined)
-        return [joined]
+        return [joined(self._found)]
 
     def _connect(self, vertices: LightVertices) -> tuple[Splats, mi.UInt32]:
         """The splats, and the shadow rays of each vertex."""
@@ -148,8 +136,3 @@ class LightImage:
         return Splats(
             value, connection.position, vertices.wavelengths(vertex, active), finite, vertex.lane
         ), tested
-
-
-def _one_after_the_other(vectors: list[Any]) -> Any:
-    components = zip(*vectors)
-    return type(vectors[0])(*(dr.concat(list(component)) for component in components))

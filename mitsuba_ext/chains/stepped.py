@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..arrays import joined
 from ..transport.numbers import BothEnds, Numbers
 from .chains import MOST_NUMBERS, Chains, Counts, acceptance
 from .numbers import ProposedNumbers, RecordedNumbers
@@ -28,7 +29,7 @@ class SteppedChains(Chains):
         self._values = [record.written for record, _ in zip(records, ends)]
         self._known = [dr.minimum(end.index, MOST_NUMBERS) for end in ends]
         self._state = found.target
-        self._parts, self._lanes = _joined(found.parts, found.lanes, self._everywhere())
+        self._parts, self._lanes = _wanted(found.parts, found.lanes, self._everywhere())
         dr.eval(self._values, self._known, self._state)
 
     def advance(self, steps):
@@ -82,7 +83,7 @@ class SteppedChains(Chains):
         dr.eval(
             counts, self._weight, self._state, self._known, self._values, self._image.tensors()
         )  # fmt: skip
-        self._parts, self._lanes = _joined(
+        self._parts, self._lanes = _wanted(
             [self._parts, *found.parts], [self._lanes, *found.lanes],
             [~is_accepted, *[is_accepted] * len(found.parts)],
         )  # fmt: skip
@@ -111,7 +112,7 @@ def _ends(numbers: Numbers) -> list[Any]:
     return [numbers.camera, numbers.light] if isinstance(numbers, BothEnds) else [numbers]
 
 
-def _joined(
+def _wanted(
     parts: list[Contribution], lanes: list[mi.UInt32], wanted: list[mi.Bool]
 ) -> tuple[Contribution, mi.UInt32]:
     """One array of those contributions that are wanted in their lanes, and the lanes."""
@@ -119,11 +120,4 @@ def _joined(
     for part, lane, want in zip(parts, lanes, wanted):
         index = dr.compress((part.target > 0) & dr.gather(mi.Bool, want, lane))
         kept.append((dr.gather(Contribution, part, index), dr.gather(mi.UInt32, lane, index)))
-    whole = Contribution(
-        mi.Point2f(*(dr.concat([getattr(p.position, c) for p, _ in kept]) for c in "xy")),
-        mi.Color3f(*(dr.concat([getattr(p.value, c) for p, _ in kept]) for c in "xyz")),
-        dr.concat([p.target for p, _ in kept]),
-    )
-    lane = dr.concat([lane for _, lane in kept])
-    dr.eval(whole, lane)
-    return whole, lane
+    return joined([part for part, _ in kept]), joined([lane for _, lane in kept])

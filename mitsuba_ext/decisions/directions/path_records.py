@@ -7,9 +7,10 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
+from ...arrays import joined
 from ...transport.observer import Observer
 from ..pixel_estimates import PixelEstimates, brightness
-from .tree_builder import DEPTH, cell_code, joined
+from .tree_builder import DEPTH, cell_code
 
 #: The most bytes of a record, including the temporaries while trees are built.
 BYTES_PER_RECORD = 320

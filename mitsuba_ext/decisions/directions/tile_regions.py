@@ -10,9 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import joined
 from .path_records import PathRecords
 from .sample_trees import SampleTrees
-from .tree_builder import DEPTH, UNIFORM, Samples, TreeBuilder, joined
+from .tree_builder import DEPTH, UNIFORM, Samples, TreeBuilder
 
 #: Edges, in tiles, of the larger tiles whose trees are the priors of the smaller ones.
 _GROUPS = (8, 4, 2, 1)

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 import drjit as dr
 import mitsuba as mi
 
+from ...arrays import joined
 from ...discrete_sampling import first_above
 from .sample_trees import LEAF
 
@@ -298,14 +299,3 @@ def _alternate(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
     index = dr.arange(mi.UInt32, 2 * len(a))
     half, array = index >> 1, type(a)
     return dr.select((index & 1) == 1, dr.gather(array, b, half), dr.gather(array, a, half))
-
-
-def joined(parts: list) -> mi.Float:
-    """Concatenates arrays of one type. (``dr.concat`` compiles kernels for each size.)"""
-    result, offset = dr.empty(type(parts[0]), sum(map(len, parts))), 0
-    for part in parts:
-        index = dr.arange(mi.UInt32, len(part)) + dr.opaque(mi.UInt32, offset)
-        dr.scatter(result, part, index)
-        offset += len(part)
-    dr.eval(result)
-    return result

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import joined
 from ...regions.nested_regions import NestedRegions
 from ...transport.path_decisions import SubpathSelection
 from ..learner import Learner
@@ -82,7 +83,7 @@ class RegionLearner(Learner):
             return None
         most = min(_MOST_REGIONS, (self._pilot_samples * _CONNECTIONS / _TESTS) ** 0.5)
         self._regions = regions = NestedRegions(
-            _joined(p, light.p), _joined(n, light.n), most=max(1, int(most))
+            joined([p, light.p]), joined([n, light.n]), most=max(1, int(most))
         )
         number = regions.number(light.p, light.n, mi.Bool(True)).numpy()
         count = np.bincount(number, minlength=regions.count)
@@ -195,7 +196,3 @@ class RegionLearner(Learner):
 
     def __str__(self) -> str:
         return self._summary
-
-
-def _joined(a, b):
-    return type(a)(*(dr.concat([x, y]) for x, y in zip(a, b)))

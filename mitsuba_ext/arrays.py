@@ -1,0 +1,40 @@
+"""Arrays of Dr.Jit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar
+
+import drjit as dr
+import mitsuba as mi
+
+T = TypeVar("T")
+
+
+def joined(parts: Sequence[T]) -> T:
+    """One after the other: arrays, vectors of arrays, or dataclasses of these or of ``None``, all
+    of one type. It evaluates the result. (``dr.concat`` compiles kernels for each size.)"""
+    widths = [dr.width(part) for part in parts]
+    indices, offset = [], 0
+    for width in widths:
+        indices.append(dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, offset))
+        offset += width
+    result = _joined(parts, indices, offset)
+    dr.eval(result)
+    return result
+
+
+def _joined(parts: Sequence[Any], indices: Sequence[mi.UInt32], width: int) -> Any:
+    kind = type(parts[0])
+    if parts[0] is None:
+        return None
+    if is_dataclass(kind):
+        columns = ([getattr(part, field.name) for part in parts] for field in fields(kind))
+        return kind(*(_joined(column, indices, width) for column in columns))
+    if dr.depth_v(kind) > 1:
+        return kind(*(_joined(column, indices, width) for column in zip(*parts)))
+    result = dr.empty(kind, width)
+    for part, index in zip(parts, indices):
+        dr.scatter(result, part, index)
+    return result
