@@ -31,8 +31,8 @@ class EnergyRedistribution(MetropolisIntegrator):
          chains, as the original does. (Default: 10)
      * - mutations_per_pixel
        - |int|
-       - Mutations per pixel, if all energy were redistributed. Of the share that is, the same
-         share of mutations is made. (Default: 200)
+       - Mutations per pixel, if all energy were redistributed; of the share that is, the same
+         share of mutations is made. 0 stands for ``spp``. (Default: 0)
      * - chain_length
        - |int|
        - Mutations of a chain. (Default: 100)
@@ -80,7 +80,7 @@ class EnergyRedistribution(MetropolisIntegrator):
         super().__init__(props)
         self.outliers = self.parameter(props, "outliers", 10.0, minimum=0.0)
         self.mutations_per_pixel = self.parameter(
-            props, "mutations_per_pixel", 200, minimum=1, maximum=1 << 24
+            props, "mutations_per_pixel", 0, minimum=0, maximum=1 << 24
         )
         self.chain_length = self.parameter(
             props, "chain_length", 100, minimum=1, maximum=1 << 20

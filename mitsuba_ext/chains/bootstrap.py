@@ -86,6 +86,8 @@ class Bootstrap:
     def choose_by_energy(self, energy: float) -> mi.UInt32:
         """The indices of samples, each as often as its value of the target function holds this
         ``energy``, on average."""
+        if self._sums[-1] == 0:
+            return dr.zeros(mi.UInt32, 0)
         count = int(np.floor(self._sums[-1] / energy - self._offset)) + 1
         return self._at((np.arange(count) + self._offset) * energy)
 

@@ -23,7 +23,7 @@ from .target import Found
 #: long where they are few.
 _BATCH, _TIMED_BATCH = 1 << 22, 1 << 19
 
-#: Chains of a batch, at most. Where more were wanted, each carries more energy.
+#: Chains of a batch, at most.
 _MOST_CHAINS = 1 << 17
 
 #: Streams of random numbers of batches, besides all others: this one and the next ones.
@@ -36,7 +36,7 @@ class RedistributionSettings:
 
     Attributes:
         chain_length: Mutations of a chain.
-        mutations: Mutations per pixel, if all energy were redistributed.
+        mutations: Mutations per pixel, if all energy were redistributed; 0 for as many as samples.
         outliers: Samples so many times as bright as their neighbourhood lose what they have beyond
             that to chains. 0 redistributes all energy.
         luminance_samples: Samples that measure brightness first.
@@ -86,7 +86,7 @@ class RedistributionRender(ChainRender):
         image = ChainImage(self._film)
         rules = ChainRules(0.0, settings.steps, bound)
         # Energy of a deposit, in units of the target function of a sample
-        deposit = self._spp * first.mean / settings.mutations
+        deposit = self._spp * first.mean / (settings.mutations or self._spp)
         total = self._spp * self._pixel_count
         size = min(total, _TIMED_BATCH if self._integrator.timeout > 0 else _BATCH)
 
@@ -126,7 +126,10 @@ class RedistributionRender(ChainRender):
         self._statistics.rays["camera"] += samples.count
         energy = samples.mean * samples.count
         self._redistributed += energy
-        spacing = max(deposit * settings.chain_length, energy / _MOST_CHAINS)
+        # A very bright sample does not make more chains than all energy would: they carry more
+        wanted = samples.count * settings.mutations / self._spp or samples.count
+        most = min(_MOST_CHAINS, max(1.0, wanted / settings.chain_length))
+        spacing = max(deposit * settings.chain_length, energy / most)
         winners = samples.choose_by_energy(spacing)
         if len(winners) == 0:
             return

@@ -1,0 +1,114 @@
+"""``erpt`` renders what ``path`` renders, however much of the energy chains redistribute."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_cases import stage
+from statistical import (
+    MANY_SEEDS,
+    REFERENCE_SEEDS,
+    SEEDS,
+    THRESHOLD,
+    assert_images_are_sound,
+    assert_same_quarters,
+    batches,
+    some,
+)
+from techniques import REFERENCE
+from test_chains import _ramp, _Target
+
+from mitsuba_ext.chains.bootstrap import Bootstrap
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+#: Light that ``path`` finds rarely.
+_GLASS = {"type": "sphere", "center": [-0.2, -0.8, 0.4], "radius": 0.3,
+          "bsdf": {"type": "dielectric"}}  # fmt: skip
+
+
+def erpt(max_depth: int = 4, **parameters: Any) -> Any:
+    defaults = {"bidirectional": False, "luminance_samples": 4096, "chain_length": 20}
+    return mi.load_dict({"type": "erpt", "max_depth": max_depth, **defaults, **parameters})
+
+
+_SETTINGS = {
+    "outliers": {"outliers": 2.0},
+    "everything": {"outliers": 0.0, "mutations_per_pixel": 50},
+    "chains find all light": {"outliers": 1.0, "direct_samples": -1},
+    "chains of one mutation": {"outliers": 0.0, "chain_length": 1},
+    "bidirectional": {"outliers": 2.0, "bidirectional": True},
+}
+
+
+@pytest.mark.parametrize("which", some("outliers", "everything", of=_SETTINGS))
+def test_redistribution_keeps_the_mean(which: str) -> None:
+    scene = mi.load_dict(stage(glass=_GLASS), optimize=False)
+    integrator = erpt(**{"direct_samples": 64, **_SETTINGS[which]})
+    images = batches(scene, integrator, 32, SEEDS[:MANY_SEEDS])
+    expected = batches(scene, REFERENCE.make(4), 1024, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert_same_quarters(images, expected, precision=0.02)
+
+
+def test_only_outliers_are_redistributed() -> None:
+    scene = mi.load_dict(stage(glass=_GLASS))
+    shares = []
+    for outliers in (0.0, 1.0, 4.0, 1e6):
+        integrator = erpt(outliers=outliers)
+        batches(scene, integrator, 16, [1])
+        shares.append(float(re.match(r"([\d.]+)% of the energy", integrator.statistics.learned)[1]))
+    assert shares[0] == 100 and shares[-1] == 0 and shares == sorted(shares, reverse=True)
+    assert len(set(shares)) == 4
+
+
+def test_the_number_of_mutations_follows_the_energy() -> None:
+    """All of it: as many as asked for, give or take a chain's."""
+    scene, mutations = mi.load_dict(stage(glass=_GLASS)), 60
+    integrator = erpt(outliers=0.0, mutations_per_pixel=mutations, direct_samples=16)
+    batches(scene, integrator, 64, [1])
+    pixels = 16 * 16
+    samples = integrator.statistics.rays["camera"] - 16 * pixels - mutations * pixels
+    assert samples == pytest.approx(64 * pixels, rel=0.15)
+
+
+def test_samples_start_as_many_chains_as_they_hold_energies() -> None:
+    """On average over the random offset, which is that of the seed."""
+    counts = []
+    for seed in range(1, 65):
+        samples = Bootstrap(_Target(_ramp), seed, 64)
+        found, _ = _ramp(samples.numbers(dr.arange(mi.UInt32, samples.count)))
+        target = found.target.numpy()
+        energy = 2.5 * target.mean()
+        chosen = np.bincount(samples.choose_by_energy(energy).numpy(), minlength=64)
+        assert not chosen[target == 0].any()
+        assert np.abs(chosen - target / energy).max() < 1 + 1e-4
+        counts.append(chosen.sum() - target.sum() / energy)
+    assert abs(np.mean(counts)) < THRESHOLD * np.std(counts, ddof=1) / 8
+
+
+@pytest.mark.parametrize("light", [{}, {"type": "point", "position": [0, 0, -5]}],
+                         ids=["none", "below the floor"])  # fmt: skip
+def test_an_image_without_light_is_black(light: dict[str, Any]) -> None:
+    integrator = erpt()
+    assert not batches(mi.load_dict(stage(light=light)), integrator, 16, [1]).any()
+    assert not integrator.statistics.interrupted
+
+
+def test_cancelling_leaves_a_sound_image() -> None:
+    scene, integrator = mi.load_dict(stage(glass=_GLASS)), erpt()
+    integrator.progress = lambda fraction: integrator.cancel()
+    (image,) = batches(scene, integrator, 8, [1])
+    assert_images_are_sound(image)
+    assert image.any() and integrator.statistics.spp > 0
+
+
+def test_a_time_limit_ends_between_batches() -> None:
+    scene, integrator = mi.load_dict(stage(glass=_GLASS)), erpt(timeout=2.0)
+    (image,) = batches(scene, integrator, 1 << 14, [1])
+    assert_images_are_sound(image)
+    assert 0 < integrator.statistics.spp and not integrator.statistics.interrupted
