@@ -158,7 +158,7 @@ class ChainRender:
         uniform = bootstrap.count + counts["large"]
         mean = (bootstrap.mean * bootstrap.count + counts["large_target"]) / uniform
         per_mutation = self._pixel_count * self._camera_spp / mutations
-        image.write(mean * per_mutation, bootstrap.mean * per_mutation)
+        image.write(mean * per_mutation, bootstrap.mean * per_mutation, self._camera_spp)
         small = mutations - counts["large"]
         statistics.rays["scatter"] += int(counts["scatter"])
         statistics.rays["shadow"] += int(counts["shadow"])
