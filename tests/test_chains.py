@@ -1,0 +1,353 @@
+"""Chains visit states in proportion to the target function, from the first mutation on."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_cases import film, sensor, stage
+from scipy import stats
+from statistical import THRESHOLD, sidak, z_exact
+
+from mitsuba_ext.chains.bootstrap import Bootstrap
+from mitsuba_ext.chains.chain_image import mean_weights
+from mitsuba_ext.chains.chains import Chains, Counts
+from mitsuba_ext.chains.small_steps import SmallSteps
+from mitsuba_ext.chains.target import Contribution, ImageTarget
+from mitsuba_ext.transport.estimator import Sample
+from mitsuba_ext.transport.numbers import NumberTable, StoredNumbers
+from mitsuba_ext.transport.walk import Walk
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+#: A probability below which a test fails: that of |z| > THRESHOLD.
+_UNLIKELY = 2 * stats.norm.sf(THRESHOLD)
+
+
+def _uniform(count: int, seed: int) -> mi.Float:
+    return mi.Float(np.random.default_rng(seed).random(count, dtype=np.float32))
+
+
+# ---- Small steps ----
+
+_STEPS = [SmallSteps(), SmallSteps(1 / 64, 0.5), SmallSteps(0.1, 0.1)]
+
+
+def test_the_logarithm_of_the_distance_of_a_small_step_is_uniform() -> None:
+    steps, count = SmallSteps(1 / 512, 1 / 8), 1 << 16
+    moved = steps.move(mi.Float(0.5), _uniform(count, 1)).numpy().astype(np.float64) - 0.5
+    assert np.abs(moved).min() >= steps.low * (1 - 1e-4)
+    assert np.abs(moved).max() <= steps.high * (1 + 1e-4)
+    position = np.log(np.abs(moved) / steps.low) / math.log(steps.high / steps.low)
+    for part in (position[moved > 0], position[moved < 0]):
+        assert abs(len(part) - count / 2) < THRESHOLD * math.sqrt(count) / 2
+        seen, _ = np.histogram(part, 32, (-1e-4, 1 + 1e-4))
+        assert stats.chisquare(seen).pvalue > _UNLIKELY
+
+
+def test_a_small_step_and_its_reverse_are_equally_likely() -> None:
+    """Also over the ends of the interval."""
+    count, bins = 1 << 20, 24
+    value = _uniform(count, 2)
+    moved = SmallSteps(1 / 256, 1 / 4).move(value, _uniform(count, 3)).numpy()
+    pairs, _, _ = np.histogram2d(value.numpy(), moved, bins, [(0, 1), (0, 1)])
+    assert pairs[0, -1] > 100 and pairs[-1, 0] > 100
+    forward, backward = (p[np.triu_indices(bins, 1)] for p in (pairs, pairs.T))
+    seen = forward + backward > 0
+    z2 = (forward - backward)[seen] ** 2 / (forward + backward)[seen]
+    assert stats.chi2.sf(z2.sum(), seen.sum()) > _UNLIKELY
+
+
+@pytest.mark.parametrize("steps", _STEPS, ids=str)
+def test_small_steps_stay_in_the_interval(steps: SmallSteps) -> None:
+    largest = 1 - 2.0**-24
+    ends = [0.0, 1e-30, 1e-9, steps.low, 0.5, 1 - steps.high, 1 - steps.low, largest]
+    samples = [0.0, 1e-9, 0.25, 0.5 - 2.0**-25, 0.5, 0.75, largest]
+    value, sample = (mi.Float(x) for x in np.array(np.meshgrid(ends, samples)).reshape(2, -1))
+    moved = steps.move(value, sample).numpy()
+    assert moved.min() >= 0 and moved.max() <= largest
+    distance = np.abs(moved - value.numpy())
+    distance = np.minimum(distance, 1 - distance)
+    assert distance.min() >= steps.low * (1 - 1e-5) - 1e-7
+    assert distance.max() <= steps.high * (1 + 1e-5) + 1e-7
+
+
+# ---- Chains on known densities ----
+
+
+class _Histogram:
+    """Stands in for an image: the sums of visits and of uniform samples in each bin of the unit
+    square, and of visits · target."""
+
+    def __init__(self) -> None:
+        self.visits, self.uniform = (dr.zeros(mi.Float, _BINS**2) for _ in range(2))
+        self.total = dr.zeros(mi.Float64, 1)
+        self.counts: list[Counts] = []
+
+    def _bin(self, found: Contribution) -> mi.UInt32:
+        place = mi.Point2u(found.position * _BINS)
+        return place.y * _BINS + place.x
+
+    def add(self, found: Contribution, weight: mi.Float) -> None:
+        dr.scatter_add(self.visits, found.value.x * weight, self._bin(found))
+        dr.scatter_add(self.total, mi.Float64(found.target) * mi.Float64(weight), mi.UInt32(0))
+
+    def add_uniform(self, found: Contribution, weight: mi.Float) -> None:
+        dr.scatter_add(self.uniform, found.value.x * weight, self._bin(found))
+
+    def tensors(self) -> list[Any]:
+        return [self.visits, self.uniform, self.total]
+
+
+def _found(x: mi.Float, y: mi.Float, target: mi.Float) -> tuple[Contribution, Sample]:
+    zero = dr.zeros(mi.UInt32, dr.width(x))
+    sample = Sample(mi.Color3f(target), mi.Bool(True), zero, zero, zero)
+    return Contribution(mi.Point2f(x, y), mi.Color3f(target), target), sample
+
+
+def _ramp(numbers: Any) -> tuple[Contribution, Sample]:
+    """Of one number; black below 1/4, where chains must not stay."""
+    x = numbers.next_1d()
+    return _found(x, mi.Float(0.1), dr.maximum(x - 0.25, 0) ** 2)
+
+
+def _hill(numbers: Any) -> tuple[Contribution, Sample]:
+    """Of two numbers, on a plain; a high plateau besides."""
+    x, y = numbers.next_2d()
+    plateau = dr.select((x > 0.625) & (y > 0.75), 2, 0)
+    return _found(x, y, 0.05 + 3 * dr.exp(-60 * ((x - 0.2) ** 2 + (y - 0.3) ** 2)) + plateau)
+
+
+@dr.syntax
+def _varying(numbers: Any) -> tuple[Contribution, Sample]:
+    """Of a first number which says how many others there are: none, two, or up to six, by what
+    these are. Where there are others, its mean over all but the first two is 2 x y."""
+    x = numbers.next_1d()
+    y, target = mi.Float(0.1), mi.Float(0.7)
+    if x > 0.5:
+        y = numbers.next_1d()
+        target = y * numbers.next_1d() * 4 * x
+    index = dr.select(x > 0.75, mi.UInt32(0), 4)
+    while (index < 4) & (target < 1.5):
+        target *= 0.5 + numbers.next_1d()  # 1 on average
+        index += 1
+    return _found(x, y, target)
+
+
+#: Bins of a histogram along each axis, and their edges.
+_BINS = 8
+_EDGES = np.arange(_BINS + 1) / _BINS
+
+
+def _integrals_of_ramp() -> np.ndarray:
+    exact = np.zeros((_BINS, _BINS))
+    exact[0] = np.diff(np.maximum(_EDGES - 0.25, 0) ** 3) / 3
+    return exact
+
+
+def _integrals_of_hill() -> np.ndarray:
+    x, y = (np.diff(stats.norm.cdf(_EDGES, centre, 120**-0.5)) for centre in (0.2, 0.3))
+    exact = 0.05 / _BINS**2 + 3 * math.pi / 60 * np.outer(y, x)
+    exact[6:, 5:] += 2 / _BINS**2
+    return exact
+
+
+def _integrals_of_varying() -> np.ndarray:
+    exact = np.outer(np.diff(_EDGES**2), np.diff(_EDGES**2)) / 2
+    exact[:, :4] = 0
+    exact[0, :4] = 0.7 / _BINS
+    return exact
+
+
+#: Target functions, and their integrals over the bins: [y, x].
+TARGETS = {
+    "ramp": (_ramp, _integrals_of_ramp()),
+    "hill": (_hill, _integrals_of_hill()),
+    "varying": (_varying, _integrals_of_varying()),
+}
+
+
+def _run(
+    target: Any,
+    seed: int,
+    steps: int,
+    large_step: float = 0.3,
+    kelemen: bool = False,
+    count: int = 1024,
+    bootstrap: int = 4096,
+) -> tuple[Chains, _Histogram, np.ndarray]:
+    """Chains after so many mutations, what they saw, and their estimate of the integrals."""
+    samples = Bootstrap(target, seed, bootstrap)
+    image = _Histogram()
+    weight = large_step * samples.mean if kelemen else 0.0
+    chains = Chains(target, image, large_step, SmallSteps(1 / 64, 1 / 4), weight)
+    chains.begin(samples, seed, count)
+    image.counts = [chains.advance(min(16, steps - done)) for done in range(0, steps, 16)]
+    chains.end()
+    sums = (image.visits.numpy() + image.uniform.numpy()).reshape(_BINS, _BINS)
+    return chains, image, sums * samples.mean / (steps * count)
+
+
+def _assert_unbiased(estimates: np.ndarray, exact: np.ndarray, precision: float) -> None:
+    """Of independent seeds: [seed, y, x]."""
+    assert not estimates[:, exact == 0].any()
+    known = estimates[:, exact > 0]
+    z = np.array([z_exact(e, x)[0] for e, x in zip(known.T, exact[exact > 0])])
+    assert np.abs(z).max() < sidak(len(z)), z.round(1)
+    score, error = z_exact(known.sum(axis=1), exact.sum())
+    errors = [z_exact(e, x)[1] for e, x in zip(known.T, exact[exact > 0])]
+    assert abs(score) < THRESHOLD and error < precision, (score, error)
+    assert np.median(errors) < 5 * precision, errors
+
+
+@pytest.mark.parametrize(("large_step", "kelemen"), [(0.0, False), (0.3, False), (0.3, True),
+                                                     (1.0, True)])  # fmt: skip
+@pytest.mark.parametrize("name", TARGETS)
+def test_visits_and_uniform_samples_estimate_a_known_function(
+    name: str, large_step: float, kelemen: bool
+) -> None:
+    """In each of 64 bins, over independent seeds."""
+    target, exact = TARGETS[name]
+    found = [_run(target, seed, 64, large_step, kelemen)[2] for seed in range(1, 17)]
+    _assert_unbiased(np.array(found), exact, 0.01)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_few_mutations_from_few_samples_are_right_on_average(name: str) -> None:
+    """There is no start-up bias: chains start where the target function is large, and all of them
+    count by the mean of the samples from which they were chosen."""
+    target, exact = TARGETS[name]
+    found = [_run(target, seed, 2, 0.1, count=16, bootstrap=16)[2] for seed in range(1, 257)]
+    _assert_unbiased(np.array(found), exact, 0.05)
+
+
+@pytest.mark.parametrize("large_step", [0.0, 0.2])
+@pytest.mark.parametrize("name", TARGETS)
+def test_last_states_of_chains_have_the_density_of_the_target(
+    name: str, large_step: float
+) -> None:
+    target, exact = TARGETS[name]
+    chains, _, _ = _run(target, 5, 96, large_step, count=1 << 14)
+    place = (chains._state.position.numpy() * _BINS).astype(int)
+    seen = np.zeros((_BINS, _BINS))
+    np.add.at(seen, (place[1], place[0]), 1)
+    assert not seen[exact == 0].any()
+    seen, expected = seen[exact > 0], exact[exact > 0] / exact.sum() * (1 << 14)
+    assert stats.chisquare(seen, expected).pvalue > _UNLIKELY
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_all_mutations_are_in_the_image(name: str) -> None:
+    chains, image, _ = _run(TARGETS[name][0], 1, 40)
+    assert image.total.numpy()[0] == pytest.approx(40 * 1024, rel=1e-5)
+    chains.advance(3)
+    chains.end()
+    chains.end()
+    assert image.total.numpy()[0] == pytest.approx(43 * 1024, rel=1e-5), "they may go on"
+
+
+def test_every_proposal_is_accepted_where_the_target_is_constant() -> None:
+    def constant(numbers: Any) -> tuple[Contribution, Sample]:
+        x, y = numbers.next_2d()
+        return _found(x, y, mi.Float(0.7) + 0 * x)
+
+    _, image, _ = _run(constant, 1, 48)
+    large, large_accepted, small_accepted = (
+        sum(int(dr.sum(getattr(counts, name))[0]) for counts in image.counts)
+        for name in ("large", "accepted_large", "accepted_small")
+    )
+    assert large == large_accepted and small_accepted == 48 * 1024 - large
+    assert abs(large / (48 * 1024) - 0.3) < THRESHOLD * math.sqrt(0.3 * 0.7 / (48 * 1024))
+
+
+def test_a_chain_leaves_no_black_state_behind_for_another() -> None:
+    """Once a state is not black, no black one is accepted."""
+    chains, _, _ = _run(_ramp, 3, 50)
+    assert chains._state.target.numpy().min() > 0
+
+
+# ---- The states of a walk ----
+
+
+def _walk_target() -> ImageTarget:
+    glass = {"type": "sphere", "center": [-0.2, -0.8, 0.4], "radius": 0.3,
+             "bsdf": {"type": "dielectric"}}  # fmt: skip
+    scene = mi.load_dict(stage(glass=glass))
+    return ImageTarget(scene, scene.sensors()[0], Walk(6, 2), 16)
+
+
+class _NoImage:
+    def add(self, *_: Any) -> None: ...
+
+    def tensors(self) -> list:
+        return []
+
+
+@pytest.mark.parametrize("steps", [0, 1, 37])
+def test_a_stored_state_is_what_its_numbers_stand_for(steps: int) -> None:
+    """Bit for bit: a chain forgets nothing of a path that it may come from."""
+    target, count = _walk_target(), 2048
+    chains = Chains(target, _NoImage(), 0.3, SmallSteps(), 0.0)
+    chains.begin(Bootstrap(target, 7, 4096), 7, count)
+    for _ in range(steps):
+        chains.advance(1)
+    numbers = StoredNumbers.begin(NumberTable(chains._values, count), count)
+    found, _ = target(numbers)
+    dr.eval(found, numbers.index)
+    np.testing.assert_array_equal(numbers.index.numpy(), chains._known.numpy())
+    for part in ("value", "target", "position"):
+        np.testing.assert_array_equal(
+            getattr(found, part).numpy(), getattr(chains._state, part).numpy()
+        )
+    assert chains._state.target.numpy().min() > 0 and len(set(chains._known.numpy())) > 3
+
+
+# ---- Where chains start ----
+
+
+def test_samples_of_the_bootstrap_lie_in_one_cell_each() -> None:
+    samples = Bootstrap(_hill, 3, 900)
+    numbers = samples.numbers(dr.arange(mi.UInt32, samples.count))
+    place, others = numbers.next_2d(), numbers.next_2d()
+    cells = np.floor(place.numpy() * math.isqrt(samples.count)).astype(int)
+    assert samples.count == 900 and len(set(map(tuple, cells.T))) == 900
+    assert stats.kstest(others.numpy().ravel(), "uniform").pvalue > _UNLIKELY
+    assert Bootstrap(_hill, 3, 901).count == 31**2 and Bootstrap(_hill, 3, 1).count == 1
+
+
+def test_samples_are_chosen_in_proportion_to_the_target() -> None:
+    """As often as expected, up to one; black ones never."""
+    samples, count = Bootstrap(_ramp, 3, 1000), 5000
+    found, _ = _ramp(samples.numbers(dr.arange(mi.UInt32, samples.count)))
+    expected = found.target.numpy() / found.target.numpy().sum() * count
+    chosen = np.bincount(samples.choose(count).numpy(), minlength=samples.count)
+    assert chosen.sum() == count and not chosen[expected == 0].any()
+    assert np.abs(chosen - expected).max() < 1 + 1e-3
+
+
+def test_the_mean_of_the_bootstrap_is_that_of_the_target() -> None:
+    for name, (target, exact) in TARGETS.items():
+        means = np.array([Bootstrap(target, seed, 100).mean for seed in range(1, 65)])
+        z, error = z_exact(means, exact.sum())
+        assert abs(z) < THRESHOLD and error < 0.01, (name, z, error)
+
+
+# ---- Filters ----
+
+
+@pytest.mark.parametrize("rfilter", ["box", "tent", "gaussian", "mitchell", "lanczos"])
+def test_mean_weights_are_those_of_many_camera_samples(rfilter: str) -> None:
+    camera = mi.load_dict(sensor(film=film(7, 5, rfilter={"type": rfilter})))
+    camera.film().prepare([])
+    block, spp = camera.film().create_block(), 1 << 14
+    lane = dr.arange(mi.UInt32, 35 * spp)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(1, 35 * spp)
+    position = mi.Point2f(lane // spp % 7, lane // spp // 7) + sampler.next_2d()
+    block.put(position, [mi.Float(0)] * 3 + [mi.Float(1)])
+    weights = np.array(block.tensor())[..., 3] / spp
+    np.testing.assert_allclose(weights, mean_weights(camera.film()), atol=0.02)
