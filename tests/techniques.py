@@ -107,6 +107,12 @@ _UNSEEN_FROM_LIGHTS = {
     "floor_under_water",
 }  # fmt: skip
 
+#: Chains do not take a film with a sampled border; and where one pixel is all there is, 128 camera
+#: samples are few.
+_OF_CHAINS = tuple(
+    case for case in HARD_CASES if case not in ("cropped_film", "film_of_one_pixel")
+)
+
 _SEVERAL_LIGHTS = ("delta_lights", "textured_two_sided_lights", "materials", "no_light")
 
 # Settings with more learning, or with more shadow rays rejected: they must be unbiased too. The
@@ -255,6 +261,27 @@ TECHNIQUES: dict[str, Technique] = {
             ["rooms"], ["llvm_ad_spectral"],
             [name for name in FURNACES if name not in _UNSEEN_FROM_LIGHTS], [2, -1],
             [case for case in _LIGHT_PATHS if case not in _UNSEEN_FROM_LIGHTS],
+        ),
+    ),
+    # As many camera samples as ``path`` has in the tests. ``test_chains.py`` and
+    # ``test_pssmlt.py`` have chains on known densities, films and sensors
+    "pssmlt": Technique(
+        "pssmlt", {"direct_samples": 128, "chains": 1024}, is_plugin=True, makes_splats=True,
+        checks=Checks(
+            ["cornell_box"], furnaces=["furnace_glass"], depths=[-1],
+            cases=("no_light", "light_that_nothing_sees", "materials", "one_sample"),
+        ),
+        thorough=Checks(
+            SCENES, ["llvm_ad_mono", "llvm_ad_spectral"], FURNACES, DEPTHS, _OF_CHAINS,
+        ),
+    ),
+    # Chains find all light
+    "chains_alone": Technique(
+        "pssmlt", {"direct_samples": -1, "chains": 1024, "kelemen_style_weights": False},
+        makes_splats=True,
+        checks=Checks(cases=["plain", "film_of_one_pixel"]),
+        thorough=Checks(
+            ["cornell_box", "rooms"], ["llvm_ad_spectral"], FURNACES[2:4], [2, -1], _OF_CHAINS,
         ),
     ),
 }  # fmt: skip

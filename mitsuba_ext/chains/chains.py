@@ -123,7 +123,8 @@ class Chains:
         lane = dr.arange(mi.UInt32, count)
         streams = [CAMERA, LIGHT] if target.has_light_paths else [CAMERA]
         self._rngs = [generator(stream(seed, number), lane) for number in streams]
-        self._weight = dr.zeros(mi.Float, count)
+        # Not a literal: the first launch would need a kernel of its own
+        self._weight = dr.opaque(mi.Float, 0, count)
         self._begin(bootstrap, bootstrap.choose(count))
 
     def _begin(self, bootstrap: Bootstrap, winners: mi.UInt32) -> None:

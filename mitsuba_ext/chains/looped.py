@@ -91,5 +91,5 @@ class LoopedChains(Chains):
 
     def end(self):
         self._image.add(self._state, self._weight * self._share(self._state.target))
-        self._weight = dr.zeros(mi.Float, self.count)
+        self._weight = dr.opaque(mi.Float, 0, self.count)
         dr.eval(self._image.tensors(), self._weight)

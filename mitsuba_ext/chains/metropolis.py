@@ -166,15 +166,17 @@ class MetropolisIntegrator(WalkIntegrator):
         target = self._target(setting)
         self._render_camera_samples(scene, sensor, seed, target is not None)
         statistics, camera_spp = self.statistics, self.statistics.spp
+        is_interrupted = False
         if target is not None and not self.is_cancelled:
             chains = ChainRender(
                 self, target, self.settings(), seed, spp, camera_spp, statistics, start
             )
             with deferred_interrupt() as interrupt:
                 chains.run(interrupt)
+            is_interrupted = interrupt.is_set()
         statistics.seconds = time.perf_counter() - start
         image = develop_film(sensor.film(), develop, evaluate)
-        if target is not None and statistics.interrupted and not self.is_cancelled:
+        if is_interrupted:
             raise KeyboardInterrupt
         return image
 

@@ -118,7 +118,9 @@ def _joined(
     kept = []
     for part, lane, want in zip(parts, lanes, wanted):
         index = dr.compress((part.target > 0) & dr.gather(mi.Bool, want, lane))
-        kept.append((dr.gather(Contribution, part, index), dr.gather(mi.UInt32, lane, index)))
+        # Empty arrays cannot be joined: where all proposals are accepted, or all rejected
+        if dr.width(index) > 0:
+            kept.append((dr.gather(Contribution, part, index), dr.gather(mi.UInt32, lane, index)))
     whole = Contribution(
         mi.Point2f(*(dr.concat([getattr(p.position, c) for p, _ in kept]) for c in "xy")),
         mi.Color3f(*(dr.concat([getattr(p.value, c) for p, _ in kept]) for c in "xyz")),
