@@ -15,8 +15,10 @@ from statistical import THRESHOLD, sidak, z_exact
 
 from mitsuba_ext.chains.bootstrap import Bootstrap
 from mitsuba_ext.chains.chain_image import mean_weights
-from mitsuba_ext.chains.chains import Chains, Counts
+from mitsuba_ext.chains.chains import ChainRules, Chains, Counts
+from mitsuba_ext.chains.looped import LoopedChains
 from mitsuba_ext.chains.small_steps import SmallSteps
+from mitsuba_ext.chains.stepped import SteppedChains
 from mitsuba_ext.chains.target import Contribution, ImageTarget
 from mitsuba_ext.transport.estimator import Sample
 from mitsuba_ext.transport.numbers import NumberTable, StoredNumbers
@@ -26,54 +28,6 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 #: A probability below which a test fails: that of |z| > THRESHOLD.
 _UNLIKELY = 2 * stats.norm.sf(THRESHOLD)
-
-
-def _uniform(count: int, seed: int) -> mi.Float:
-    return mi.Float(np.random.default_rng(seed).random(count, dtype=np.float32))
-
-
-# ---- Small steps ----
-
-_STEPS = [SmallSteps(), SmallSteps(1 / 64, 0.5), SmallSteps(0.1, 0.1)]
-
-
-def test_the_logarithm_of_the_distance_of_a_small_step_is_uniform() -> None:
-    steps, count = SmallSteps(1 / 512, 1 / 8), 1 << 16
-    moved = steps.move(mi.Float(0.5), _uniform(count, 1)).numpy().astype(np.float64) - 0.5
-    assert np.abs(moved).min() >= steps.low * (1 - 1e-4)
-    assert np.abs(moved).max() <= steps.high * (1 + 1e-4)
-    position = np.log(np.abs(moved) / steps.low) / math.log(steps.high / steps.low)
-    for part in (position[moved > 0], position[moved < 0]):
-        assert abs(len(part) - count / 2) < THRESHOLD * math.sqrt(count) / 2
-        seen, _ = np.histogram(part, 32, (-1e-4, 1 + 1e-4))
-        assert stats.chisquare(seen).pvalue > _UNLIKELY
-
-
-def test_a_small_step_and_its_reverse_are_equally_likely() -> None:
-    """Also over the ends of the interval."""
-    count, bins = 1 << 20, 24
-    value = _uniform(count, 2)
-    moved = SmallSteps(1 / 256, 1 / 4).move(value, _uniform(count, 3)).numpy()
-    pairs, _, _ = np.histogram2d(value.numpy(), moved, bins, [(0, 1), (0, 1)])
-    assert pairs[0, -1] > 100 and pairs[-1, 0] > 100
-    forward, backward = (p[np.triu_indices(bins, 1)] for p in (pairs, pairs.T))
-    seen = forward + backward > 0
-    z2 = (forward - backward)[seen] ** 2 / (forward + backward)[seen]
-    assert stats.chi2.sf(z2.sum(), seen.sum()) > _UNLIKELY
-
-
-@pytest.mark.parametrize("steps", _STEPS, ids=str)
-def test_small_steps_stay_in_the_interval(steps: SmallSteps) -> None:
-    largest = 1 - 2.0**-24
-    ends = [0.0, 1e-30, 1e-9, steps.low, 0.5, 1 - steps.high, 1 - steps.low, largest]
-    samples = [0.0, 1e-9, 0.25, 0.5 - 2.0**-25, 0.5, 0.75, largest]
-    value, sample = (mi.Float(x) for x in np.array(np.meshgrid(ends, samples)).reshape(2, -1))
-    moved = steps.move(value, sample).numpy()
-    assert moved.min() >= 0 and moved.max() <= largest
-    distance = np.abs(moved - value.numpy())
-    distance = np.minimum(distance, 1 - distance)
-    assert distance.min() >= steps.low * (1 - 1e-5) - 1e-7
-    assert distance.max() <= steps.high * (1 + 1e-5) + 1e-7
 
 
 # ---- Chains on known densities ----
@@ -138,6 +92,22 @@ def _varying(numbers: Any) -> tuple[Contribution, Sample]:
     return _found(x, y, target)
 
 
+@dr.syntax
+def _both_ends(numbers: Any) -> tuple[Contribution, Sample]:
+    """The same, with all but the first number from the other end of the path."""
+    x = numbers.next_1d()
+    light = numbers.light
+    y, target = mi.Float(0.1), mi.Float(0.7)
+    if x > 0.5:
+        y = light.next_1d()
+        target = y * light.next_1d() * 4 * x
+    index = dr.select(x > 0.75, mi.UInt32(0), 4)
+    while (index < 4) & (target < 1.5):
+        target *= 0.5 + light.next_1d()
+        index += 1
+    return _found(x, y, target)
+
+
 #: Bins of a histogram along each axis, and their edges.
 _BINS = 8
 _EDGES = np.arange(_BINS + 1) / _BINS
@@ -163,16 +133,50 @@ def _integrals_of_varying() -> np.ndarray:
     return exact
 
 
+class _Target(ImageTarget):
+    """A function instead of a scene."""
+
+    def __init__(self, function: Any, has_light_paths: bool = False) -> None:
+        super().__init__(None, None, None, 1, has_light_paths)
+        self._function = function
+
+    def __call__(self, numbers: Any) -> tuple[Contribution, Sample]:
+        return self._function(numbers)
+
+
 #: Target functions, and their integrals over the bins: [y, x].
 TARGETS = {
-    "ramp": (_ramp, _integrals_of_ramp()),
-    "hill": (_hill, _integrals_of_hill()),
-    "varying": (_varying, _integrals_of_varying()),
+    "ramp": (_Target(_ramp), _integrals_of_ramp()),
+    "hill": (_Target(_hill), _integrals_of_hill()),
+    "varying": (_Target(_varying), _integrals_of_varying()),
+    "both ends": (_Target(_both_ends, True), _integrals_of_varying()),
 }
+
+#: Of the two kinds of chains, the targets for which each is made.
+CASES = [
+    *((LoopedChains, name) for name in ("ramp", "hill", "varying")),
+    *((SteppedChains, name) for name in ("hill", "varying", "both ends")),
+]
+EACH_CASE = pytest.mark.parametrize(("kind", "name"), [
+    pytest.param(
+        kind, name, id=f"{kind.__name__}-{name}",
+        # A mutation is several kernels
+        marks=pytest.mark.slow if kind is SteppedChains and name != "both ends" else (),
+    )
+    for kind, name in CASES
+])  # fmt: skip
+
+
+def _chains(
+    kind: type, target: ImageTarget, image: Any, rules: ChainRules, samples: Bootstrap,
+    seed: int, count: int,
+) -> Chains:  # fmt: skip
+    return kind(target, image, rules, samples, seed, count)
 
 
 def _run(
-    target: Any,
+    kind: type,
+    target: ImageTarget,
     seed: int,
     steps: int,
     large_step: float = 0.3,
@@ -184,8 +188,8 @@ def _run(
     samples = Bootstrap(target, seed, bootstrap)
     image = _Histogram()
     weight = large_step * samples.mean if kelemen else 0.0
-    chains = Chains(target, image, large_step, SmallSteps(1 / 64, 1 / 4), weight)
-    chains.begin(samples, seed, count)
+    rules = ChainRules(large_step, SmallSteps(1 / 64, 1 / 4), weight)
+    chains = _chains(kind, target, image, rules, samples, seed, count)
     image.counts = [chains.advance(min(16, steps - done)) for done in range(0, steps, 16)]
     chains.end()
     sums = (image.visits.numpy() + image.uniform.numpy()).reshape(_BINS, _BINS)
@@ -204,35 +208,38 @@ def _assert_unbiased(estimates: np.ndarray, exact: np.ndarray, precision: float)
     assert np.median(errors) < 5 * precision, errors
 
 
-@pytest.mark.parametrize(("large_step", "kelemen"), [(0.0, False), (0.3, False), (0.3, True),
-                                                     (1.0, True)])  # fmt: skip
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize(("large_step", "kelemen"), [
+    (0.0, False), (0.3, True), *(pytest.param(p, k, marks=pytest.mark.slow)
+                                 for p, k in ((0.3, False), (1.0, True))),
+])  # fmt: skip
+@EACH_CASE
 def test_visits_and_uniform_samples_estimate_a_known_function(
-    name: str, large_step: float, kelemen: bool
+    kind: type, name: str, large_step: float, kelemen: bool
 ) -> None:
     """In each of 64 bins, over independent seeds."""
     target, exact = TARGETS[name]
-    found = [_run(target, seed, 64, large_step, kelemen)[2] for seed in range(1, 17)]
+    found = [_run(kind, target, seed, 64, large_step, kelemen)[2] for seed in range(1, 17)]
     _assert_unbiased(np.array(found), exact, 0.01)
 
 
-@pytest.mark.parametrize("name", TARGETS)
-def test_few_mutations_from_few_samples_are_right_on_average(name: str) -> None:
+@EACH_CASE
+def test_few_mutations_from_few_samples_are_right_on_average(kind: type, name: str) -> None:
     """There is no start-up bias: chains start where the target function is large, and all of them
     count by the mean of the samples from which they were chosen."""
     target, exact = TARGETS[name]
-    found = [_run(target, seed, 2, 0.1, count=16, bootstrap=16)[2] for seed in range(1, 257)]
+    found = [_run(kind, target, seed, 2, 0.1, count=16, bootstrap=16)[2] for seed in range(1, 257)]
     _assert_unbiased(np.array(found), exact, 0.05)
 
 
 @pytest.mark.parametrize("large_step", [0.0, 0.2])
-@pytest.mark.parametrize("name", TARGETS)
+@EACH_CASE
 def test_last_states_of_chains_have_the_density_of_the_target(
-    name: str, large_step: float
+    kind: type, name: str, large_step: float
 ) -> None:
     target, exact = TARGETS[name]
-    chains, _, _ = _run(target, 5, 96, large_step, count=1 << 14)
-    place = (chains._state.position.numpy() * _BINS).astype(int)
+    chains, _, _ = _run(kind, target, 5, 96, large_step, count=1 << 14)
+    states = chains._parts if kind is SteppedChains else chains._state
+    place = (states.position.numpy() * _BINS).astype(int)
     seen = np.zeros((_BINS, _BINS))
     np.add.at(seen, (place[1], place[0]), 1)
     assert not seen[exact == 0].any()
@@ -240,9 +247,9 @@ def test_last_states_of_chains_have_the_density_of_the_target(
     assert stats.chisquare(seen, expected).pvalue > _UNLIKELY
 
 
-@pytest.mark.parametrize("name", TARGETS)
-def test_all_mutations_are_in_the_image(name: str) -> None:
-    chains, image, _ = _run(TARGETS[name][0], 1, 40)
+@EACH_CASE
+def test_all_mutations_are_in_the_image(kind: type, name: str) -> None:
+    chains, image, _ = _run(kind, TARGETS[name][0], 1, 40)
     assert image.total.numpy()[0] == pytest.approx(40 * 1024, rel=1e-5)
     chains.advance(3)
     chains.end()
@@ -250,12 +257,13 @@ def test_all_mutations_are_in_the_image(name: str) -> None:
     assert image.total.numpy()[0] == pytest.approx(43 * 1024, rel=1e-5), "they may go on"
 
 
-def test_every_proposal_is_accepted_where_the_target_is_constant() -> None:
+@pytest.mark.parametrize("kind", [LoopedChains, SteppedChains])
+def test_every_proposal_is_accepted_where_the_target_is_constant(kind: type) -> None:
     def constant(numbers: Any) -> tuple[Contribution, Sample]:
         x, y = numbers.next_2d()
         return _found(x, y, mi.Float(0.7) + 0 * x)
 
-    _, image, _ = _run(constant, 1, 48)
+    _, image, _ = _run(kind, _Target(constant), 1, 48)
     large, large_accepted, small_accepted = (
         sum(int(dr.sum(getattr(counts, name))[0]) for counts in image.counts)
         for name in ("large", "accepted_large", "accepted_small")
@@ -266,7 +274,7 @@ def test_every_proposal_is_accepted_where_the_target_is_constant() -> None:
 
 def test_a_chain_leaves_no_black_state_behind_for_another() -> None:
     """Once a state is not black, no black one is accepted."""
-    chains, _, _ = _run(_ramp, 3, 50)
+    chains, _, _ = _run(LoopedChains, TARGETS["ramp"][0], 3, 50)
     assert chains._state.target.numpy().min() > 0
 
 
@@ -291,8 +299,9 @@ class _NoImage:
 def test_a_stored_state_is_what_its_numbers_stand_for(steps: int) -> None:
     """Bit for bit: a chain forgets nothing of a path that it may come from."""
     target, count = _walk_target(), 2048
-    chains = Chains(target, _NoImage(), 0.3, SmallSteps(), 0.0)
-    chains.begin(Bootstrap(target, 7, 4096), 7, count)
+    rules = ChainRules(0.3, SmallSteps(), 0.0)
+    samples = Bootstrap(target, 7, 4096)
+    chains = _chains(LoopedChains, target, _NoImage(), rules, samples, 7, count)
     for _ in range(steps):
         chains.advance(1)
     numbers = StoredNumbers.begin(NumberTable(chains._values, count), count)
@@ -310,18 +319,18 @@ def test_a_stored_state_is_what_its_numbers_stand_for(steps: int) -> None:
 
 
 def test_samples_of_the_bootstrap_lie_in_one_cell_each() -> None:
-    samples = Bootstrap(_hill, 3, 900)
+    samples = Bootstrap(TARGETS["hill"][0], 3, 900)
     numbers = samples.numbers(dr.arange(mi.UInt32, samples.count))
     place, others = numbers.next_2d(), numbers.next_2d()
     cells = np.floor(place.numpy() * math.isqrt(samples.count)).astype(int)
     assert samples.count == 900 and len(set(map(tuple, cells.T))) == 900
     assert stats.kstest(others.numpy().ravel(), "uniform").pvalue > _UNLIKELY
-    assert Bootstrap(_hill, 3, 901).count == 31**2 and Bootstrap(_hill, 3, 1).count == 1
+    assert [Bootstrap(TARGETS["hill"][0], 3, n).count for n in (1, 901)] == [1, 31**2]
 
 
 def test_samples_are_chosen_in_proportion_to_the_target() -> None:
     """As often as expected, up to one; black ones never."""
-    samples, count = Bootstrap(_ramp, 3, 1000), 5000
+    samples, count = Bootstrap(TARGETS["ramp"][0], 3, 1000), 5000
     found, _ = _ramp(samples.numbers(dr.arange(mi.UInt32, samples.count)))
     expected = found.target.numpy() / found.target.numpy().sum() * count
     chosen = np.bincount(samples.choose(count).numpy(), minlength=samples.count)
