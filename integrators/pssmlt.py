@@ -30,7 +30,8 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
      * - luminance_samples
        - |int|
        - Independent samples, at least, that estimate the brightness of the image, and from which
-         chains start. (Default: 100000)
+         chains start; without a time limit, a quarter of all mutations if that is more. (Default:
+         100000)
      * - mutation_size_low, mutation_size_high
        - |float|
        - By how much small steps change a number, at least and at most. (Default: 1/1024, 1/64)

@@ -266,7 +266,8 @@ TECHNIQUES: dict[str, Technique] = {
     # As many camera samples as ``path`` has in the tests. ``test_chains.py`` and
     # ``test_pssmlt.py`` have chains on known densities, films and sensors
     "pssmlt": Technique(
-        "pssmlt", {"direct_samples": 128, "chains": 1024}, is_plugin=True, makes_splats=True,
+        "pssmlt", {"bidirectional": False, "direct_samples": 128, "chains": 1024},
+        is_plugin=True, makes_splats=True,
         checks=Checks(
             ["cornell_box"], furnaces=["furnace_glass"], depths=[-1],
             cases=("no_light", "light_that_nothing_sees", "materials", "one_sample"),
@@ -277,11 +278,31 @@ TECHNIQUES: dict[str, Technique] = {
     ),
     # Chains find all light
     "chains_alone": Technique(
-        "pssmlt", {"direct_samples": -1, "chains": 1024, "kelemen_style_weights": False},
+        "pssmlt",
+        {"bidirectional": False, "direct_samples": -1, "chains": 1024,
+         "kelemen_style_weights": False},
         makes_splats=True,
         checks=Checks(cases=["plain", "film_of_one_pixel"]),
         thorough=Checks(
             ["cornell_box", "rooms"], ["llvm_ad_spectral"], FURNACES[2:4], [2, -1], _OF_CHAINS,
+        ),
+    ),
+    # From both ends
+    "bidirectional_chains": Technique(
+        "pssmlt", {"direct_samples": 128, "chains": 4096, "two_stage": True}, makes_splats=True,
+        checks=Checks(cases=["no_light"]),
+        thorough=Checks(
+            ["cornell_box", "rooms"], ["llvm_ad_spectral"], FURNACES[2:], [2, -1],
+            tuple(case for case in _LIGHT_PATHS if case in _OF_CHAINS),
+        ),
+    ),
+    "erpt": Technique(
+        "erpt", {"bidirectional": False, "direct_samples": 128, "outliers": 2.0}, is_plugin=True,
+        makes_splats=True,
+        checks=Checks(furnaces=["furnace_glass"], cases=("no_light", "materials")),
+        thorough=Checks(
+            ["cornell_box", "mirrors_and_glass"], ["llvm_ad_spectral"], FURNACES[2:], [2, -1],
+            _OF_CHAINS,
         ),
     ),
 }  # fmt: skip

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -20,7 +18,7 @@ from mitsuba_ext.chains.chains import ChainRules, Chains, Counts
 from mitsuba_ext.chains.looped import LoopedChains
 from mitsuba_ext.chains.small_steps import SmallSteps
 from mitsuba_ext.chains.stepped import SteppedChains
-from mitsuba_ext.chains.target import Contribution, Found, ImageTarget
+from mitsuba_ext.chains.target import Contribution, ImageTarget
 from mitsuba_ext.rendering.filter_weights import mean_weights
 from mitsuba_ext.transport.estimator import Sample
 from mitsuba_ext.transport.numbers import NumberTable, StoredNumbers
@@ -30,54 +28,6 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 #: A probability below which a test fails: that of |z| > THRESHOLD.
 _UNLIKELY = 2 * stats.norm.sf(THRESHOLD)
-
-
-def _uniform(count: int, seed: int) -> mi.Float:
-    return mi.Float(np.random.default_rng(seed).random(count, dtype=np.float32))
-
-
-# ---- Small steps ----
-
-_STEPS = [SmallSteps(), SmallSteps(1 / 64, 0.5), SmallSteps(0.1, 0.1)]
-
-
-def test_the_logarithm_of_the_distance_of_a_small_step_is_uniform() -> None:
-    steps, count = SmallSteps(1 / 512, 1 / 8), 1 << 16
-    moved = steps.move(mi.Float(0.5), _uniform(count, 1)).numpy().astype(np.float64) - 0.5
-    assert np.abs(moved).min() >= steps.low * (1 - 1e-4)
-    assert np.abs(moved).max() <= steps.high * (1 + 1e-4)
-    position = np.log(np.abs(moved) / steps.low) / math.log(steps.high / steps.low)
-    for part in (position[moved > 0], position[moved < 0]):
-        assert abs(len(part) - count / 2) < THRESHOLD * math.sqrt(count) / 2
-        seen, _ = np.histogram(part, 32, (-1e-4, 1 + 1e-4))
-        assert stats.chisquare(seen).pvalue > _UNLIKELY
-
-
-def test_a_small_step_and_its_reverse_are_equally_likely() -> None:
-    """Also over the ends of the interval."""
-    count, bins = 1 << 20, 24
-    value = _uniform(count, 2)
-    moved = SmallSteps(1 / 256, 1 / 4).move(value, _uniform(count, 3)).numpy()
-    pairs, _, _ = np.histogram2d(value.numpy(), moved, bins, [(0, 1), (0, 1)])
-    assert pairs[0, -1] > 100 and pairs[-1, 0] > 100
-    forward, backward = (p[np.triu_indices(bins, 1)] for p in (pairs, pairs.T))
-    seen = forward + backward > 0
-    z2 = (forward - backward)[seen] ** 2 / (forward + backward)[seen]
-    assert stats.chi2.sf(z2.sum(), seen.sum()) > _UNLIKELY
-
-
-@pytest.mark.parametrize("steps", _STEPS, ids=str)
-def test_small_steps_stay_in_the_interval(steps: SmallSteps) -> None:
-    largest = 1 - 2.0**-24
-    ends = [0.0, 1e-30, 1e-9, steps.low, 0.5, 1 - steps.high, 1 - steps.low, largest]
-    samples = [0.0, 1e-9, 0.25, 0.5 - 2.0**-25, 0.5, 0.75, largest]
-    value, sample = (mi.Float(x) for x in np.array(np.meshgrid(ends, samples)).reshape(2, -1))
-    moved = steps.move(value, sample).numpy()
-    assert moved.min() >= 0 and moved.max() <= largest
-    distance = np.abs(moved - value.numpy())
-    distance = np.minimum(distance, 1 - distance)
-    assert distance.min() >= steps.low * (1 - 1e-5) - 1e-7
-    assert distance.max() <= steps.high * (1 + 1e-5) + 1e-7
 
 
 # ---- Chains on known densities ----
@@ -105,24 +55,6 @@ class _Histogram:
 
     def tensors(self) -> list[Any]:
         return [self.visits, self.uniform, self.total]
-
-
-@dataclass
-class _Target:
-    """Stands in for the target function of an image."""
-
-    function: Callable[[Any], tuple[Contribution, Sample]]
-    has_light_paths = False
-
-    def __call__(self, numbers: Any) -> tuple[Contribution, Sample]:
-        return self.function(numbers)
-
-    def evaluate(self, numbers: Any, active: mi.Bool | bool = True) -> Found:
-        found, sample = self.function(numbers)
-        found.target = dr.select(active, found.target, 0)
-        lane = dr.arange(mi.UInt32, dr.width(found.target))
-        dr.eval(numbers, found, lane, sample)
-        return Found(found.target, [found], [lane], sample)
 
 
 def _found(x: mi.Float, y: mi.Float, target: mi.Float) -> tuple[Contribution, Sample]:
@@ -160,6 +92,22 @@ def _varying(numbers: Any) -> tuple[Contribution, Sample]:
     return _found(x, y, target)
 
 
+@dr.syntax
+def _both_ends(numbers: Any) -> tuple[Contribution, Sample]:
+    """The same, with all but the first number from the other end of the path."""
+    x = numbers.next_1d()
+    light = numbers.light
+    y, target = mi.Float(0.1), mi.Float(0.7)
+    if x > 0.5:
+        y = light.next_1d()
+        target = y * light.next_1d() * 4 * x
+    index = dr.select(x > 0.75, mi.UInt32(0), 4)
+    while (index < 4) & (target < 1.5):
+        target *= 0.5 + light.next_1d()
+        index += 1
+    return _found(x, y, target)
+
+
 #: Bins of a histogram along each axis, and their edges.
 _BINS = 8
 _EDGES = np.arange(_BINS + 1) / _BINS
@@ -185,31 +133,65 @@ def _integrals_of_varying() -> np.ndarray:
     return exact
 
 
+class _Target(ImageTarget):
+    """A function instead of a scene."""
+
+    def __init__(self, function: Any, has_light_paths: bool = False) -> None:
+        super().__init__(None, None, None, 1, has_light_paths)
+        self._function = function
+
+    def _camera(self, numbers: Any, active: mi.Bool) -> tuple[Contribution, Sample]:
+        found, sample = self._function(numbers)
+        found.target = dr.select(active, found.target, 0)
+        return found, sample
+
+
 #: Target functions, and their integrals over the bins: [y, x].
 TARGETS = {
-    "ramp": (_ramp, _integrals_of_ramp()),
-    "hill": (_hill, _integrals_of_hill()),
-    "varying": (_varying, _integrals_of_varying()),
+    "ramp": (_Target(_ramp), _integrals_of_ramp()),
+    "hill": (_Target(_hill), _integrals_of_hill()),
+    "varying": (_Target(_varying), _integrals_of_varying()),
+    "both ends": (_Target(_both_ends, True), _integrals_of_varying()),
 }
+
+#: Of the two kinds of chains, the targets for which each is made.
+CASES = [
+    *((LoopedChains, name) for name in ("ramp", "hill", "varying")),
+    *((SteppedChains, name) for name in ("hill", "varying", "both ends")),
+]
+EACH_CASE = pytest.mark.parametrize(("kind", "name"), [
+    pytest.param(
+        kind, name, id=f"{kind.__name__}-{name}",
+        # A mutation is several kernels
+        marks=pytest.mark.slow if kind is SteppedChains and name != "both ends" else (),
+    )
+    for kind, name in CASES
+])  # fmt: skip
+
+
+def _chains(
+    kind: type, target: ImageTarget, image: Any, rules: ChainRules, samples: Bootstrap,
+    seed: int, count: int,
+) -> Chains:  # fmt: skip
+    return kind(target, image, rules, samples, samples.choose(count), seed)
 
 
 def _run(
-    target: Any,
+    kind: type,
+    target: ImageTarget,
     seed: int,
     steps: int,
     large_step: float = 0.3,
     kelemen: bool = False,
     count: int = 1024,
     bootstrap: int = 4096,
-    kind: type[Chains] = LoopedChains,
 ) -> tuple[Chains, _Histogram, np.ndarray]:
     """Chains after so many mutations, what they saw, and their estimate of the integrals."""
-    target = _Target(target)
     samples = Bootstrap(target, seed, bootstrap)
     image = _Histogram()
     weight = large_step * samples.mean if kelemen else 0.0
     rules = ChainRules(large_step, SmallSteps(1 / 64, 1 / 4), weight)
-    chains = kind(target, image, rules, samples, samples.choose(count), seed)
+    chains = _chains(kind, target, image, rules, samples, seed, count)
     image.counts = [chains.advance(min(16, steps - done)) for done in range(0, steps, 16)]
     chains.end()
     sums = (image.visits.numpy() + image.uniform.numpy()).reshape(_BINS, _BINS)
@@ -228,35 +210,38 @@ def _assert_unbiased(estimates: np.ndarray, exact: np.ndarray, precision: float)
     assert np.median(errors) < 5 * precision, errors
 
 
-@pytest.mark.parametrize(("large_step", "kelemen"), [(0.0, False), (0.3, False), (0.3, True),
-                                                     (1.0, True)])  # fmt: skip
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize(("large_step", "kelemen"), [
+    (0.0, False), (0.3, True), *(pytest.param(p, k, marks=pytest.mark.slow)
+                                 for p, k in ((0.3, False), (1.0, True))),
+])  # fmt: skip
+@EACH_CASE
 def test_visits_and_uniform_samples_estimate_a_known_function(
-    name: str, large_step: float, kelemen: bool
+    kind: type, name: str, large_step: float, kelemen: bool
 ) -> None:
     """In each of 64 bins, over independent seeds."""
     target, exact = TARGETS[name]
-    found = [_run(target, seed, 64, large_step, kelemen)[2] for seed in range(1, 17)]
+    found = [_run(kind, target, seed, 64, large_step, kelemen)[2] for seed in range(1, 17)]
     _assert_unbiased(np.array(found), exact, 0.01)
 
 
-@pytest.mark.parametrize("name", TARGETS)
-def test_few_mutations_from_few_samples_are_right_on_average(name: str) -> None:
+@EACH_CASE
+def test_few_mutations_from_few_samples_are_right_on_average(kind: type, name: str) -> None:
     """There is no start-up bias: chains start where the target function is large, and all of them
     count by the mean of the samples from which they were chosen."""
     target, exact = TARGETS[name]
-    found = [_run(target, seed, 2, 0.1, count=16, bootstrap=16)[2] for seed in range(1, 257)]
+    found = [_run(kind, target, seed, 2, 0.1, count=16, bootstrap=16)[2] for seed in range(1, 257)]
     _assert_unbiased(np.array(found), exact, 0.05)
 
 
 @pytest.mark.parametrize("large_step", [0.0, 0.2])
-@pytest.mark.parametrize("name", TARGETS)
+@EACH_CASE
 def test_last_states_of_chains_have_the_density_of_the_target(
-    name: str, large_step: float
+    kind: type, name: str, large_step: float
 ) -> None:
     target, exact = TARGETS[name]
-    chains, _, _ = _run(target, 5, 96, large_step, count=1 << 14)
-    place = (chains._state.position.numpy() * _BINS).astype(int)
+    chains, _, _ = _run(kind, target, 5, 96, large_step, count=1 << 14)
+    states = chains._parts if kind is SteppedChains else chains._state
+    place = (states.position.numpy() * _BINS).astype(int)
     seen = np.zeros((_BINS, _BINS))
     np.add.at(seen, (place[1], place[0]), 1)
     assert not seen[exact == 0].any()
@@ -264,9 +249,9 @@ def test_last_states_of_chains_have_the_density_of_the_target(
     assert stats.chisquare(seen, expected).pvalue > _UNLIKELY
 
 
-@pytest.mark.parametrize("name", TARGETS)
-def test_all_mutations_are_in_the_image(name: str) -> None:
-    chains, image, _ = _run(TARGETS[name][0], 1, 40)
+@EACH_CASE
+def test_all_mutations_are_in_the_image(kind: type, name: str) -> None:
+    chains, image, _ = _run(kind, TARGETS[name][0], 1, 40)
     assert image.total.numpy()[0] == pytest.approx(40 * 1024, rel=1e-5)
     chains.advance(3)
     chains.end()
@@ -274,29 +259,29 @@ def test_all_mutations_are_in_the_image(name: str) -> None:
     assert image.total.numpy()[0] == pytest.approx(43 * 1024, rel=1e-5), "they may go on"
 
 
-@pytest.mark.parametrize("name", TARGETS)
-def test_both_forms_of_chains_end_in_the_same_state(name: str) -> None:
-    """Bit for bit: as one loop, and as one call of the estimator for each mutation."""
+@pytest.mark.parametrize("name", ["hill", "varying"])
+def test_both_kinds_of_chains_end_in_the_same_states(name: str) -> None:
+    """Bit for bit."""
     looped, stepped = (
-        _run(TARGETS[name][0], 9, 24, kelemen=True, kind=kind)
+        _run(kind, TARGETS[name][0], 9, 24, kelemen=True)
         for kind in (LoopedChains, SteppedChains)
     )
-    numbers = stepped[0]._values[0], stepped[0]._known[0], stepped[0]._state
-    expected = looped[0]._values, looped[0]._known, looped[0]._state.target
-    known = np.tile(expected[1].numpy(), (len(expected[0]) // 1024, 1))
-    used = (np.arange(len(known))[:, None] < known).ravel()
-    for ours, theirs in zip(numbers[1:], expected[1:]):
-        np.testing.assert_array_equal(ours.numpy(), theirs.numpy())
-    np.testing.assert_array_equal(numbers[0].numpy()[used], expected[0].numpy()[used])
+    known = looped[0]._known.numpy()
+    np.testing.assert_array_equal(stepped[0]._known[0].numpy(), known)
+    np.testing.assert_array_equal(stepped[0]._state.numpy(), looped[0]._state.target.numpy())
+    ours, theirs = stepped[0]._values[0].numpy(), looped[0]._values.numpy()
+    used = (np.arange(len(ours) // len(known))[:, None] < known).ravel()
+    np.testing.assert_array_equal(ours[used], theirs[used])
     np.testing.assert_allclose(stepped[2], looped[2], rtol=1e-3, atol=1e-6)
 
 
-def test_every_proposal_is_accepted_where_the_target_is_constant() -> None:
+@pytest.mark.parametrize("kind", [LoopedChains, SteppedChains])
+def test_every_proposal_is_accepted_where_the_target_is_constant(kind: type) -> None:
     def constant(numbers: Any) -> tuple[Contribution, Sample]:
         x, y = numbers.next_2d()
         return _found(x, y, mi.Float(0.7) + 0 * x)
 
-    _, image, _ = _run(constant, 1, 48)
+    _, image, _ = _run(kind, _Target(constant), 1, 48)
     large, large_accepted, small_accepted = (
         sum(int(dr.sum(getattr(counts, name))[0]) for counts in image.counts)
         for name in ("large", "accepted_large", "accepted_small")
@@ -307,7 +292,7 @@ def test_every_proposal_is_accepted_where_the_target_is_constant() -> None:
 
 def test_a_chain_leaves_no_black_state_behind_for_another() -> None:
     """Once a state is not black, no black one is accepted."""
-    chains, _, _ = _run(_ramp, 3, 50)
+    chains, _, _ = _run(LoopedChains, TARGETS["ramp"][0], 3, 50)
     assert chains._state.target.numpy().min() > 0
 
 
@@ -332,9 +317,9 @@ class _NoImage:
 def test_a_stored_state_is_what_its_numbers_stand_for(steps: int) -> None:
     """Bit for bit: a chain forgets nothing of a path that it may come from."""
     target, count = _walk_target(), 2048
-    samples = Bootstrap(target, 7, 4096)
     rules = ChainRules(0.3, SmallSteps(), 0.0)
-    chains = LoopedChains(target, _NoImage(), rules, samples, samples.choose(count), 7)
+    samples = Bootstrap(target, 7, 4096)
+    chains = _chains(LoopedChains, target, _NoImage(), rules, samples, 7, count)
     for _ in range(steps):
         chains.advance(1)
     numbers = StoredNumbers.begin(NumberTable(chains._values, count), count)
@@ -352,19 +337,18 @@ def test_a_stored_state_is_what_its_numbers_stand_for(steps: int) -> None:
 
 
 def test_samples_of_the_bootstrap_lie_in_one_cell_each() -> None:
-    samples = Bootstrap(_Target(_hill), 3, 900)
+    samples = Bootstrap(TARGETS["hill"][0], 3, 900)
     numbers = samples.numbers(dr.arange(mi.UInt32, samples.count))
     place, others = numbers.next_2d(), numbers.next_2d()
     cells = np.floor(place.numpy() * math.isqrt(samples.count)).astype(int)
     assert samples.count == 900 and len(set(map(tuple, cells.T))) == 900
     assert stats.kstest(others.numpy().ravel(), "uniform").pvalue > _UNLIKELY
-    counts = [Bootstrap(_Target(_hill), 3, count).count for count in (901, 1)]
-    assert counts == [31**2, 1]
+    assert [Bootstrap(TARGETS["hill"][0], 3, n).count for n in (1, 901)] == [1, 31**2]
 
 
 def test_samples_are_chosen_in_proportion_to_the_target() -> None:
     """As often as expected, up to one; black ones never."""
-    samples, count = Bootstrap(_Target(_ramp), 3, 1000), 5000
+    samples, count = Bootstrap(TARGETS["ramp"][0], 3, 1000), 5000
     found, _ = _ramp(samples.numbers(dr.arange(mi.UInt32, samples.count)))
     expected = found.target.numpy() / found.target.numpy().sum() * count
     chosen = np.bincount(samples.choose(count).numpy(), minlength=samples.count)
@@ -374,7 +358,7 @@ def test_samples_are_chosen_in_proportion_to_the_target() -> None:
 
 def test_the_mean_of_the_bootstrap_is_that_of_the_target() -> None:
     for name, (target, exact) in TARGETS.items():
-        means = np.array([Bootstrap(_Target(target), seed, 100).mean for seed in range(1, 65)])
+        means = np.array([Bootstrap(target, seed, 100).mean for seed in range(1, 65)])
         z, error = z_exact(means, exact.sum())
         assert abs(z) < THRESHOLD and error < 0.01, (name, z, error)
 

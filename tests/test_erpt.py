@@ -21,7 +21,7 @@ from statistical import (
     some,
 )
 from techniques import REFERENCE
-from test_chains import _ramp, _Target
+from test_chains import TARGETS
 
 from mitsuba_ext.chains.bootstrap import Bootstrap
 
@@ -78,10 +78,10 @@ def test_the_number_of_mutations_follows_the_energy() -> None:
 
 def test_samples_start_as_many_chains_as_they_hold_energies() -> None:
     """On average over the random offset, which is that of the seed."""
-    counts = []
+    ramp, counts = TARGETS["ramp"][0], []
     for seed in range(1, 65):
-        samples = Bootstrap(_Target(_ramp), seed, 64)
-        found, _ = _ramp(samples.numbers(dr.arange(mi.UInt32, samples.count)))
+        samples = Bootstrap(ramp, seed, 64)
+        found = ramp.evaluate(samples.numbers(dr.arange(mi.UInt32, samples.count)))
         target = found.target.numpy()
         energy = 2.5 * target.mean()
         chosen = np.bincount(samples.choose_by_energy(energy).numpy(), minlength=64)

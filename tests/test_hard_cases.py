@@ -153,7 +153,11 @@ def test_extreme_seeds_give_images_of_their_own(name: str) -> None:
         _assert_same_seed(array, image, name)
 
 
-@EACH_DEFAULT
+#: Chains are not cut into passes.
+_IN_PASSES = [p for p in EACH_PLUGIN if getattr(p, "values", (p,))[0] != "pssmlt"]
+
+
+@pytest.mark.parametrize("name", _IN_PASSES)
 def test_passes_of_one_render_draw_different_numbers(name: str) -> None:
     """Sixteen passes of one sample are as exact as one pass of sixteen, not as one sample."""
     scene, integrator = _scene("plain"), TECHNIQUES[name].make(4)

@@ -33,14 +33,17 @@ from mitsuba_ext.chains.looped import LoopedChains
 
 pytestmark = pytest.mark.usefixtures("variant")
 
+#: Samples from which chains start, by default: a square.
+_BOOTSTRAP = 317**2
+
 #: All light is left to the chains.
 ALONE = {"direct_samples": -1}
 
 
 def pssmlt(max_depth: int = 4, **parameters: Any) -> Any:
-    return mi.load_dict(
-        {"type": "pssmlt", "max_depth": max_depth, "bidirectional": False, **parameters}
-    )
+    """Chains around the walk: one kernel for all of their mutations."""
+    own = {"bidirectional": False, "max_depth": max_depth}
+    return mi.load_dict({"type": "pssmlt", **own, **parameters})
 
 
 def composed(max_depth: int = 4, **parameters: Any) -> Any:
@@ -97,7 +100,7 @@ def test_all_mutations_are_made_if_chains_do_not_divide_them() -> None:
     integrator = pssmlt(**ALONE, chains=100)
     batches(mi.load_dict(stage()), integrator, 1, [1])
     camera, statistics = 16 * 256, integrator.statistics
-    assert statistics.rays["camera"] == camera + 300 and statistics.spp == 1
+    assert statistics.rays["camera"] == camera + _BOOTSTRAP + 300 and statistics.spp == 1
 
 
 # ---- Films ----
@@ -167,7 +170,7 @@ def test_a_film_that_takes_no_light_of_chains_is_refused(variant: str) -> None:
 @pytest.fixture
 def small_launches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sixteen mutations per pixel: four of each chain."""
-    monkeypatch.setattr("mitsuba_ext.chains.chains.Chains.launch", 4)
+    monkeypatch.setattr("mitsuba_ext.chains.looped.LoopedChains.launch", 4)
 
 
 #: 64 mutations per pixel are then 16 of each chain.
@@ -190,7 +193,7 @@ def test_a_seed_gives_one_image() -> None:
 def test_launches_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = mi.load_dict(stage())
     (in_four,) = batches(scene, pssmlt(**_FOUR_PER_PIXEL), 64, [3])
-    monkeypatch.setattr("mitsuba_ext.chains.chains.Chains.launch", 16)
+    monkeypatch.setattr("mitsuba_ext.chains.looped.LoopedChains.launch", 16)
     (in_one,) = batches(scene, pssmlt(**_FOUR_PER_PIXEL), 64, [3])
     _assert_same_seed(in_four, in_one)
 
@@ -276,8 +279,8 @@ def test_statistics_count_rays_and_acceptance() -> None:
     integrator = pssmlt(**_FOUR_PER_PIXEL, p_large=0.5)
     batches(mi.load_dict(stage()), integrator, 64, [1])
     statistics = integrator.statistics
-    assert statistics.rays["camera"] == (16 + 64) * 256 and statistics.spp == 64
-    assert statistics.rays["scatter"] > 0.5 * statistics.rays["camera"]
+    assert statistics.rays["camera"] == (16 + 64) * 256 + _BOOTSTRAP and statistics.spp == 64
+    assert statistics.rays["scatter"] > 0.5 * (16 + 64) * 256
     assert 0 < statistics.rays["shadow"] <= statistics.connections
     accepted = [float(x) for x in re.findall(r"([\d.]+)% of", statistics.learned)]
     assert len(accepted) == 2 and 0 < accepted[0] < accepted[1] < 100
@@ -288,6 +291,7 @@ def test_statistics_count_rays_and_acceptance() -> None:
 
 @pytest.mark.parametrize(("parameters", "words"), [
     ({"direct_samples": -2}, "direct_samples.*-2"),
+    ({"chains": -1}, "chains.*-1"),
     ({"p_large": 1.5}, r"p_large.*1\.5"),
     ({"luminance_samples": 0}, "luminance_samples.*0"),
     ({"mutation_size_low": 0.1, "mutation_size_high": 0.01}, '"mutation_size_low" is 0.1'),
@@ -316,7 +320,7 @@ def test_it_cannot_be_nested_where_single_samples_are_asked_for(outer: str) -> N
 
 def test_variance_can_hold_it() -> None:
     scene = mi.load_dict(stage())
-    nested = {"type": "pssmlt", "max_depth": 4, **_FOUR_PER_PIXEL}
+    nested = {"type": "pssmlt", "bidirectional": False, "max_depth": 4, **_FOUR_PER_PIXEL}
     integrator = mi.load_dict({"type": "variance", "nested": nested, "batches": 4})
     image = integrator.render(scene, spp=64).numpy()
     assert image.shape[-1] > 3 and np.isfinite(image).all() and image[..., 3:].min() >= 0
@@ -342,9 +346,10 @@ def _assert_mean_of_path(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"],
-                         indirect=True)  # fmt: skip
-@pytest.mark.parametrize("which", _SENSORS)
+@pytest.mark.parametrize(("variant", "which"), [
+    *(("llvm_ad_rgb", which) for which in _SENSORS),
+    ("llvm_ad_mono", "thinlens"), ("llvm_ad_spectral", "thinlens"),
+], indirect=["variant"])  # fmt: skip
 def test_a_sensor_sees_what_it_sees_with_path(which: str, variant: str) -> None:
     camera = below_the_lamp(**_SENSORS[which])
     scene = mi.load_dict(stage(camera=camera), optimize=False)
@@ -380,7 +385,7 @@ def test_dispersive_glass_is_that_of_the_path_tracer(variant: str) -> None:
     lamp = rectangle(T().translate([0, 0, 2.5]).rotate([1, 0, 0], 180), emitter=area(5.0),
                      bsdf=diffuse(0.0))  # fmt: skip
     ball = {"type": "sphere", "center": [0, 0, 0.7], "radius": 0.5,
-            "bsdf": {"type": "dispersive_dielectric", "material": "sf10"}}  # fmt: skip
+            "bsdf": {"type": "dispersive_dielectric", "int_ior": "sf10"}}  # fmt: skip
     scene = mi.load_dict(stage(light=lamp, block=ball), optimize=False)
     images = batches(scene, pssmlt(6, **ALONE, chains=1024), 512, SEEDS[:MANY_SEEDS])
     expected = batches(scene, composed(6), 2048, REFERENCE_SEEDS[:MANY_SEEDS])

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 
 from ..rendering.filter_weights import put_splats
-from .target import Contribution
+from .target import Contribution, Found
 
 
 class ChainImage:
@@ -29,6 +30,13 @@ class ChainImage:
     def add_uniform(self, found: Contribution, weight: mi.Float) -> None:
         """Adds uniform samples with this weight."""
         self._put(self._uniform, found, weight)
+
+    def add_found(self, found: Found, weight: mi.Float) -> None:
+        """Adds uniform samples, with the weights of their lanes, and evaluates the image."""
+        dr.eval(weight)
+        for part, lanes in zip(found.parts, found.lanes):
+            self.add_uniform(part, dr.gather(mi.Float, weight, lanes, part.target > 0))
+        dr.eval(self.tensors())
 
     def _put(self, block: mi.ImageBlock, found: Contribution, weight: mi.Float) -> None:
         value = found.value * weight

@@ -67,8 +67,8 @@ class ChainRules:
     Attributes:
         large_step: The probability of a large step.
         steps: How numbers are moved by the others.
-        uniform_weight: Probability of a large step · mean of the target function, by which uniform
-            samples count in the balance heuristic; 0 if they are not used. Where the target
+        uniform_weight: Uniform samples for each mutation · mean of the target function (about), by
+            which they count in the balance heuristic; 0 if they are not used. Where the target
             function is what luminance is beyond a bound, the bound.
     """
 
@@ -100,6 +100,7 @@ class Chains:
         energy: By how much a visit counts.
 
     Attributes:
+        rules: How they move.
         count: How many there are.
         done: Mutations of each.
     """
@@ -117,7 +118,7 @@ class Chains:
         seed: int,
         energy: float = 1.0,
     ) -> None:
-        self._target, self._image, self._rules = target, image, rules
+        self._target, self._image, self.rules = target, image, rules
         count = len(winners)
         self._large_step = dr.opaque(mi.Float, rules.large_step)
         self._uses_uniform = rules.large_step > 0 and rules.uniform_weight > 0

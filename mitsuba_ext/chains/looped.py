@@ -15,7 +15,7 @@ class LoopedChains(Chains):
 
     def _begin(self, bootstrap, winners):
         record = RecordedNumbers(
-            dr.zeros(mi.Float, MOST_NUMBERS * self.count), self.count, self._rules.steps
+            dr.zeros(mi.Float, MOST_NUMBERS * self.count), self.count, self.rules.steps
         )
         numbers = bootstrap.numbers(winners, [record, record])
         self._state, _sample = self._target(numbers)
@@ -52,7 +52,7 @@ class LoopedChains(Chains):
             threshold = rng.next_float32()
             moved = dr.select(is_large, 0, known)
             before = mi.PCG32(rng)
-            numbers_now = LocalNumbers(vector, self._rules.steps)
+            numbers_now = LocalNumbers(vector, self.rules.steps)
             numbers = ProposedNumbers(rng, mi.UInt32(none), moved, numbers_now)
             proposal, sample = self._target(numbers)
             rng = numbers.rng

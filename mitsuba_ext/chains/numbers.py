@@ -38,7 +38,7 @@ class StateNumbers:
         """A number of the state."""
         return mi.Float(0)
 
-    def write(self, index: mi.UInt32, value: mi.Float, active: mi.Bool | bool) -> None:
+    def write(self, index: mi.UInt32, value: mi.Float) -> None:
         """Is told what is drawn."""
 
 
@@ -72,9 +72,9 @@ class RecordedNumbers(StateNumbers):
     def read(self, index):
         return dr.gather(mi.Float, self._values, index * self._lanes + self._lane)
 
-    def write(self, index, value, active):
+    def write(self, index, value):
         place = index * self._lanes + self._lane
-        dr.scatter(self.written, value, place, active & (index < self._count))
+        dr.scatter(self.written, value, place, index < self._count)
 
 
 @dataclass
@@ -110,7 +110,7 @@ class StratifiedNumbers:
         corner = dr.select(self.index == 0, self.corner.x, self.corner.y)
         in_cell = dr.minimum((corner + x) / self.cells, 1 - 2.0**-24)
         x = dr.select(self.index < 2, in_cell, x)
-        self.record.write(self.index, x, active)
+        self.record.write(self.index, x)
         self.index = self.index + 1
         return x
 
@@ -143,7 +143,7 @@ class ProposedNumbers:
         is_known = self.index < self.known
         value = self.state.read(dr.select(is_known, self.index, 0))
         x = dr.select(is_known, self.state.steps.move(value, x), x)
-        self.state.write(self.index, x, active)
+        self.state.write(self.index, x)
         self.index = self.index + 1
         return x
 

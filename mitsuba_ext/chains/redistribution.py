@@ -114,11 +114,9 @@ class RedistributionRender(ChainRender):
             kept = mi.Float(dr.select(found.target > 0, 0, 1))
             if target.bound > 0:
                 kept = dr.rcp(1 + found.target / target.bound)
-            dr.eval(kept)
-            for part, lanes in zip(found.parts, found.lanes):
-                image.add_uniform(part, dr.gather(mi.Float, kept, lanes, part.target > 0))
+            image.add_found(found, kept)
+            for part in found.parts:
                 self._energy += float(dr.sum(mi.Float64(part.target))[0])
-            dr.eval(image.tensors())
 
         samples = Bootstrap(target, seed, size, take)
         self._batches += 1

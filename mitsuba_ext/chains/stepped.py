@@ -90,7 +90,7 @@ class SteppedChains(Chains):
         return counts
 
     def _records(self, values: list[mi.Float]) -> list[RecordedNumbers]:
-        return [RecordedNumbers(v, self.count, self._rules.steps) for v in values]
+        return [RecordedNumbers(v, self.count, self.rules.steps) for v in values]
 
     def _everywhere(self) -> list[mi.Bool]:
         return [dr.full(mi.Bool, True, self.count)] * 2
@@ -119,5 +119,8 @@ def _wanted(
     kept = []
     for part, lane, want in zip(parts, lanes, wanted):
         index = dr.compress((part.target > 0) & dr.gather(mi.Bool, want, lane))
-        kept.append((dr.gather(Contribution, part, index), dr.gather(mi.UInt32, lane, index)))
+        if len(index) > 0:
+            kept.append((dr.gather(Contribution, part, index), dr.gather(mi.UInt32, lane, index)))
+    if not kept:
+        kept.append((dr.zeros(Contribution), dr.zeros(mi.UInt32)))
     return joined([part for part, _ in kept]), joined([lane for _, lane in kept])

@@ -7,6 +7,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
 from .chains import ChainRules, Chains
@@ -14,12 +16,19 @@ from .even_tiles import EvenTiles
 from .numbers import stream
 from .render import FIRST_STAGE, ChainRender
 from .small_steps import SmallSteps
-from .target import ImageTarget
+from .target import Found, ImageTarget
 
 #: Chains without and with light paths, at least and at most: these need several kernels for each
 #: mutation, which take as long to trace as 65536 mutations. Mutations of a chain, about, where
 #: these bounds allow it.
 _CHAINS, _LENGTH = {False: (1 << 14, 1 << 16), True: (1 << 16, 1 << 18)}, 64
+
+#: Samples of the bootstrap, in proportion to the mutations, and at most: their mean is the
+#: brightness of what chains find.
+_BOOTSTRAP_SHARE, _MOST_BOOTSTRAP = 0.25, 1 << 24
+
+#: Samples that find the scale of MIS weights.
+_SCALE_SAMPLES = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -61,20 +70,35 @@ class MetropolisRender(ChainRender):
         statistics.interrupted = True
         total = self._spp * self._pixel_count
         count = min(settings.chains or _suitable(total, self._target), total)
-        samples = max(settings.bootstrap, count)
-        if settings.is_even:
-            tiles = EvenTiles(self._film, samples)
-            Bootstrap(self._target, stream(self._seed, FIRST_STAGE), samples, tiles.take)
-            self._target.weights = tiles
-        bootstrap = Bootstrap(self._target, self._seed, samples)
-        statistics.learning_seconds += time.perf_counter() - begin
+        scale = self._first_stage()
+        samples = max(settings.bootstrap, count, self._bootstrap_share(total))
+        # Uniform samples are those of large steps and of the bootstrap
+        share = settings.large_step + _BOOTSTRAP_SHARE
+        rules = ChainRules(
+            settings.large_step, settings.steps, share * scale if settings.uses_uniform else 0.0
+        )
+        image = ChainImage(self._film)
+
+        def take(found: Found) -> None:
+            if interrupt.is_set() or self._integrator.is_cancelled:
+                raise _StoppedError
+            if rules.uniform_weight > 0:
+                weight = dr.select(
+                    found.target > 0, dr.rcp(found.target + rules.uniform_weight), 0
+                )
+                image.add_found(found, weight)
+
+        try:
+            bootstrap = Bootstrap(self._target, self._seed, samples, take)
+        except _StoppedError:
+            return
+        finally:
+            statistics.learning_seconds += time.perf_counter() - begin
+        statistics.rays["camera"] += bootstrap.count
         if bootstrap.mean == 0:
             statistics.learned = "no light was found"
             statistics.interrupted = False
             return
-        image = ChainImage(self._film)
-        uniform_weight = settings.large_step * bootstrap.mean if settings.uses_uniform else 0.0
-        rules = ChainRules(settings.large_step, settings.steps, uniform_weight)
         winners = bootstrap.choose(count)
         chains = self._kind(self._target, image, rules, bootstrap, winners, self._seed)
 
@@ -91,16 +115,37 @@ class MetropolisRender(ChainRender):
                 chains.end()
                 self._write(chains, image, bootstrap)
 
+    def _first_stage(self) -> float:
+        """The mean of the target function, about, which scales MIS weights: any number makes them
+        unbiased, if the samples of the image do not decide it. Finds the weights of tiles too."""
+        settings = self._settings
+        seed, samples = stream(self._seed, FIRST_STAGE), settings.bootstrap
+        if not settings.is_even:
+            return Bootstrap(self._target, seed, min(samples, _SCALE_SAMPLES)).mean
+        tiles = EvenTiles(self._film, samples)
+        scale = Bootstrap(self._target, seed, samples, tiles.take).mean
+        self._target.weights = tiles
+        return scale
+
+    def _bootstrap_share(self, total: int) -> int:
+        if self._integrator.timeout > 0:
+            return 0
+        return min(int(_BOOTSTRAP_SHARE * total), _MOST_BOOTSTRAP)
+
     def _write(self, chains: Chains, image: ChainImage, bootstrap: Bootstrap) -> None:
-        counts = self._counts
-        # Uniform samples of the bootstrap and of large steps have the same mean
-        uniform = bootstrap.count + counts["large"]
-        mean = (bootstrap.mean * bootstrap.count + counts["large_target"]) / uniform
         mutations = chains.done * chains.count
-        per_mutation = self._pixel_count * self._camera_spp / mutations
-        image.write(mean * per_mutation, bootstrap.mean * per_mutation, self._camera_spp)
+        camera_samples = self._pixel_count * self._camera_spp
+        # The mean of those samples from which the chains started: visits depend on it
+        visit_factor = bootstrap.mean * camera_samples / mutations
+        uniform = self._settings.large_step * mutations + bootstrap.count
+        uniform_factor = chains.rules.uniform_weight * camera_samples / uniform
+        image.write(visit_factor, uniform_factor, self._camera_spp)
         self._report(round(mutations / self._pixel_count))
         self._statistics.learned = self._rates()
+
+
+class _StoppedError(Exception):
+    """The render was interrupted, or cancelled."""
 
 
 def _suitable(mutations: int, target: ImageTarget) -> int:
