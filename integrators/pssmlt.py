@@ -7,8 +7,8 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext import registry
-from mitsuba_ext.chains.metropolis import MetropolisIntegrator
 from mitsuba_ext.chains.visits import ChainSettings, MetropolisRender
+from mitsuba_ext.composition.metropolis_integrator import MetropolisIntegrator
 
 
 @registry.plugin

@@ -17,12 +17,14 @@ PLUGINS = ("integrators", "emitters", "bsdfs", "shapes", "samplers")
 
 #: By room, what it imports nothing of.
 FORBIDDEN = {
-    "transport": {"decisions", "bidirectional", "composition", "rendering", *PLUGINS},
-    "regions": {"transport", "decisions", "bidirectional", "composition", "rendering", *PLUGINS},
-    "lights": {"decisions", "bidirectional", "composition", "rendering", *PLUGINS},
-    "decisions": {"bidirectional", "composition", "rendering", *PLUGINS},
-    "bidirectional": {"decisions", "composition", "rendering", *PLUGINS},
-    "rendering": {"decisions", "bidirectional", "composition", *PLUGINS},
+    "transport": {"decisions", "bidirectional", "chains", "composition", "rendering", *PLUGINS},
+    "regions": {"transport", "decisions", "bidirectional", "chains", "composition", "rendering",
+                *PLUGINS},
+    "lights": {"decisions", "bidirectional", "chains", "composition", "rendering", *PLUGINS},
+    "decisions": {"bidirectional", "chains", "composition", "rendering", *PLUGINS},
+    "bidirectional": {"decisions", "chains", "composition", "rendering", *PLUGINS},
+    "chains": {"decisions", "bidirectional", "composition", *PLUGINS},
+    "rendering": {"decisions", "bidirectional", "chains", "composition", *PLUGINS},
     "composition": set(PLUGINS),
     "pointsets": {"transport", "regions", "lights", "decisions", "composition", "rendering",
                   *PLUGINS},

@@ -13,10 +13,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..bidirectional.path_tracer import BidirectionalPathTracer
-from ..composition.decision_parameters import DecisionParameters, Setting
-from ..composition.light_side import LightSide
-from ..composition.slots import read_slot
-from ..composition.walk_integrator import WalkIntegrator
+from ..chains.render import ChainRender
+from ..chains.small_steps import SmallSteps
+from ..chains.target import ImageTarget
+from ..parameters import MOST_SPP
 from ..rendering.batches import sample_count
 from ..rendering.camera import check_takes_splats, find_sensor
 from ..rendering.camera import develop as develop_film
@@ -26,9 +26,10 @@ from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.path_decisions import Weights
 from ..transport.walk import Walk
 from ..transport.without_direct import WithoutDirect
-from .render import ChainRender
-from .small_steps import SmallSteps
-from .target import ImageTarget
+from .decision_parameters import DecisionParameters, Setting
+from .light_side import LightSide
+from .slots import read_slot
+from .walk_integrator import WalkIntegrator
 
 #: The largest share of the time limit for camera samples.
 _CAMERA_SHARE = 0.25
@@ -191,8 +192,6 @@ class MetropolisIntegrator(WalkIntegrator):
         return image
 
     def _check_spp(self, spp: int, sensor: mi.Sensor) -> int:
-        from ..parameters import MOST_SPP
-
         if not 0 <= spp <= MOST_SPP:
             raise ValueError(
                 f'"{self.name}": spp is {spp}; it must be 1 to {MOST_SPP}, or 0 for as many '
