@@ -31,8 +31,8 @@ INTEGRATORS = {
     "bdpt": {"type": "bdpt"},
     "pssmlt": {"type": "pssmlt"},
     "pssmlt, path": {"type": "pssmlt", "bidirectional": False},
-    "erpt": {"type": "erpt"},
-    "erpt, path": {"type": "erpt", "bidirectional": False},
+    "erpt": {"type": "erpt", "bidirectional": True},
+    "erpt, path": {"type": "erpt"},
 }
 
 COLUMNS = ["scene", "`path`: seconds", "error", "means"]

@@ -29,18 +29,18 @@ PICTURES = {
     "caustic": 256,
     "glass_lamp": 96,
     "ring": 768,
-    "pool": 2800,
-    "keyhole": 2000,
+    "pool": 512,
+    "keyhole": 512,
     "shaded_lamp": 192,
     "corridor": 64,
     "night_classroom": 128,
 }
 
-#: Scenes that are rendered by light paths, or in which nothing can be learned about visibility; all
+#: Scenes rendered by light paths or chains, or in which nothing is learned of visibility; all
 #: others have "neepp".
 INTEGRATORS = {
     **dict.fromkeys(["caustic", "glass_lamp", "corridor", "ring", "shaded_lamp"], "bdpt"),
-    **dict.fromkeys(["pool", "keyhole"], "composed_path"),
+    **dict.fromkeys(["pool", "keyhole"], "erpt"),
 }
 
 #: Scenes that are not 16 : 9.

@@ -50,9 +50,10 @@ class EnergyRedistribution(MetropolisIntegrator):
 
     ``spp`` is the number of independent samples per pixel.
 
-    **Use it when** an image of :monosp:`path` or :class:`bdpt` is fine but for bright spots that
-    need very many samples: caustics, small lamps behind glass. **Not when** there are none: it then
-    is :class:`bdpt` (or :monosp:`path`) at a somewhat higher price.
+    **Use it when** an image of :monosp:`path` is fine but for bright spots that need very many
+    samples: caustics that are seen through water or glass, light through a small hole; with
+    ``bidirectional``, when that is so of :class:`bdpt`. **Not when** there are none: it then is
+    :monosp:`path` at a somewhat higher price.
 
     Chains change the random numbers of a sample by small steps (:class:`pssmlt`), and deposit the
     same energy at each place that they visit. They begin at independent samples, so that there is
@@ -75,6 +76,9 @@ class EnergyRedistribution(MetropolisIntegrator):
             'type': 'erpt',
             'max_depth': 8
     """
+
+    #: Chains of bidirectional paths cost more than they gained on most scenes
+    is_bidirectional = False
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

@@ -59,7 +59,7 @@ class MetropolisIntegrator(WalkIntegrator):
        - |bool|
        - Do chains sample the paths of :class:`bdpt`, else those of :monosp:`path`? A mutation of
          the former takes about three times as long, and finds caustics of small lamps.
-         (Default: true)
+         (Default: true; false in :class:`erpt`)
      * - direct_samples
        - |int|
        - Camera samples per pixel for visible lights and direct light, which :monosp:`path` finds
@@ -77,14 +77,17 @@ class MetropolisIntegrator(WalkIntegrator):
         direct_samples: Camera samples per pixel; 0 for as many as suit the render, −1 where chains
             find all light.
         bidirectional: Do chains sample paths from both ends?
+        is_bidirectional: Do they, by default?
     """
+
+    is_bidirectional = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.direct_samples = self.parameter(
             props, "direct_samples", 0, minimum=-1, maximum=1 << 20
         )
-        self.bidirectional = self.parameter(props, "bidirectional", True)
+        self.bidirectional = self.parameter(props, "bidirectional", self.is_bidirectional)
         self.fill(props, next_event=self._unlearned(props, "next_event"))
 
     def _unlearned(self, props: mi.Properties, slot: str) -> DecisionParameters | None:
