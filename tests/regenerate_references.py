@@ -83,8 +83,8 @@ REGRESSIONS = {
         Regression("bdpt", "corridor"),
         Regression("bdpt", "night_classroom"),
         Regression("light_tracer", "glass_lamp"),
-        Regression("pssmlt", "corridor", {"direct_samples": 64, "chains": 1024}),
-        Regression("pssmlt", "door_ajar", {"direct_samples": -1, "chains": 1024}),
+        Regression("pssmlt", "cornell_box", {"bidirectional": False, "chains": 1024}),
+        Regression("erpt", "cornell_box", {"outliers": 2.0}),
     )
 }  # fmt: skip
 
