@@ -113,7 +113,7 @@ class RedistributionRender(ChainRender):
             """Adds what is within the bound to the image."""
             kept = mi.Float(dr.select(found.target > 0, 0, 1))
             if target.bound > 0:
-                kept = dr.rcp(1 + found.target / target.bound)
+                kept = dr.rcp(1 + found.target / dr.opaque(mi.Float, target.bound))
             image.add_found(found, kept)
             for part in found.parts:
                 self._energy += float(dr.sum(mi.Float64(part.target))[0])

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
@@ -70,12 +71,12 @@ class MetropolisRender(ChainRender):
         statistics.interrupted = True
         total = self._spp * self._pixel_count
         count = min(settings.chains or _suitable(total, self._target), total)
-        scale = self._first_stage()
+        mean = self._first_stage()
         samples = max(settings.bootstrap, count, self._bootstrap_share(total))
         # Uniform samples are those of large steps and of the bootstrap
         share = settings.large_step + _BOOTSTRAP_SHARE
         rules = ChainRules(
-            settings.large_step, settings.steps, share * scale if settings.uses_uniform else 0.0
+            settings.large_step, settings.steps, share * mean if settings.uses_uniform else 0.0
         )
         image = ChainImage(self._film)
 
@@ -83,9 +84,9 @@ class MetropolisRender(ChainRender):
             if interrupt.is_set() or self._integrator.is_cancelled:
                 raise _StoppedError
             if rules.uniform_weight > 0:
-                weight = dr.select(
-                    found.target > 0, dr.rcp(found.target + rules.uniform_weight), 0
-                )
+                # Opaque: each render has another one, and would need another kernel
+                scale = dr.opaque(mi.Float, rules.uniform_weight)
+                weight = dr.select(found.target > 0, dr.rcp(found.target + scale), 0)
                 image.add_found(found, weight)
 
         try:
