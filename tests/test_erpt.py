@@ -13,7 +13,6 @@ from hard_cases import stage
 from statistical import (
     MANY_SEEDS,
     REFERENCE_SEEDS,
-    SEEDS,
     THRESHOLD,
     assert_images_are_sound,
     assert_same_quarters,
@@ -39,20 +38,21 @@ def erpt(max_depth: int = 4, **parameters: Any) -> Any:
 
 _SETTINGS = {
     "outliers": {"outliers": 2.0},
-    "everything": {"outliers": 0.0, "mutations_per_pixel": 50},
+    "everything": {"outliers": 0.0, "mutations_per_pixel": 50, "direct_samples": -1},
     "chains find all light": {"outliers": 1.0, "direct_samples": -1},
     "chains of one mutation": {"outliers": 0.0, "chain_length": 1},
     "bidirectional": {"outliers": 2.0, "bidirectional": True},
 }
 
 
-@pytest.mark.parametrize("which", some("outliers", "everything", of=_SETTINGS))
+@pytest.mark.parametrize("which", some("chains find all light", "everything", of=_SETTINGS))
 def test_redistribution_keeps_the_mean(which: str) -> None:
     scene = mi.load_dict(stage(glass=_GLASS), optimize=False)
     integrator = erpt(**{"direct_samples": 64, **_SETTINGS[which]})
-    images = batches(scene, integrator, 32, SEEDS[:MANY_SEEDS])
+    # Many seeds: a tenth more energy in the chains must be seen
+    images = batches(scene, integrator, 32, range(1, 25))
     expected = batches(scene, REFERENCE.make(4), 1024, REFERENCE_SEEDS[:MANY_SEEDS])
-    assert_same_quarters(images, expected, precision=0.02)
+    assert_same_quarters(images, expected, precision=0.015)
 
 
 def test_only_outliers_are_redistributed() -> None:
