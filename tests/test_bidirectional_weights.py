@@ -186,8 +186,8 @@ def assert_camera_ratios(
     compared = 0
     for own, ratio in zip(found[2:], ratios):
         for by_camera, q in zip(found[:2], ratio):
-            # What camera paths cannot find
-            assert not q[(by_camera == 0) & (own > 0)].any()
+            # What camera paths cannot find, or so rarely that its weight is below the least float
+            assert np.all((own * q**2)[(by_camera == 0) & (own > 0)] < 1e-30)
             is_clear = (own > 1e-3) & (by_camera > 1e-3)
             if is_clear.any():
                 expected = np.sqrt(by_camera[is_clear] / own[is_clear])
