@@ -36,6 +36,7 @@ _BASES = (
     "mitsuba_ext.rendering.staged_integrator",
     "mitsuba_ext.composition.decision_plugin",
     "mitsuba_ext.composition.walk_integrator",
+    "mitsuba_ext.composition.chain_integrator",
     "mitsuba_ext.composition.metropolis_integrator",
     "mitsuba_ext.composition.reweighted_camera",
 )

@@ -76,6 +76,7 @@ class LightEmission:
     Attributes:
         probability (numpy.ndarray): With which each emitter is chosen; shape [emitters].
         has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
+        radius (mi.Float): Of the scene, about.
 
     Raises:
         NotImplementedError: Paths cannot start from one of the emitters.
@@ -109,6 +110,7 @@ class LightEmission:
         sphere = box.bounding_sphere() if box.valid() else mi.ScalarBoundingSphere3f(0.0, 1.0)
         self._centre, self._radius = mi.Point3f(sphere.center), mi.Float(_MARGIN * sphere.radius)
         dr.make_opaque(self._centre, self._radius)
+        self.radius = self._radius
         # Paths start from no other emitters
         density = (self.probability > 0) / np.maximum(self._pieces.area, 1e-300)
         density[self._infinite] = 1 / (np.pi * (_MARGIN * sphere.radius) ** 2)
@@ -297,6 +299,7 @@ class LightEmission:
         n: mi.Normal3f,
         ref: mi.Interaction3f,
         active: mi.Bool,
+        knows_normal: bool = False,
     ) -> tuple[mi.Float, mi.Float]:
         """With what densities :meth:`sample` finds a ray that another technique has found, as
         MIS weights see it: where normals are interpolated, both sides of a triangle count as its
@@ -307,6 +310,8 @@ class LightEmission:
             d: The direction of emission.
             n: Geometric normal of the light where the ray leaves it.
             ref: A point that the light shines at; only lights at infinity are asked about it.
+            knows_normal: Is ``n`` the normal of the triangle in any case? Then densities are those
+                of :meth:`sample` itself.
 
         Returns:
             ``probability · pdf_position`` and ``pdf_direction``, as in :class:`EmittedRay`.
@@ -315,9 +320,8 @@ class LightEmission:
         row = self._row(index, active)
         pdf = mi.Float(1)
         if self._has_surfaces:
-            pdf = dr.select(
-                row.kind <= pieces.CYLINDER, self._weighing_density(dr.dot(n, d), row.way), pdf
-            )
+            leaves = self._cosine_density if knows_normal else self._weighing_density
+            pdf = dr.select(row.kind <= pieces.CYLINDER, leaves(dr.dot(n, d), row.way), pdf)
         if pieces.POINT in self._kinds:
             pdf = dr.select(row.kind == pieces.POINT, dr.inv_four_pi, pdf)
         if pieces.SPOT in self._kinds:
@@ -337,6 +341,10 @@ class LightEmission:
         pdf = dr.select(row.is_beam, 1, pdf)
         known = active & (emitter != None)  # noqa: E711
         return dr.select(known, row.probability * row.density, 0), dr.select(known, pdf, 0)
+
+    def chance(self, index: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """The probability with which an emitter is chosen."""
+        return dr.gather(mi.Float, self._table, index * _WORDS, active)
 
     def index(self, emitter: mi.EmitterPtr, active: mi.Bool) -> mi.UInt32:
         """The number of an emitter in ``scene.emitters()``."""

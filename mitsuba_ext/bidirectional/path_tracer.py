@@ -13,7 +13,7 @@ from ..transport.numbers import BothEnds, Numbers
 from ..transport.observer import Observers
 from ..transport.path_decisions import SubpathSelection
 from ..transport.walk import Walk
-from ..transport.without_direct import WithoutDirect
+from ..transport.without_lengths import WithoutLengths
 from .connections import LightSubpaths
 from .emission import LightEmission
 from .light_image import LightImage
@@ -102,7 +102,7 @@ class BidirectionalPathTracer:
         splats = image.splats() if image is not None else []
         weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)
         if self.skips_direct:
-            weights = WithoutDirect(weights)
+            weights = WithoutLengths(weights, 1, 2)
         subpaths = None
         if rounds:
             vertices = VertexCache(rounds, lanes)

@@ -119,6 +119,7 @@ class Chains:
         energy: float = 1.0,
     ) -> None:
         self._target, self._image, self.rules = target, image, rules
+        self._seed = seed
         count = len(winners)
         self._large_step = dr.opaque(mi.Float, rules.large_step)
         self._uses_uniform = rules.large_step > 0 and rules.uniform_weight > 0

@@ -15,6 +15,8 @@ from ..rendering.render import RenderStatistics, kernel_cache_misses
 from ..rendering.time_budget import TimeBudget
 from .chains import Chains, Counts
 from .looped import LoopedChains
+from .path_chains import PathChains
+from .path_target import PathTarget
 from .stepped import SteppedChains
 from .target import ImageTarget
 
@@ -68,6 +70,8 @@ class ChainRender:
 
     @property
     def _kind(self) -> type[Chains]:
+        if isinstance(self._target, PathTarget):
+            return PathChains
         return SteppedChains if self._target.has_light_paths else LoopedChains
 
     def _repeat(

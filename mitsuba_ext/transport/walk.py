@@ -19,6 +19,7 @@ from .connection import Connection, Connector
 from .emission import can_be_hit, emission
 from .estimator import CameraRays, Sample
 from .heroes import Heroes
+from .hidden_emitters import behind_emitters
 from .observer import Observer
 from .path_decisions import (
     AlwaysTest,
@@ -117,7 +118,7 @@ class Walk:
 
         pi = self.query.closest(scene, ray, coherent=True, active=active)
         if dr.hint(self.hide_emitters, mode="scalar"):
-            ray, pi = self._skip_emitters(scene, ray, pi, active)
+            ray, pi = behind_emitters(self.query, scene, ray, pi, active)
 
         while dr.hint(active, label="walk"):
             si = self.query.interaction(pi, ray)
@@ -229,15 +230,3 @@ class Walk:
             return connector.one(place, sampler, vertex, active)
         sampler.next_2d()  # the numbers that follow are those of `path`
         return Connection(dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), ())
-
-    @dr.syntax
-    def _skip_emitters(self, scene, ray, pi, active):
-        """The first surface behind the area lights that a camera ray meets, and the ray from the
-        last of these lights, to which that intersection belongs."""
-        ray = mi.Ray3f(ray)
-        on_emitter = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
-        while on_emitter:
-            ray = self.query.interaction(pi, ray).spawn_ray(ray.d)
-            pi = self.query.closest(scene, ray, coherent=True, active=on_emitter)
-            on_emitter &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
-        return ray, pi

@@ -1,0 +1,155 @@
+"""Metropolis light transport in the space of paths."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.chains.path_target import PathTarget
+from mitsuba_ext.chains.small_steps import SmallSteps
+from mitsuba_ext.chains.visits import ChainSettings, MetropolisRender
+from mitsuba_ext.composition.chain_integrator import ChainIntegrator
+from mitsuba_ext.composition.light_side import LightSide
+from mitsuba_ext.path_space.mutations import Mutations, Switches
+from mitsuba_ext.path_space.space import PathSpace
+from mitsuba_ext.rendering.stages import OneStage
+from mitsuba_ext.transport.path_decisions import Weights
+from mitsuba_ext.transport.without_lengths import WithoutLengths
+
+#: Segments of paths that chains sample, at most: memory of each chain grows with it.
+_MOST = 32
+
+#: The parameters that switch mutations, and the attributes of :class:`Switches`.
+_SWITCHES = {
+    "bidirectional_mutation": "bidirectional",
+    "lens_perturbation": "lens",
+    "multi_chain_perturbation": "multi_chain",
+    "caustic_perturbation": "caustic",
+}
+
+
+@registry.plugin
+class PathMetropolis(ChainIntegrator):
+    r"""
+    .. _integrator-mlt:
+
+    Path space Metropolis light transport (:monosp:`mlt`)
+    -----------------------------------------------------
+
+    Markov chains change light paths vertex by vertex, and stay where much light is found.
+
+    .. pluginparameters::
+
+     * - p_large
+       - |float|
+       - The probability of a new path; the other mutations share the rest equally. (Default: 0.2)
+     * - bidirectional_mutation
+       - |bool|
+       - Replace a part of the path by a random walk from both sides? (Default: true)
+     * - lens_perturbation
+       - |bool|
+       - Move the place on the film, and all up to the first two vertices in a row that are neither
+         mirrors nor smooth glass? (Default: true)
+     * - multi_chain_perturbation
+       - |bool|
+       - The same, where the path is scattered by other surfaces in between? (Default: true)
+     * - caustic_perturbation
+       - |bool|
+       - Move the direction in which light leaves its source, or the last diffuse surface before
+         the one that the camera sees? It needs a sensor that light paths can be connected to.
+         (Default: true)
+     * - luminance_samples
+       - |int|
+       - Independent paths, at least, that estimate the brightness of the image, and from which
+         chains start; without a time limit, a quarter of all mutations if that is more. (Default:
+         100000)
+     * - chains
+       - |int|
+       - Chains, which run in parallel; there are no more than mutations. 0 stands for as many as
+         suit the render: 16384, and more if each then makes 64 mutations. (Default: 0)
+     * - two_stage
+       - |bool|
+       - Estimate the brightness of parts of the image first, and spread mutations evenly over them
+         instead of by brightness? (Default: false)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`ChainIntegrator`: direct_samples, max_depth, rr_depth, hide_emitters,
+         timeout, aovs.
+
+    ``spp`` is the number of mutations per pixel. New paths are independent samples besides, and
+    count as such. Chains sample paths of up to 32 segments; camera samples find longer ones, if
+    ``max_depth`` allows them.
+
+    **Use it when** most light comes by ways that few random walks take: caustics, also behind
+    glass and in mirrors; light through a gap. **Not when** :monosp:`path` or :class:`bdpt`
+    converge well, or for noise that must look even (:class:`pssmlt`).
+
+    The statistics hold the rates of acceptance.
+
+    Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997; D. Cline, PhD thesis,
+    2007, section 7.12. Parameters: Mitsuba 0.6.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="mlt">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'mlt',
+            'max_depth': 8
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.p_large = self.parameter(props, "p_large", 0.2, minimum=0.0, maximum=1.0)
+        self.luminance_samples = self.read_luminance_samples(props)
+        self.two_stage = self.parameter(props, "two_stage", False)
+        self.chains = self.parameter(props, "chains", 0, minimum=0, maximum=1 << 20)
+        chosen = {key: self.parameter(props, key, True) for key in _SWITCHES}
+        self.switches = Switches(**{_SWITCHES[key]: is_on for key, is_on in chosen.items()})
+
+    @property
+    def _least(self) -> int:
+        """Segments of the shortest paths that chains sample."""
+        if self.finds_direct:
+            return 3
+        return 2 if self.hide_emitters else 1
+
+    def schedule(self, scene, sensor, samples, seed):
+        if self.max_depth <= _MOST:
+            return super().schedule(scene, sensor, samples, seed)
+        weights = WithoutLengths(Weights(), self._least, _MOST)
+        setting = self.setting(scene, sensor, samples, seed)
+        return OneStage(self.composed_walk(setting, self.max_depth, weights=weights))
+
+    def target(self, setting):
+        scene, sensor, most = setting.scene, setting.sensor, min(self.max_depth, _MOST)
+        if not scene.emitters() or most < self._least:
+            return None
+        side = LightSide.of(self.name, scene, sensor)
+        space = PathSpace(
+            scene, sensor, side.emission, side.sensor, self._query(scene), setting.spp,
+            self._least, most, self.hide_emitters,
+        )  # fmt: skip
+        return PathTarget(Mutations(space, self.switches))
+
+    def chain_render(self, *render: Any) -> MetropolisRender:
+        settings = ChainSettings(
+            self.chains, self.luminance_samples, self.p_large, SmallSteps(), True, self.two_stage
+        )
+        return MetropolisRender(settings, *render)
+
+    def parameters(self) -> dict[str, Any]:
+        return {
+            **super().parameters(),
+            "chains": self.chains,
+            "p_large": self.p_large,
+            "luminance_samples": self.luminance_samples,
+            **{key: getattr(self.switches, name) for key, name in _SWITCHES.items()},
+            "two_stage": self.two_stage,
+        }

@@ -1,0 +1,146 @@
+"""Chains of light paths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..path_space.memory import Head, Logs, PathMemory, Place, stride
+from ..path_space.mutations import NEW_PATH
+from .chains import Chains, Counts
+from .numbers import ProposedNumbers, StateNumbers, stream
+from .target import Contribution
+
+#: Streams of numbers that all chains share: of the kinds of mutations, and of places on the film.
+_KIND, _FILM = 6, 7
+
+
+@dataclass
+class _State:
+    """A chain's path, without its vertices.
+
+    Attributes:
+        head: The path.
+        found: What it adds to the image.
+        density: The logarithm of its density as a new path.
+    """
+
+    head: Head
+    found: Contribution
+    density: mi.Float
+
+
+class PathChains(Chains):
+    """All mutations of a launch are one traced loop. All chains make the same kind of mutation at a
+    time, if their paths allow it: lanes of a processor then do the same. See :class:`Chains`."""
+
+    def _begin(self, bootstrap, winners):
+        most = self._target.most
+        self._width = stride(most)
+        self._seeds = [dr.opaque(mi.UInt32, stream(self._seed, n)) for n in (_KIND, _FILM)]
+        self._new_path = dr.opaque(mi.Float, self.rules.large_step)
+        numbers = bootstrap.numbers(winners)
+        memory, at = PathMemory.of(most), dr.zeros(mi.UInt32, self.count)
+        memory, _numbers, proposal = self._target.mutations.new_path(
+            memory, at, numbers, mi.Bool(True)
+        )
+        self._state = self._as_state(proposal)
+        self._store(memory, self._state.head)
+
+    def _as_state(self, proposal) -> _State:
+        return _State(proposal.head, self._target.contribution(proposal), proposal.log_density)
+
+    def advance(self, steps):
+        counts = self._advance(dr.opaque(mi.UInt32, steps), dr.opaque(mi.UInt32, self.done))
+        dr.eval(
+            self._state, self._weight, self._rngs, self._places, self._logs, counts,
+            self._image.tensors(),
+        )  # fmt: skip
+        self.done += steps
+        return counts
+
+    @dr.syntax
+    def _advance(self, steps: mi.UInt32, done: mi.UInt32) -> Counts:
+        mutations = self._target.mutations
+        none, lane = dr.zeros(mi.UInt32, self.count), dr.arange(mi.UInt32, self.count)
+        rng, state, weight = mi.PCG32(self._rngs[0]), self._state, mi.Float(self._weight)
+        counts = Counts.none(self.count)
+        memory = self._load(state.head)
+        unused = StateNumbers(self.rules.steps)
+        step = mi.UInt32(none)
+        while step < steps:
+            # ----- Propose -----
+            which = mi.sample_tea_float32(self._seeds[0], done + step)
+            kind = mutations.kind(which, self._new_path)
+            place = mutations.place(lane, self._seeds[1], done + step)
+            threshold = rng.next_float32()
+            numbers = ProposedNumbers(rng, mi.UInt32(none), mi.UInt32(none), unused)
+            memory, numbers, proposal = mutations.mutate(
+                memory, state.head, state.density, kind, place, numbers
+            )
+            rng = numbers.rng
+            new = self._as_state(proposal)
+
+            # ----- Accept or reject -----
+            # Densities of states are those of new paths, times their contributions as such
+            change = new.density - state.density + proposal.log_ratio
+            ratio = new.found.target / state.found.target * dr.exp(change)
+            ratio = dr.select(dr.isfinite(ratio), ratio, 0)
+            a = dr.select(new.found.target > 0, dr.minimum(ratio, 1), 0)
+            a = dr.select(state.found.target > 0, a, 1)
+            is_accepted = threshold < a
+            is_large = kind == NEW_PATH
+            counts = counts.plus(
+                is_large, is_accepted, new.found.target, self._target.sample(proposal)
+            )
+
+            # ----- Add what is left behind to the image -----
+            left = dr.select(is_accepted, state.found, new.found)
+            visits = dr.select(is_accepted, weight + (1 - a), a)
+            self._image.add(left, visits * self._share(left.target))
+            if dr.hint(self._uses_uniform, mode="scalar"):
+                share = self._share(new.found.target)
+                self._image.add_uniform(new.found, dr.select(is_large, share, 0))
+            weight = dr.select(is_accepted, a, weight + (1 - a))
+            # The vertices of the new path lie where those of the next proposal would
+            state = dr.select(is_accepted, new, state)
+            step += 1
+
+        self._store(memory, state.head)
+        self._rngs, self._state, self._weight = [rng], state, weight
+        return counts
+
+    # ---- Vertices between launches ----
+
+    @dr.syntax
+    def _load(self, head: Head) -> PathMemory:
+        memory = PathMemory.of(self._target.most)
+        lane, count = dr.arange(mi.UInt32, self.count), dr.opaque(mi.UInt32, self.count)
+        index = dr.zeros(mi.UInt32, self.count)
+        while index <= head.length:
+            where = index * count + lane
+            memory.places[head.at + index] = dr.gather(type(self._places), self._places, where)
+            memory.logs[head.at + index] = dr.gather(type(self._logs), self._logs, where)
+            index += 1
+        return memory
+
+    @dr.syntax
+    def _store(self, memory: PathMemory, head: Head) -> None:
+        size = self.count * self._width
+        places, logs = dr.zeros(Place, size), dr.zeros(Logs, size)
+        lane, count = dr.arange(mi.UInt32, self.count), dr.opaque(mi.UInt32, self.count)
+        index = dr.zeros(mi.UInt32, self.count)
+        while index <= head.length:
+            where = index * count + lane
+            dr.scatter(places, memory.places[head.at + index], where)
+            dr.scatter(logs, memory.logs[head.at + index], where)
+            index += 1
+        self._places, self._logs = places, logs
+        dr.eval(self._state, places, logs)
+
+    def end(self):
+        self._image.add(self._state.found, self._weight * self._share(self._state.found.target))
+        self._weight = dr.opaque(mi.Float, 0, self.count)
+        dr.eval(self._image.tensors(), self._weight)

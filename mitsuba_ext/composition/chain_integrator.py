@@ -1,0 +1,168 @@
+"""The base class of integrators with chains.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..chains.path_target import PathTarget
+from ..chains.render import ChainRender
+from ..chains.target import ImageTarget
+from ..parameters import MOST_SPP
+from ..rendering.batches import sample_count
+from ..rendering.camera import check_takes_splats, find_sensor
+from ..rendering.camera import develop as develop_film
+from ..rendering.interrupts import deferred_interrupt
+from ..rendering.stages import OneStage
+from ..transport.estimator import CameraRays, Estimator, Sample
+from ..transport.walk import Walk
+from .decision_parameters import Setting
+from .walk_integrator import WalkIntegrator
+
+#: The largest share of the time limit for camera samples.
+_CAMERA_SHARE = 0.25
+
+#: Camera samples per pixel, at least (as in Mitsuba 0.6), and their share of ``spp``: a sample of
+#: direct light takes a fraction of the time of a mutation.
+_CAMERA_SAMPLES, _DIRECT_SHARE = 16, 0.25
+
+
+@dataclass
+class _OnlyAlpha:
+    """Camera samples without radiance."""
+
+    estimator: Estimator
+
+    def __call__(self, scene, sampler, rays: CameraRays, active) -> Sample:
+        sample = self.estimator(scene, sampler, rays, active)
+        return replace(sample, L=dr.zeros(mi.Spectrum, dr.width(sample.L)))
+
+
+class ChainIntegrator(WalkIntegrator):
+    """An integrator that renders direct light with camera samples, and the rest with chains.
+
+    .. pluginparameters::
+
+     * - direct_samples
+       - |int|
+       - Camera samples per pixel for visible lights and direct light, which :monosp:`path` finds
+         well; the chains find the rest. 0 stands for a quarter of ``spp``, and 16 at least; −1
+         leaves all light to the chains. (Default: 0)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+
+    Attributes:
+        direct_samples: Camera samples per pixel; 0 for as many as suit the render, −1 where chains
+            find all light.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.direct_samples = self.parameter(
+            props, "direct_samples", 0, minimum=-1, maximum=1 << 20
+        )
+
+    def read_luminance_samples(self, props: mi.Properties) -> int:
+        """The parameter ``luminance_samples``."""
+        return self.parameter(props, "luminance_samples", 100_000, minimum=1, maximum=1 << 26)
+
+    def chain_render(self, *render: Any) -> ChainRender:
+        """The render of the chains, of which the parameters are those of :class:`ChainRender`."""
+        raise NotImplementedError
+
+    def target(self, setting: Setting) -> ImageTarget | PathTarget | None:
+        """What chains sample; ``None`` where they have nothing to find."""
+        raise NotImplementedError
+
+    def parameters(self) -> dict[str, Any]:
+        return {"direct_samples": self.direct_samples, **super().parameters()}
+
+    @property
+    def finds_direct(self) -> bool:
+        """Do camera samples find direct light?"""
+        return self.direct_samples >= 0
+
+    def schedule(self, scene, sensor, samples, seed) -> OneStage:
+        """Of the camera samples."""
+        setting = self.setting(scene, sensor, samples, seed)
+        if self.finds_direct:
+            return OneStage(self.composed_walk(setting, min(self.max_depth, 2)))
+        return OneStage(_OnlyAlpha(self.composed_walk(setting, min(self.max_depth, 1))))
+
+    def setting(
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
+    ) -> Setting:
+        """Of the camera samples."""
+        return Setting(
+            scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), 0, self.timeout > 0
+        )
+
+    def composed_walk(self, setting: Setting, max_depth: int, **decisions: Any) -> Walk:
+        """A walk with this integrator's decisions, and others."""
+        chosen = {slot: p.decision(setting) for slot, p in self.slots.items()}
+        decisions.update({slot: decision for slot, decision in chosen.items() if decision})
+        return replace(self.walk(query=self._query(setting.scene), **decisions),
+                       max_depth=max_depth)
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        start = time.perf_counter()
+        sensor = find_sensor(scene, sensor)
+        try:
+            check_takes_splats(sensor.film())
+        except NotImplementedError as error:
+            raise NotImplementedError(f'"{self.name}": {error}') from None
+        spp = self._check_spp(spp, sensor)
+        seed = int(seed[0]) if isinstance(seed, mi.UInt32) else int(seed)
+        setting = Setting(scene, sensor, seed, self.max_depth, self.rr_depth, spp)
+        target = self.target(setting)
+        self._render_camera_samples(scene, sensor, seed, spp, target is not None)
+        statistics, camera_spp = self.statistics, self.statistics.spp
+        is_interrupted = False
+        if target is not None and not self.is_cancelled:
+            chains = self.chain_render(self, target, seed, spp, camera_spp, statistics, start)
+            with deferred_interrupt() as interrupt:
+                chains.run(interrupt)
+            is_interrupted = interrupt.is_set()
+        statistics.seconds = time.perf_counter() - start
+        image = develop_film(sensor.film(), develop, evaluate)
+        if is_interrupted:
+            raise KeyboardInterrupt
+        return image
+
+    def _check_spp(self, spp: int, sensor: mi.Sensor) -> int:
+        if not 0 <= spp <= MOST_SPP:
+            raise ValueError(
+                f'"{self.name}": spp is {spp}; it must be 1 to {MOST_SPP}, or 0 for as many '
+                f"as the sampler says"
+            )
+        return spp or sample_count(sensor, 0)
+
+    def _render_camera_samples(self, scene, sensor, seed, spp: int, has_chains: bool) -> None:
+        """Leaves them in the film, and their statistics in ``self.statistics``; ``spp`` is that of
+        the render."""
+        report, timeout = self.progress, self.timeout
+        if has_chains:
+            self.progress = None
+            self.timeout = timeout * _CAMERA_SHARE
+        count = _CAMERA_SAMPLES
+        if self.finds_direct:
+            count = self.direct_samples or max(count, int(_DIRECT_SHARE * spp))
+        try:
+            super().render(scene, sensor, seed, count, develop=False, evaluate=False)
+        finally:
+            self.progress, self.timeout = report, timeout
+
+    def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
+        raise NotImplementedError(
+            f'"{self.name}": chains have no single samples: it cannot be nested in an integrator '
+            f'that asks for those, such as "moment" or "aov"; "variance" can hold it, and it has a '
+            f'parameter "aovs" of its own'
+        )
