@@ -24,6 +24,11 @@ class EnergyRedistribution(MetropolisIntegrator):
 
     .. pluginparameters::
 
+     * - bidirectional
+       - |bool|
+       - Do chains sample the paths of :class:`bdpt`, else those of :monosp:`path`? A mutation of
+         the former takes about three times as long, and finds caustics of small lamps.
+         (Default: false)
      * - outliers
        - |float|
        - Samples so many times as bright as their part of the image are outliers: what they have
@@ -40,13 +45,16 @@ class EnergyRedistribution(MetropolisIntegrator):
        - |int|
        - Independent samples, at least, that measure the brightness of the image and of its parts
          first. (Default: 100000)
-     * - mutation_size_low, mutation_size_high
+     * - mutation_size_low
        - |float|
-       - By how much mutations change a number, at least and at most. (Default: 1/1024, 1/64)
+       - By how much mutations change a number, at least. (Default: 1/1024)
+     * - mutation_size_high
+       - |float|
+       - By how much mutations change a number, at most. (Default: 1/64)
      * - (Common parameters)
        - |several|
-       - Those of :class:`MetropolisIntegrator`: bidirectional, direct_samples, next_event,
-         max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`MetropolisIntegrator`: direct_samples, next_event, max_depth,
+         rr_depth, hide_emitters, timeout, aovs.
 
     ``spp`` is the number of independent samples per pixel.
 

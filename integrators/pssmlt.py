@@ -24,6 +24,11 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
 
     .. pluginparameters::
 
+     * - bidirectional
+       - |bool|
+       - Do chains sample the paths of :class:`bdpt`, else those of :monosp:`path`? A mutation of
+         the former takes about three times as long, and finds caustics of small lamps.
+         (Default: true)
      * - p_large
        - |float|
        - The probability of a large step, which draws all numbers anew. (Default: 0.3)
@@ -32,9 +37,12 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
        - Independent samples, at least, that estimate the brightness of the image, and from which
          chains start; without a time limit, a quarter of all mutations if that is more. (Default:
          100000)
-     * - mutation_size_low, mutation_size_high
+     * - mutation_size_low
        - |float|
-       - By how much small steps change a number, at least and at most. (Default: 1/1024, 1/64)
+       - By how much small steps change a number, at least. (Default: 1/1024)
+     * - mutation_size_high
+       - |float|
+       - By how much small steps change a number, at most. (Default: 1/64)
      * - kelemen_style_weights
        - |bool|
        - Use large steps as independent samples besides, weighted by the balance heuristic: it
@@ -50,8 +58,8 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
          instead of by brightness? (Default: false)
      * - (Common parameters)
        - |several|
-       - Those of :class:`MetropolisIntegrator`: bidirectional, direct_samples, next_event,
-         max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`MetropolisIntegrator`: direct_samples, next_event, max_depth,
+         rr_depth, hide_emitters, timeout, aovs.
 
     ``spp`` is the number of mutations per pixel.
 

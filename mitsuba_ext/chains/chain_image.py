@@ -44,6 +44,12 @@ class ChainImage:
         others = [mi.Float(0)] * (block.channel_count() - 3)
         block.put(found.position, [value.x, value.y, value.z, *others], weight > 0)
 
+    def add_image(self, other: ChainImage) -> None:
+        """Adds all of another image of this film."""
+        for block, added in zip((self._visits, self._uniform), (other._visits, other._uniform)):
+            block.put_block(added)
+        dr.eval(self.tensors())
+
     def tensors(self) -> list[mi.TensorXf]:
         """What a launch evaluates."""
         return [self._visits.tensor(), self._uniform.tensor()]

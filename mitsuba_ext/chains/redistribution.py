@@ -106,7 +106,9 @@ class RedistributionRender(ChainRender):
                 statistics.learned = f"{share:.1%} of the energy was redistributed; {self._rates()}"
 
     def _batch(self, image: ChainImage, rules: ChainRules, size: int, deposit: float) -> None:
+        """Adds a batch to the image: all of it, or nothing if an exception ends it."""
         settings, target = self._settings, self._target
+        part, energies = ChainImage(self._film), []
         seed = stream(self._seed, _BATCHES + self._batches)
 
         def take(found: Found) -> None:
@@ -114,27 +116,27 @@ class RedistributionRender(ChainRender):
             kept = mi.Float(dr.select(found.target > 0, 0, 1))
             if target.bound > 0:
                 kept = dr.rcp(1 + found.target / dr.opaque(mi.Float, target.bound))
-            image.add_found(found, kept)
-            for part in found.parts:
-                self._energy += float(dr.sum(mi.Float64(part.target))[0])
+            part.add_found(found, kept)
+            energies.extend(float(dr.sum(mi.Float64(p.target))[0]) for p in found.parts)
 
         samples = Bootstrap(target, seed, size, take)
-        self._batches += 1
-        self._samples += samples.count
         self._statistics.rays["camera"] += samples.count
         energy = samples.mean * samples.count
-        self._redistributed += energy
         # A very bright sample does not make more chains than all energy would: they carry more
         wanted = samples.count * settings.mutations / self._spp or samples.count
         most = min(_MOST_CHAINS, max(1.0, wanted / settings.chain_length))
         spacing = max(deposit * settings.chain_length, energy / most)
         winners = samples.choose_by_energy(spacing)
-        if len(winners) == 0:
-            return
-        chains = self._kind(
-            target, image, rules, samples, winners, seed, spacing / settings.chain_length
-        )
-        while chains.done < settings.chain_length:
-            length = min(chains.launch, settings.chain_length - chains.done)
-            self._count(chains.advance(length), length * chains.count)
-        chains.end()
+        if len(winners) > 0:
+            chains = self._kind(
+                target, part, rules, samples, winners, seed, spacing / settings.chain_length
+            )
+            while chains.done < settings.chain_length:
+                length = min(chains.launch, settings.chain_length - chains.done)
+                self._count(chains.advance(length), length * chains.count)
+            chains.end()
+        image.add_image(part)
+        self._batches += 1
+        self._samples += samples.count
+        self._redistributed += energy
+        self._energy += sum(energies)

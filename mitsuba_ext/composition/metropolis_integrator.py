@@ -55,11 +55,6 @@ class MetropolisIntegrator(WalkIntegrator):
 
     .. pluginparameters::
 
-     * - bidirectional
-       - |bool|
-       - Do chains sample the paths of :class:`bdpt`, else those of :monosp:`path`? A mutation of
-         the former takes about three times as long, and finds caustics of small lamps.
-         (Default: true; false in :class:`erpt`)
      * - direct_samples
        - |int|
        - Camera samples per pixel for visible lights and direct light, which :monosp:`path` finds
