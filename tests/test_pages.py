@@ -39,8 +39,9 @@ VALUES = {
     "light_sampling": "visibility",
     **dict.fromkeys(["bidirectional", "kelemen_style_weights", "two_stage"], True),
     **dict.fromkeys(["chains", "chain_length", "direct_samples", "luminance_samples"], 3),
+    **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
     **dict.fromkeys(["mutation_size_low", "mutation_size_high"], 0.01),
-    "mutations_per_pixel": 3, "outliers": 2.0, "p_large": 0.5,
+    "outliers": 2.0, "p_large": 0.5,
 }  # fmt: skip
 
 #: What makes a parameter known that is not always.

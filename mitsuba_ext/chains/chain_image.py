@@ -54,8 +54,11 @@ class ChainImage:
         """What a launch evaluates."""
         return [self._visits.tensor(), self._uniform.tensor()]
 
+    def _filtered(self, visits: mi.TensorXf) -> mi.TensorXf:
+        return visits
+
     def write(self, visit_factor: float, uniform_factor: float, camera_spp: int) -> None:
         """Adds the image to the film, which holds ``camera_spp`` camera samples per pixel."""
-        visits, uniform = self.tensors()
+        visits, uniform = self._filtered(self._visits.tensor()), self._uniform.tensor()
         tensor = visits * visit_factor + uniform * uniform_factor
         put_splats(self._film, tensor, self._visits.offset(), camera_spp)

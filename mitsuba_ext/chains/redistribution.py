@@ -12,8 +12,9 @@ import mitsuba as mi
 
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
-from .chains import ChainRules
+from .chains import ChainRules, Chains
 from .even_tiles import EvenTiles
+from .noise_filters import FilteredChains, FilteredImage, NoiseFilters
 from .numbers import stream
 from .render import FIRST_STAGE, ChainRender
 from .small_steps import SmallSteps
@@ -41,6 +42,7 @@ class RedistributionSettings:
             that to chains. 0 redistributes all energy.
         luminance_samples: Samples that measure brightness first.
         steps: How numbers are moved.
+        filters: Of the noise.
     """
 
     chain_length: int
@@ -48,6 +50,7 @@ class RedistributionSettings:
     outliers: float
     luminance_samples: int
     steps: SmallSteps
+    filters: NoiseFilters = NoiseFilters()
 
 
 class RedistributionRender(ChainRender):
@@ -83,7 +86,7 @@ class RedistributionRender(ChainRender):
         if settings.outliers > 0 and first.mean > 0:
             target.weights = tiles
             target.bound = bound = settings.outliers * first.mean
-        image = ChainImage(self._film)
+        image = self._image()
         rules = ChainRules(0.0, settings.steps, bound)
         # Energy of a deposit, in units of the target function of a sample
         deposit = self._spp * first.mean / (settings.mutations or self._spp)
@@ -105,10 +108,18 @@ class RedistributionRender(ChainRender):
                 share = self._redistributed / self._energy if self._energy else 0.0
                 statistics.learned = f"{share:.1%} of the energy was redistributed; {self._rates()}"
 
+    def _image(self) -> ChainImage:
+        filters = self._settings.filters
+        return FilteredImage(self._film, filters.width) if filters else ChainImage(self._film)
+
+    def _chains(self, *chains: Any) -> Chains:
+        filters = self._settings.filters
+        return FilteredChains(filters, *chains) if filters else self._kind(*chains)
+
     def _batch(self, image: ChainImage, rules: ChainRules, size: int, deposit: float) -> None:
         """Adds a batch to the image: all of it, or nothing if an exception ends it."""
         settings, target = self._settings, self._target
-        part, energies = ChainImage(self._film), []
+        part, energies = self._image(), []
         seed = stream(self._seed, _BATCHES + self._batches)
 
         def take(found: Found) -> None:
@@ -128,7 +139,7 @@ class RedistributionRender(ChainRender):
         spacing = max(deposit * settings.chain_length, energy / most)
         winners = samples.choose_by_energy(spacing)
         if len(winners) > 0:
-            chains = self._kind(
+            chains = self._chains(
                 target, part, rules, samples, winners, seed, spacing / settings.chain_length
             )
             while chains.done < settings.chain_length:
