@@ -23,7 +23,8 @@ class LoopedChains(Chains):
         self._known = dr.minimum(numbers.index, MOST_NUMBERS)
         self._values = record.written
         self._earlier = dr.opaque(mi.Float, 0, self.count)
-        dr.eval(self._state, self._known, self._values)
+        # Evaluated now, the first launch has the kernel of the others
+        dr.eval(self._state, self._known, self._values, self._rngs)
 
     def advance(self, steps):
         counts = self._advance(dr.opaque(mi.UInt32, steps))
