@@ -13,9 +13,10 @@ from .numbers import generator, stream
 from .small_steps import SmallSteps
 from .target import ImageTarget
 
-#: Numbers of a state that a chain remembers, for each end of its path: 20 bounces, about. A path
-#: that draws more draws those anew for each proposal, which is a large step in them.
-MOST_NUMBERS = 128
+#: Numbers of a state that a chain remembers, for the camera's end of its path and for the light's:
+#: 20 bounces, about. A path that draws more draws those anew for each proposal, which is a large
+#: step in them.
+MOST_NUMBERS, MOST_LIGHT_NUMBERS = 128, 96
 
 #: Streams of random numbers, which differ from those of the bootstrap.
 CAMERA, LIGHT = 3, 4
