@@ -41,7 +41,7 @@ VALUES = {
     **dict.fromkeys(["chains", "chain_length", "direct_samples", "luminance_samples"], 3),
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
     **dict.fromkeys(["mutation_size_low", "mutation_size_high"], 0.01),
-    "outliers": 2.0, "p_large": 0.5,
+    "chain_file": "chains.npz", "outliers": 2.0, "p_large": 0.5,
 }  # fmt: skip
 
 #: What makes a parameter known that is not always.

@@ -14,6 +14,8 @@ class LoopedChains(Chains):
     """All mutations of a launch are one traced loop around the estimator. What it finds has one
     place on the film: no splats. See :class:`Chains`."""
 
+    _parts_of_state = ("_rngs", "_state", "_known", "_values", "_weight", "_earlier")
+
     def _begin(self, bootstrap, winners):
         record = RecordedNumbers(
             dr.zeros(mi.Float, MOST_NUMBERS * self.count), self.count, self.rules.steps

@@ -49,17 +49,11 @@ class FilteredImage(ChainImage):
         self._proposals = mi.ImageBlock(
             film.crop_size(), film.crop_offset(), 1, film.rfilter(), border, coalesce=False
         )
+        self._blocks.append(self._proposals)
 
     def propose(self, found: Contribution) -> None:
         """Counts proposals, black ones too."""
         self._proposals.put(found.position, [mi.Float(1)])
-
-    def add_image(self, other):
-        self._proposals.put_block(other._proposals)
-        super().add_image(other)
-
-    def tensors(self):
-        return [*super().tensors(), self._proposals.tensor()]
 
     def _filtered(self, visits):
         if self._width == 0:

@@ -146,7 +146,7 @@ class RedistributionRender(ChainRender):
                 length = min(chains.launch, settings.chain_length - chains.done)
                 self._count(chains.advance(length), length * chains.count)
             chains.end()
-        image.add_image(part)
+        image.add_tensors(part.tensors())
         self._batches += 1
         self._samples += samples.count
         self._redistributed += energy

@@ -23,6 +23,8 @@ class SteppedChains(Chains):
     #: Numbers that are remembered, for each end of a path.
     _most = (MOST_NUMBERS, MOST_LIGHT_NUMBERS)
 
+    _parts_of_state = ("_rngs", "_state", "_parts", "_lanes", "_known", "_values", "_weight")
+
     def _begin(self, bootstrap, winners):
         empty = [dr.zeros(mi.Float, most * self.count) for most in self._most]
         records = self._records(empty)
