@@ -3,6 +3,7 @@ errors are the variance between seeds."""
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -35,14 +36,21 @@ def options(command: Callable) -> Callable:
     return command
 
 
-def load(name: str, size: tuple[int, int]) -> mi.Scene:
-    """A file, or one of our scenes by its name. Scenes made elsewhere call the film's size resx and
-    resy."""
+def load(name: str, size: tuple[int, int], sampler: str = "") -> mi.Scene:
+    """A file, or one of our scenes by its name, with another sampler than its own if that is given.
+    Scenes made elsewhere call the film's size resx and resy."""
     file = Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml"
-    width, height = size
-    if "$resx" in file.read_text():
-        return mi.load_file(str(file), resx=width, resy=height)
-    return mi.load_file(str(file), width=width, height=height, rfilter="box")
+    text, (width, height) = file.read_text(), size
+    parameters = {"width": width, "height": height, "rfilter": "box"}
+    if "$resx" in text:
+        parameters = {"resx": width, "resy": height}
+    elif "$rfilter" not in text:
+        del parameters["rfilter"]
+    if not sampler:
+        return mi.load_file(str(file), **parameters)
+    mi.file_resolver().prepend(str(file.parent))
+    text = re.sub(r'<sampler type="\w+"', f'<sampler type="{sampler}"', text)
+    return mi.load_string(text, **{k: str(v) for k, v in parameters.items()})
 
 
 def title(name: str) -> str:
@@ -79,11 +87,13 @@ class Renders:
 
 
 def render_in_turns(
-    scene: mi.Scene, integrators: dict[str, dict], max_depth: int, spp: int, seeds: int
+    scene: mi.Scene, integrators: dict[str, dict], max_depth: int | None, spp: int, seeds: int
 ) -> dict[str, Renders]:
     """Renders a scene with each integrator (as for ``mi.load_dict``) and so many seeds. A render
-    before, which compiles the kernels, does not count."""
-    made = {k: mi.load_dict({**v, "max_depth": max_depth}) for k, v in integrators.items()}
+    before, which compiles the kernels, does not count. ``max_depth`` is that of the integrators, if
+    they do not say it themselves."""
+    depth = {} if max_depth is None else {"max_depth": max_depth}
+    made = {k: mi.load_dict({**v, **depth}) for k, v in integrators.items()}
     renders = {kind: Renders() for kind in integrators}
     for seed in range(seeds + 1):
         for kind, integrator in made.items():
@@ -129,6 +139,12 @@ def error(
     scale = np.stack([relative_scale(x) for x in np.moveaxis(image, -1, 0)], axis=-1)
     values = np.sort((variance * scale**2)[pixels].ravel())
     return float(values[: len(values) - int(np.ceil(trimmed * len(values)))].mean())
+
+
+def percentile(squares: np.ndarray, image: np.ndarray) -> float:
+    """The 99th percentile of the pixels' relative squared errors."""
+    scale = np.stack([relative_scale(x) for x in np.moveaxis(image, -1, 0)], axis=-1)
+    return float(np.percentile((squares * scale**2).mean(axis=-1), 99))
 
 
 def print_header(columns: Sequence[str]) -> None:

@@ -2,12 +2,13 @@
 by variance and CPU time, start-up included:
 
     .venv/bin/python examples/metropolis.py caustic ring /somewhere/scene.xml --size 192 108
+    .venv/bin/python examples/metropolis.py fast_balls fan --motion --max-depth 4
 
 Writes one row of Markdown for each scene. Errors are those of ``examples/equal_samples.py``,
 relative to the mean of all images of ``pssmlt``; times are the median of the seeds. The efficiency,
 1 / (error · time), is relative to ``path``. ``means`` has those of ``path`` and ``bdpt``, relative
 to that of ``pssmlt``: where they are below 1, light is found too rarely for the variance to tell
-the error.
+the error. With ``--motion``, there is a row for each integrator that renders moving shapes.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from equal_samples import (
     error,
     load,
     options,
+    percentile,
     print_header,
     print_row,
     render_in_turns,
@@ -35,6 +37,21 @@ INTEGRATORS = {
     "erpt, path": {"type": "erpt"},
 }
 
+_PATH = {"type": "composed_path"}
+_PSSMLT = {"type": "pssmlt", "bidirectional": False}
+
+#: Mitsuba's path tracer does not see moving shapes.
+MOTION = {
+    "path": _PATH,
+    "path, multijitter": {**_PATH, "sampler": "multijitter"},
+    "reweighted_time": {"type": "reweighted_time", "nested": _PATH},
+    "pssmlt": _PSSMLT,
+    "pssmlt, only chains": {**_PSSMLT, "direct_samples": -1},
+    "pssmlt, only chains, two_stage": {**_PSSMLT, "direct_samples": -1, "two_stage": True},
+    "erpt": {"type": "erpt"},
+    "erpt, only chains": {"type": "erpt", "direct_samples": -1},
+}
+
 COLUMNS = ["scene", "`path`: seconds", "error", "means"]
 for _kind in list(INTEGRATORS)[1:]:
     COLUMNS += [f"{_kind}: time", "error", "efficiency"]
@@ -43,10 +60,18 @@ COLUMNS.append("accepted")
 
 @click.command()
 @options
-def main(names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple) -> None:
+@click.option("--motion", is_flag=True, help="Compare integrators that render moving shapes.")
+def main(
+    names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, motion: bool
+) -> None:
     """Compares the integrators on the scenes NAMES."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
+    if motion:
+        print_header(["scene", "", "time", "error", "efficiency", "99th percentile", "mean"])
+        for name in names:
+            print_motion(name, size, max_depth, spp, seeds)
+        return
     print_header(COLUMNS)
     for name in names:
         renders = render_in_turns(load(name, size), INTEGRATORS, max_depth, spp, seeds)
@@ -63,6 +88,28 @@ def cells(renders: dict[str, Renders]) -> list[str]:
         e = error(renders[kind].variance, mean) / base
         row += [f"{slower:.2f}", f"{e:.2g}", f"{1 / (e * slower):.2g}"]
     return [*row, renders["pssmlt"].learned[-1].removeprefix("accepted: ")]
+
+
+def print_motion(name: str, size: tuple, max_depth: int, spp: int, seeds: int) -> None:
+    """A row for each integrator of :data:`MOTION`, in units of the first."""
+    renders = {}
+    for kind, values in MOTION.items():
+        values = dict(values)
+        scene = load(name, size, values.pop("sampler", ""))
+        if "nested" in values:
+            values["nested"] = {**values["nested"], "max_depth": max_depth}
+        else:
+            values["max_depth"] = max_depth
+        renders |= render_in_turns(scene, {kind: values}, None, spp, seeds)
+    base, mean = renders["path"], renders["path, multijitter"].mean
+    first = [error(base.variance, mean), percentile(base.variance, mean)]
+    for kind, r in renders.items():
+        slower = r.time / base.time
+        e, p = (f(r.variance, mean) / x for f, x in zip((error, percentile), first))
+        print_row([
+            title(name), kind, f"{slower:.2f}", f"{e:.2g}", f"{1 / (e * slower):.2g}", f"{p:.2g}",
+            f"{r.mean.mean() / mean.mean():.3f}",
+        ])  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 
 from mitsuba_ext import registry
+from mitsuba_ext.chains.target import ImageTarget
 from mitsuba_ext.chains.visits import ChainSettings, MetropolisRender
+from mitsuba_ext.composition.chain_file import ChainFile
 from mitsuba_ext.composition.metropolis_integrator import MetropolisIntegrator
 
 
@@ -24,6 +27,11 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
 
     .. pluginparameters::
 
+     * - bidirectional
+       - |bool|
+       - Do chains sample the paths of :class:`bdpt`, else those of :monosp:`path`? A mutation of
+         the former takes about three times as long, and finds caustics of small lamps.
+         (Default: true)
      * - p_large
        - |float|
        - The probability of a large step, which draws all numbers anew. (Default: 0.3)
@@ -32,9 +40,12 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
        - Independent samples, at least, that estimate the brightness of the image, and from which
          chains start; without a time limit, a quarter of all mutations if that is more. (Default:
          100000)
-     * - mutation_size_low, mutation_size_high
+     * - mutation_size_low
        - |float|
-       - By how much small steps change a number, at least and at most. (Default: 1/1024, 1/64)
+       - By how much small steps change a number, at least. (Default: 1/1024)
+     * - mutation_size_high
+       - |float|
+       - By how much small steps change a number, at most. (Default: 1/64)
      * - kelemen_style_weights
        - |bool|
        - Use large steps as independent samples besides, weighted by the balance heuristic: it
@@ -48,10 +59,16 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
        - |bool|
        - Estimate the brightness of parts of the image first, and spread mutations evenly over them
          instead of by brightness? (Default: false)
+     * - chain_file
+       - |string|
+       - A file. If it is not there, the state of the chains is saved to it in the end, also after
+         Ctrl-C or a time limit. If it is there, the same render (scene, sensor, seed, parameters)
+         goes on from it, up to ``spp``, which may be higher than before; the brightness of the
+         image is known as well as the first render found it. (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`MetropolisIntegrator`: bidirectional, direct_samples, next_event,
-         max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`MetropolisIntegrator`: direct_samples, next_event, max_depth,
+         rr_depth, hide_emitters, timeout, aovs.
 
     ``spp`` is the number of mutations per pixel.
 
@@ -88,13 +105,27 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
         self.two_stage = self.parameter(props, "two_stage", False)
         self.steps = self.read_steps(props)
         self.chains = self.parameter(props, "chains", 0, minimum=0, maximum=1 << 20)
+        self.chain_file = self.parameter(props, "chain_file", "")
 
     def chain_render(self, *render: Any) -> MetropolisRender:
         settings = ChainSettings(
             self.chains, self.luminance_samples, self.p_large, self.steps,
-            self.kelemen_style_weights, self.two_stage,
+            self.kelemen_style_weights, self.two_stage, self._file(*render),
         )  # fmt: skip
         return MetropolisRender(settings, *render)
+
+    def _file(self, _: Any, target: ImageTarget, seed: int, *render: Any) -> ChainFile | None:
+        if not self.chain_file:
+            return None
+        self.check_target("chain_file", self.chain_file)
+        parameters = {
+            **self.parameters(), "chain_file": "", "max_depth": self.max_depth,
+            "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters,
+        }  # fmt: skip
+        where = f'"{self.name}": the parameter "chain_file"'
+        return ChainFile(
+            Path(self.chain_file), target.scene, target.sensor, seed, parameters, where
+        )
 
     def parameters(self) -> dict[str, Any]:
         return {
@@ -106,4 +137,5 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
             "mutation_size_high": self.steps.high,
             "kelemen_style_weights": self.kelemen_style_weights,
             "two_stage": self.two_stage,
+            **({"chain_file": self.chain_file} if self.chain_file else {}),
         }

@@ -23,6 +23,8 @@ from techniques import REFERENCE
 from test_chains import TARGETS
 
 from mitsuba_ext.chains.bootstrap import Bootstrap
+from mitsuba_ext.chains.chain_image import ChainImage
+from mitsuba_ext.chains.looped import LoopedChains
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -105,6 +107,33 @@ def test_cancelling_leaves_a_sound_image() -> None:
     (image,) = batches(scene, integrator, 8, [1])
     assert_images_are_sound(image)
     assert image.any() and integrator.statistics.spp > 0
+
+
+@pytest.mark.parametrize("chains", [True, False])
+def test_an_error_amid_a_batch_leaves_the_batches_before_it(
+    monkeypatch: pytest.MonkeyPatch, chains: bool
+) -> None:
+    """Also a second Ctrl-C, in chains or in samples: half of a batch would not have the right
+    mean."""
+    monkeypatch.setattr("mitsuba_ext.chains.redistribution._BATCH", 16 * 16 * 16)
+    scene, integrator = mi.load_dict(stage(glass=_GLASS)), erpt(outliers=1.0, direct_samples=8)
+    (expected,) = batches(scene, integrator, 16, [5])
+    fails = LoopedChains if chains else ChainImage
+    name = "end" if chains else "add_found"
+    original, calls = getattr(fails, name), []
+
+    def fail(part: Any, *found: Any) -> None:
+        original(part, *found)
+        calls.append(name)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(fails, name, fail)
+    with pytest.raises(KeyboardInterrupt):
+        integrator.render(scene, seed=5, spp=48)
+    assert integrator.statistics.interrupted and integrator.statistics.spp == 16
+    image = np.array(scene.sensors()[0].film().bitmap())
+    np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-5 * expected.mean())
 
 
 def test_a_time_limit_ends_between_batches() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,9 @@ FILES = {file.stem: file for folder in FOLDERS for file in registry.plugin_files
 README = Path(__file__).parents[1] / "README.md"
 DECISIONS = FOLDERS["samplers"]
 #: The integrators that nest no other one.
-WALKS = ["auto_path", "composed_path", "neepp", "pss_guided", "reweighted_direct"]
+WALKS = [
+    "auto_path", "composed_path", "erpt", "neepp", "pss_guided", "pssmlt", "reweighted_direct",
+]
 
 #: A value that each parameter accepts, besides the words that its row begins with.
 VALUES = {
@@ -34,6 +37,11 @@ VALUES = {
     "aperture": "sobol", "time": "sobol", "wavelength": "sampler", "pattern": "sobol",
     "weights": "torus", "vertices": "all", "law": "affine", "target": "visibility",
     "light_sampling": "visibility",
+    **dict.fromkeys(["bidirectional", "kelemen_style_weights", "two_stage"], True),
+    **dict.fromkeys(["chains", "chain_length", "direct_samples", "luminance_samples"], 3),
+    **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
+    **dict.fromkeys(["mutation_size_low", "mutation_size_high"], 0.01),
+    "chain_file": "chains.npz", "outliers": 2.0, "p_large": 0.5,
 }  # fmt: skip
 
 #: What makes a parameter known that is not always.
@@ -125,7 +133,9 @@ def test_what_str_shows_is_on_the_page_with_the_same_default(name):
         if key in SLOTS and name != "composed_path":  # of a preset: with several parameters
             continue
         default = on_page[key].partition(";")[0].partition(" ")[0]
-        if value != "automatic":
+        if re.fullmatch(r"\d+/\d+", default):
+            assert float(value) == Fraction(default)
+        elif value != "automatic":
             assert {value.lower(), value.removesuffix(".0")} & {default, default.rstrip(",")}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
@@ -18,8 +20,9 @@ class ChainImage:
 
     def __init__(self, film: mi.Film) -> None:
         self._film = film
-        self._visits, self._uniform = film.create_block(), film.create_block()
-        for block in (self._visits, self._uniform):
+        self._blocks = [film.create_block(), film.create_block()]
+        self._visits, self._uniform = self._blocks
+        for block in self._blocks:
             # Positions of lanes have nothing to do with each other
             block.set_coalesce(False)
 
@@ -44,12 +47,21 @@ class ChainImage:
         others = [mi.Float(0)] * (block.channel_count() - 3)
         block.put(found.position, [value.x, value.y, value.z, *others], weight > 0)
 
+    def add_tensors(self, tensors: Sequence[mi.TensorXf]) -> None:
+        """Adds all of another image of this film: its :meth:`tensors`."""
+        for block, tensor in zip(self._blocks, tensors):
+            block.put_block(mi.ImageBlock(tensor, offset=block.offset()))
+        dr.eval(self.tensors())
+
     def tensors(self) -> list[mi.TensorXf]:
         """What a launch evaluates."""
-        return [self._visits.tensor(), self._uniform.tensor()]
+        return [block.tensor() for block in self._blocks]
+
+    def _filtered(self, visits: mi.TensorXf) -> mi.TensorXf:
+        return visits
 
     def write(self, visit_factor: float, uniform_factor: float, camera_spp: int) -> None:
         """Adds the image to the film, which holds ``camera_spp`` camera samples per pixel."""
-        visits, uniform = self.tensors()
+        visits, uniform = self._filtered(self._visits.tensor()), self._uniform.tensor()
         tensor = visits * visit_factor + uniform * uniform_factor
         put_splats(self._film, tensor, self._visits.offset(), camera_spp)

@@ -6,16 +6,19 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
 from .numbers import generator, stream
 from .small_steps import SmallSteps
+from .stored import Arrays, arrays_of, value_of
 from .target import ImageTarget
 
-#: Numbers of a state that a chain remembers, for each end of its path: 20 bounces, about. A path
-#: that draws more draws those anew for each proposal, which is a large step in them.
-MOST_NUMBERS = 128
+#: Numbers of a state that a chain remembers, for the camera's end of its path and for the light's:
+#: 20 bounces, about. A path that draws more draws those anew for each proposal, which is a large
+#: step in them.
+MOST_NUMBERS, MOST_LIGHT_NUMBERS = 128, 96
 
 #: Streams of random numbers, which differ from those of the bootstrap.
 CAMERA, LIGHT = 3, 4
@@ -98,6 +101,8 @@ class Chains:
         bootstrap, winners: Samples, and at which of these each chain starts.
         seed: Of the random numbers.
         energy: By how much a visit counts.
+        stored: From :meth:`stored` of chains with the same parameters, which these go on with;
+            ``bootstrap`` and ``winners`` are then not needed.
 
     Attributes:
         rules: How they move.
@@ -108,19 +113,23 @@ class Chains:
     #: Mutations of each chain between two looks at the clock, and for Ctrl-C.
     launch = 16
 
+    #: What makes a state of all chains.
+    _parts_of_state: tuple[str, ...]
+
     def __init__(
         self,
         target: ImageTarget,
         image: ChainImage,
         rules: ChainRules,
-        bootstrap: Bootstrap,
-        winners: mi.UInt32,
+        bootstrap: Bootstrap | None,
+        winners: mi.UInt32 | None,
         seed: int,
         energy: float = 1.0,
+        stored: Arrays | None = None,
     ) -> None:
         self._target, self._image, self.rules = target, image, rules
         self._seed = seed
-        count = len(winners)
+        count = int(stored["count"]) if stored else len(winners)
         self._large_step = dr.opaque(mi.Float, rules.large_step)
         self._uses_uniform = rules.large_step > 0 and rules.uniform_weight > 0
         self._uniform_weight = dr.opaque(mi.Float, rules.uniform_weight)
@@ -131,7 +140,18 @@ class Chains:
         self._rngs = [generator(stream(seed, number), lane) for number in streams]
         # Not a literal: the first launch would need a kernel of its own
         self._weight = dr.opaque(mi.Float, 0, count)
-        self._begin(bootstrap, winners)
+        if not stored:
+            self._begin(bootstrap, winners)
+            return
+        self.done = int(stored["done"])
+        for name in self._parts_of_state:
+            setattr(self, name, value_of(stored, name))
+
+    def stored(self) -> Arrays:
+        """The chains as they are, between two launches."""
+        parts = (arrays_of(getattr(self, name), name) for name in self._parts_of_state)
+        own = {"count": np.array(self.count), "done": np.array(self.done)}
+        return {key: array for part in (own, *parts) for key, array in part.items()}
 
     def _begin(self, bootstrap: Bootstrap, winners: mi.UInt32) -> None:
         """Makes these samples the states of the chains."""

@@ -7,11 +7,14 @@ import mitsuba as mi
 
 from .chains import MOST_NUMBERS, Chains, Counts, acceptance
 from .numbers import LocalNumbers, ProposedNumbers, RecordedNumbers
+from .target import Contribution
 
 
 class LoopedChains(Chains):
     """All mutations of a launch are one traced loop around the estimator. What it finds has one
     place on the film: no splats. See :class:`Chains`."""
+
+    _parts_of_state = ("_rngs", "_state", "_known", "_values", "_weight", "_earlier")
 
     def _begin(self, bootstrap, winners):
         record = RecordedNumbers(
@@ -21,13 +24,15 @@ class LoopedChains(Chains):
         self._state, _sample = self._target(numbers)
         self._known = dr.minimum(numbers.index, MOST_NUMBERS)
         self._values = record.written
-        dr.eval(self._state, self._known, self._values)
+        self._earlier = dr.opaque(mi.Float, 0, self.count)
+        # Evaluated now, the first launch has the kernel of the others
+        dr.eval(self._state, self._known, self._values, self._rngs)
 
     def advance(self, steps):
         counts = self._advance(dr.opaque(mi.UInt32, steps))
         dr.eval(
-            self._state, self._known, self._weight, self._rngs, self._values, counts,
-            self._image.tensors(),
+            self._state, self._known, self._weight, self._earlier, self._rngs, self._values,
+            counts, self._image.tensors(),
         )  # fmt: skip
         self.done += steps
         return counts
@@ -38,6 +43,7 @@ class LoopedChains(Chains):
         lane = dr.arange(mi.UInt32, self.count)
         rng, state = mi.PCG32(self._rngs[0]), self._state
         known, weight = mi.UInt32(self._known), mi.Float(self._weight)
+        earlier = mi.Float(self._earlier)
         counts = Counts.none(self.count)
         vector = dr.alloc_local(mi.Float, MOST_NUMBERS, value=dr.zeros(mi.Float))
         index = mi.UInt32(none)
@@ -64,12 +70,13 @@ class LoopedChains(Chains):
 
             # ----- Add what is left behind to the image -----
             left = dr.select(is_accepted, state, proposal)
-            visits = dr.select(is_accepted, weight + (1 - a), a)
+            weight += 1 - a
+            visits, earlier = self._added(state, proposal, is_accepted, weight, a, earlier)
             self._image.add(left, visits * self._share(left.target))
             if dr.hint(self._uses_uniform, mode="scalar"):
                 share = self._share(proposal.target)
                 self._image.add_uniform(proposal, dr.select(is_large, share, 0))
-            weight = dr.select(is_accepted, a, weight + (1 - a))
+            weight = dr.select(is_accepted, a, weight)
             state = dr.select(is_accepted, proposal, state)
 
             # ----- Remember the numbers of the new state: the same again -----
@@ -87,9 +94,23 @@ class LoopedChains(Chains):
             dr.scatter(self._values, vector[index], index * count + lane)
             index += 1
         self._rngs, self._state, self._known, self._weight = [rng], state, known, weight
+        self._earlier = earlier
         return counts
 
+    def _added(
+        self, state: Contribution, proposal: Contribution, is_accepted: mi.Bool,
+        weight: mi.Float, a: mi.Float, earlier: mi.Float,
+    ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
+        """How many visits are added to the image now: ``weight`` of a state that is left, or
+        ``a`` of a proposal. ``earlier`` is
+        for chains that remember visits of earlier states."""
+        return dr.select(is_accepted, weight, a), earlier
+
+    def _last(self) -> mi.Float:
+        """How many visits of the last state are added."""
+        return self._weight
+
     def end(self):
-        self._image.add(self._state, self._weight * self._share(self._state.target))
+        self._image.add(self._state, self._last() * self._share(self._state.target))
         self._weight = dr.opaque(mi.Float, 0, self.count)
         dr.eval(self._image.tensors(), self._weight)

@@ -12,8 +12,9 @@ import mitsuba as mi
 
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
-from .chains import ChainRules
+from .chains import ChainRules, Chains
 from .even_tiles import EvenTiles
+from .noise_filters import FilteredChains, FilteredImage, NoiseFilters
 from .numbers import stream
 from .render import FIRST_STAGE, ChainRender
 from .small_steps import SmallSteps
@@ -41,6 +42,7 @@ class RedistributionSettings:
             that to chains. 0 redistributes all energy.
         luminance_samples: Samples that measure brightness first.
         steps: How numbers are moved.
+        filters: Of the noise.
     """
 
     chain_length: int
@@ -48,6 +50,7 @@ class RedistributionSettings:
     outliers: float
     luminance_samples: int
     steps: SmallSteps
+    filters: NoiseFilters = NoiseFilters()
 
 
 class RedistributionRender(ChainRender):
@@ -83,7 +86,7 @@ class RedistributionRender(ChainRender):
         if settings.outliers > 0 and first.mean > 0:
             target.weights = tiles
             target.bound = bound = settings.outliers * first.mean
-        image = ChainImage(self._film)
+        image = self._image()
         rules = ChainRules(0.0, settings.steps, bound)
         # Energy of a deposit, in units of the target function of a sample
         deposit = self._spp * first.mean / (settings.mutations or self._spp)
@@ -105,8 +108,18 @@ class RedistributionRender(ChainRender):
                 share = self._redistributed / self._energy if self._energy else 0.0
                 statistics.learned = f"{share:.1%} of the energy was redistributed; {self._rates()}"
 
+    def _image(self) -> ChainImage:
+        filters = self._settings.filters
+        return FilteredImage(self._film, filters.width) if filters else ChainImage(self._film)
+
+    def _chains(self, *chains: Any) -> Chains:
+        filters = self._settings.filters
+        return FilteredChains(filters, *chains) if filters else self._kind(*chains)
+
     def _batch(self, image: ChainImage, rules: ChainRules, size: int, deposit: float) -> None:
+        """Adds a batch to the image: all of it, or nothing if an exception ends it."""
         settings, target = self._settings, self._target
+        part, energies = self._image(), []
         seed = stream(self._seed, _BATCHES + self._batches)
 
         def take(found: Found) -> None:
@@ -114,27 +127,27 @@ class RedistributionRender(ChainRender):
             kept = mi.Float(dr.select(found.target > 0, 0, 1))
             if target.bound > 0:
                 kept = dr.rcp(1 + found.target / dr.opaque(mi.Float, target.bound))
-            image.add_found(found, kept)
-            for part in found.parts:
-                self._energy += float(dr.sum(mi.Float64(part.target))[0])
+            part.add_found(found, kept)
+            energies.extend(float(dr.sum(mi.Float64(p.target))[0]) for p in found.parts)
 
         samples = Bootstrap(target, seed, size, take)
-        self._batches += 1
-        self._samples += samples.count
         self._statistics.rays["camera"] += samples.count
         energy = samples.mean * samples.count
-        self._redistributed += energy
         # A very bright sample does not make more chains than all energy would: they carry more
         wanted = samples.count * settings.mutations / self._spp or samples.count
         most = min(_MOST_CHAINS, max(1.0, wanted / settings.chain_length))
         spacing = max(deposit * settings.chain_length, energy / most)
         winners = samples.choose_by_energy(spacing)
-        if len(winners) == 0:
-            return
-        chains = self._kind(
-            target, image, rules, samples, winners, seed, spacing / settings.chain_length
-        )
-        while chains.done < settings.chain_length:
-            length = min(chains.launch, settings.chain_length - chains.done)
-            self._count(chains.advance(length), length * chains.count)
-        chains.end()
+        if len(winners) > 0:
+            chains = self._chains(
+                target, part, rules, samples, winners, seed, spacing / settings.chain_length
+            )
+            while chains.done < settings.chain_length:
+                length = min(chains.launch, settings.chain_length - chains.done)
+                self._count(chains.advance(length), length * chains.count)
+            chains.end()
+        image.add_tensors(part.tensors())
+        self._batches += 1
+        self._samples += samples.count
+        self._redistributed += energy
+        self._energy += sum(energies)

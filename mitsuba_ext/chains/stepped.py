@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ..arrays import joined
 from ..transport.numbers import BothEnds, Numbers
-from .chains import MOST_NUMBERS, Chains, Counts, acceptance
+from .chains import MOST_LIGHT_NUMBERS, MOST_NUMBERS, Chains, Counts, acceptance
 from .numbers import ProposedNumbers, RecordedNumbers
 from .target import Contribution
 
@@ -20,14 +20,19 @@ class SteppedChains(Chains):
 
     launch = 1
 
+    #: Numbers that are remembered, for each end of a path.
+    _most = (MOST_NUMBERS, MOST_LIGHT_NUMBERS)
+
+    _parts_of_state = ("_rngs", "_state", "_parts", "_lanes", "_known", "_values", "_weight")
+
     def _begin(self, bootstrap, winners):
-        empty = [dr.zeros(mi.Float, MOST_NUMBERS * self.count) for _ in range(2)]
+        empty = [dr.zeros(mi.Float, most * self.count) for most in self._most]
         records = self._records(empty)
         numbers = bootstrap.numbers(winners, records)
         found = self._target.evaluate(numbers)
         ends = _ends(numbers)
         self._values = [record.written for record, _ in zip(records, ends)]
-        self._known = [dr.minimum(end.index, MOST_NUMBERS) for end in ends]
+        self._known = [dr.minimum(end.index, most) for end, most in zip(ends, self._most)]
         self._state = found.target
         self._parts, self._lanes = _wanted(found.parts, found.lanes, self._everywhere())
         dr.eval(self._values, self._known, self._state)
@@ -73,13 +78,9 @@ class SteppedChains(Chains):
         # ----- Remember the new state -----
         self._weight = dr.select(is_accepted, a, visits)
         self._state = dr.select(is_accepted, found.target, self._state)
-        drawn = [dr.minimum(end.index, MOST_NUMBERS) for end in ends]
+        drawn = [dr.minimum(end.index, most) for end, most in zip(ends, self._most)]
         self._known = [dr.select(is_accepted, n, known) for n, known in zip(drawn, self._known)]
-        of_all = dr.tile(is_accepted, MOST_NUMBERS)
-        self._values = [
-            dr.select(of_all, record.written, values)
-            for record, values in zip(records, self._values)
-        ]
+        self._remember([record.written for record in records], is_accepted)
         dr.eval(
             counts, self._weight, self._state, self._known, self._values, self._image.tensors()
         )  # fmt: skip
@@ -88,6 +89,19 @@ class SteppedChains(Chains):
             [~is_accepted, *[is_accepted] * len(found.parts)],
         )  # fmt: skip
         return counts
+
+    def _remember(self, written: list[mi.Float], is_accepted: mi.Bool) -> None:
+        """Makes the numbers of accepted proposals those of the states: in place, since all of them
+        are hundreds of megabytes."""
+        dr.eval(written)
+        accepted = dr.compress(is_accepted)
+        if len(accepted) == 0:
+            return
+        width, count = (dr.opaque(mi.UInt32, n) for n in (len(accepted), self.count))
+        for source, values, most in zip(written, self._values, self._most):
+            entry = dr.arange(mi.UInt32, most * len(accepted))
+            place = entry // width * count + dr.gather(mi.UInt32, accepted, entry % width)
+            dr.scatter(values, dr.gather(mi.Float, source, place), place)
 
     def _records(self, values: list[mi.Float]) -> list[RecordedNumbers]:
         return [RecordedNumbers(v, self.count, self.rules.steps) for v in values]

@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
@@ -17,6 +18,7 @@ from .even_tiles import EvenTiles
 from .numbers import stream
 from .render import FIRST_STAGE, ChainRender
 from .small_steps import SmallSteps
+from .stored import Arrays
 from .target import Found, ImageTarget
 
 #: Chains without and with light paths, at least and at most: these need several kernels for each
@@ -32,6 +34,16 @@ _BOOTSTRAP_SHARE, _MOST_BOOTSTRAP = 0.25, 1 << 24
 _SCALE_SAMPLES = 1 << 14
 
 
+class StateFile(Protocol):
+    """Where the state of a render is kept."""
+
+    def load(self) -> Arrays | None:
+        """What was saved; ``None`` if nothing was yet."""
+
+    def save(self, arrays: Arrays) -> None:
+        """Keeps this, and nothing else."""
+
+
 @dataclass(frozen=True)
 class ChainSettings:
     """The parameters of a Metropolis render.
@@ -43,6 +55,7 @@ class ChainSettings:
         steps: How numbers are moved by the others.
         uses_uniform: Are large steps used as uniform samples besides?
         is_even: Do a first stage's samples spread the visits evenly over the film?
+        file: If it has a state, the render goes on from there; it has the last state afterwards.
     """
 
     chains: int
@@ -51,6 +64,20 @@ class ChainSettings:
     steps: SmallSteps
     uses_uniform: bool
     is_even: bool = False
+    file: StateFile | None = None
+
+
+@dataclass(frozen=True)
+class Start:
+    """The samples from which chains started.
+
+    Attributes:
+        mean: Of the target function.
+        count: How many there are.
+    """
+
+    mean: float
+    count: int
 
 
 class MetropolisRender(ChainRender):
@@ -66,10 +93,49 @@ class MetropolisRender(ChainRender):
         self._settings = settings
 
     def run(self, interrupt: threading.Event) -> None:
-        settings, statistics = self._settings, self._statistics
+        statistics = self._statistics
         begin = time.perf_counter()
         statistics.interrupted = True
-        total = self._spp * self._pixel_count
+        total, image = self._spp * self._pixel_count, ChainImage(self._film)
+        file = self._settings.file
+        stored = file.load() if file else None
+        try:
+            if stored:
+                chains, start = self._restored(stored, image)
+            else:
+                chains, start = self._begun(total, image, interrupt)
+        except _StoppedError:
+            return
+        finally:
+            statistics.learning_seconds += time.perf_counter() - begin
+        if chains is None:
+            statistics.learned = "no light was found"
+            statistics.interrupted = False
+            return
+        count = chains.count
+
+        def act(most: int) -> int:
+            length = min(chains.launch, most)
+            self._count(chains.advance(length), length * count)
+            return length
+
+        try:
+            left = max(0, -(-total // count) - chains.done)
+            is_done = left == 0 or self._repeat(left, count, interrupt, act)
+            statistics.interrupted = not is_done
+        finally:
+            if chains.done > 0:
+                chains.end()
+                self._write(chains, image, start)
+        # Not after an error: the chains may be amid a launch
+        if file:
+            file.save(self._stored(chains, image, start))
+
+    def _begun(
+        self, total: int, image: ChainImage, interrupt: threading.Event
+    ) -> tuple[Chains | None, Start]:
+        """New chains, if there is light."""
+        settings, statistics = self._settings, self._statistics
         count = min(settings.chains or _suitable(total, self._target), total)
         mean = self._first_stage()
         samples = max(settings.bootstrap, count, self._bootstrap_share(total))
@@ -78,7 +144,6 @@ class MetropolisRender(ChainRender):
         rules = ChainRules(
             settings.large_step, settings.steps, share * mean if settings.uses_uniform else 0.0
         )
-        image = ChainImage(self._film)
 
         def take(found: Found) -> None:
             if interrupt.is_set() or self._integrator.is_cancelled:
@@ -89,32 +154,33 @@ class MetropolisRender(ChainRender):
                 weight = dr.select(found.target > 0, dr.rcp(found.target + scale), 0)
                 image.add_found(found, weight)
 
-        try:
-            bootstrap = Bootstrap(self._target, self._seed, samples, take)
-        except _StoppedError:
-            return
-        finally:
-            statistics.learning_seconds += time.perf_counter() - begin
+        bootstrap = Bootstrap(self._target, self._seed, samples, take)
         statistics.rays["camera"] += bootstrap.count
+        start = Start(bootstrap.mean, bootstrap.count)
         if bootstrap.mean == 0:
-            statistics.learned = "no light was found"
-            statistics.interrupted = False
-            return
+            return None, start
         winners = bootstrap.choose(count)
-        chains = self._kind(self._target, image, rules, bootstrap, winners, self._seed)
+        return self._kind(self._target, image, rules, bootstrap, winners, self._seed), start
 
-        def act(most: int) -> int:
-            length = min(chains.launch, most)
-            self._count(chains.advance(length), length * count)
-            return length
+    def _restored(self, stored: Arrays, image: ChainImage) -> tuple[Chains, Start]:
+        """Chains that go on, with the image that they have made."""
+        settings = self._settings
+        if settings.is_even:
+            self._first_stage()
+        image.add_tensors([mi.TensorXf(stored[name]) for name in ("visits", "uniform")])
+        rules = ChainRules(settings.large_step, settings.steps, float(stored["uniform_weight"]))
+        chains = self._kind(
+            self._target, image, rules, None, None, self._seed, stored=stored
+        )
+        return chains, Start(float(stored["mean"]), int(stored["samples"]))
 
-        try:
-            is_done = self._repeat(-(-total // count), count, interrupt, act)
-            statistics.interrupted = not is_done
-        finally:
-            if chains.done > 0:
-                chains.end()
-                self._write(chains, image, bootstrap)
+    def _stored(self, chains: Chains, image: ChainImage, start: Start) -> Arrays:
+        visits, uniform = (np.array(tensor) for tensor in image.tensors())
+        return {
+            "visits": visits, "uniform": uniform, "mean": np.array(start.mean),
+            "samples": np.array(start.count),
+            "uniform_weight": np.array(chains.rules.uniform_weight), **chains.stored(),
+        }  # fmt: skip
 
     def _first_stage(self) -> float:
         """The mean of the target function, about, which scales MIS weights: any number makes them
@@ -133,12 +199,12 @@ class MetropolisRender(ChainRender):
             return 0
         return min(int(_BOOTSTRAP_SHARE * total), _MOST_BOOTSTRAP)
 
-    def _write(self, chains: Chains, image: ChainImage, bootstrap: Bootstrap) -> None:
+    def _write(self, chains: Chains, image: ChainImage, start: Start) -> None:
         mutations = chains.done * chains.count
         camera_samples = self._pixel_count * self._camera_spp
         # The mean of those samples from which the chains started: visits depend on it
-        visit_factor = bootstrap.mean * camera_samples / mutations
-        uniform = self._settings.large_step * mutations + bootstrap.count
+        visit_factor = start.mean * camera_samples / mutations
+        uniform = self._settings.large_step * mutations + start.count
         uniform_factor = chains.rules.uniform_weight * camera_samples / uniform
         image.write(visit_factor, uniform_factor, self._camera_spp)
         self._report(round(mutations / self._pixel_count))

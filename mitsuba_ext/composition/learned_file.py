@@ -19,7 +19,7 @@ _FORMAT = 1
 States = dict[str, dict[str, np.ndarray]]
 
 
-def save(path: Path, scene: mi.Scene, made_by: str, states: Mapping[str, dict]) -> None:
+def save(path: Path, scene: mi.Scene, made_by: str, states: Mapping[str, Mapping]) -> None:
     """Writes what was learned.
 
     Parameters:
@@ -67,16 +67,16 @@ def load(path: Path, scene: mi.Scene, made_by: str, parameter: str) -> States:
     if header["format"] != str(_FORMAT) or header["digest"] != _digest(arrays):
         raise ValueError(
             f'{parameter} names "{path}", which has been damaged, or comes from another version: '
-            f"delete it, and learn again"
+            f"delete it, and begin again"
         )
     if header["scene"] != fingerprint(scene):
         raise ValueError(
             f'{parameter} names "{path}", which belongs to another scene, or this one has changed: '
-            f"delete it, and learn again"
+            f"delete it, and begin again"
         )
     if header["made_by"] != made_by:
         raise ValueError(
-            f'{parameter} names "{path}", which was learned with other parameters: '
+            f'{parameter} names "{path}", which was made with other parameters: '
             f'{header["made_by"]} instead of {made_by}'
         )
     states: States = {}

@@ -26,18 +26,14 @@ class MetropolisIntegrator(ChainIntegrator):
 
     .. pluginparameters::
 
-     * - bidirectional
-       - |bool|
-       - Do chains sample the paths of :class:`bdpt`, else those of :monosp:`path`? A mutation of
-         the former takes about three times as long, and finds caustics of small lamps.
-         (Default: true; false in :class:`erpt`)
      * - next_event
        - |string| or |decision|
        - How points on lights are chosen, as in :class:`composed_path`; by a choice that learns
          nothing. (Default: that of :monosp:`path`)
      * - (Common parameters)
        - |several|
-       - Those of :class:`ChainIntegrator`: direct_samples, max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`ChainIntegrator`: direct_samples, max_depth, rr_depth, hide_emitters,
+         timeout, aovs.
 
     Attributes:
         bidirectional: Do chains sample paths from both ends?
