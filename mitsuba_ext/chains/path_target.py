@@ -11,7 +11,12 @@ from ..path_space.memory import PathMemory
 from ..path_space.mutations import Mutations, Proposal
 from ..transport.estimator import Sample
 from ..transport.numbers import Numbers
+from .numbers import ProposedNumbers, StateNumbers, generator, stream
+from .small_steps import SmallSteps
 from .target import Contribution, Found, PlaceWeights
+
+#: Rounds of learning, and paths of each.
+_ROUNDS, _PATHS = 3, 1 << 15
 
 
 @dataclass
@@ -40,12 +45,24 @@ class PathTarget:
 
     def evaluate(self, numbers: Numbers, active: mi.Bool | bool = True) -> Found:
         """What a new path brings; also the place that ``numbers`` have reached, evaluated."""
-        proposal, numbers_after = self._evaluate(numbers, mi.Bool(active))
+        proposal, numbers = self._evaluate(numbers, mi.Bool(active))
         found = self.contribution(proposal)
         sample = self.sample(proposal)
         lane = dr.arange(mi.UInt32, dr.width(found.target))
-        dr.eval(found, lane, sample, numbers_after)
+        dr.eval(found, lane, sample, numbers)
         return Found(found.target, [found], [lane], sample)
+
+    def learn(self, seed: int) -> None:
+        """Learns from paths of its own how new paths should be made."""
+        unused = StateNumbers(SmallSteps())
+        for round in range(_ROUNDS):
+            lane = dr.arange(mi.UInt32, _PATHS)
+            rng, none = generator(stream(seed, round), lane), dr.zeros(mi.UInt32, _PATHS)
+            numbers = ProposedNumbers(rng, mi.UInt32(none), none, unused)
+            proposal, _numbers = self._evaluate(numbers, mi.Bool(True))
+            target = self.contribution(proposal).target
+            dr.eval(target, proposal.technique)
+            self.mutations.techniques.learn(proposal.technique.numpy(), target.numpy())
 
     def _evaluate(self, numbers: Numbers, active: mi.Bool) -> tuple[Proposal, Numbers]:
         memory, at = PathMemory.of(self.most), mi.UInt32(0)

@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from .memory import Head, PathMemory
 from .space import PathSpace
+from .techniques import Techniques
 
 #: Stands for the logarithm of 0.
 _NONE = -1e30
@@ -20,13 +21,16 @@ def log_density(
     keeps: mi.UInt32,
     rest: mi.UInt32,
     active: mi.Bool,
+    techniques: Techniques | None = None,
 ) -> mi.Float:
-    """The logarithm of the density with which the vertices between two that are kept are made, if
-    each number of vertices that are made from the camera has the same probability.
+    """The logarithm of the density with which the vertices between two that are kept are made.
 
     Parameters:
         keeps, rest: As in :class:`~mitsuba_ext.path_space.plan.Plan`.
+        techniques: How often vertices are made from the camera, and how many of them; ``None`` if
+            each number has the same probability.
     """
+    uniform = -dr.log(mi.Float(rest - keeps))
     can_be_hit = ~space.kinds.is_unhittable(path.emitter, active)
     # ----- All vertices made from the light -----
     index = keeps + 1
@@ -43,7 +47,10 @@ def log_density(
     largest, total = mi.Float(_NONE), mi.Float(0)
     while active & (index <= rest):
         joins = _joins(space, memory, path, index, can_be_hit)
-        x = dr.select(joins & (impossible == 0), others, _NONE)
+        chance = mi.Float(uniform)
+        if dr.hint(techniques is not None, mode="scalar"):
+            chance = techniques.log_chance(path.length, index - 1, active)
+        x = dr.select(joins & (impossible == 0), others + chance, _NONE)
         larger = dr.maximum(largest, x)
         total = total * dr.exp(largest - larger) + dr.select(x > _NONE, dr.exp(x - larger), 0)
         largest = larger
@@ -53,8 +60,7 @@ def log_density(
         others += dr.select(gained < _NONE, 0, gained) - dr.select(lost < _NONE, 0, lost)
         impossible += dr.select(gained < _NONE, 1, 0) - dr.select(lost < _NONE, 1, 0)
         index += 1
-    count = mi.Float(rest - keeps)
-    return largest + dr.log(total / count)
+    return largest + dr.log(total)
 
 
 def _from_light(memory: PathMemory, path: Head, index: mi.UInt32) -> mi.Float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -15,12 +14,10 @@ from .light_subpaths import grow_from_light
 from .memory import Head, Logs, PathMemory, Place, stride
 from .plan import Plan
 from .space import PathSpace
+from .techniques import Techniques
 
 #: Kinds of mutations.
 NEW_PATH, BIDIRECTIONAL, FROM_CAMERA, FROM_LIGHT = 0, 1, 2, 3
-
-#: Of the lengths of new paths, each is as frequent as the one before times this.
-_DECAY = 0.7
 
 #: Distances on the film, in pixels at least, and in units of its width at most, by which
 #: perturbations move paths.
@@ -58,12 +55,14 @@ class Proposal:
         found: What it brings.
         log_density: The logarithm of its density as a new path.
         log_ratio: That of the density of the opposite mutation / density of this one.
+        technique: The number of the technique that a new path is made by.
     """
 
     head: Head
     found: Evaluation
     log_density: mi.Float
     log_ratio: mi.Float
+    technique: mi.UInt32
 
 
 # Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
@@ -87,10 +86,8 @@ class Mutations:
                 (FROM_LIGHT, switches.caustic and space.connectable is not None),
             ) if is_there
         ]  # fmt: skip
-        count = space.most - space.least + 1
-        self._least, self._most = dr.opaque(mi.UInt32, space.least), dr.opaque(mi.UInt32, space.most)
-        # Of a geometric distribution of so many lengths
-        self._mass = dr.opaque(mi.Float, 1 - _DECAY**count)
+        #: How new paths are made.
+        self.techniques = Techniques(space.least, space.most)
 
     # ---- New paths ----
 
@@ -99,26 +96,23 @@ class Mutations:
     ) -> tuple[PathMemory, Numbers, Proposal]:
         """A path made anew. The first two numbers are its place on the film."""
         film = numbers.next_2d()
-        head, plan = self._fresh(at, film, numbers)
+        technique, head, plan = self._fresh(at, film, numbers)
         memory, numbers, head, found = self._make(memory, head, head, plan, numbers, active)
         density = self._density(memory, head, found.active)
-        return memory, numbers, Proposal(head, found, density, mi.Float(0))
+        return memory, numbers, Proposal(head, found, density, mi.Float(0), technique)
 
-    def _fresh(self, at: mi.UInt32, film: mi.Point2f, numbers: Numbers) -> tuple[Head, Plan]:
-        """A path of any length, of which nothing is known yet."""
-        x = numbers.next_1d()
-        steps = dr.log(1 - x * self._mass) / math.log(_DECAY)
-        length = dr.minimum(self._least + mi.UInt32(steps), self._most)
-        grown = dr.minimum(mi.UInt32(numbers.next_1d() * mi.Float(length + 1)), length)
+    def _fresh(
+        self, at: mi.UInt32, film: mi.Point2f, numbers: Numbers
+    ) -> tuple[mi.UInt32, Head, Plan]:
+        """A path of which nothing is known yet but how it will be made: by which technique."""
+        technique, length, grown = self.techniques.choose(numbers.next_1d())
         aperture, time, wavelength = numbers.next_2d(), numbers.next_1d(), numbers.next_1d()
         head = Head(at, length, film, aperture, time, wavelength, dr.zeros(mi.UInt32, 1))
-        return head, Plan(mi.UInt32(0), grown, length + 1, mi.Bool(False))
+        return technique, head, Plan(mi.UInt32(0), grown, length + 1, mi.Bool(False))
 
     def _density(self, memory: PathMemory, path: Head, active: mi.Bool) -> mi.Float:
-        steps = mi.Float(path.length - self._least)
-        of_length = steps * math.log(_DECAY) + dr.log((1 - _DECAY) / self._mass)
-        return of_length + log_density(
-            self.space, memory, path, mi.UInt32(0), path.length + 1, active
+        return log_density(
+            self.space, memory, path, mi.UInt32(0), path.length + 1, active, self.techniques
         )
 
     # ---- Mutations ----
@@ -141,7 +135,7 @@ class Mutations:
             film: Where a new path begins on the film, if from the camera.
         """
         space = self.space
-        fresh, plan = self._fresh(stride(space.most) - path.at, film, numbers)
+        technique, fresh, plan = self._fresh(stride(space.most) - path.at, film, numbers)
         is_new = kind == NEW_PATH
         kind, first, second = self._possible(memory, path, kind)
         choice = numbers.next_2d()
@@ -195,7 +189,7 @@ class Mutations:
                 for which in (path, head)
             )
             ratio = dr.select(is_perturbed, back - there, ratio)
-        return memory, numbers, Proposal(head, found, found_density, ratio)
+        return memory, numbers, Proposal(head, found, found_density, ratio, technique)
 
     def kind(self, sample: mi.Float, new_path: mi.Float) -> mi.UInt32:
         """The kind of mutation that ``sample`` chooses, with the probability ``new_path`` of new
