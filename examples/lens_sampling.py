@@ -99,7 +99,7 @@ def unblocked(scene: mi.Scene, share: np.ndarray, max_depth: int) -> dict[str, l
     paths = walk.begin(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths, mi.Bool(True))
     vertices, _ = walk.advance(scene, numbers, paths, STRIDE)
     index = dr.arange(mi.UInt32, vertices.count)
-    si = vertices.interaction(query, vertices.gather(index, mi.Bool(True)), mi.Bool(True))
+    si = vertices.gather(index, mi.Bool(True)).si
     u = mi.Point2f(mi.sample_tea_float32(index, 0), mi.sample_tea_float32(index, 1))
     found: dict[str, list[float]] = {region: [] for region in REGIONS}
     for kind in LENS_SAMPLING:

@@ -196,8 +196,8 @@ class LightWalk:
             # ----- Store what can be connected -----
             connectable = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             store.write(
-                place, paths.pi, si, paths.ray.d, paths.emitted * paths.β, sums, paths.depth,
-                paths.hero_is_alone, connectable,
+                place, si, paths.emitted * paths.β, sums, paths.depth, paths.hero_is_alone,
+                connectable,
             )  # fmt: skip
             place += 1
 
