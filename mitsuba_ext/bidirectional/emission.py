@@ -12,6 +12,7 @@ from ..bounds import scene_bounds
 from ..transport.numbers import Numbers
 from . import light_pieces as pieces
 from .light_pieces import LightPieces, Piece
+from .stored_interaction import needs_whole_interaction
 
 #: The share of the rays of a mesh with interpolated normals that leave to the back of a triangle.
 _TO_BACK = 1 / 16
@@ -76,6 +77,8 @@ class LightEmission:
     Attributes:
         probability (numpy.ndarray): With which each emitter is chosen; shape [emitters].
         has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
+        needs_whole_interaction (bool): What vertices of the paths have to hold: see
+            :func:`~mitsuba_ext.bidirectional.stored_interaction.needs_whole_interaction`.
 
     Raises:
         NotImplementedError: Paths cannot start from one of the emitters.
@@ -83,6 +86,8 @@ class LightEmission:
 
     def __init__(self, scene: mi.Scene) -> None:
         emitters = scene.emitters()
+        # Found here, once for a render: all shapes are asked
+        self.needs_whole_interaction = needs_whole_interaction(scene)
         self._pieces = LightPieces(scene)
         self.probability = self._pieces.probability
         self._emitters = scene.emitters_dr()

@@ -9,13 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .partial_sums import Sums
-from .stored_interaction import (
-    as_float,
-    from_words,
-    interaction_words,
-    needs_whole_interaction,
-    to_words,
-)
+from .stored_interaction import as_float, from_words, interaction_words, to_words
 
 #: Bit of the word of depth and region: only the hero wavelength is left of the path.
 _HERO_IS_ALONE = 1 << 31
@@ -42,10 +36,6 @@ class Layout:
     sums: int
     is_whole: bool
     has_region: bool = False
-
-    @classmethod
-    def of(cls, scene: mi.Scene, sums: int, has_region: bool = False) -> Layout:
-        return cls(dr.size_v(mi.Spectrum), sums, needs_whole_interaction(scene), has_region)
 
     @property
     def words(self) -> int:

@@ -37,7 +37,7 @@ def needs_whole_interaction(scene: mi.Scene) -> bool:
     shapes = scene.shapes()
     if movers(scene) or any(shape.class_name() == "Instance" for shape in shapes):
         return True
-    return not all(_is_plain(shape.bsdf()) for shape in shapes if shape.bsdf() is not None)
+    return not all(_is_plain(bsdf) for bsdf in {shape.bsdf() for shape in shapes} - {None})
 
 
 def interaction_words(is_whole: bool) -> int:
