@@ -75,10 +75,10 @@ class LightEmission:
         scene: A scene with at least one emitter.
 
     Attributes:
+        needs_whole_interaction (bool): What stored vertices have to hold
+            (``stored_interaction.py``).
         probability (numpy.ndarray): With which each emitter is chosen; shape [emitters].
         has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
-        needs_whole_interaction (bool): What vertices of the paths have to hold: see
-            :func:`~mitsuba_ext.bidirectional.stored_interaction.needs_whole_interaction`.
 
     Raises:
         NotImplementedError: Paths cannot start from one of the emitters.
