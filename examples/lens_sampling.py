@@ -30,6 +30,7 @@ from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.sensor import is_occluded
 from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
+from mitsuba_ext.transport.numbers import hashed_2d
 from mitsuba_ext.transport.path_decisions import SceneQuery
 
 import drjit as dr  # isort: skip
@@ -99,8 +100,8 @@ def unblocked(scene: mi.Scene, share: np.ndarray, max_depth: int) -> dict[str, l
     paths = walk.begin(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths, mi.Bool(True))
     vertices, _ = walk.advance(scene, numbers, paths, STRIDE)
     index = dr.arange(mi.UInt32, vertices.count)
-    si = vertices.interaction(query, vertices.gather(index, mi.Bool(True)), mi.Bool(True))
-    u = mi.Point2f(mi.sample_tea_float32(index, 0), mi.sample_tea_float32(index, 1))
+    si = vertices.gather(index, mi.Bool(True)).si
+    u = hashed_2d(index, mi.UInt32(0))
     found: dict[str, list[float]] = {region: [] for region in REGIONS}
     for kind in LENS_SAMPLING:
         target = connectable_sensor("light_tracer", kind, scene, sensor, query)

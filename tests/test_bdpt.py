@@ -180,6 +180,14 @@ def test_dispersed_light_is_that_of_the_path_tracer(variant: str) -> None:
     assert_image_of_path(scene, 4, 256, 0.01, reference="composed_path")
 
 
+def test_parts_of_the_film_share_the_light_of_all_light_paths(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = mi.load_dict(stage(camera=below_the_lamp(film=film(48, 48))))
+    monkeypatch.setattr(type(bdpt()), "most_lanes", 48 * 48 // 2)
+    assert_image_of_path(scene, spp=8)
+
+
 def test_shadow_rays_are_counted() -> None:
     """At most one for each connection: to a light and to a light path from each of 3 vertices, and
     to the sensor from each of 3."""

@@ -15,6 +15,7 @@ from test_light_tracer import MANY_SEEDS, T
 
 from mitsuba_ext.bidirectional.lens_visibility import VisibilityLens, visibility_lens
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor, UniformLens, is_occluded
+from mitsuba_ext.transport.numbers import hashed_2d
 from mitsuba_ext.transport.path_decisions import SceneQuery
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -109,7 +110,7 @@ def test_more_connections_reach_the_lens(crop: bool) -> None:
     size = film(128, 96, **(window if crop else {}))
     scene = mi.load_dict(behind_bars(camera={"film": size}))
     eye, si, lane = scene.sensors()[0], points(scene, 1 << 20), dr.arange(mi.UInt32, 1 << 20)
-    u = mi.Point2f(mi.sample_tea_float32(lane, 0), mi.sample_tea_float32(lane, 1))
+    u = hashed_2d(lane, mi.UInt32(0))
     reached, light = [], []
     for lens in (UniformLens(), lens_of(scene)):
         target = ConnectableSensor(eye, lens)

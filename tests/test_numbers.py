@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ from mitsuba_ext.decisions.next_event.light_table import LightTable, OneRow
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.lights.weights import power_weights
 from mitsuba_ext.transport.estimator import CameraRays
-from mitsuba_ext.transport.numbers import NumberTable, StoredNumbers, hashed_2d
+from mitsuba_ext.transport.numbers import NumberTable, StoredNumbers, hashed, hashed_2d
 from mitsuba_ext.transport.path_decisions import DirectionSamples, Roulette, ShadowTest
 from mitsuba_ext.transport.walk import Walk
 
@@ -178,7 +179,7 @@ def test_numbers_beyond_the_stored_ones_are_zero() -> None:
 @pytest.mark.parametrize("words", ["random", "consecutive"])
 def test_pairs_of_hashed_numbers_are_uniform(words: str) -> None:
     """Those of one index, and first or second numbers of consecutive indices."""
-    count, bins = 1 << 22, 64
+    count = 1 << 22
     word = dr.arange(mi.UInt32, count)
     if words == "random":
         rng = np.random.default_rng(1)
@@ -187,9 +188,21 @@ def test_pairs_of_hashed_numbers_are_uniform(words: str) -> None:
     for index in (1, 2, 3, 7):
         here, next_one = (np.array(hashed_2d(word, mi.UInt32(i))) for i in (index, index + 1))
         assert here.min() >= 0 and here.max() < 1
-        for x, y in (here, (here[0], next_one[0]), (here[1], next_one[1])):
-            cell = (x * bins).astype(int) * bins + (y * bins).astype(int)
-            found, expected = np.bincount(cell, minlength=bins**2), count / bins**2
-            chi2 = ((found - expected) ** 2 / expected).sum()
-            p_values.append(stats.chi2.sf(chi2, bins**2 - 1))
+        pairs = (here, (here[0], next_one[0]), (here[1], next_one[1]))
+        p_values += [_chi2_of_pair(x, y) for x, y in pairs]
     assert min(p_values) > 1e-4 / len(p_values)
+
+
+def test_all_pairs_of_the_hashed_numbers_of_a_lane_are_uniform() -> None:
+    """Depth maps take five numbers for each of their pixels, whose words are consecutive."""
+    numbers = [np.array(x) for x in hashed(dr.arange(mi.UInt32, 1 << 22), 5)]
+    p_values = [_chi2_of_pair(x, y) for x, y in itertools.combinations(numbers, 2)]
+    assert len(p_values) == 10 and min(p_values) > 1e-4 / len(p_values)
+
+
+def _chi2_of_pair(x: np.ndarray, y: np.ndarray, bins: int = 64) -> float:
+    """The p-value of the hypothesis that pairs of numbers are uniform."""
+    cell = (x * bins).astype(int) * bins + (y * bins).astype(int)
+    found, expected = np.bincount(cell, minlength=bins**2), len(x) / bins**2
+    chi2 = ((found - expected) ** 2 / expected).sum()
+    return float(stats.chi2.sf(chi2, bins**2 - 1))

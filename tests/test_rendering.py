@@ -129,6 +129,38 @@ def test_absurd_numbers_of_samples_are_refused(scene, name, spp):
         rendering._Job(_path(), scene, large, 0, 2**30)
 
 
+class _Recorder:
+    """An estimator whose samples are the numbers of their pixels; it records what it draws."""
+
+    def __init__(self) -> None:
+        self.pixels, self.drawn = [], []
+
+    def __call__(self, scene, sampler, rays, active):
+        self.pixels.append(rays.pixel.numpy())
+        self.drawn.append(sampler.next_1d().numpy())
+        zero = dr.zeros(mi.UInt32, dr.width(rays.ray))
+        return Sample(mi.Color3f(mi.Float(rays.pixel)), mi.Bool(True), zero, zero, zero)
+
+
+@pytest.mark.parametrize("sampler", ["independent", "multijitter", "stratified"])
+def test_a_film_with_more_pixels_than_a_pass_has_lanes_is_rendered_in_parts(scene, sampler):
+    """Each pixel has all of its samples, and all of them have numbers of their own."""
+    estimator, integrator = _Recorder(), _TwoStages(pilot_spp=1)
+    integrator.most_lanes = 40
+    integrator.schedule = lambda *rest: _Schedule(Stage(estimator), Stage(estimator))
+    sensor = mi.load_dict({
+        "type": "perspective", "sampler": {"type": sampler},
+        "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}},
+    })  # fmt: skip
+    image = rendering.render(integrator, scene, sensor, 0, 4, True, True).numpy()
+    expected = np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
+    np.testing.assert_allclose(image[..., 0], expected, rtol=1e-6)
+    assert [len(p) for p in estimator.pixels] == 4 * [32, 32, 32]
+    assert len(np.unique(np.concatenate(estimator.drawn))) == 4 * WIDTH * HEIGHT
+    assert integrator.statistics.spp == integrator.statistics.passes == 4
+    assert integrator.statistics.rays["camera"] == 4 * WIDTH * HEIGHT
+
+
 @pytest.mark.usefixtures("small_passes")
 def test_pilot_samples_weigh_as_much_as_the_others(scene):
     integrator = _TwoStages(pilot_spp=3)

@@ -23,7 +23,7 @@ from mitsuba_ext.decisions.subpaths import region_learner
 from mitsuba_ext.decisions.subpaths.region_table import RegionTable
 from mitsuba_ext.regions.nested_regions import NestedRegions
 from mitsuba_ext.regions.surface_sides import lit_normal
-from mitsuba_ext.transport.path_decisions import EmitterSampling, SceneQuery
+from mitsuba_ext.transport.path_decisions import EmitterSampling
 from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -167,7 +167,7 @@ def _table_and_vertices(adversarial: bool) -> tuple[RegionTable, VertexCache]:
     some_vertices = vertices(None)
     active = dr.full(mi.Bool, True, some_vertices.count)
     vertex = some_vertices.gather(dr.arange(mi.UInt32, some_vertices.count), active)
-    si = some_vertices.interaction(SceneQuery(), vertex, active)
+    si = vertex.si
     regions = NestedRegions(si.p, lit_normal(si), most=12)
     rng = np.random.default_rng(2)
     probability = rng.uniform(0.1, 1, (regions.count, regions.count))

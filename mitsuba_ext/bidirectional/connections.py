@@ -133,8 +133,8 @@ class LightSubpaths(Subpaths):
         other = self._vertices.at(chosen.index, active)
         # The path's segments: those of both subpaths, and one in between
         active &= vertex.depth + other.depth + 2 <= self._max_depth
-        si, far = vertex.si, self._vertices.interaction(self._query, other, active)
-        d = other.p - si.p
+        si, far = vertex.si, other.si
+        d = far.p - si.p
         squared_distance = dr.squared_norm(d)
         distance = dr.sqrt(squared_distance)
         active &= distance > 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.numbers import hashed
 from ..transport.path_decisions import SceneQuery
 
 #: The numbers that choose the middle of the aperture.
@@ -105,7 +106,7 @@ class DepthMaps:
         """The maps, one after the other, row by row; 0 where nothing is seen."""
         width, height = self.shape
         lane = dr.arange(mi.UInt32, width * height * self.pieces**2)
-        numbers = [mi.sample_tea_float32(lane, i) for i in range(5)]
+        numbers = hashed(lane, 5)
         x, y, piece = lane % width, (lane // width) % height, lane // (width * height)
         position = mi.Point2f(x + numbers[0], y + numbers[1]) / mi.Vector2f(width, height)
         sensor = self._sensor

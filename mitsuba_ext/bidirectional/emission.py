@@ -12,6 +12,7 @@ from ..bounds import scene_bounds
 from ..transport.numbers import Numbers
 from . import light_pieces as pieces
 from .light_pieces import LightPieces, Piece
+from .stored_interaction import needs_whole_interaction
 
 #: The share of the rays of a mesh with interpolated normals that leave to the back of a triangle.
 _TO_BACK = 1 / 16
@@ -74,6 +75,8 @@ class LightEmission:
         scene: A scene with at least one emitter.
 
     Attributes:
+        needs_whole_interaction (bool): What stored vertices have to hold
+            (``stored_interaction.py``).
         probability (numpy.ndarray): With which each emitter is chosen; shape [emitters].
         has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
         radius (mi.Float): Of the scene, about.
@@ -84,6 +87,8 @@ class LightEmission:
 
     def __init__(self, scene: mi.Scene) -> None:
         emitters = scene.emitters()
+        # Found here, once for a render: all shapes are asked
+        self.needs_whole_interaction = needs_whole_interaction(scene)
         self._pieces = LightPieces(scene)
         self.probability = self._pieces.probability
         self._emitters = scene.emitters_dr()

@@ -9,6 +9,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.numbers import hashed
 from ..transport.path_decisions import SceneQuery
 from .depth_maps import DepthMaps
 from .sensor import UniformLens
@@ -179,7 +180,7 @@ class VisibilityLens(UniformLens):
         cell = mi.Point3f(x, rest % self._size.y, rest // self._size.y)
         # What is nearer than the next slice hides the cell; its own surface does not
         nearest = (cell.z + 2) / self._scale.z + self._offset.z
-        seen, random = mi.UInt32(0), [mi.sample_tea_float32(lane, i) for i in range(5)]
+        seen, random = mi.UInt32(0), hashed(lane, 5)
         for tap in range(_TAPS**2):
             # Random, and spread evenly over the places
             numbers = [x + tap * _STEP**-i for i, x in enumerate(random, 1)]

@@ -89,7 +89,7 @@ class LightImage:
         index = dr.arange(mi.UInt32, max(16, vertices.count))
         active = index < dr.opaque(mi.UInt32, vertices.count)
         vertex = vertices.gather(index, active)
-        si = vertices.interaction(self._query, vertex, active)
+        si = vertex.si
         sample = mi.Point2f(0.5)
         if self._seed is not None:
             word = dr.gather(mi.UInt32, self._seed, vertex.lane, active)

@@ -8,44 +8,44 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..movers import movers
-from ..transport.path_decisions import SceneQuery
 from .partial_sums import Sums
+from .stored_interaction import as_float, from_words, interaction_words, to_words
 
-#: Bit of the last word: only the hero wavelength is left of the path.
+#: Bit of the word of depth and region: only the hero wavelength is left of the path.
 _HERO_IS_ALONE = 1 << 31
 
-#: Bits of the last word that hold the depth, where the region follows.
+#: Dr.Jit reads and writes so many words at once: the number of a vertex's words is a multiple.
+_PACKET = 8
+
+#: Bits of that word that hold the depth, where the region follows.
 _DEPTH_BITS = 15
 
 
 @dataclass
 class Layout:
-    """The words of a stored vertex: 14 to 20 in RGB variants.
+    """The words of a stored vertex: 19 to 37 in RGB variants.
 
     Attributes:
         spectrum: Words of a spectrum.
         sums: Words of the partial sums of MIS weights: 0, 2, or 4 (``Sums.by_camera``).
-        has_instances: May a vertex lie on an instance?
+        is_whole: Is all that an interaction holds stored?
         has_region: Are vertices chosen by the region in which they lie?
     """
 
     spectrum: int
     sums: int
-    has_instances: bool
+    is_whole: bool
     has_region: bool = False
-
-    @classmethod
-    def of(cls, scene: mi.Scene, sums: int, has_region: bool = False) -> Layout:
-        # The scenes of moving shapes may hold instances
-        has_instances = bool(movers(scene)) or any(
-            shape.class_name() == "Instance" for shape in scene.shapes()
-        )
-        return cls(dr.size_v(mi.Spectrum), sums, has_instances, has_region)
 
     @property
     def words(self) -> int:
-        return 11 + self.spectrum + self.sums + 2 * self.has_instances
+        used = self.mark + 1 + interaction_words(self.is_whole)
+        return -(-used // _PACKET) * _PACKET
+
+    @property
+    def mark(self) -> int:
+        """The place of the word that holds depth and region: it follows spectrum and sums."""
+        return self.spectrum + self.sums
 
 
 class VertexStore:
@@ -70,9 +70,7 @@ class VertexStore:
     def write(
         self,
         slot: mi.UInt32,
-        pi: mi.PreliminaryIntersection3f,
         si: mi.SurfaceInteraction3f,
-        d: mi.Vector3f,
         β: mi.Spectrum,
         sums: Sums,
         depth: mi.UInt32,
@@ -85,11 +83,9 @@ class VertexStore:
             mark |= dr.select(hero_is_alone, mi.UInt32(_HERO_IS_ALONE), 0)
         if self.layout.has_region:
             mark |= sums.region << _DEPTH_BITS
-        words = [*si.p, *d, *pi.prim_uv, _as_float(pi.prim_index), _as_float(pi.shape), *β]
-        words += [sums.last, sums.dVC, *sums.by_camera][: self.layout.sums]
-        words += [_as_float(mark)]
-        if self.layout.has_instances:
-            words += [_as_float(pi.instance), _as_float(pi.shape_index)]
+        words = [*β, *[sums.last, sums.dVC, *sums.by_camera][: self.layout.sums], as_float(mark)]
+        words += to_words(si, self.layout.is_whole)
+        words += [mi.Float(0)] * (self.layout.words - len(words))
         dr.scatter(self.words, mi.ArrayXf(words), slot, active)
         dr.scatter(self.is_taken, mi.Bool(True), slot, active)
 
@@ -104,10 +100,7 @@ class LightVertex:
     """A stored vertex, in each lane.
 
     Attributes:
-        p: Its position.
-        d: The direction in which light arrives.
-        prim_uv, prim_index, shape, instance, shape_index: What was hit, and where. The last two say
-            which shape of which group; they are ``None`` where there are no instances.
+        si: The interaction there, as the light walk saw it: ``wi`` is where light comes from.
         β: Radiance · throughput / density of the path up to the vertex.
         sums: Partial sums of the MIS weights (0 if none are stored).
         depth: Segments between the light and the vertex; at least 1.
@@ -115,13 +108,7 @@ class LightVertex:
         lane: The number of the light path.
     """
 
-    p: mi.Point3f
-    d: mi.Vector3f
-    prim_uv: mi.Point2f
-    prim_index: mi.UInt32
-    shape: mi.ShapePtr
-    instance: Any
-    shape_index: Any
+    si: mi.SurfaceInteraction3f
     β: mi.Spectrum
     sums: Sums
     depth: mi.UInt32
@@ -165,45 +152,24 @@ class LightVertices:
         w = dr.gather(
             mi.ArrayXf, self._words, slot, active, shape=(layout.words, dr.width(slot))
         )
-        rest = 10 + n + layout.sums
         sums = Sums(mi.Float(0), mi.Float(0))
         if layout.sums > 0:
-            sums = Sums(w[10 + n], w[11 + n])
+            sums = Sums(w[n], w[n + 1])
         if layout.sums > 2:
-            sums.by_camera = mi.Vector2f(w[12 + n], w[13 + n])
-        mark = dr.reinterpret_array(mi.UInt32, w[rest])
+            sums.by_camera = mi.Vector2f(w[n + 2], w[n + 3])
+        mark = dr.reinterpret_array(mi.UInt32, w[layout.mark])
         depth = mark & (_HERO_IS_ALONE - 1)
         if layout.has_region:
             depth, sums.region = _depth_and_region(mark)
-        instance, shape_index = None, None
-        if layout.has_instances:
-            instance = _as_shape(w[rest + 1])
-            shape_index = dr.reinterpret_array(mi.UInt32, w[rest + 2])
-        hero_is_alone = (mark & _HERO_IS_ALONE) != 0 if self._disperses else ()
-        return LightVertex(
-            mi.Point3f(w[0], w[1], w[2]), mi.Vector3f(w[3], w[4], w[5]), mi.Point2f(w[6], w[7]),
-            dr.reinterpret_array(mi.UInt32, w[8]), _as_shape(w[9]), instance, shape_index,
-            mi.Spectrum(*(w[10 + i] for i in range(n))), sums, depth, hero_is_alone,
-            self._lane_of(slot, active),
-        )  # fmt: skip
-
-    def interaction(
-        self, query: SceneQuery, vertex: LightVertex, active: mi.Bool
-    ) -> mi.SurfaceInteraction3f:
-        """The interaction at a vertex, as the light walk saw it: ``wi`` is where light comes
-        from."""
-        pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(vertex.p))
-        pi.prim_uv, pi.prim_index = vertex.prim_uv, vertex.prim_index
-        pi.shape, pi.valid = vertex.shape, mi.Bool(active)
-        if vertex.instance is not None:
-            pi.instance, pi.shape_index = vertex.instance, vertex.shape_index
-        # The ray begins where it ends
-        pi.t = dr.select(active, mi.Float(0), dr.inf)
-        ray = mi.Ray3f(vertex.p, vertex.d)
-        ray.time = self._of_lane(self._time, vertex.lane, active)
+        lane = self._lane_of(slot, active)
+        si = from_words([w[i] for i in range(layout.mark + 1, layout.words)], layout.is_whole)
+        si.t = dr.select(active, mi.Float(0), dr.inf)
+        si.time = self._of_lane(self._time, lane, active)
         if mi.is_spectral:
-            ray.wavelengths = self._of_lane(self._wavelengths, vertex.lane, active)
-        return query.interaction(pi, ray)
+            si.wavelengths = self._of_lane(self._wavelengths, lane, active)
+        hero_is_alone = (mark & _HERO_IS_ALONE) != 0 if self._disperses else ()
+        β = mi.Spectrum(*(w[i] for i in range(n)))
+        return LightVertex(si, β, sums, depth, hero_is_alone, lane)
 
     def wavelengths(self, vertex: LightVertex, active: mi.Bool) -> mi.Spectrum | None:
         """The wavelengths of a vertex's path; ``None`` in variants that are not spectral."""
@@ -293,8 +259,7 @@ class VertexCache(PackedVertices):
     def region(self) -> mi.UInt32:
         """The region in which each vertex lies, where the layout has it."""
         layout = self._layout
-        place = 10 + layout.spectrum + layout.sums
-        index = dr.arange(mi.UInt32, self.count) * layout.words + place
+        index = dr.arange(mi.UInt32, self.count) * layout.words + layout.mark
         mark = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, index))
         return _depth_and_region(mark)[1]
 
@@ -307,15 +272,5 @@ def _numbers(lane: mi.UInt32, lanes: int) -> mi.UInt32:
 
 
 def _depth_and_region(mark: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-    """Of the last word of a vertex, which has 16 bits for the region."""
+    """Of the word that holds both, with 16 bits for the region."""
     return mark & ((1 << _DEPTH_BITS) - 1), (mark & (_HERO_IS_ALONE - 1)) >> _DEPTH_BITS
-
-
-def _as_float(value: Any) -> mi.Float:
-    if not isinstance(value, mi.UInt32):
-        value = dr.reinterpret_array(mi.UInt32, value)
-    return dr.reinterpret_array(mi.Float, value)
-
-
-def _as_shape(word: mi.Float) -> mi.ShapePtr:
-    return dr.reinterpret_array(mi.ShapePtr, dr.reinterpret_array(mi.UInt32, word))

@@ -83,12 +83,15 @@ class LightWalk:
     roulette: Roulette = field(default_factory=Roulette)
     query: SceneQuery = field(default_factory=SceneQuery)
 
-    def layout(self, scene: mi.Scene) -> Layout:
+    @property
+    def layout(self) -> Layout:
         """Of the stored vertices."""
-        sums = self.sums
+        sums, spectrum = self.sums, dr.size_v(mi.Spectrum)
+        is_whole = self.emission.needs_whole_interaction
         if sums is None:
-            return Layout.of(scene, 0)
-        return Layout.of(scene, 4 if sums.follows_camera else 2, sums.selection is not None)
+            return Layout(spectrum, 0, is_whole)
+        has_region = sums.selection is not None
+        return Layout(spectrum, 4 if sums.follows_camera else 2, is_whole, has_region)
 
     def begin(
         self,
@@ -137,7 +140,7 @@ class LightWalk:
         # Fresh copies: kernels would otherwise differ in which of the inputs are the same array
         dr.make_opaque(paths)
         dr.eval(paths)
-        store = VertexStore(self.layout(scene), dr.width(paths.active), stride)
+        store = VertexStore(self.layout, dr.width(paths.active), stride)
         time, wavelengths = paths.ray.time, paths.ray.wavelengths
         with garbage_left_alone():
             numbers, paths = self._trace(scene, numbers, paths, store)
@@ -165,7 +168,7 @@ class LightWalk:
         """
         paths = self.begin(scene, numbers, time, wavelengths, active)
         dr.eval(paths)
-        bytes_per_place = dr.width(paths.active) * bytes_per_vertex(self.layout(scene))
+        bytes_per_place = dr.width(paths.active) * bytes_per_vertex(self.layout)
         stride = min(STRIDE, max(1, _STORE_BYTES // bytes_per_place))
         for _ in range(_MOST_ROUNDS):
             vertices, paths = self.advance(scene, numbers, paths, stride)
@@ -196,8 +199,8 @@ class LightWalk:
             # ----- Store what can be connected -----
             connectable = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             store.write(
-                place, paths.pi, si, paths.ray.d, paths.emitted * paths.β, sums, paths.depth,
-                paths.hero_is_alone, connectable,
+                place, si, paths.emitted * paths.β, sums, paths.depth, paths.hero_is_alone,
+                connectable,
             )  # fmt: skip
             place += 1
 

@@ -67,7 +67,7 @@ def _light_vertices(setting: Setting) -> LightVertexSample:
     vertices = VertexCache(rounds, _PATHS)
     active = dr.full(mi.Bool, True, vertices.count)
     vertex = vertices.gather(dr.arange(mi.UInt32, vertices.count), active)
-    si = vertices.interaction(walk.query, vertex, active)
+    si = vertex.si
     n, β = lit_normal(from_both_ends(si)), brightness(vertex.β)
     finite = dr.compress(dr.all(dr.isfinite(si.p) & dr.isfinite(n)) & dr.isfinite(β))
     return LightVertexSample(

@@ -49,19 +49,24 @@ class Lanes:
     index: mi.UInt32
 
 
-def lanes_of(film: mi.Film, spp_per_pass: int, first: int = 0) -> Lanes:
-    """The lanes of a pass of ``spp_per_pass`` samples for each pixel, after ``first`` ones of
-    earlier passes."""
+def lanes_of(
+    film: mi.Film, spp_per_pass: int, first: int = 0, pixels: range | None = None
+) -> Lanes:
+    """The lanes of a pass of ``spp_per_pass`` samples for each of the ``pixels`` (all of them), row
+    by row in the film's extent, after ``first`` ones of earlier passes."""
     width, height = film_extent(film)
+    count = width * height if pixels is None else len(pixels)
     # The divisor is opaque, so that passes of different length share a kernel
-    lane = dr.arange(mi.UInt32, width * height * spp_per_pass)
+    lane = dr.arange(mi.UInt32, count * spp_per_pass)
     pixel = lane // dr.opaque(mi.UInt32, spp_per_pass)
+    index = lane - pixel * dr.opaque(mi.UInt32, spp_per_pass) + dr.opaque(mi.UInt32, first)
+    if pixels is not None:
+        pixel += dr.opaque(mi.UInt32, pixels.start)
     y = pixel // width
     corner = mi.Vector2i(mi.Int32(pixel - y * width), mi.Int32(y))
     if film.sample_border():
         corner -= film.rfilter().border_size()
     corner += mi.Vector2i(film.crop_offset())
-    index = lane - pixel * dr.opaque(mi.UInt32, spp_per_pass) + dr.opaque(mi.UInt32, first)
     return Lanes(pixel, corner, index)
 
 
@@ -144,17 +149,19 @@ def sample_rays(
     spp: int,
     samples: CameraSamples,
     first: int = 0,
+    pixels: range | None = None,
 ) -> CameraRays:
-    """Camera rays of one pass: ``spp_per_pass`` for each pixel of the film.
+    """Camera rays of one pass: ``spp_per_pass`` for each pixel.
 
     Parameters:
-        sensor, sampler: The sampler is seeded for ``width · height · spp_per_pass`` lanes.
+        sensor, sampler: The sampler is seeded for as many lanes as there are rays.
         spp_per_pass: Samples per pixel of this pass.
         spp: Samples per pixel of the whole render.
         samples: Which numbers choose aperture, time and wavelengths.
         first: Samples per pixel that earlier passes took.
+        pixels: Row by row in the film's extent; all of them by default.
     """
-    lanes = lanes_of(sensor.film(), spp_per_pass, first)
+    lanes = lanes_of(sensor.film(), spp_per_pass, first, pixels)
     return camera_rays(sensor, lanes, draw_numbers(sensor, sampler, lanes, samples), spp)
 
 

@@ -47,7 +47,7 @@ class Planned(Protocol):
 
     @property
     def most_lanes(self) -> int:
-        """Samples of a pass, at most, as its memory allows; one for each pixel is always taken."""
+        """Samples that are taken at a time, at most, as memory allows."""
 
     def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
         """The samples per pixel of each pilot stage, out of ``spp``."""
@@ -69,6 +69,7 @@ class RenderPlan:
             length.
         limit: Samples per pixel of a pass, at most.
         set_size: Samples of a pixel that a timeout does not separate.
+        parts: Parts of the film, one of which is rendered after the other in each pass.
     """
 
     seed: int
@@ -78,6 +79,7 @@ class RenderPlan:
     structured: bool
     limit: int
     set_size: int
+    parts: int = 1
 
     def pass_length(self, samples: int) -> int:
         """Samples per pixel of passes of about equal length that take ``samples`` samples."""
@@ -85,6 +87,13 @@ class RenderPlan:
             return self.limit
         pass_count = -(-samples // self.limit)
         return max(1, -(-samples // max(1, pass_count)))
+
+    @property
+    def pixels(self) -> list[range]:
+        """The pixels of each part, row by row in the film's extent."""
+        length = -(-self.pixel_count // self.parts)
+        starts = range(0, self.pixel_count, length)
+        return [range(start, min(start + length, self.pixel_count)) for start in starts]
 
     @property
     def longest_pass(self) -> int:
@@ -144,7 +153,9 @@ def plan_render(
         limit = max(d for d in range(1, limit + 1) if _divides(d, spp, set_size))
         pilots = [limit * max(1, samples // limit) for samples in pilots]
     stages = (*pilots, spp - sum(pilots))
-    return RenderPlan(seed, spp, stages, pixel_count, structured, limit, set_size)
+    # Of films that are too large for a pass even of one sample for each pixel
+    parts = -(-pixel_count // integrator.most_lanes)
+    return RenderPlan(seed, spp, stages, pixel_count, structured, limit, set_size, parts)
 
 
 def _divides(length: int, spp: int, set_size: int) -> bool:

@@ -144,9 +144,15 @@ class _Job:
                 f'"{self.film.class_name()}": use an "hdrfilm".'
             )
         self.film.prepare(aovs)
+        # One part has no range: nothing is added to a pixel's number
+        self.parts = [None] if self.plan.parts == 1 else self.plan.pixels
+        # Those of a structured sampler, which go on from pass to pass, for each part of the film
+        self.samplers: list[mi.Sampler] = []
         if self.plan.structured:
-            self.sampler.set_samples_per_wavefront(self.plan.limit)
-            self.sampler.seed(dr.opaque(mi.UInt32, self.plan.seed), self._lanes(self.plan.limit))
+            self.samplers = [self.sampler, *(self.sampler.clone() for _ in self.parts[1:])]
+            for index, sampler in enumerate(self.samplers):
+                sampler.set_samples_per_wavefront(self.plan.limit)
+                self._seed(sampler, index, self.plan.limit, self.parts[index])
         pilot_spp = sum(self.plan.stages[:-1])
         self.budget = TimeBudget(
             integrator.timeout, self.start, self.plan.pixel_count, pilot_spp
@@ -155,8 +161,16 @@ class _Job:
         # One kernel for all passes: coalescing is decided once
         self.block.set_coalesce(self.block.coalesce() and self.plan.longest_pass >= 4)
 
-    def _lanes(self, spp: int) -> int:
-        return self.plan.pixel_count * spp
+    def _lanes(self, spp: int, pixels: range | None = None) -> int:
+        return (self.plan.pixel_count if pixels is None else len(pixels)) * spp
+
+    def _seed(self, sampler: mi.Sampler, index: int, spp: int, pixels: range | None) -> None:
+        """Seeds a sampler for part ``index``, those of earlier passes counted. The first one is
+        seeded as Mitsuba's own integrators do: it draws the same numbers."""
+        seed = self.plan.seed
+        if index > 0:
+            seed = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(index))[0][0]
+        sampler.seed(dr.opaque(mi.UInt32, seed), self._lanes(spp, pixels))
 
     def run(self, interrupt: threading.Event) -> None:
         plan = self.plan
@@ -207,22 +221,40 @@ class _Job:
 
     def _run_scout(self, stage: Stage) -> None:
         begin = time.perf_counter()
-        sampler = mi.load_dict({"type": "independent"})
-        # The same for all seeds: what a scout decides changes the size of tables, and kernels
-        sampler.seed(dr.opaque(mi.UInt32, 0), self._lanes(1))
-        rays = camera.sample_rays(self.sensor, sampler, 1, self.plan.spp, stage.camera)
-        sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
-        dr.eval(sample.L)
+        for pixels in self.parts:
+            self._scout(stage, pixels)
         self.statistics.compile_seconds += time.perf_counter() - begin
         dr.sync_thread()
+
+    def _scout(self, stage: Stage, pixels: range | None) -> None:
+        sampler = mi.load_dict({"type": "independent"})
+        # The same for all seeds: what a scout decides changes the size of tables, and kernels
+        number = 0 if pixels is None else pixels.start
+        sampler.seed(dr.opaque(mi.UInt32, number), self._lanes(1, pixels))
+        rays = camera.sample_rays(
+            self.sensor, sampler, 1, self.plan.spp, stage.camera, pixels=pixels
+        )
+        sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
+        dr.eval(sample.L)
 
     def _run_pass(self, stage: Stage, spp: int) -> bool:
         """Renders ``spp`` samples per pixel into the block; did it have to compile a kernel?"""
         begin = time.perf_counter()
         misses = kernel_cache_misses()
-        sampler = self._pass_sampler(spp)
+        for part in range(len(self.parts)):
+            self._run_part(stage, spp, part)
+        self.statistics.compile_seconds += time.perf_counter() - begin
+        dr.sync_thread()
+
+        self.statistics.passes += 1
+        self.statistics.spp += spp
+        self.statistics.rays["camera"] += self._lanes(spp)
+        return kernel_cache_misses() > misses
+
+    def _run_part(self, stage: Stage, spp: int, part: int) -> None:
+        sampler, pixels = self._part_sampler(spp, part), self.parts[part]
         rays = camera.sample_rays(
-            self.sensor, sampler, spp, self.plan.spp, stage.camera, self.statistics.spp
+            self.sensor, sampler, spp, self.plan.spp, stage.camera, self.statistics.spp, pixels
         )
         sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
         if dr.grad_enabled(sample.L):
@@ -239,24 +271,13 @@ class _Job:
             sampler.advance()
             sampler.schedule_state()
         dr.eval(self.block.tensor(), self.splats and self.splats.tensor(), self.tally)
-        self.statistics.compile_seconds += time.perf_counter() - begin
-        dr.sync_thread()
 
-        self.statistics.passes += 1
-        self.statistics.spp += spp
-        self.statistics.rays["camera"] += self._lanes(spp)
-        return kernel_cache_misses() > misses
-
-    def _pass_sampler(self, spp: int) -> mi.Sampler:
+    def _part_sampler(self, spp: int, part: int) -> mi.Sampler:
         if self.plan.structured:
-            return self.sampler
-        # The first pass is seeded as Mitsuba's own integrators do: it draws the same numbers
-        seed = self.plan.seed
-        if self.statistics.passes > 0:
-            index = mi.UInt32(self.statistics.passes)
-            seed = mi.sample_tea_32(mi.UInt32(seed), index)[0][0]
+            return self.samplers[part]
         sampler = self.sampler.clone()
-        sampler.seed(dr.opaque(mi.UInt32, seed), self._lanes(spp))
+        index = self.statistics.passes * len(self.parts) + part
+        self._seed(sampler, index, spp, self.parts[part])
         return sampler
 
     def _count(self, sample) -> None:

@@ -30,6 +30,13 @@ def hashed_2d(word: mi.UInt32, index: mi.UInt32) -> mi.Point2f:
     return mi.Point2f(x >> 8, y >> 8) * 2.0**-24
 
 
+def hashed(word: mi.UInt32, count: int) -> list[mi.Float]:
+    """``count`` numbers in [0, 1) for any integer: the pairs of :func:`hashed_2d`, one after the
+    other."""
+    pairs = (hashed_2d(word, mi.UInt32(index)) for index in range((count + 1) // 2))
+    return [x for pair in pairs for x in pair][:count]
+
+
 class Numbers(Protocol):
     """What an estimator asks of a sampler."""
 
