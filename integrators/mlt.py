@@ -44,7 +44,7 @@ class PathMetropolis(ChainIntegrator):
 
      * - p_large
        - |float|
-       - The probability of a new path; the other mutations share the rest equally. (Default: 0.2)
+       - The probability of a new path. Of the rest, perturbations take most. (Default: 0.2)
      * - bidirectional_mutation
        - |bool|
        - Replace a part of the path by a random walk from both sides? (Default: true)

@@ -85,6 +85,7 @@ REGRESSIONS = {
         Regression("light_tracer", "glass_lamp"),
         Regression("pssmlt", "cornell_box", {"bidirectional": False, "chains": 1024}),
         Regression("erpt", "cornell_box", {"outliers": 2.0}),
+        Regression("mlt", "cornell_box", {"chains": 1024}),
     )
 }  # fmt: skip
 

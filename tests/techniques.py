@@ -306,6 +306,16 @@ TECHNIQUES: dict[str, Technique] = {
             tuple(case for case in _OF_CHAINS if case != "bulb_under_a_shade"),
         ),
     ),
+    "mlt": Technique(
+        "mlt", {"direct_samples": 128, "chains": 1024}, is_plugin=True, makes_splats=True,
+        checks=Checks(
+            furnaces=["furnace_glass"], depths=[-1], cases=("no_light", "materials", "plain"),
+        ),
+        thorough=Checks(
+            ["cornell_box", "rooms", "mirrors_and_glass"], ["llvm_ad_mono", "llvm_ad_spectral"],
+            FURNACES, DEPTHS, tuple(case for case in _LIGHT_PATHS if case in _OF_CHAINS),
+        ),
+    ),
 }  # fmt: skip
 
 #: The integrator to compare with.

@@ -154,7 +154,7 @@ def test_extreme_seeds_give_images_of_their_own(name: str) -> None:
 
 
 #: Chains are not cut into passes.
-_CHAINS = ("pssmlt", "erpt")
+_CHAINS = ("pssmlt", "erpt", "mlt")
 _IN_PASSES = [p for p in EACH_PLUGIN if getattr(p, "values", (p,))[0] not in _CHAINS]
 
 

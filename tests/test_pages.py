@@ -22,7 +22,7 @@ README = Path(__file__).parents[1] / "README.md"
 DECISIONS = FOLDERS["samplers"]
 #: The integrators that nest no other one.
 WALKS = [
-    "auto_path", "composed_path", "erpt", "neepp", "pss_guided", "pssmlt", "reweighted_direct",
+    "auto_path", "composed_path", "erpt", "mlt", "neepp", "pss_guided", "pssmlt", "reweighted_direct",
 ]
 
 #: A value that each parameter accepts, besides the words that its row begins with.

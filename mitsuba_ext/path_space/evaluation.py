@@ -77,7 +77,8 @@ def trace_from_camera(
     value = mi.Spectrum(rays.importance)
     hero_is_alone = space.heroes.begin()
     emitter = mi.UInt32(new.emitter)
-    index = mi.UInt32(1)
+    # With a lane for each path: memory is written at it
+    index = dr.full(mi.UInt32, 1, dr.width(new.film))
     geometry = mi.Float(0)
     # Of the vertex before: its densities so far, and the cosine of the direction that leaves it
     before, cosine = _no_logs(), mi.Float(1)

@@ -79,12 +79,13 @@ class Mutations:
 
     def __init__(self, space: PathSpace, switches: Switches) -> None:
         self.space, self._switches = space, switches
+        # Perturbations are the more frequent ones: they are accepted more often
         self.kinds = [
-            kind for kind, is_there in (
-                (BIDIRECTIONAL, switches.bidirectional),
-                (FROM_CAMERA, switches.lens or switches.multi_chain),
-                (FROM_LIGHT, switches.caustic and space.connectable is not None),
-            ) if is_there
+            kind for kind, shares in (
+                (BIDIRECTIONAL, 1 if switches.bidirectional else 0),
+                (FROM_CAMERA, 2 if switches.lens or switches.multi_chain else 0),
+                (FROM_LIGHT, 2 if switches.caustic and space.connectable is not None else 0),
+            ) for _ in range(shares)
         ]  # fmt: skip
         #: How new paths are made.
         self.techniques = Techniques(space.least, space.most)
@@ -193,7 +194,7 @@ class Mutations:
 
     def kind(self, sample: mi.Float, new_path: mi.Float) -> mi.UInt32:
         """The kind of mutation that ``sample`` chooses, with the probability ``new_path`` of new
-        paths, and equal ones of the others."""
+        paths, and equal ones of all others in ``kinds``."""
         if not self.kinds:
             return mi.UInt32(NEW_PATH)
         x = dr.maximum(sample - new_path, 0) / dr.maximum(1 - new_path, 1e-6) * len(self.kinds)
@@ -303,7 +304,7 @@ class Mutations:
 @dr.syntax
 def _copy(memory: PathMemory, path: Head, to: Head, active: mi.Bool) -> PathMemory:
     """Copies the vertices of a path."""
-    index = mi.UInt32(1)
+    index = dr.full(mi.UInt32, 1, dr.width(path.film))
     while active & (index <= path.length):
         memory.places[to.at + index] = memory.places[path.at + index]
         index += 1
