@@ -52,6 +52,11 @@ class ComposedPath(WalkIntegrator):
        - To how many points of lights the first vertex of a path is connected: :monosp:`one`, a
          number (of points of a :monosp:`hammersley` set), or a nested
          :monosp:`weighted_connections`. (Default: one)
+     * - mis
+       - |string| or |decision|
+       - How connections to lights and BSDF samples that run into them are weighed: :monosp:`power`,
+         :monosp:`balance`, :monosp:`cutoff`, :monosp:`maximum`, :monosp:`bsdf` or :monosp:`light`
+         alone, or a nested :monosp:`mis_heuristic`. (Default: power)
      * - shadow_test
        - |string| or |decision|
        - Whether the shadow ray of a connection is traced: :monosp:`always`, by

@@ -38,6 +38,7 @@ FACTORS: dict[str, dict[str, dict[str, Any]]] = {
         "four_at_first": {"connections": _connections(4, "first")},
         "four": {"connections": _connections(4, "all")},
     },
+    "mis": {"power": {}, "balance": {"mis": "balance"}, "maximum": {"mis": "maximum"}},
     "shadow_test": {
         "always": {},
         # Half of the shadow rays, wherever they go

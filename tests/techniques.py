@@ -113,6 +113,8 @@ _OF_CHAINS = tuple(
     case for case in HARD_CASES if case not in ("cropped_film", "film_of_one_pixel")
 )
 
+_WEIGHED = ("plain", "delta_lights", "constant_environment", "materials")
+
 _SEVERAL_LIGHTS = ("delta_lights", "textured_two_sided_lights", "materials", "no_light")
 
 # Settings with more learning, or with more shadow rays rejected: they must be unbiased too. The
@@ -216,6 +218,22 @@ TECHNIQUES: dict[str, Technique] = {
         "composed_path", {"next_event": "linear"},
         checks=Checks(["rooms"], cases=_SEVERAL_LIGHTS),
         thorough=Checks(cases=["thousand_lights"]),
+    ),
+    # How connections and BSDF samples are weighed
+    **{
+        f"mis_{heuristic}": Technique(
+            "composed_path", {"mis": heuristic},
+            checks=Checks(cases=["textured_two_sided_lights"]),
+            thorough=Checks(
+                ["cornell_box"], furnaces=["furnace_lamps"], depths=[-1], cases=_WEIGHED,
+            ),
+        )
+        for heuristic in ("balance", "cutoff", "maximum", "light")
+    },
+    # Too noisy to say anything where lights are small
+    "mis_bsdf": Technique(
+        "composed_path", {"mis": "bsdf"}, checks=Checks(cases=["textured_two_sided_lights"]),
+        thorough=Checks(cases=_WEIGHED),
     ),
     "trained": _neepp("rooms", **_TRAINED),
     "visibility": _neepp("window", **_TRAINED, light_sampling="visibility"),

@@ -33,7 +33,8 @@ VALUES = {
     "directions": "guided", "next_event": "power", "shadow_test": "visibility_roulette",
     "aperture": "sobol", "time": "sobol", "wavelength": "sampler", "pattern": "sobol",
     "weights": "torus", "vertices": "all", "law": "affine", "target": "visibility",
-    "light_sampling": "visibility",
+    "light_sampling": "visibility", "mis": "balance", "heuristic": "cutoff", "exponent": 3.0,
+    "threshold": 0.2,
 }  # fmt: skip
 
 #: What makes a parameter known that is not always.
@@ -43,6 +44,7 @@ CONDITIONS = {
     ("pss_guided", "tile"): {"regions": "tiles"},
     ("guided_directions", "tile"): {"regions": "tiles"},
     **{("neepp", key): {"rejection": True} for key in ("law", "slope", "floor")},
+    ("mis_heuristic", "threshold"): {"heuristic": "cutoff"},
     ("neepp", "refine"): {"rejection": True, "light_sampling": "uniform"},
 }
 

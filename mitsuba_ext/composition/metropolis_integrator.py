@@ -156,7 +156,7 @@ class MetropolisIntegrator(WalkIntegrator):
             return None
         if not self.bidirectional or self.max_depth < 2:
             weights = WithoutDirect(Weights()) if self._finds_direct else Weights()
-            walk = self._walk(setting, self.max_depth, weights=weights)
+            walk = self._walk(setting, self.max_depth, mis=weights)
             return ImageTarget(scene, sensor, walk, setting.spp)
         side = LightSide.of(self.name, scene, sensor)
         walk = self._walk(setting, self.max_depth)

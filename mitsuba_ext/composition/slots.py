@@ -12,6 +12,7 @@ from .connections import Connections
 from .decision_parameters import DecisionParameters, ParameterReader
 from .directions import Guided
 from .light_paths import LightPathsWhereTheyPay
+from .mis import HEURISTICS, MisHeuristic
 from .next_event import METHODS, LearnedLights, SpatialLights
 from .roulette import GuidedRoulette
 from .shadow_test import RejectedShadowRays
@@ -27,6 +28,7 @@ SLOTS: dict[str, dict[str, _Maker | None]] = {
     "next_event": METHODS,
     "roulette": {"automatic": lambda read: GuidedRoulette(), "throughput": None},
     "connections": {"one": None},
+    "mis": {HEURISTICS[0]: None, **{name: MisHeuristic.named(name) for name in HEURISTICS[1:]}},
     "shadow_test": {"always": None, "visibility_roulette": RejectedShadowRays},
     **{slot: {"sampler": None} for slot in PURPOSES},
 }
@@ -41,7 +43,8 @@ _ALL_SLOTS = {**SLOTS, **BIDIRECTIONAL_SLOTS}
 
 #: What can be nested into a slot, of this package.
 _PLUGINS: tuple[type[DecisionParameters], ...] = (
-    Guided, LearnedLights, SpatialLights, Connections, RejectedShadowRays, WeightedNumbers,
+    Guided, LearnedLights, SpatialLights, Connections, MisHeuristic, RejectedShadowRays,
+    WeightedNumbers,
 )  # fmt: skip
 
 

@@ -50,7 +50,7 @@ class Walk:
         shadow_test: Whether the shadow ray of a connection is traced.
         roulette: Which paths go on.
         query: How a ray meets the scene.
-        weights: Of multiple importance sampling.
+        mis: How what connections find is weighed against what scattering finds.
         subpaths: Other subpaths whose vertices are connected to those of the path.
         observer: Is told what happens.
     """
@@ -65,7 +65,7 @@ class Walk:
     shadow_test: ShadowTest = field(default_factory=AlwaysTest)
     roulette: Roulette = field(default_factory=Roulette)
     query: SceneQuery = field(default_factory=SceneQuery)
-    weights: Weights = field(default_factory=Weights)
+    mis: Weights = field(default_factory=Weights)
     subpaths: Subpaths | None = None
     observer: Observer = field(default_factory=Observer)
 
@@ -88,7 +88,7 @@ class Walk:
         ctx = heroes.context()
         connector = Connector(
             scene, self.next_event, self.connections, self.shadow_test, self.scattering,
-            self.query, heroes, self.weights, self.observer,
+            self.query, heroes, self.mis, self.observer,
         )  # fmt: skip
         makes_one, makes_many = connects and connector.single, connects and connector.many
 
@@ -103,7 +103,7 @@ class Walk:
             depth=mi.UInt32(0),
             arrival=Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)),
             hero_is_alone=heroes.begin(),
-            sums=self.weights.begin(ray),
+            sums=self.mis.begin(ray),
         )
         valid = mi.Bool(sees_environment and self.max_depth > 0)  # Has the path met anything?
         scatter_count, shadow_count, connection_count = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
@@ -121,13 +121,13 @@ class Walk:
 
         while dr.hint(active, label="walk"):
             si = self.query.interaction(pi, ray)
-            path.sums = self.weights.arrive(path, si)
+            path.sums = self.mis.arrive(path, si)
 
             # ----- How much does this vertex emit towards the previous one? -----
             if dr.hint(can_hit_emitters, mode="scalar"):
                 count = self.connections.weight(path.depth - 1)
                 emitted, mis, hit, light_pdf = emission(
-                    scene, si, path, self.next_event, next_event_state, self.weights, count
+                    scene, si, path, self.next_event, next_event_state, self.mis, count
                 )
                 L = dr.fma(path.β, emitted, L)
                 self.observer.emission(
@@ -191,7 +191,7 @@ class Walk:
                 depth=path.depth + dr.select(si.is_valid(), mi.UInt32(1), 0),
                 arrival=Arrival(mi.Interaction3f(si), bs.pdf, is_delta),
                 hero_is_alone=hero_is_alone,
-                sums=self.weights.leave(vertex, bs),
+                sums=self.mis.leave(vertex, bs),
             )
             next_event_state = self._leave(connects, place)
 
