@@ -38,7 +38,8 @@ class ComposedPath(WalkIntegrator):
          (as :monosp:`path` chooses), :monosp:`power` (in proportion to the lights' power),
          :monosp:`spatial` (by unoccluded contributions, per voxel) or a nested
          :monosp:`spatial_lights`, :monosp:`linear` (by an estimate for each light at each vertex;
-         its cost grows with their number). Learned: :monosp:`contribution`, :monosp:`visibility`,
+         its cost grows with their number), :monosp:`resampled` (one of several candidates) or a
+         nested :monosp:`resampled_lights`. Learned: :monosp:`contribution`, :monosp:`visibility`,
          or a nested :monosp:`learned_lights`. (Default: uniform)
      * - roulette
        - |string|

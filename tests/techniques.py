@@ -219,6 +219,19 @@ TECHNIQUES: dict[str, Technique] = {
         checks=Checks(["rooms"], cases=_SEVERAL_LIGHTS),
         thorough=Checks(cases=["thousand_lights"]),
     ),
+    "resampled": Technique(
+        "composed_path", {"next_event": "resampled"},
+        checks=Checks(
+            ["rooms"],
+            cases=(*_SEVERAL_LIGHTS, "sun_of_one_texel", "constant_environment", "empty"),
+        ),
+        thorough=Checks(
+            ["cornell_box", "mirrors_and_glass", "sunny_gloss"], ["llvm_ad_spectral"],
+            FURNACES, [3, -1],
+            ("plain", "scaled_by_1e4", "radiance_1e6", "lamp_of_radius_1e-4", "smooth_normal_lamp",
+             "degenerate_light", "instances", "film_of_one_pixel", "hidden_environment"),
+        ),
+    ),
     # How connections and BSDF samples are weighed
     **{
         f"mis_{heuristic}": Technique(

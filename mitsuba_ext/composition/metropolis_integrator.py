@@ -81,6 +81,7 @@ class MetropolisIntegrator(WalkIntegrator):
     """
 
     is_bidirectional = True
+    has_light_paths = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

@@ -123,8 +123,11 @@ class EmitterSampling:
         ds, weight = scene.sample_emitter_direction(si, numbers.point, False, active)
         return ds, weight, place
 
-    def remember(self, place: Any) -> Any:
-        """The state when the vertex of ``place`` is left."""
+    def remember(
+        self, place: Any, scene: mi.Scene, d: mi.Vector3f, pdf: mi.Float, active: mi.Bool
+    ) -> Any:
+        """The state when the vertex of ``place`` is left in the direction ``d`` (in world space),
+        which scattering chose with the density ``pdf``."""
         return place
 
     def density(

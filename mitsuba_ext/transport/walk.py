@@ -193,7 +193,7 @@ class Walk:
                 hero_is_alone=hero_is_alone,
                 sums=self.mis.leave(vertex, bs),
             )
-            next_event_state = self._leave(connects, place)
+            next_event_state = self._leave(connects, place, scene, ray.d, bs.pdf, active_em)
 
             # ----- Russian roulette -----
             rr_active = path.depth >= self.rr_depth
@@ -219,9 +219,9 @@ class Walk:
         """What the next event decision knows of a vertex."""
         return self.next_event.visit(state, scene, si, active) if connects else state
 
-    def _leave(self, connects: bool, place):
+    def _leave(self, connects: bool, place, scene, d, pdf, active):
         """The state of the next event decision when it leaves a vertex."""
-        return self.next_event.remember(place) if connects else place
+        return self.next_event.remember(place, scene, d, pdf, active) if connects else place
 
     def _connect(self, connector, connects: bool, place, sampler, vertex, active) -> Connection:
         """The one connection of a vertex, or none."""
