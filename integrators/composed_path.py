@@ -39,8 +39,10 @@ class ComposedPath(WalkIntegrator):
          :monosp:`spatial` (by unoccluded contributions, per voxel) or a nested
          :monosp:`spatial_lights`, :monosp:`linear` (by an estimate for each light at each vertex;
          its cost grows with their number), :monosp:`resampled` (one of several candidates) or a
-         nested :monosp:`resampled_lights`. Learned: :monosp:`contribution`, :monosp:`visibility`,
-         or a nested :monosp:`learned_lights`. (Default: uniform)
+         nested :monosp:`resampled_lights`, :monosp:`two_stage` (directions of the environment by
+         the product of BSDF and light) or a nested :monosp:`two_stage_lights`. Learned:
+         :monosp:`contribution`, :monosp:`visibility`, or a nested :monosp:`learned_lights`.
+         (Default: uniform)
      * - roulette
        - |string|
        - Which paths go on from :monosp:`rr_depth` on. With :monosp:`automatic`, where directions

@@ -30,6 +30,7 @@ FACTORS: dict[str, dict[str, dict[str, Any]]] = {
         "linear": {"next_event": "linear"},
         "visibility": {"next_event": {"type": "learned_lights", "target": "visibility", "grid": 4}},
         "contribution": {"next_event": {"type": "learned_lights", "grid": 4}},
+        "two_stage": {"next_event": {"type": "two_stage_lights", "splits": 4}},
         "resampled": {"next_event": {"type": "resampled_lights", "candidates": 4}},
     },
     "connections": {

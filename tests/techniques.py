@@ -232,6 +232,26 @@ TECHNIQUES: dict[str, Technique] = {
              "degenerate_light", "instances", "film_of_one_pixel", "hidden_environment"),
         ),
     ),
+    # With one connection, which draws less of each partition but more of them
+    "two_stage": Technique(
+        "two_stage", {"light_samples": 1}, is_plugin=True,
+        checks=Checks(
+            ["sunny_gloss"], furnaces=["furnace_convex"], depths=[2, -1],
+            cases=(
+                "sun_of_one_texel", "constant_environment", "materials", "no_light", "empty",
+                "empty_before_environment", "hidden_environment", "film_of_one_pixel",
+            ),
+        ),
+        thorough=EVERYTHING,
+    ),
+    "two_stage_connections": Technique(
+        "two_stage", {"light_samples": 4, "vertices": "all", "splits": 4},
+        checks=Checks(cases=["sun_of_one_texel"]),
+        thorough=Checks(
+            ["sunny_gloss", "window"], ["llvm_ad_spectral"], ["furnace_convex"], [-1],
+            ("materials", "constant_environment"),
+        ),
+    ),
     # How connections and BSDF samples are weighed
     **{
         f"mis_{heuristic}": Technique(

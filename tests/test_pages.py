@@ -20,14 +20,14 @@ FILES = {file.stem: file for folder in FOLDERS for file in registry.plugin_files
 README = Path(__file__).parents[1] / "README.md"
 DECISIONS = FOLDERS["samplers"]
 #: The integrators that nest no other one.
-WALKS = ["auto_path", "composed_path", "neepp", "pss_guided", "reweighted_direct"]
+WALKS = ["auto_path", "composed_path", "neepp", "pss_guided", "reweighted_direct", "two_stage"]
 
 #: A value that each parameter accepts, besides the words that its row begins with.
 VALUES = {
     "roulette": "throughput", "save_learned": "learned.npz", "load_learned": "learned.npz",
     **dict.fromkeys(["max_depth", "rr_depth", "grid", "pilot_spp", "refine", "tile", "bounces"], 3),
     **dict.fromkeys(["connections", "count", "light_samples", "camera_samples"], 3),
-    "candidates": 4,
+    "candidates": 4, "splits": 7,
     **dict.fromkeys(["hide_emitters", "rejection", "always_guide", "nee_first_bounce"], True),
     **dict.fromkeys(["timeout", "max_memory", "slope"], 8.0), "floor": 0.5,
     "aovs": "d:depth", "save_map": "map.npz", "load_map": "map.npz", "regions": "surfaces",

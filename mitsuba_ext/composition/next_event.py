@@ -11,10 +11,12 @@ import numpy as np
 
 from ..bounds import scene_bounds
 from ..decisions.learner import Learner
+from ..decisions.next_event.environment_partition import MOST_SPLITS
 from ..decisions.next_event.light_map_learner import LightMapLearner
 from ..decisions.next_event.light_table import TABLE_BYTES, LightTable, OneRow
 from ..decisions.next_event.linear_lights import LinearChoice
 from ..decisions.next_event.resampled_lights import ResampledLights
+from ..decisions.next_event.two_stage import TwoStage
 from ..errors import InputError
 from ..files import check_target
 from ..lights.light_cells import LightCells
@@ -161,7 +163,7 @@ class ResampledLightsChoice(DecisionParameters):
 
     name = "resampled_lights"
     slots = ("next_event",)
-    asks_for_scattering = True
+    camera_paths_only = True
 
     def __init__(self, read: ParameterReader) -> None:
         self.candidates = read("candidates", 8, minimum=1, maximum=1024)
@@ -174,6 +176,24 @@ class ResampledLightsChoice(DecisionParameters):
         if not setting.scene.emitters():
             return None
         return ResampledLights(setting.scene, self.candidates)
+
+
+class TwoStageLights(DecisionParameters):
+    """Directions of the environment by the product of BSDF and light. The attributes are the
+    parameters of the plugin ``two_stage_lights``; see there."""
+
+    name = "two_stage_lights"
+    slots = ("next_event",)
+    camera_paths_only = True
+
+    def __init__(self, read: ParameterReader) -> None:
+        self.splits = read("splits", 16, minimum=0, maximum=MOST_SPLITS)
+        self.vertices = read("vertices", "first", choices=("first", "all"))
+
+    def decision(self, setting: Setting) -> Any | None:
+        if setting.scene.environment() is None or setting.max_depth < 2:
+            return None
+        return TwoStage(setting.scene, self.splits, self.vertices == "all")
 
 
 #: What lights can be learned for, the default first.
@@ -192,6 +212,7 @@ METHODS: dict[str, Callable[[ParameterReader], DecisionParameters] | None] = {
 #: Those that an integrator of camera paths can have besides.
 CAMERA_METHODS: dict[str, Callable[[ParameterReader], DecisionParameters]] = {
     "resampled": ResampledLightsChoice,
+    "two_stage": TwoStageLights,
 }
 
 

@@ -19,6 +19,7 @@ from .next_event import (
     LearnedLights,
     ResampledLightsChoice,
     SpatialLights,
+    TwoStageLights,
 )
 from .roulette import GuidedRoulette
 from .shadow_test import RejectedShadowRays
@@ -49,8 +50,8 @@ _ALL_SLOTS = {**SLOTS, **BIDIRECTIONAL_SLOTS}
 
 #: What can be nested into a slot, of this package.
 _PLUGINS: tuple[type[DecisionParameters], ...] = (
-    Guided, LearnedLights, SpatialLights, ResampledLightsChoice, Connections, MisHeuristic,
-    RejectedShadowRays, WeightedNumbers,
+    Guided, LearnedLights, SpatialLights, ResampledLightsChoice, TwoStageLights, Connections,
+    MisHeuristic, RejectedShadowRays, WeightedNumbers,
 )  # fmt: skip
 
 

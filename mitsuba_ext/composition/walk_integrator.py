@@ -99,7 +99,7 @@ class WalkIntegrator(StagedIntegrator):
         self.slots = {slot: slots[slot] for slot in known if slots.get(slot) is not None}
         for slot, parameters in self.slots.items():
             parameters.check_together(self.name, self.slots)
-            if self.has_light_paths and parameters.asks_for_scattering:
+            if self.has_light_paths and parameters.camera_paths_only:
                 raise ValueError(
                     f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which is for '
                     f"integrators without light paths"

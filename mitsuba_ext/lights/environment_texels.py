@@ -58,7 +58,7 @@ class EnvironmentTexels:
     def corners(self) -> np.ndarray:
         """Brightness times sin θ at the corners of each texel, all positive; shape [rows · columns,
         4]. It is computed at each call: large maps are not kept in memory twice."""
-        node = self._node_values()
+        node = self.nodes()
         corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]], axis=-1)
         return corners.reshape(-1, 4)
 
@@ -90,6 +90,11 @@ class EnvironmentTexels:
         )
         return *self.directions.direction(uv), uv
 
+    def node_direction(self, x: mi.UInt32, y: mi.UInt32) -> mi.Vector3f:
+        """The direction of a corner of texels."""
+        u = mi.Float(x) / self.columns + self._shift
+        return self.directions.direction(mi.Point2f(u, mi.Float(y) / self.rows))[0]
+
     def find(self, d: mi.Vector3f) -> tuple[mi.UInt32, mi.UInt32, mi.Point2f, mi.Float]:
         """Column and row of the texel of a direction, the point of the texel, and the sine of the
         polar angle."""
@@ -109,9 +114,9 @@ class EnvironmentTexels:
             return self.directions.emitter.eval_direction(ref, ds, active)
         return self.directions.radiance(ref, ds.d, active)
 
-    def _node_values(self) -> np.ndarray:
-        """Brightness times sin θ at the nodes, the first column repeated; shape [rows + 1,
-        columns + 1]."""
+    def nodes(self) -> np.ndarray:
+        """Brightness times sin θ at the corners of texels, all positive, the first column repeated;
+        shape [rows + 1, columns + 1]."""
         columns, rows = self.columns, self.rows
         index = dr.arange(mi.UInt32, columns * (rows + 1))
         row = index // columns
