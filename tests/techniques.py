@@ -7,7 +7,7 @@ A new technique takes one row. ``make test`` runs the tests in ``checks``; those
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mitsuba as mi
@@ -236,13 +236,14 @@ TECHNIQUES: dict[str, Technique] = {
     "two_stage": Technique(
         "two_stage", {"light_samples": 1}, is_plugin=True,
         checks=Checks(
-            ["sunny_gloss"], furnaces=["furnace_convex"], depths=[2, -1],
+            ["window"], furnaces=["furnace_convex"], depths=[2, -1],
             cases=(
                 "sun_of_one_texel", "constant_environment", "materials", "no_light", "empty",
                 "empty_before_environment", "hidden_environment", "film_of_one_pixel",
             ),
         ),
-        thorough=EVERYTHING,
+        # In sunny_gloss, the image of the sun in one pixel hides all else
+        thorough=replace(EVERYTHING, scenes=[name for name in SCENES if name != "sunny_gloss"]),
     ),
     "two_stage_connections": Technique(
         "two_stage", {"light_samples": 4, "vertices": "all", "splits": 4},

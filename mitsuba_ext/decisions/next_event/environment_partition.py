@@ -37,7 +37,7 @@ _PEAKS = 8
 
 #: A rectangle is divided if its potential exceeds this share of all weight, times the number of
 #: divisions.
-_THRESHOLD = 1.0
+_THRESHOLD = 0.25
 
 #: The share of the defensive part: what is emitted, without the BSDF.
 _DEFENSIVE = 0.01
