@@ -30,7 +30,7 @@ class TwoStageLightsPlugin(DecisionPlugin):
      * - vertices
        - |string|
        - Which vertices of a path divide the map: the :monosp:`first`, or :monosp:`all`. At the
-         others, directions are chosen by what the map emits. (Default: first)
+         others, lights are chosen as by :monosp:`path`. (Default: first)
 
     **Use it when** glossy things reflect a map of which they see most, and each vertex has several
     :monosp:`connections`, which share its partition: a partition takes longer than a path.

@@ -135,25 +135,21 @@ class Partitioner:
     # ---- Making a partition ----
 
     @dr.syntax
-    def partition(
-        self, si: mi.SurfaceInteraction3f, refines: mi.Bool, active: mi.Bool
-    ) -> Partition:
-        """The partition of the vertex ``si``. Where it is not refined, it is the whole environment,
-        and the BSDF is not asked."""
-        refines = refines & active
+    def partition(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Partition:
+        """The partition of the vertex ``si``."""
         nodes = dr.alloc_local(Node, 1 + 2 * self._splits)
         potentials = dr.alloc_local(mi.Float, 1 + 2 * self._splits)
         parents = dr.alloc_local(mi.UInt32, self._splits)
-        local = self._peaks(si, refines)
+        local = self._peaks(si, active)
         # In registers: each rectangle is compared with all of them
-        peaks = [local.read(mi.UInt32(i), refines) for i in range(_PEAKS)]
-        root = self._root(si, refines)
+        peaks = [local.read(mi.UInt32(i), active) for i in range(_PEAKS)]
+        root = self._root(si, active)
         zero = mi.UInt32(0)
         nodes.write(_packed(root), zero, active)
         potentials.write(self._potential(root, peaks), zero, active)
         total, split, next, count = mi.Float(root.weight), mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
         # Local memory knows nothing of lanes that have left a loop: masks must say it
-        working = mi.Bool(refines)
+        working = mi.Bool(active)
         while dr.hint(working, label="partition"):
             end = 2 * split + 1
             threshold = total * (_THRESHOLD / self._splits)
@@ -176,8 +172,7 @@ class Partitioner:
         branches = self._branches(nodes, parents, count, floor, active)
         sun = mi.Float(0)
         if dr.hint(self._sun_share > 0, mode="scalar"):
-            sun = self._value(si, self._texels.sun.direction, refines)
-            sun = dr.select(refines, sun, 1) + floor
+            sun = self._value(si, self._texels.sun.direction, active) + floor
             sun *= self._sun_share
             sun = sun / (sun + total + floor)
         return Partition(nodes, branches, floor, sun)
@@ -223,9 +218,7 @@ class Partitioner:
         columns, rows = mi.UInt32(self._texels.columns), mi.UInt32(self._texels.rows)
         zero = mi.UInt32(0)
         # All directions of a pole are one
-        top, bottom = (
-            dr.select(active, self._corner(si, zero, y, active), 1) for y in (zero, rows)
-        )
+        top, bottom = (self._corner(si, zero, y, active) for y in (zero, rows))
         return Rectangle(zero, zero, columns, rows, top, top, bottom, bottom, mi.Float64(1))
 
     def _divided(self, si, node: Node, active) -> tuple[Rectangle, Rectangle]:
