@@ -16,7 +16,7 @@ from mitsuba_ext.decisions.next_event.environment_partition import Partitioner
 from mitsuba_ext.decisions.next_event.two_stage import TwoStage
 from mitsuba_ext.lights.environment_texels import EnvironmentTexels
 from mitsuba_ext.lights.spectra import brightness
-from mitsuba_ext.lights.texel_sums import TexelSums
+from mitsuba_ext.lights.texel_sums import Corners, TexelSums
 from mitsuba_ext.transport.path_decisions import EmitterSampling, LightNumbers
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -62,9 +62,10 @@ def test_shares_are_sums_of_texels(name: str) -> None:
     rng = np.random.default_rng(3)
     x = np.sort(rng.integers(0, texels.columns + 1, (2, 500)), axis=0).astype(np.uint32)
     y = np.sort(rng.integers(0, texels.rows + 1, (2, 500)), axis=0).astype(np.uint32)
-    found = sums.share(
-        mi.UInt32(x[0]), mi.UInt32(y[0]), mi.UInt32(x[1]), mi.UInt32(y[1]), mi.Bool(True)
-    ).numpy()
+    found = sums.rectangle(
+        mi.UInt32(x[0]), mi.UInt32(y[0]), mi.UInt32(x[1]), mi.UInt32(y[1]), Corners(0, 0, 0, 0),
+        mi.Bool(True),
+    ).share.numpy()  # fmt: skip
     expected = [
         weight[c:d, a:b].sum() / weight.sum() for (a, b, c, d) in zip(x[0], x[1], y[0], y[1])
     ]

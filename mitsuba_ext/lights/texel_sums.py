@@ -17,33 +17,74 @@ from .environment_texels import EnvironmentTexels
 
 
 @dataclass
+class Corners:
+    """Values at the corners of a rectangle: at (x0, y0), (x1, y0), (x0, y1) and (x1, y1)."""
+
+    v00: mi.Float
+    v10: mi.Float
+    v01: mi.Float
+    v11: mi.Float
+
+    @property
+    def mean(self) -> mi.Float:
+        return 0.25 * (self.v00 + self.v10 + self.v01 + self.v11)
+
+    def divided(self, by_x: mi.Bool, low: mi.Float, high: mi.Float) -> tuple[Corners, Corners]:
+        """Those of both halves.
+
+        Parameters:
+            by_x: Is the rectangle divided across x, or across y?
+            low, high: The values at the ends of the dividing line.
+        """
+        kind = type(self)
+        return (
+            kind(
+                self.v00, dr.select(by_x, low, self.v10), dr.select(by_x, self.v01, low), high
+            ),
+            kind(
+                low, dr.select(by_x, self.v10, high), dr.select(by_x, high, self.v01), self.v11
+            ),
+        )
+
+
+@dataclass
+class Sums(Corners):
+    """The same in double precision."""
+
+    v00: mi.Float64
+    v10: mi.Float64
+    v01: mi.Float64
+    v11: mi.Float64
+
+
+@dataclass
 class Rectangle:
-    """Texels x0 ≤ x < x1, y0 ≤ y < y1, and the values of a function at their corners.
+    """Texels x0 ≤ x < x1, y0 ≤ y < y1.
 
     Attributes:
-        share: What the texels emit, in units of all; in double precision, as differences of shares
-            are what dark texels beside a sun emit.
+        f: A function at the corners.
+        sums: Of what the texels emit, from the first one of all to the corners, in units of all; in
+            double precision, as differences of sums are what dark texels beside a sun emit.
     """
 
     x0: mi.UInt32
     y0: mi.UInt32
     x1: mi.UInt32
     y1: mi.UInt32
-    f00: mi.Float
-    f10: mi.Float
-    f01: mi.Float
-    f11: mi.Float
-    share: mi.Float64
+    f: Corners
+    sums: Sums
 
     @property
-    def mean(self) -> mi.Float:
-        """The mean of the function at the corners."""
-        return 0.25 * (self.f00 + self.f10 + self.f01 + self.f11)
+    def share(self) -> mi.Float:
+        """What the texels emit, in units of all."""
+        s = self.sums
+        # Sums grow along each row and column; only rounding could make the difference negative
+        return mi.Float(dr.maximum((s.v11 - s.v01) - (s.v10 - s.v00), 0))
 
     @property
     def weight(self) -> mi.Float:
         """Eq. 5.5 (Cline): what the texels emit times the mean of the function."""
-        return mi.Float(self.share) * self.mean
+        return self.share * self.f.mean
 
 
 class TexelSums:
@@ -68,17 +109,23 @@ class TexelSums:
         #: From the probability of a texel to a density on the sphere, but for 1 / sin θ.
         self._density = dr.opaque(mi.Float, texels.columns * texels.rows / texels.area)
 
-    def share(
-        self, x0: mi.UInt32, y0: mi.UInt32, x1: mi.UInt32, y1: mi.UInt32, active: mi.Bool
-    ) -> mi.Float64:
-        """What a rectangle of texels emits, in units of all."""
-        low, high = y0 * self._stride, y1 * self._stride
-        a, b, c, d = (
-            dr.gather(mi.Float64, self._sums, i, active)
-            for i in (high + x1, high + x0, low + x1, low + x0)
+    def rectangle(
+        self,
+        x0: mi.UInt32,
+        y0: mi.UInt32,
+        x1: mi.UInt32,
+        y1: mi.UInt32,
+        f: Corners,
+        active: mi.Bool,
+    ) -> Rectangle:
+        """A rectangle of texels, with a function that is known at its corners."""
+        corners = ((x0, y0), (x1, y0), (x0, y1), (x1, y1))
+        return Rectangle(
+            x0, y0, x1, y1, f, Sums(*(self._sum(x, y, active) for x, y in corners))
         )
-        # Sums grow along each row and column; only rounding could make the difference negative
-        return dr.maximum((a - b) - (c - d), 0)
+
+    def _sum(self, x, y, active) -> mi.Float64:
+        return dr.gather(mi.Float64, self._sums, y * self._stride + x, active)
 
     @dr.syntax
     def sample(
@@ -130,43 +177,43 @@ class TexelSums:
         density = mi.warp.square_to_bilinear_pdf(*self._corners(inside, active), point)
         return dr.select(active, probability * density * self._density / sin_theta, 0)
 
+    def middle(
+        self, r: Rectangle, by_x: mi.Bool
+    ) -> tuple[tuple[mi.UInt32, mi.UInt32], tuple[mi.UInt32, mi.UInt32]]:
+        """The ends of the line that divides a rectangle across x, or across y."""
+        x, y = (r.x0 + r.x1) // 2, (r.y0 + r.y1) // 2
+        return (
+            (dr.select(by_x, x, r.x0), dr.select(by_x, r.y0, y)),
+            (dr.select(by_x, x, r.x1), dr.select(by_x, r.y1, y)),
+        )
+
     def divide(
-        self, inside: Rectangle, by_x: mi.Bool, f_low: mi.Float, f_high: mi.Float, active: mi.Bool
+        self, r: Rectangle, by_x: mi.Bool, f_low: mi.Float, f_high: mi.Float, active: mi.Bool
     ) -> tuple[Rectangle, Rectangle]:
-        """Both halves of a rectangle, divided across its x or y axis.
+        """Both halves of a rectangle.
 
         Parameters:
             f_low, f_high: The function at the ends of the dividing line.
         """
-        x = (inside.x0 + inside.x1) // 2
-        y = (inside.y0 + inside.y1) // 2
-        r = inside
-        low = Rectangle(
-            r.x0, r.y0, dr.select(by_x, x, r.x1), dr.select(by_x, r.y1, y), r.f00,
-            dr.select(by_x, f_low, r.f10), dr.select(by_x, r.f01, f_low),
-            f_high, mi.Float64(0),
-        )  # fmt: skip
-        low.share = dr.minimum(self.share(low.x0, low.y0, low.x1, low.y1, active), r.share)
-        high = Rectangle(
-            dr.select(by_x, x, r.x0), dr.select(by_x, r.y0, y), r.x1, r.y1, f_low,
-            dr.select(by_x, r.f10, f_high), dr.select(by_x, f_high, r.f01), r.f11,
-            r.share - low.share,
-        )  # fmt: skip
-        return low, high
+        low, high = self.middle(r, by_x)
+        sums = (self._sum(x, y, active) for x, y in (low, high))
+        f, sums = r.f.divided(by_x, f_low, f_high), r.sums.divided(by_x, *sums)
+        return (
+            Rectangle(r.x0, r.y0, *high, f[0], sums[0]),
+            Rectangle(*low, r.x1, r.y1, f[1], sums[1]),
+        )
 
-    def _halves(self, inside, active):
+    def _halves(self, r: Rectangle, active):
         """Divides a rectangle across its longer side, with the function interpolated: is it divided
         across x, the halves, and the probability of the first one."""
-        width, height = inside.x1 - inside.x0, inside.y1 - inside.y0
+        width, height = r.x1 - r.x0, r.y1 - r.y0
         by_x = width > height
         # The dividing line is not in the middle where the number of texels is odd
-        t = dr.select(
-            by_x, mi.Float(width // 2) / mi.Float(width), mi.Float(height // 2) / mi.Float(height)
-        )
-        r = inside
-        f_low = dr.lerp(r.f00, dr.select(by_x, r.f10, r.f01), t)
-        f_high = dr.lerp(dr.select(by_x, r.f01, r.f10), r.f11, t)
-        low, high = self.divide(inside, by_x, f_low, f_high, active)
+        side = dr.select(by_x, width, height)
+        t = mi.Float(side // 2) / mi.Float(side)
+        f_low = dr.lerp(r.f.v00, dr.select(by_x, r.f.v10, r.f.v01), t)
+        f_high = dr.lerp(dr.select(by_x, r.f.v01, r.f.v10), r.f.v11, t)
+        low, high = self.divide(r, by_x, f_low, f_high, active)
         a, b = low.weight, high.weight
         # Shares and function are positive, but may underflow
         return by_x, low, high, dr.select(a + b > 0, a / (a + b), 0.5)

@@ -20,7 +20,7 @@ import mitsuba as mi
 
 from ...discrete_sampling import ONE_MINUS_EPSILON
 from ...lights.spectra import brightness
-from ...lights.texel_sums import Rectangle, TexelSums
+from ...lights.texel_sums import Corners, Rectangle, TexelSums
 
 #: The first rectangles of each partition: so many columns and rows at least.
 _GRID = (4, 2)
@@ -66,21 +66,18 @@ class Node:
 
     Attributes:
         x, y: First and last + 1 column (row), in 16 bits each.
-        f00, f10, f01, f11: The function at the corners.
+        f: The function at the corners.
         share: What the texels emit.
     """
 
     x: mi.UInt32
     y: mi.UInt32
-    f00: mi.Float
-    f10: mi.Float
-    f01: mi.Float
-    f11: mi.Float
+    f: Corners
     share: mi.Float
 
     @property
     def weight(self) -> mi.Float:
-        return self.share * 0.25 * (self.f00 + self.f10 + self.f01 + self.f11)
+        return self.share * self.f.mean
 
 
 @dataclass
@@ -219,26 +216,23 @@ class Partitioner:
         zero = mi.UInt32(0)
         # All directions of a pole are one
         top, bottom = (self._corner(si, zero, y, active) for y in (zero, rows))
-        return Rectangle(zero, zero, columns, rows, top, top, bottom, bottom, mi.Float64(1))
+        f = Corners(top, top, bottom, bottom)
+        return self._sums.rectangle(zero, zero, columns, rows, f, active)
 
     def _divided(self, si, node: Node, active) -> tuple[Rectangle, Rectangle]:
         whole = self._rectangle(node, active)
         width, height = whole.x1 - whole.x0, whole.y1 - whole.y0
         # Eq. 5.4 (Cline). Where corners tell little, the longer side
-        dx = dr.square(node.f10 - node.f00) + dr.square(node.f11 - node.f01)
-        dy = dr.square(node.f01 - node.f00) + dr.square(node.f11 - node.f10)
-        little = dr.maximum(_LITTLE * dr.square(whole.mean), 1e-30)
+        f = whole.f
+        dx = dr.square(f.v10 - f.v00) + dr.square(f.v11 - f.v01)
+        dy = dr.square(f.v01 - f.v00) + dr.square(f.v11 - f.v10)
+        little = dr.maximum(_LITTLE * dr.square(f.mean), 1e-30)
         by_x = (dx + little) * mi.Float(width) > (dy + little) * mi.Float(height)
         is_wide = mi.Float(width) * self._height > mi.Float(height) * self._width
         by_x = dr.select(self._is_large(whole), is_wide, by_x)
         by_x = (by_x | (height < 2)) & (width > 1)
-        x, y = (whole.x0 + whole.x1) // 2, (whole.y0 + whole.y1) // 2
-        f_low = self._corner(
-            si, dr.select(by_x, x, whole.x0), dr.select(by_x, whole.y0, y), active
-        )
-        f_high = self._corner(
-            si, dr.select(by_x, x, whole.x1), dr.select(by_x, whole.y1, y), active
-        )
+        ends = self._sums.middle(whole, by_x)
+        f_low, f_high = (self._corner(si, x, y, active) for x, y in ends)
         return self._sums.divide(whole, by_x, f_low, f_high, active)
 
     def _is_large(self, r: Rectangle) -> mi.Bool:
@@ -246,14 +240,12 @@ class Partitioner:
 
     def _rectangle(self, node: Node, active) -> Rectangle:
         x0, x1, y0, y1 = node.x & 0xFFFF, node.x >> 16, node.y & 0xFFFF, node.y >> 16
-        # The share of a node is not precise enough
-        share = self._sums.share(x0, y0, x1, y1, active)
-        return Rectangle(x0, y0, x1, y1, node.f00, node.f10, node.f01, node.f11, share)
+        return self._sums.rectangle(x0, y0, x1, y1, node.f, active)
 
     def _potential(self, r: Rectangle, peaks) -> mi.Float:
         """What is to be gained by dividing a rectangle: Eq. 5.3 (Cline), with the range in the
         place of the deviation, and without the area."""
-        values = (r.f00, r.f10, r.f01, r.f11)
+        values = (r.f.v00, r.f.v10, r.f.v01, r.f.v11)
         least, most = values[0], values[0]
         for value in values[1:]:
             least, most = dr.minimum(least, value), dr.maximum(most, value)
@@ -261,7 +253,7 @@ class Partitioner:
             is_inside = (peak.column >= r.x0) & (peak.column < r.x1)
             is_inside &= (peak.row >= r.y0) & (peak.row < r.y1)
             most = dr.maximum(most, dr.select(is_inside, peak.value, 0))
-        potential = mi.Float(r.share) * (most - least)
+        potential = r.share * (most - least)
         is_texel = (r.x1 - r.x0 <= 1) & (r.y1 - r.y0 <= 1)
         potential = dr.select(is_texel, 0, potential)
         return dr.select(self._is_large(r), dr.largest(mi.Float), potential)
@@ -362,15 +354,13 @@ class Partitioner:
 
     def _leaf(self, node: Node, floor: mi.Float, active) -> Rectangle:
         leaf = self._rectangle(node, active)
-        leaf.f00, leaf.f10 = leaf.f00 + floor, leaf.f10 + floor
-        leaf.f01, leaf.f11 = leaf.f01 + floor, leaf.f11 + floor
+        f = leaf.f
+        leaf.f = Corners(f.v00 + floor, f.v10 + floor, f.v01 + floor, f.v11 + floor)
         return leaf
 
 
 def _packed(r: Rectangle) -> Node:
-    return Node(
-        r.x0 | (r.x1 << 16), r.y0 | (r.y1 << 16), r.f00, r.f10, r.f01, r.f11, mi.Float(r.share)
-    )
+    return Node(r.x0 | (r.x1 << 16), r.y0 | (r.y1 << 16), r.f, r.share)
 
 
 def _choose(probability: mi.Float, number: mi.Float) -> tuple[mi.Bool, mi.Float]:
