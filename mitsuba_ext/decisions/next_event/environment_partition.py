@@ -35,6 +35,13 @@ MOST_SPLITS = 1024
 #: BSDF samples that look for lobes.
 _PEAKS = 8
 
+#: A peak counts for a rectangle that is so much larger, and by so many half texels.
+_REACH, _BORDER = 1.25, 2
+
+#: So much of what a BSDF sample has found inside a rectangle, beyond the corners, counts for all of
+#: it.
+_LIFT = 0.25
+
 #: A rectangle is divided if its potential exceeds this share of all weight, times the number of
 #: divisions.
 _THRESHOLD = 0.25
@@ -67,17 +74,19 @@ class Node:
     Attributes:
         x, y: First and last + 1 column (row), in 16 bits each.
         f: The function at the corners.
+        lift: Is added to the function, as it is larger inside than at the corners.
         share: What the texels emit.
     """
 
     x: mi.UInt32
     y: mi.UInt32
     f: Corners
+    lift: mi.Float
     share: mi.Float
 
     @property
     def weight(self) -> mi.Float:
-        return self.share * self.f.mean
+        return self.share * (self.f.mean + self.lift)
 
 
 @dataclass
@@ -142,9 +151,10 @@ class Partitioner:
         peaks = [local.read(mi.UInt32(i), active) for i in range(_PEAKS)]
         root = self._root(si, active)
         zero = mi.UInt32(0)
-        nodes.write(_packed(root), zero, active)
-        potentials.write(self._potential(root, peaks), zero, active)
-        total, split, next, count = mi.Float(root.weight), mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+        whole, potential = self._node(root, peaks)
+        nodes.write(whole, zero, active)
+        potentials.write(potential, zero, active)
+        total, split, next, count = mi.Float(whole.weight), mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
         # Local memory knows nothing of lanes that have left a loop: masks must say it
         working = mi.Bool(active)
         while dr.hint(working, label="partition"):
@@ -153,11 +163,12 @@ class Partitioner:
             next = self._next(potentials, next, end, threshold, working)
             divides = working & (next < end)
             node = nodes.read(next, divides)
-            low, high = self._divided(si, node, divides)
-            nodes.write(_packed(low), end, divides)
-            nodes.write(_packed(high), end + 1, divides)
-            potentials.write(self._potential(low, peaks), end, divides)
-            potentials.write(self._potential(high, peaks), end + 1, divides)
+            halves = self._divided(si, node, divides)
+            (low, of_low), (high, of_high) = (self._node(half, peaks) for half in halves)
+            nodes.write(low, end, divides)
+            nodes.write(high, end + 1, divides)
+            potentials.write(of_low, end, divides)
+            potentials.write(of_high, end + 1, divides)
             parents.write(next, split, divides)
             total += dr.select(divides, low.weight + high.weight - node.weight, 0)
             next += 1
@@ -242,21 +253,28 @@ class Partitioner:
         x0, x1, y0, y1 = node.x & 0xFFFF, node.x >> 16, node.y & 0xFFFF, node.y >> 16
         return self._sums.rectangle(x0, y0, x1, y1, node.f, active)
 
-    def _potential(self, r: Rectangle, peaks) -> mi.Float:
-        """What is to be gained by dividing a rectangle: Eq. 5.3 (Cline), with the range in the
-        place of the deviation, and without the area."""
+    def _node(self, r: Rectangle, peaks) -> tuple[Node, mi.Float]:
+        """A rectangle for local memory, and what is to be gained by dividing it: Eq. 5.3 (Cline),
+        with the range in the place of the deviation, and without the area."""
         values = (r.f.v00, r.f.v10, r.f.v01, r.f.v11)
-        least, most = values[0], values[0]
+        least, most, peak = values[0], values[0], mi.Float(0)
         for value in values[1:]:
             least, most = dr.minimum(least, value), dr.maximum(most, value)
-        for peak in peaks:
-            is_inside = (peak.column >= r.x0) & (peak.column < r.x1)
-            is_inside &= (peak.row >= r.y0) & (peak.row < r.y1)
-            most = dr.maximum(most, dr.select(is_inside, peak.value, 0))
-        potential = r.share * (most - least)
+        # The lobe of a peak that lies just beyond the border reaches over it
+        x_sum, y_sum = mi.Float(r.x0 + r.x1), mi.Float(r.y0 + r.y1)
+        width = _REACH * mi.Float(r.x1 - r.x0) + _BORDER
+        height = _REACH * mi.Float(r.y1 - r.y0) + _BORDER
+        for p in peaks:
+            is_inside = dr.abs(2 * mi.Float(p.column) + 1 - x_sum) <= width
+            is_inside &= dr.abs(2 * mi.Float(p.row) + 1 - y_sum) <= height
+            peak = dr.maximum(peak, dr.select(is_inside, p.value, 0))
+        lift = _LIFT * dr.maximum(peak - most, 0)
+        potential = r.share * (dr.maximum(most, peak) - least)
         is_texel = (r.x1 - r.x0 <= 1) & (r.y1 - r.y0 <= 1)
         potential = dr.select(is_texel, 0, potential)
-        return dr.select(self._is_large(r), dr.largest(mi.Float), potential)
+        potential = dr.select(self._is_large(r), dr.largest(mi.Float), potential)
+        x, y = r.x0 | (r.x1 << 16), r.y0 | (r.y1 << 16)
+        return Node(x, y, r.f, lift, r.share), potential
 
     @dr.syntax
     def _branches(self, nodes, parents, count: mi.UInt32, floor: mi.Float, active) -> Any:
@@ -354,13 +372,9 @@ class Partitioner:
 
     def _leaf(self, node: Node, floor: mi.Float, active) -> Rectangle:
         leaf = self._rectangle(node, active)
-        f = leaf.f
+        f, floor = leaf.f, floor + node.lift
         leaf.f = Corners(f.v00 + floor, f.v10 + floor, f.v01 + floor, f.v11 + floor)
         return leaf
-
-
-def _packed(r: Rectangle) -> Node:
-    return Node(r.x0 | (r.x1 << 16), r.y0 | (r.y1 << 16), r.f, r.share)
 
 
 def _choose(probability: mi.Float, number: mi.Float) -> tuple[mi.Bool, mi.Float]:
