@@ -32,10 +32,10 @@ class TwoStageLightsPlugin(DecisionPlugin):
        - Which vertices of a path divide the map: the :monosp:`first`, or :monosp:`all`. At the
          others, lights are chosen as by :monosp:`path`. (Default: first)
 
-    **Use it when** glossy things reflect a map of which they see most, and each vertex has several
-    :monosp:`connections`, which share its partition: a partition takes longer than a path.
-    **Not when** walls or other things hide the bright parts of the map: it knows nothing of what is
-    in between.
+    **Use it when** rough metal reflects an uneven map of which it sees most, and each vertex has
+    several :monosp:`connections`, which share its partition: that takes longer than a path.
+    **Not when** walls or other things hide the bright parts of the map, as it knows nothing of what
+    is in between; or for lobes that are nearly those of mirrors, which BSDF samples find better.
 
     Lights other than the environment are chosen as by :monosp:`path`. Without an environment this
     is what :monosp:`path` does. BSDF samples take part by MIS; lobes that are thinner than a texel

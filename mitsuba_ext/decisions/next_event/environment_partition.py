@@ -5,9 +5,9 @@ Source: Cline, PhD dissertation, section 5.2.2. In the place of a queue ordered 
 rectangles are looked at once, in the order in which they were made; in the place of neighbour
 cascades, BSDF samples that lie in a rectangle tell what its corners do not see.
 
-On CPUs, Dr.Jit 1.5 writes to local memory only where all lanes of a packet write at the same index
-(it takes the largest of them for all); reads may differ. All writes here have the loop's own count
-as their index.
+All writes to local memory have the count of the loop as their index, reads may differ: on CPUs,
+Dr.Jit 1.5 takes an index that begins a loop as a literal for the same in all lanes of a packet, and
+writes where the largest one points.
 """
 
 from __future__ import annotations
