@@ -136,6 +136,8 @@ class BidirectionalIntegrator(WalkIntegrator):
             'max_depth': 8
     """
 
+    has_light_paths = True
+
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.connections = self.parameter(props, "connections", 1, minimum=1, maximum=1024)

@@ -38,8 +38,11 @@ class ComposedPath(WalkIntegrator):
          (as :monosp:`path` chooses), :monosp:`power` (in proportion to the lights' power),
          :monosp:`spatial` (by unoccluded contributions, per voxel) or a nested
          :monosp:`spatial_lights`, :monosp:`linear` (by an estimate for each light at each vertex;
-         its cost grows with their number). Learned: :monosp:`contribution`, :monosp:`visibility`,
-         or a nested :monosp:`learned_lights`. (Default: uniform)
+         its cost grows with their number), :monosp:`resampled` (one of several candidates) or a
+         nested :monosp:`resampled_lights`, :monosp:`two_stage` (directions of the environment by
+         the product of BSDF and light) or a nested :monosp:`two_stage_lights`. Learned:
+         :monosp:`contribution`, :monosp:`visibility`, or a nested :monosp:`learned_lights`.
+         (Default: uniform)
      * - roulette
        - |string|
        - Which paths go on from :monosp:`rr_depth` on. With :monosp:`automatic`, where directions
@@ -52,6 +55,11 @@ class ComposedPath(WalkIntegrator):
        - To how many points of lights the first vertex of a path is connected: :monosp:`one`, a
          number (of points of a :monosp:`hammersley` set), or a nested
          :monosp:`weighted_connections`. (Default: one)
+     * - mis
+       - |string| or |decision|
+       - How connections to lights and BSDF samples that run into them are weighed: :monosp:`power`,
+         :monosp:`balance`, :monosp:`cutoff`, :monosp:`maximum`, :monosp:`bsdf` or :monosp:`light`
+         alone, or a nested :monosp:`mis_heuristic`. (Default: power)
      * - shadow_test
        - |string| or |decision|
        - Whether the shadow ray of a connection is traced: :monosp:`always`, by

@@ -125,7 +125,7 @@ class PathMetropolis(ChainIntegrator):
             return super().schedule(scene, sensor, samples, seed)
         weights = WithoutLengths(Weights(), self._least, _MOST)
         setting = self.setting(scene, sensor, samples, seed)
-        return OneStage(self.composed_walk(setting, self.max_depth, weights=weights))
+        return OneStage(self.composed_walk(setting, self.max_depth, mis=weights))
 
     def target(self, setting):
         scene, sensor, most = setting.scene, setting.sensor, min(self.max_depth, _MOST)

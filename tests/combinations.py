@@ -30,6 +30,8 @@ FACTORS: dict[str, dict[str, dict[str, Any]]] = {
         "linear": {"next_event": "linear"},
         "visibility": {"next_event": {"type": "learned_lights", "target": "visibility", "grid": 4}},
         "contribution": {"next_event": {"type": "learned_lights", "grid": 4}},
+        "two_stage": {"next_event": {"type": "two_stage_lights", "splits": 4}},
+        "resampled": {"next_event": {"type": "resampled_lights", "candidates": 4}},
     },
     "connections": {
         "one": {},
@@ -38,6 +40,7 @@ FACTORS: dict[str, dict[str, dict[str, Any]]] = {
         "four_at_first": {"connections": _connections(4, "first")},
         "four": {"connections": _connections(4, "all")},
     },
+    "mis": {"power": {}, "balance": {"mis": "balance"}, "maximum": {"mis": "maximum"}},
     "shadow_test": {
         "always": {},
         # Half of the shadow rays, wherever they go

@@ -67,7 +67,7 @@ def connect(
     choice = choices[selection.choice_dimension]()
     numbers = LightNumbers(sampler.next_2d(), choice)
     ds, weight, chosen = selection.sample(place, scene, numbers, si, active)
-    return ds, weight, chosen, selection.remember(place)
+    return ds, weight, chosen, selection.remember(place, scene, ds.d, mi.Float(0), active)
 
 
 def vertex_at(depth: int, si: mi.SurfaceInteraction3f | None = None) -> SimpleNamespace:

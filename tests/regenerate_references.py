@@ -73,6 +73,7 @@ REGRESSIONS = {
         Regression("pss_guided", "door_ajar", {"pilot_spp": 96, "regions": "tiles", "tile": 8},
                    spp=384, is_slow=True),
         Regression("reweighted_direct", "cornell_box", {"light_samples": 16}, spp=32),
+        Regression("two_stage", "window", {"light_samples": 4}, max_depth=3),
         Regression("reweighted_lens", "defocus", {"nested": "path"}, spp=512),
         Regression("reweighted_time", "fan", {"nested": "composed_path"}),
         Regression("composed_path", "fast_balls"),

@@ -7,7 +7,7 @@ A new technique takes one row. ``make test`` runs the tests in ``checks``; those
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mitsuba as mi
@@ -113,6 +113,8 @@ _OF_CHAINS = tuple(
     case for case in HARD_CASES if case not in ("cropped_film", "film_of_one_pixel")
 )
 
+_WEIGHED = ("plain", "delta_lights", "constant_environment", "materials")
+
 _SEVERAL_LIGHTS = ("delta_lights", "textured_two_sided_lights", "materials", "no_light")
 
 # Settings with more learning, or with more shadow rays rejected: they must be unbiased too. The
@@ -216,6 +218,56 @@ TECHNIQUES: dict[str, Technique] = {
         "composed_path", {"next_event": "linear"},
         checks=Checks(["rooms"], cases=_SEVERAL_LIGHTS),
         thorough=Checks(cases=["thousand_lights"]),
+    ),
+    "resampled": Technique(
+        "composed_path", {"next_event": "resampled"},
+        checks=Checks(
+            ["rooms"],
+            cases=(*_SEVERAL_LIGHTS, "sun_of_one_texel", "constant_environment", "empty"),
+        ),
+        thorough=Checks(
+            ["cornell_box", "mirrors_and_glass", "sunny_gloss"], ["llvm_ad_spectral"],
+            FURNACES, [3, -1],
+            ("plain", "scaled_by_1e4", "radiance_1e6", "lamp_of_radius_1e-4", "smooth_normal_lamp",
+             "degenerate_light", "instances", "film_of_one_pixel", "hidden_environment"),
+        ),
+    ),
+    # With one connection, which draws less of each partition but more of them
+    "two_stage": Technique(
+        "two_stage", {"light_samples": 1}, is_plugin=True,
+        checks=Checks(
+            ["window"], furnaces=["furnace_convex"], depths=[2, -1],
+            cases=(
+                "sun_of_one_texel", "constant_environment", "materials", "no_light", "empty",
+                "empty_before_environment", "hidden_environment", "film_of_one_pixel",
+            ),
+        ),
+        # In sunny_gloss, the image of the sun in one pixel hides all else
+        thorough=replace(EVERYTHING, scenes=[name for name in SCENES if name != "sunny_gloss"]),
+    ),
+    "two_stage_connections": Technique(
+        "two_stage", {"light_samples": 4, "vertices": "all", "splits": 4},
+        checks=Checks(cases=["sun_of_one_texel"]),
+        thorough=Checks(
+            ["sunny_gloss", "window"], ["llvm_ad_spectral"], ["furnace_convex"], [-1],
+            ("materials", "constant_environment"),
+        ),
+    ),
+    # How connections and BSDF samples are weighed
+    **{
+        f"mis_{heuristic}": Technique(
+            "composed_path", {"mis": heuristic},
+            checks=Checks(cases=["textured_two_sided_lights"]),
+            thorough=Checks(
+                ["cornell_box"], furnaces=["furnace_lamps"], depths=[-1], cases=_WEIGHED,
+            ),
+        )
+        for heuristic in ("balance", "cutoff", "maximum", "light")
+    },
+    # Too noisy to say anything where lights are small
+    "mis_bsdf": Technique(
+        "composed_path", {"mis": "bsdf"}, checks=Checks(cases=["textured_two_sided_lights"]),
+        thorough=Checks(cases=_WEIGHED),
     ),
     "trained": _neepp("rooms", **_TRAINED),
     "visibility": _neepp("window", **_TRAINED, light_sampling="visibility"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from typing import Any
 
 import mitsuba as mi
@@ -25,6 +26,13 @@ from mitsuba_ext.regions.surface_rows import SurfaceRows
 from mitsuba_ext.transport.path_decisions import EmitterSampling, SubpathSelection
 
 pytestmark = pytest.mark.usefixtures("variant")
+
+
+@pytest.fixture(autouse=True)
+def no_scene_of_an_earlier_test() -> None:
+    """Garbage is collected at times that depend on what was imported. Where scenes of earlier tests
+    were still in memory, Dr.Jit once defined a function of a kernel twice."""
+    gc.collect()
 
 
 def weights(

@@ -353,8 +353,8 @@ class _Recording(LinearChoice):
         dr.scatter(self.distances, ds.dist, bounce, active & (bounce < self.bounces))
         return ds, weight, choice
 
-    def remember(self, place):
-        return place[0] + 1, super().remember(place[1])
+    def remember(self, place, *arguments):
+        return place[0] + 1, super().remember(place[1], *arguments)
 
     def density(self, state, *arguments):
         return super().density(state[1], *arguments)

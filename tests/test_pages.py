@@ -22,7 +22,8 @@ README = Path(__file__).parents[1] / "README.md"
 DECISIONS = FOLDERS["samplers"]
 #: The integrators that nest no other one.
 WALKS = [
-    "auto_path", "composed_path", "erpt", "mlt", "neepp", "pss_guided", "pssmlt", "reweighted_direct",
+    "auto_path", "composed_path", "erpt", "mlt", "neepp", "pss_guided", "pssmlt",
+    "reweighted_direct", "two_stage",
 ]
 
 #: A value that each parameter accepts, besides the words that its row begins with.
@@ -30,18 +31,22 @@ VALUES = {
     "roulette": "throughput", "save_learned": "learned.npz", "load_learned": "learned.npz",
     **dict.fromkeys(["max_depth", "rr_depth", "grid", "pilot_spp", "refine", "tile", "bounces"], 3),
     **dict.fromkeys(["connections", "count", "light_samples", "camera_samples"], 3),
+    "candidates": 4, "splits": 7,
     **dict.fromkeys(["hide_emitters", "rejection", "always_guide", "nee_first_bounce"], True),
     **dict.fromkeys(["timeout", "max_memory", "slope"], 8.0), "floor": 0.5,
     "aovs": "d:depth", "save_map": "map.npz", "load_map": "map.npz", "regions": "surfaces",
     "directions": "guided", "next_event": "power", "shadow_test": "visibility_roulette",
     "aperture": "sobol", "time": "sobol", "wavelength": "sampler", "pattern": "sobol",
     "weights": "torus", "vertices": "all", "law": "affine", "target": "visibility",
-    "light_sampling": "visibility",
+    "light_sampling": "visibility", "mis": "balance", "heuristic": "cutoff", "exponent": 3.0,
+    "threshold": 0.2,
     **dict.fromkeys(["bidirectional", "kelemen_style_weights", "two_stage"], True),
     **dict.fromkeys(["chains", "chain_length", "direct_samples", "luminance_samples"], 3),
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
     **dict.fromkeys(["mutation_size_low", "mutation_size_high"], 0.01),
     "chain_file": "chains.npz", "outliers": 2.0, "p_large": 0.5,
+    **dict.fromkeys(["bidirectional_mutation", "lens_perturbation"], True),
+    **dict.fromkeys(["multi_chain_perturbation", "caustic_perturbation"], True),
 }  # fmt: skip
 
 #: What makes a parameter known that is not always.
@@ -51,6 +56,7 @@ CONDITIONS = {
     ("pss_guided", "tile"): {"regions": "tiles"},
     ("guided_directions", "tile"): {"regions": "tiles"},
     **{("neepp", key): {"rejection": True} for key in ("law", "slope", "floor")},
+    ("mis_heuristic", "threshold"): {"heuristic": "cutoff"},
     ("neepp", "refine"): {"rejection": True, "light_sampling": "uniform"},
 }
 

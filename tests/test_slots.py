@@ -14,7 +14,10 @@ from statistical import batches, one_thread
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-SLOTS = ("directions", "next_event", "connections", "shadow_test", "aperture", "time", "wavelength")
+SLOTS = (
+    "directions", "next_event", "connections", "mis", "shadow_test", "aperture", "time",
+    "wavelength",
+)  # fmt: skip
 
 GUIDED = {"type": "guided_directions", "always_guide": True}
 
@@ -43,14 +46,15 @@ def test_a_decision_in_a_wrong_slot_is_told_its_own(slot: str, plugin: str, belo
 
 @pytest.mark.parametrize("slot, value", [
     ("directions", "guded"), ("next_event", "all"), ("connections", "many"), ("connections", 2.5),
-    ("shadow_test", "never"), ("shadow_test", 1), ("aperture", "uniform"), ("time", True),
+    ("mis", "best"), ("shadow_test", "never"), ("shadow_test", 1), ("aperture", "uniform"),
+    ("time", True),
 ])  # fmt: skip
 def test_a_word_that_is_none_is_named_with_those_that_are(slot: str, value: Any) -> None:
     message = _refusal(**{slot: value})
     words = {
         "directions": "uniform, guided", "next_event": "power, spatial, linear",
-        "connections": "one", "shadow_test": "visibility_roulette", "aperture": "sobol",
-        "time": "sampler",
+        "connections": "one", "mis": "balance, cutoff", "shadow_test": "visibility_roulette",
+        "aperture": "sobol", "time": "sampler",
     }  # fmt: skip
     assert f'"{slot}" is {value!r}' in message and words[slot] in message
 
@@ -89,7 +93,8 @@ def test_weights_that_a_purpose_cannot_have_are_refused(monkeypatch) -> None:
 @pytest.mark.parametrize("plugin, slot", [
     ("guided_directions", "directions"), ("learned_lights", "next_event"),
     ("visibility_roulette", "shadow_test"), ("weighted_connections", "connections"),
-    ("weighted_numbers", "aperture"),
+    ("mis_heuristic", "mis"), ("resampled_lights", "next_event"),
+    ("two_stage_lights", "next_event"), ("weighted_numbers", "aperture"),
 ])  # fmt: skip
 def test_a_decision_is_no_sampler_of_a_sensor(plugin: str, slot: str) -> None:
     camera = {**sensor(), "sampler": {"type": plugin}}

@@ -45,8 +45,8 @@ class FromBothEnds(EmitterSampling):
     def sample(self, place, scene, numbers, si, active):
         return self._decision.sample(place, scene, numbers, si, active)
 
-    def remember(self, place):
-        return self._decision.remember(place)
+    def remember(self, place, scene, d, pdf, active):
+        return self._decision.remember(place, scene, d, pdf, active)
 
     def density(self, state, scene, ref, si, ds, active):
         return self._decision.density(state, scene, ref, si, ds, active)

@@ -131,7 +131,10 @@ class PartialSums:
         place = self._next_event.visit(
             self._next_event.begin(None, emitted.ray), scene, si, active
         )
-        state = self._next_event.remember(place)
+        # With what density scattering finds the light is not known here: decisions that ask for it
+        # have no place beside light paths
+        d = -emitted.ray.d
+        state = self._next_event.remember(place, scene, d, mi.Float(0), active)
         start, ds = emitted.start, dr.zeros(mi.DirectionSample3f, dr.width(si))
         ds.p, ds.n, ds.uv, ds.time = start.p, start.sh_frame.n, start.uv, si.time
         ds.d, ds.dist, ds.emitter = -emitted.ray.d, si.t, emitted.emitter

@@ -116,7 +116,7 @@ class BidirectionalPathTracer:
             )  # fmt: skip
         if isinstance(sampler, BothEnds):
             sampler = sampler.camera
-        sample = replace(walk, weights=weights, subpaths=subpaths)(scene, sampler, rays, active)
+        sample = replace(walk, mis=weights, subpaths=subpaths)(scene, sampler, rays, active)
         shadow_count = sample.shadow_count
         if image is not None:
             # Counted as if the first lane had traced them

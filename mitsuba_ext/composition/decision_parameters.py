@@ -115,6 +115,8 @@ class DecisionParameters:
         pilot_spp: Samples per pixel from which it would learn, by default; 0 if it does not learn.
         pilot_paths: So many samples of the whole film are enough for it; 0 if it can use all.
         tries: Does what it learns in a first pilot make the next ones better?
+        camera_paths_only: Does it ask what only camera paths know of a vertex (from where it is
+            seen, its depth, with what density scattering finds a light)?
         sample_cost: The time of a sample in units of that of a path, about.
     """
 
@@ -123,6 +125,7 @@ class DecisionParameters:
     pilot_spp = 0
     pilot_paths = 0
     tries = False
+    camera_paths_only = False
     sample_cost = 1
 
     def check_slot(self, plugin: str, slot: str) -> None:

@@ -41,6 +41,7 @@ class MetropolisIntegrator(ChainIntegrator):
     """
 
     is_bidirectional = True
+    has_light_paths = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -85,7 +86,7 @@ class MetropolisIntegrator(ChainIntegrator):
             return None
         if not self.bidirectional or self.max_depth < 2:
             weights = WithoutLengths(Weights(), 1, 2) if self.finds_direct else Weights()
-            walk = self.composed_walk(setting, self.max_depth, weights=weights)
+            walk = self.composed_walk(setting, self.max_depth, mis=weights)
             return ImageTarget(scene, sensor, walk, setting.spp)
         side = LightSide.of(self.name, scene, sensor)
         walk = self.composed_walk(setting, self.max_depth)

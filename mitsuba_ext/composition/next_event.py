@@ -11,9 +11,12 @@ import numpy as np
 
 from ..bounds import scene_bounds
 from ..decisions.learner import Learner
+from ..decisions.next_event.environment_partition import MOST_SPLITS
 from ..decisions.next_event.light_map_learner import LightMapLearner
 from ..decisions.next_event.light_table import TABLE_BYTES, LightTable, OneRow
 from ..decisions.next_event.linear_lights import LinearChoice
+from ..decisions.next_event.resampled_lights import ResampledLights
+from ..decisions.next_event.two_stage import TwoStage
 from ..errors import InputError
 from ..files import check_target
 from ..lights.light_cells import LightCells
@@ -21,6 +24,9 @@ from ..lights.weights import VoxelRows, power_weights, spatial_weights
 from ..regions.voxel_grid import VoxelGrid
 from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
+
+#: Candidates that take as long as a path, about.
+_CANDIDATES_PER_PATH = 32
 
 #: Voxels along each axis for ``spatial``, where the scene's author does not say.
 _SPATIAL_GRID = 32
@@ -151,6 +157,45 @@ class LearnedLights(DecisionParameters):
         return {**super().parameters(*slots), "grid": self.grid or "automatic"}
 
 
+class ResampledLightsChoice(DecisionParameters):
+    """Lights among candidates, by what each would bring. The attributes are the parameters of the
+    plugin ``resampled_lights``; see there."""
+
+    name = "resampled_lights"
+    slots = ("next_event",)
+    camera_paths_only = True
+
+    def __init__(self, read: ParameterReader) -> None:
+        self.candidates = read("candidates", 8, minimum=1, maximum=1024)
+
+    @property
+    def sample_cost(self) -> int:
+        return 1 + self.candidates // _CANDIDATES_PER_PATH
+
+    def decision(self, setting: Setting) -> Any | None:
+        if not setting.scene.emitters():
+            return None
+        return ResampledLights(setting.scene, self.candidates)
+
+
+class TwoStageLights(DecisionParameters):
+    """Directions of the environment by the product of BSDF and light. The attributes are the
+    parameters of the plugin ``two_stage_lights``; see there."""
+
+    name = "two_stage_lights"
+    slots = ("next_event",)
+    camera_paths_only = True
+
+    def __init__(self, read: ParameterReader) -> None:
+        self.splits = read("splits", 16, minimum=0, maximum=MOST_SPLITS)
+        self.vertices = read("vertices", "first", choices=("first", "all"))
+
+    def decision(self, setting: Setting) -> Any | None:
+        if setting.scene.environment() is None or setting.max_depth < 2:
+            return None
+        return TwoStage(setting.scene, self.splits, self.vertices == "all")
+
+
 #: What lights can be learned for, the default first.
 TARGETS = ("contribution", "visibility")
 
@@ -162,6 +207,12 @@ METHODS: dict[str, Callable[[ParameterReader], DecisionParameters] | None] = {
     "linear": lambda read: LinearLights(),
     "visibility": lambda read: LearnedLights(read, "visibility"),
     "contribution": lambda read: LearnedLights(read, "contribution"),
+}
+
+#: Those that an integrator of camera paths can have besides.
+CAMERA_METHODS: dict[str, Callable[[ParameterReader], DecisionParameters]] = {
+    "resampled": ResampledLightsChoice,
+    "two_stage": TwoStageLights,
 }
 
 

@@ -12,7 +12,15 @@ from .connections import Connections
 from .decision_parameters import DecisionParameters, ParameterReader
 from .directions import Guided
 from .light_paths import LightPathsWhereTheyPay
-from .next_event import METHODS, LearnedLights, SpatialLights
+from .mis import HEURISTICS, MisHeuristic
+from .next_event import (
+    CAMERA_METHODS,
+    METHODS,
+    LearnedLights,
+    ResampledLightsChoice,
+    SpatialLights,
+    TwoStageLights,
+)
 from .roulette import GuidedRoulette
 from .shadow_test import RejectedShadowRays
 from .subpath_selection import LearnedSubpaths
@@ -24,9 +32,10 @@ _Maker = Callable[[ParameterReader], DecisionParameters]
 #: which learners are made, of which later ones can use earlier ones.
 SLOTS: dict[str, dict[str, _Maker | None]] = {
     "directions": {"uniform": None, "guided": Guided},
-    "next_event": METHODS,
+    "next_event": {**METHODS, **CAMERA_METHODS},
     "roulette": {"automatic": lambda read: GuidedRoulette(), "throughput": None},
     "connections": {"one": None},
+    "mis": {HEURISTICS[0]: None, **{name: MisHeuristic.named(name) for name in HEURISTICS[1:]}},
     "shadow_test": {"always": None, "visibility_roulette": RejectedShadowRays},
     **{slot: {"sampler": None} for slot in PURPOSES},
 }
@@ -41,7 +50,8 @@ _ALL_SLOTS = {**SLOTS, **BIDIRECTIONAL_SLOTS}
 
 #: What can be nested into a slot, of this package.
 _PLUGINS: tuple[type[DecisionParameters], ...] = (
-    Guided, LearnedLights, SpatialLights, Connections, RejectedShadowRays, WeightedNumbers,
+    Guided, LearnedLights, SpatialLights, ResampledLightsChoice, TwoStageLights, Connections,
+    MisHeuristic, RejectedShadowRays, WeightedNumbers,
 )  # fmt: skip
 
 

@@ -60,9 +60,12 @@ class WalkIntegrator(StagedIntegrator):
     :class:`composed_path`.
 
     Attributes:
+        has_light_paths (bool): Are there light paths beside the camera paths?
         slots (dict[str, DecisionParameters]): What fills the slots of the walk.
         learners (dict[str, Learner]): Who learned in the last render, by slot.
     """
+
+    has_light_paths = False
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -94,8 +97,13 @@ class WalkIntegrator(StagedIntegrator):
         """
         known = (*SLOTS, *BIDIRECTIONAL_SLOTS)
         self.slots = {slot: slots[slot] for slot in known if slots.get(slot) is not None}
-        for parameters in self.slots.values():
+        for slot, parameters in self.slots.items():
             parameters.check_together(self.name, self.slots)
+            if self.has_light_paths and parameters.camera_paths_only:
+                raise ValueError(
+                    f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which is for '
+                    f"integrators without light paths"
+                )
         wishes = [p.pilot_spp for p in self.slots.values() if p.pilot_spp]
         if wishes:
             self._pilot_spp = self.parameter(props, "pilot_spp", max(wishes), minimum=0)

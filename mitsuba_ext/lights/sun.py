@@ -29,12 +29,13 @@ class SunDisk:
         half_angle: The angle between the axis and the edge, in radians.
 
     Attributes:
+        direction (mi.Vector3f): The axis.
         solid_angle (float): Of the cone.
     """
 
     def __init__(self, direction: mi.Vector3f, half_angle: float) -> None:
-        self._direction = mi.Vector3f(direction)
-        dr.make_opaque(self._direction)
+        self.direction = mi.Vector3f(direction)
+        dr.make_opaque(self.direction)
         # The square of the chord: precise for small angles, and proportional to the solid angle
         self._square = float(4 * np.sin(half_angle / 2) ** 2)
         self.solid_angle = np.pi * self._square
@@ -68,7 +69,7 @@ class SunDisk:
 
     def contains(self, d: mi.Vector3f) -> mi.Bool:
         """Does the direction ``d`` lie in the disk?"""
-        return dr.squared_norm(d - self._direction) < self._square
+        return dr.squared_norm(d - self.direction) < self._square
 
     def sample(self, sample: mi.Point2f) -> mi.Vector3f:
         """A direction in the disk, uniformly distributed."""
@@ -76,4 +77,4 @@ class SunDisk:
         square = self._square * (1 - 1e-5) * dr.squared_norm(p)
         # The cosine of the angle is 1 − square / 2
         p *= math.sqrt(self._square) * dr.sqrt(1 - 0.25 * square)
-        return mi.Frame3f(self._direction).to_world(mi.Vector3f(p.x, p.y, 1 - 0.5 * square))
+        return mi.Frame3f(self.direction).to_world(mi.Vector3f(p.x, p.y, 1 - 0.5 * square))

@@ -15,7 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .mis import power_heuristic
+from .mis import Heuristic, power_heuristic
 from .vertex import PathState, Vertex
 
 
@@ -123,8 +123,11 @@ class EmitterSampling:
         ds, weight = scene.sample_emitter_direction(si, numbers.point, False, active)
         return ds, weight, place
 
-    def remember(self, place: Any) -> Any:
-        """The state when the vertex of ``place`` is left."""
+    def remember(
+        self, place: Any, scene: mi.Scene, d: mi.Vector3f, pdf: mi.Float, active: mi.Bool
+    ) -> Any:
+        """The state when the vertex of ``place`` is left in the direction ``d`` (in world space),
+        which scattering chose with the density ``pdf``."""
         return place
 
     def density(
@@ -198,9 +201,15 @@ class ConnectionCount:
 
 
 class Weights:
-    """The MIS weights of what a path finds: the power heuristic for connections to lights, and for
-    running into them. Other techniques may find the same; what they need to know of a path is its
-    ``sums``."""
+    """The MIS weights of what a path finds by connections to lights, and by running into them.
+    Other techniques may find the same; what they need to know of a path is its ``sums``.
+
+    Parameters:
+        heuristic: Weighs the two.
+    """
+
+    def __init__(self, heuristic: Heuristic = power_heuristic) -> None:
+        self._heuristic = heuristic
 
     def begin(self, ray: mi.Ray3f) -> Any:
         """The sums before the first vertex."""
@@ -220,7 +229,7 @@ class Weights:
     ) -> mi.Float:
         """For a light at ``si`` that the path has run into, in the direction ``ds``. ``pdf`` is the
         density with which connections find it, times their number."""
-        return power_heuristic(path.arrival.pdf, pdf)
+        return self._heuristic(path.arrival.pdf, pdf)
 
     def connection(
         self,
@@ -232,11 +241,31 @@ class Weights:
     ) -> mi.Float:
         """For a connection to the light that ``ds`` is about. ``pdf`` is its density times the
         number of connections, ``scattering_pdf`` that with which scattering finds it."""
-        return dr.select(ds.delta, 1, power_heuristic(pdf, scattering_pdf))
+        return dr.select(ds.delta, 1, self._heuristic(pdf, scattering_pdf))
 
     def leave(self, vertex: Vertex, bs: mi.BSDFSample3f) -> Any:
         """The sums behind ``vertex``, in the direction that was chosen there."""
         return vertex.path.sums
+
+
+class ScatteringAlone(Weights):
+    """No connection has a weight, but to light that scattering cannot find."""
+
+    def emission(self, scene, si, ds, path, pdf):
+        return dr.select(path.arrival.pdf > 0, mi.Float(1), 0)
+
+    def connection(self, scene, vertex, ds, pdf, scattering_pdf):
+        return dr.select(ds.delta | ~(scattering_pdf > 0), mi.Float(1), 0)
+
+
+class ConnectionsAlone(Weights):
+    """Light that a path runs into has no weight, but where no connection finds it."""
+
+    def emission(self, scene, si, ds, path, pdf):
+        return dr.select(pdf > 0, mi.Float(0), 1)
+
+    def connection(self, scene, vertex, ds, pdf, scattering_pdf):
+        return mi.Float(1)
 
 
 class SubpathSelection:

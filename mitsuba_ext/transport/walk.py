@@ -51,7 +51,7 @@ class Walk:
         shadow_test: Whether the shadow ray of a connection is traced.
         roulette: Which paths go on.
         query: How a ray meets the scene.
-        weights: Of multiple importance sampling.
+        mis: How what connections find is weighed against what scattering finds.
         subpaths: Other subpaths whose vertices are connected to those of the path.
         observer: Is told what happens.
     """
@@ -66,7 +66,7 @@ class Walk:
     shadow_test: ShadowTest = field(default_factory=AlwaysTest)
     roulette: Roulette = field(default_factory=Roulette)
     query: SceneQuery = field(default_factory=SceneQuery)
-    weights: Weights = field(default_factory=Weights)
+    mis: Weights = field(default_factory=Weights)
     subpaths: Subpaths | None = None
     observer: Observer = field(default_factory=Observer)
 
@@ -89,7 +89,7 @@ class Walk:
         ctx = heroes.context()
         connector = Connector(
             scene, self.next_event, self.connections, self.shadow_test, self.scattering,
-            self.query, heroes, self.weights, self.observer,
+            self.query, heroes, self.mis, self.observer,
         )  # fmt: skip
         makes_one, makes_many = connects and connector.single, connects and connector.many
 
@@ -104,7 +104,7 @@ class Walk:
             depth=mi.UInt32(0),
             arrival=Arrival(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)),
             hero_is_alone=heroes.begin(),
-            sums=self.weights.begin(ray),
+            sums=self.mis.begin(ray),
         )
         valid = mi.Bool(sees_environment and self.max_depth > 0)  # Has the path met anything?
         scatter_count, shadow_count, connection_count = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
@@ -122,13 +122,13 @@ class Walk:
 
         while dr.hint(active, label="walk"):
             si = self.query.interaction(pi, ray)
-            path.sums = self.weights.arrive(path, si)
+            path.sums = self.mis.arrive(path, si)
 
             # ----- How much does this vertex emit towards the previous one? -----
             if dr.hint(can_hit_emitters, mode="scalar"):
                 count = self.connections.weight(path.depth - 1)
                 emitted, mis, hit, light_pdf = emission(
-                    scene, si, path, self.next_event, next_event_state, self.weights, count
+                    scene, si, path, self.next_event, next_event_state, self.mis, count
                 )
                 L = dr.fma(path.β, emitted, L)
                 self.observer.emission(
@@ -192,9 +192,9 @@ class Walk:
                 depth=path.depth + dr.select(si.is_valid(), mi.UInt32(1), 0),
                 arrival=Arrival(mi.Interaction3f(si), bs.pdf, is_delta),
                 hero_is_alone=hero_is_alone,
-                sums=self.weights.leave(vertex, bs),
+                sums=self.mis.leave(vertex, bs),
             )
-            next_event_state = self._leave(connects, place)
+            next_event_state = self._leave(connects, place, scene, ray.d, bs.pdf, active_em)
 
             # ----- Russian roulette -----
             rr_active = path.depth >= self.rr_depth
@@ -220,9 +220,9 @@ class Walk:
         """What the next event decision knows of a vertex."""
         return self.next_event.visit(state, scene, si, active) if connects else state
 
-    def _leave(self, connects: bool, place):
+    def _leave(self, connects: bool, place, scene, d, pdf, active):
         """The state of the next event decision when it leaves a vertex."""
-        return self.next_event.remember(place) if connects else place
+        return self.next_event.remember(place, scene, d, pdf, active) if connects else place
 
     def _connect(self, connector, connects: bool, place, sampler, vertex, active) -> Connection:
         """The one connection of a vertex, or none."""

@@ -129,7 +129,7 @@ class LinearChoice(EmitterSampling):
         ds.pdf *= probability
         return ds, dr.select(probability > 0, weight / probability, 0), ()
 
-    def remember(self, place):
+    def remember(self, place, scene, d, pdf, active):
         return place[0] if self.count > 1 else ()
 
     def density(self, state, scene, ref, si, ds, active):

@@ -1,0 +1,83 @@
+"""Direct light of an environment by two-stage importance sampling."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.composition.connections import Connections
+from mitsuba_ext.composition.decision_parameters import ParameterReader
+from mitsuba_ext.composition.next_event import TwoStageLights
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+
+
+@registry.plugin
+class TwoStage(WalkIntegrator):
+    r"""
+    .. _integrator-two_stage:
+
+    Two-stage importance sampling (:monosp:`two_stage`)
+    ---------------------------------------------------
+
+    A path tracer that connects the first vertex of each path to several directions of the
+    environment. It chooses them by what the map emits times what the BSDF reflects of it. It is
+    :monosp:`composed_path` with :monosp:`two_stage_lights`, whose page says more, and
+    :monosp:`weighted_connections`.
+
+    .. pluginparameters::
+
+     * - light_samples
+       - |int|
+       - Connections of the first vertex, at most 1024. They share one partition of the map.
+         (Default: 16)
+     * - splits
+       - |int|
+       - How often a vertex divides rectangles of the map, at most, besides the first eight.
+         (Default: 16)
+     * - vertices
+       - |string|
+       - Which vertices divide the map and have so many connections: the :monosp:`first`, or
+         :monosp:`all`. (Default: first)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+
+    **Use it when** you compare methods, or the light of an uneven map on rough metal makes the
+    noise, nothing is in between, and the number of camera samples is limited by something else.
+    **Not when** time counts: samples have less error than those of :monosp:`path`, but take longer
+    by more than that, in all four scenes that were measured.
+
+    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    :monosp:`prb`), nor are scalar and polarized variants.
+
+    Source: D. Cline, P. K. Egbert, J. F. Talbot, D. L. Cardon, *Two Stage Importance Sampling for
+    Direct Lighting*, EGSR 2006 (= D. Cline, PhD dissertation, BYU, 2007, chapter 5).
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="two_stage">
+                <integer name="light_samples" value="32"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'two_stage',
+            'light_samples': 32
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        light_samples = self.parameter(props, "light_samples", 16, minimum=1, maximum=1024)
+        lights = TwoStageLights(self.reader(props))
+        slots: dict[str, Any] = {"next_event": lights}
+        if light_samples > 1:
+            values = {"count": light_samples, "vertices": lights.vertices}
+            slots["connections"] = Connections(ParameterReader.of_defaults(self.name, **values))
+        self.light_samples = light_samples
+        self.fill(props, **slots)
+
+    def parameters(self) -> dict[str, Any]:
+        return {"light_samples": self.light_samples, **super().parameters()}

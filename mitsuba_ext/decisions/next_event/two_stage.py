@@ -1,0 +1,112 @@
+"""Two-stage importance sampling of an environment.
+
+Source: Cline, PhD dissertation, chapter 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ...lights.environment_texels import EnvironmentTexels
+from ...lights.texel_sums import TexelSums
+from ...transport.heroes import Heroes
+from ...transport.path_decisions import EmitterSampling
+from .environment_partition import Partition, Partitioner
+
+
+@dataclass
+class State:
+    """What a path remembers of its last vertex.
+
+    Attributes:
+        density: With which a connection to the environment would have found the direction in which
+            the path has left; where ``has_partition``.
+        has_partition: Did the last vertex have one?
+        is_first: Is there no last vertex?
+    """
+
+    density: mi.Float
+    has_partition: mi.Bool
+    is_first: mi.Bool
+
+
+@dataclass
+class Place:
+    """What is known of a vertex.
+
+    Attributes:
+        partition: Of the environment, where ``has_partition``.
+        has_partition: Elsewhere lights are chosen as Mitsuba does.
+    """
+
+    partition: Partition
+    has_partition: mi.Bool
+
+
+class TwoStage(EmitterSampling):
+    """Directions of the environment by the product of what it emits and what the BSDF reflects of
+    it; points of all other lights as Mitsuba chooses them.
+
+    Parameters:
+        scene: A scene with an environment emitter.
+        splits: See :class:`Partitioner`.
+        everywhere: Are there partitions at all vertices of a path, not only at the first?
+    """
+
+    def __init__(self, scene: mi.Scene, splits: int, everywhere: bool) -> None:
+        self._everywhere = everywhere
+        self._sums = TexelSums(EnvironmentTexels(scene))
+        self._texels = self._sums.texels
+        self._partitioner = Partitioner(self._sums, Heroes(scene).context(), splits)
+        emitters = scene.emitters()
+        self.choice_dimension = 1 if len(emitters) > 1 else 0
+        self._index = emitters.index(scene.environment())
+        self._pointer = self._texels.directions.pointer
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> State:
+        return State(mi.Float(0), mi.Bool(False), mi.Bool(True))
+
+    def visit(self, state, scene, si, active) -> Place:
+        has_partition = mi.Bool(active)
+        if not self._everywhere:
+            has_partition &= state.is_first
+        return Place(self._partitioner.partition(si, has_partition), has_partition)
+
+    def sample(self, place, scene, numbers, si, active):
+        inverse, by_product = mi.Float(1), active & place.has_partition
+        if self.choice_dimension > 0:
+            index, inverse, _rest = scene.sample_emitter(numbers.choice, active)
+            by_product &= index == self._index
+            emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active & ~by_product)
+        else:
+            emitter = self._pointer
+        a, a_weight = self._by_product(place, si, numbers.point, dr.rcp(inverse), by_product)
+        is_other = active & ~by_product
+        b, b_weight = emitter.sample_direction(si, numbers.point, is_other)
+        b.pdf = dr.select(is_other, b.pdf / inverse, 0)
+        b.emitter = mi.EmitterPtr(emitter)
+        b_weight = dr.select(is_other, b_weight * inverse, 0)
+        return dr.select(by_product, a, b), dr.select(by_product, a_weight, b_weight), ()
+
+    def _by_product(self, place, si, point, probability: mi.Float, active):
+        d, uv, density = self._partitioner.sample(place.partition, point, active)
+        ds = self._texels.directions.sample(si, d)
+        ds.uv, ds.pdf = uv, dr.select(active, density * probability, 0)
+        value = self._texels.radiance(si, ds, active)
+        return ds, dr.select(ds.pdf > 0, value / ds.pdf, 0)
+
+    def remember(self, place, scene, d, pdf, active) -> State:
+        has_partition = active & place.has_partition
+        density = self._partitioner.pdf(place.partition, d, has_partition)
+        return State(density, has_partition, mi.Bool(False))
+
+    def density(self, state, scene, ref, si, ds, active):
+        by_product = active & state.has_partition & (ds.emitter == self._pointer)
+        others = scene.pdf_emitter_direction(ref, ds, active & ~by_product)
+        chosen = 1.0
+        if self.choice_dimension > 0:
+            chosen = scene.pdf_emitter(mi.UInt32(self._index), active)
+        return dr.select(active, dr.select(by_product, state.density * chosen, others), 0)

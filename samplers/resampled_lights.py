@@ -1,0 +1,65 @@
+"""Lights that are chosen among candidates by what each would bring."""
+
+from __future__ import annotations
+
+from mitsuba_ext import registry
+from mitsuba_ext.composition.decision_plugin import DecisionPlugin
+from mitsuba_ext.composition.next_event import ResampledLightsChoice
+
+
+@registry.plugin
+class ResampledLightsPlugin(DecisionPlugin):
+    r"""
+    .. _sampler-resampled_lights:
+
+    Resampled lights (:monosp:`resampled_lights`)
+    ---------------------------------------------
+
+    A decision for the slot :monosp:`next_event` of :monosp:`composed_path`: resampled importance
+    sampling. Each connection takes several candidates, half of them light samples as of
+    :monosp:`path` and, where there is an environment, half of them BSDF samples that are looked up
+    in it. It evaluates BSDF and light for all of them, chooses one in proportion to what it would
+    bring if nothing were in between, and traces one shadow ray.
+
+    .. pluginparameters::
+
+     * - candidates
+       - |int|
+       - Candidates of a connection, 1 to 1024. (Default: 8)
+
+    **Use it when** lights are many, large or unlike each other, or glossy things reflect an
+    environment, and most of the light is seen. **Not when** walls hide most of it: the candidates
+    know nothing of what is in between (:monosp:`learned_lights` does).
+
+    MIS with BSDF samples uses the density of all candidates together, times their number. The image
+    is unbiased. Not for :monosp:`bdpt` and other integrators with light paths, which do not know
+    with what density a BSDF would have found the light.
+
+    Source: J. Talbot, D. Cline, P. Egbert, *Importance Resampling for Global Illumination*, EGSR
+    2005; D. Cline, PhD dissertation, BYU, 2007, section 4.4.4. That MIS may use the density of the
+    candidates, and lattices as candidates, are our addition.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="composed_path">
+                <sampler name="next_event" type="resampled_lights">
+                    <integer name="candidates" value="32"/>
+                </sampler>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'composed_path',
+            'next_event': {
+                'type': 'resampled_lights',
+                'candidates': 32
+            }
+
+        .. code-tab:: bash
+
+            mitsuba-ext render scene.xml -o image.exr \
+                --integrator "composed_path:next_event=[resampled_lights:candidates=32]"
+    """
+
+    kind = ResampledLightsChoice

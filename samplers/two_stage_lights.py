@@ -1,0 +1,72 @@
+"""Directions of the environment by the product of BSDF and light."""
+
+from __future__ import annotations
+
+from mitsuba_ext import registry
+from mitsuba_ext.composition.decision_plugin import DecisionPlugin
+from mitsuba_ext.composition.next_event import TwoStageLights
+
+
+@registry.plugin
+class TwoStageLightsPlugin(DecisionPlugin):
+    r"""
+    .. _sampler-two_stage_lights:
+
+    Two-stage importance sampling (:monosp:`two_stage_lights`)
+    ----------------------------------------------------------
+
+    A decision for the slot :monosp:`next_event` of :monosp:`composed_path`. It chooses directions
+    of the environment (:monosp:`envmap`, :monosp:`sunsky`, :monosp:`constant`) by what the map
+    emits times what the BSDF reflects of it. Each vertex divides the map into rectangles, the
+    smaller the more the BSDF varies there, and knows the BSDF at their corners. Sums of the map
+    over rectangles come from a summed-area table. Samples are warped down to the texel.
+
+    .. pluginparameters::
+
+     * - splits
+       - |int|
+       - How often a vertex divides rectangles, at most, besides the first eight of them, 0 to 1024.
+         The source divides as often as there are connections of a vertex. (Default: 16)
+     * - vertices
+       - |string|
+       - Which vertices of a path divide the map: the :monosp:`first`, or :monosp:`all`. At the
+         others, lights are chosen as by :monosp:`path`. (Default: first)
+
+    **Use it when** rough metal reflects an uneven map of which it sees most, and each vertex has
+    several :monosp:`connections`, which share its partition: that takes longer than a path.
+    **Not when** walls or other things hide the bright parts of the map, as it knows nothing of what
+    is in between; or for lobes that are nearly those of mirrors, which BSDF samples find better.
+
+    Lights other than the environment are chosen as by :monosp:`path`. Without an environment this
+    is what :monosp:`path` does. BSDF samples take part by MIS; lobes that are thinner than a texel
+    are left to them. The density is positive wherever the map is defined: a hundredth of it follows
+    the map alone. Not for :monosp:`bdpt` and other integrators with light paths.
+
+    Source: D. Cline, P. K. Egbert, J. F. Talbot, D. L. Cardon, *Two Stage Importance Sampling for
+    Direct Lighting*, EGSR 2006 (= D. Cline, PhD dissertation, BYU, 2007, chapter 5). The order of
+    the divisions, and BSDF samples in the place of the peaks of known models, are ours.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="composed_path">
+                <sampler name="next_event" type="two_stage_lights">
+                    <integer name="splits" value="32"/>
+                </sampler>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'composed_path',
+            'next_event': {
+                'type': 'two_stage_lights',
+                'splits': 32
+            }
+
+        .. code-tab:: bash
+
+            mitsuba-ext render scene.xml -o image.exr \
+                --integrator "composed_path:next_event=[two_stage_lights:splits=32]"
+    """
+
+    kind = TwoStageLights
