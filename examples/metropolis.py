@@ -3,12 +3,14 @@ by variance and CPU time, start-up included:
 
     .venv/bin/python examples/metropolis.py caustic ring /somewhere/scene.xml --size 192 108
     .venv/bin/python examples/metropolis.py fast_balls fan --motion --max-depth 4
+    .venv/bin/python examples/metropolis.py ring keyhole --paths
 
 Writes one row of Markdown for each scene. Errors are those of ``examples/equal_samples.py``,
 relative to the mean of all images of ``pssmlt``; times are the median of the seeds. The efficiency,
 1 / (error · time), is relative to ``path``. ``means`` has those of ``path`` and ``bdpt``, relative
 to that of ``pssmlt``: where they are below 1, light is found too rarely for the variance to tell
-the error. With ``--motion``, there is a row for each integrator that renders moving shapes.
+the error. With ``--motion`` or ``--paths``, there is a row for each integrator: those that render
+moving shapes, or ``mlt`` and others.
 """
 
 from __future__ import annotations
@@ -52,6 +54,15 @@ MOTION = {
     "erpt, only chains": {"type": "erpt", "direct_samples": -1},
 }
 
+#: Chains of paths, and what they are compared with.
+PATHS = {
+    "path": {"type": "path"},
+    "bdpt": {"type": "bdpt"},
+    "pssmlt": {"type": "pssmlt"},
+    "erpt": {"type": "erpt"},
+    "mlt": {"type": "mlt"},
+}
+
 COLUMNS = ["scene", "`path`: seconds", "error", "means"]
 for _kind in list(INTEGRATORS)[1:]:
     COLUMNS += [f"{_kind}: time", "error", "efficiency"]
@@ -61,16 +72,22 @@ COLUMNS.append("accepted")
 @click.command()
 @options
 @click.option("--motion", is_flag=True, help="Compare integrators that render moving shapes.")
+@click.option("--paths", is_flag=True, help="Compare mlt with others.")
 def main(
-    names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, motion: bool
+    names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, motion: bool,
+    paths: bool,
 ) -> None:
     """Compares the integrators on the scenes NAMES."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
-    if motion:
+    if motion or paths:
         print_header(["scene", "", "time", "error", "efficiency", "99th percentile", "mean"])
         for name in names:
-            print_motion(name, size, max_depth, spp, seeds)
+            if motion:
+                print_motion(name, size, max_depth, spp, seeds)
+            else:
+                renders = render_in_turns(load(name, size), PATHS, max_depth, spp, seeds)
+                print_each(title(name), renders, "mlt")
         return
     print_header(COLUMNS)
     for name in names:
@@ -101,13 +118,18 @@ def print_motion(name: str, size: tuple, max_depth: int, spp: int, seeds: int) -
         else:
             values["max_depth"] = max_depth
         renders |= render_in_turns(scene, {kind: values}, None, spp, seeds)
-    base, mean = renders["path"], renders["path, multijitter"].mean
+    print_each(title(name), renders, "path, multijitter")
+
+
+def print_each(name: str, renders: dict[str, Renders], best: str) -> None:
+    """A row for each integrator, in units of ``path``. Errors are relative to the mean of one."""
+    base, mean = renders["path"], renders[best].mean
     first = [error(base.variance, mean), percentile(base.variance, mean)]
     for kind, r in renders.items():
         slower = r.time / base.time
         e, p = (f(r.variance, mean) / x for f, x in zip((error, percentile), first))
         print_row([
-            title(name), kind, f"{slower:.2f}", f"{e:.2g}", f"{1 / (e * slower):.2g}", f"{p:.2g}",
+            name, kind, f"{slower:.2f}", f"{e:.2g}", f"{1 / (e * slower):.2g}", f"{p:.2g}",
             f"{r.mean.mean() / mean.mean():.3f}",
         ])  # fmt: skip
 

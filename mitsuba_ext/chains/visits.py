@@ -16,8 +16,8 @@ from .chain_image import ChainImage
 from .chains import ChainRules, Chains
 from .even_tiles import EvenTiles
 from .numbers import stream
-from .render import FIRST_STAGE, ChainRender
 from .path_target import PathTarget
+from .render import FIRST_STAGE, ChainRender
 from .small_steps import SmallSteps
 from .stored import Arrays
 from .target import Found, ImageTarget

@@ -20,9 +20,9 @@ from .space import PathSpace, is_same, shape_id, towards, turned
 #: Stands for a surface that does not shine.
 NO_LIGHT = 0xFFFFFFFF
 
-#: By how much the direction of a discrete lobe may miss the next vertex, squared: it shows that the
-#: path took another lobe. Rays begin at some distance from a surface, so that the next vertex, where
-#: it is near, does not lie exactly in the direction of a mirror.
+#: By how much the direction of a discrete lobe may miss the next vertex, squared: it shows that
+#: the path took another lobe. Rays begin at some distance from a surface, so that the next vertex,
+#: where it is near, does not lie exactly in the direction of a mirror.
 _MISS = 0.1
 
 

@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..transport.numbers import Numbers
 from .memory import Head, PathMemory, Place
 from .plan import Plan
-from .space import PathSpace, shape_id, towards, turned
+from .space import PathSpace, shape_id, turned
 
 #: Angles, in radians, by which perturbations turn directions. Displacements of light that comes
 #: from infinity, in units of the radius of the scene.

@@ -11,7 +11,7 @@ from ..transport.numbers import Numbers, hashed_2d
 from .densities import log_density, log_factors
 from .evaluation import Evaluation, trace_from_camera
 from .light_subpaths import grow_from_light
-from .memory import Head, Logs, PathMemory, Place, stride
+from .memory import Head, PathMemory, stride
 from .plan import Plan
 from .space import PathSpace
 from .techniques import Techniques
@@ -23,7 +23,7 @@ NEW_PATH, BIDIRECTIONAL, FROM_CAMERA, FROM_LIGHT = 0, 1, 2, 3
 #: perturbations move paths.
 _PIXELS, _WIDTH = 0.1, 0.1
 
-#: Multiples of these numbers, modulo one, are evenly spread over the unit square (M. Roberts, 2018).
+#: Multiples of these, modulo one, are evenly spread over the unit square (M. Roberts, 2018).
 _EVENLY = (0.7548776662466927, 0.5698402909980532)
 
 
