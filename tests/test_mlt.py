@@ -192,7 +192,7 @@ def test_camera_samples_find_paths_that_are_too_long_for_chains(monkeypatch) -> 
     """In a room that reflects half of the light, which is everywhere the same."""
     integrator = mlt(-1, direct_samples=64)
     monkeypatch.setattr(sys.modules[type(integrator).__module__], "_MOST", 4)
-    room = {"type": "sphere", "radius": 3.0, "flip_normals": True, "emitter": area(1.0),
+    room = {"type": "sphere", "radius": 6.0, "flip_normals": True, "emitter": area(1.0),
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
     scene = mi.load_dict({"type": "scene", "room": room, "sensor": sensor()})
     images = batches(scene, integrator, 64, range(1, 9))
@@ -202,5 +202,5 @@ def test_camera_samples_find_paths_that_are_too_long_for_chains(monkeypatch) -> 
 
 def test_statistics_have_rates_of_acceptance() -> None:
     integrator = mlt()
-    mi.render(mi.load_dict(stage(), optimize=False), integrator=integrator, spp=4)
+    mi.render(mi.load_dict(stage(), optimize=False), integrator=integrator, spp=64)
     assert "of large steps" in integrator.statistics.learned
