@@ -99,7 +99,7 @@ def trace_from_camera(
         is_infinite = kinds.is_infinite(emitter, is_end)
         is_direction = is_end & (is_infinite | kinds.is_beam(emitter, is_end))
         distance = dr.norm(si.p - p_before)
-        found = is_new | is_same(si, place, dr.norm(place.p - ray.o))
+        found = is_new | is_same(si, dr.norm(place.p - ray.o))
         shines = (light != NO_LIGHT) & (light == emitter)
         is_there = is_infinite | is_new | (dr.norm(si.p - place.p) < 1e-3 * distance)
         ends = dr.select(unhittable, ~is_new, shines & is_there)

@@ -105,16 +105,16 @@ class PathSpace:
         ray.o, ray.d, ray.maxt = place.p + way, -dr.normalize(way), dr.largest(mi.Float)
         pi = self.query.closest(self.scene, ray, coherent=False, active=active)
         si = self.query.interaction(pi, ray)
-        return si, active & is_same(si, place, dr.norm(way))
+        return si, active & is_same(si, dr.norm(way))
 
     def target(self, memory: PathMemory, head: Head, index: mi.UInt32) -> mi.Point3f:
         return memory.places[head.at + index].p
 
 
-def is_same(si: mi.SurfaceInteraction3f, place: Place, distance: mi.Float) -> mi.Bool:
-    """Has a ray of which the end is so far away found the vertex there?"""
-    is_there = dr.abs(si.t - distance) < _TOLERANCE * distance
-    return si.is_valid() & (shape_id(si) == place.shape) & (si.prim_index == place.prim) & is_there
+def is_same(si: mi.SurfaceInteraction3f, distance: mi.Float) -> mi.Bool:
+    """Has a ray of which the end is so far away found the vertex there? Where surfaces coincide, it
+    may find another one than an earlier ray did: Mitsuba's shadow rays see no difference either."""
+    return si.is_valid() & (dr.abs(si.t - distance) < _TOLERANCE * distance)
 
 
 def shape_id(si: mi.SurfaceInteraction3f) -> mi.UInt32:
