@@ -196,7 +196,7 @@ def weights_of_techniques(
         delta, smooth = int(mi.BSDFFlags.DeltaReflection), int(mi.BSDFFlags.DiffuseReflection)
         bs.sampled_type = dr.select(v.is_delta, mi.UInt32(delta), mi.UInt32(smooth))
         place = next_event.visit(state, scene, si, active)
-        state = place
+        state = next_event.remember(place, scene, si.to_world(bs.wo), mi.Float(0), active)
         path = PathState(
             mi.Spectrum(1), mi.Float(1), mi.Float(1), path.depth + 1,
             Arrival(mi.Interaction3f(si), bs.pdf, v.is_delta), (), weights.leave(vertex, bs),

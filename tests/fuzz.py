@@ -4,8 +4,9 @@
 
 tests scenes 0, 1, 2 and so on, the kinds in turn, and prints for each failure the command that
 repeats it with the same random numbers. ``--kind``, ``--scene`` and ``--technique`` select one of
-each; ``--variant`` selects another variant. At the end it prints how often the image of ``path``
-could not serve as a reference, and how often the noise was too large for a comparison.
+each; ``--variant`` selects another variant. At the end it prints how often there was nothing to
+compare, because ``path`` is no reference or the technique refuses the scene, and how often the
+noise was too large for a comparison.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ TRIED = [
     if "paper" not in name and "floor" not in name and name != "light_tracer"
 ]  # fmt: skip
 
-#: Results of a comparison: right; ``path`` cannot be the reference; wrong.
+#: Results of a comparison: right; ``path`` cannot be the reference, or the technique refuses what
+#: it documents not to support; wrong.
 OK, UNTOLD, FAILED = "ok", "could not tell", "failed"
 
 
@@ -132,8 +134,11 @@ class Trial:
                     return FAILED, f"z = {z:.1f} and {again:.1f}, image means {means}", 0.0
         except CannotTellError:
             raise
-        except Exception as error:  # any error is a fault, because ``path`` has none here
-            return FAILED, _line(error), 0.0
+        except Exception as error:  # any other error is a fault, because ``path`` has none here
+            reason = _origin(error)
+            if isinstance(reason, NotImplementedError):
+                raise CannotTellError(f"refused: {_line(reason)}") from error
+            return FAILED, _line(reason), 0.0
         if not (_colours(images).any() or _colours(reference).any()):
             raise CannotTellError("the image is black")
         return OK, "", _relative_error(images, reference)
@@ -224,7 +229,14 @@ def _relative_error(images: np.ndarray, reference: np.ndarray) -> float:
     return error / max(abs(theirs.mean()), 1e-30)
 
 
-def _line(error: Exception) -> str:
+def _origin(error: BaseException) -> BaseException:
+    """The error that Dr.Jit's own, of a custom operation, hides."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return error
+
+
+def _line(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
 
 
@@ -279,7 +291,7 @@ def main() -> int:
     failed, untold = (sum(v.status == status for v in found) for status in (FAILED, UNTOLD))
     print(
         f"{number - first} scene(s), {len(found)} comparison(s): {failed} failure(s), {untold} "
-        f"where path could not tell, {sum(v.is_noisy for v in found)} with a relative standard "
+        f"with nothing to compare, {sum(v.is_noisy for v in found)} with a relative standard "
         f"error above {PRECISION:.0%}"
     )
     return 1 if failed else 0

@@ -15,7 +15,7 @@ from .light_subpaths import HIGH, LOW
 from .lights import light_start_densities
 from .memory import Head, Logs, PathMemory, Place, log
 from .plan import Plan
-from .space import PathSpace, is_same, shape_id, towards, turned
+from .space import TOLERANCE, PathSpace, is_same, towards, turned
 
 #: Stands for a surface that does not shine.
 NO_LIGHT = 0xFFFFFFFF
@@ -101,7 +101,7 @@ def trace_from_camera(
         distance = dr.norm(si.p - p_before)
         found = is_new | is_same(si, dr.norm(place.p - ray.o))
         shines = (light != NO_LIGHT) & (light == emitter)
-        is_there = is_infinite | is_new | (dr.norm(si.p - place.p) < 1e-3 * distance)
+        is_there = is_infinite | is_new | (dr.norm(si.p - place.p) < TOLERANCE * distance)
         ends = dr.select(unhittable, ~is_new, shines & is_there)
         active &= dr.select(is_end, ends, si.is_valid() & found)
 
@@ -143,7 +143,7 @@ def trace_from_camera(
         target = memory.places[at + index + 1]
         towards_light = next_is_end & ~grows
         given = towards_light & kinds.is_infinite(emitter, towards_light)
-        next_d, next_distance = towards(si.p, target, given)
+        next_d = towards(si.p, target, given)
         is_given = mi.Bool(False)
         if dr.hint(kinds.has_unhittable, mode="scalar"):
             is_given = towards_light & kinds.is_unhittable(emitter, towards_light) & goes_on
@@ -158,12 +158,12 @@ def trace_from_camera(
             beam_end = is_given & kinds.is_beam(emitter, is_given)
             end_p = dr.select(beam_end, ds.p, target.p)
             memory.places.write(
-                Place(end_p, target.shape, target.prim, target.lobe, target.is_discrete),
-                at + index + 1, goes_on & beam_end,
+                Place(end_p, target.lobe, target.is_discrete), at + index + 1,
+                goes_on & beam_end,
             )
         old_here, old_next = memory.places[old.at + index], memory.places[old.at + index + 1]
         old_given = (index + 1 == old.length) & kinds.is_infinite(old.emitter, next_is_end)
-        old_d, _old_distance = towards(old_here.p, old_next, old_given)
+        old_d = towards(old_here.p, old_next, old_given)
         aside = turned(old_d, sample, LOW, HIGH)
         sampled_d = dr.select(plan.perturbs & ~is_discrete, aside, si.to_world(bs.wo))
         next_d = dr.select(grows, sampled_d, next_d)
@@ -195,8 +195,6 @@ def trace_from_camera(
         memory.places.write(
             Place(
                 dr.select(is_new, dr.select(is_infinite, d, si.p), place.p),
-                dr.select(is_new, shape_id(si), place.shape),
-                dr.select(is_new, si.prim_index, place.prim),
                 lobe,
                 dr.select(is_end, mi.UInt32(0), dr.select(is_discrete, mi.UInt32(1), 0)),
             ),

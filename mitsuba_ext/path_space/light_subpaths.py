@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..transport.numbers import Numbers
 from .memory import Head, PathMemory, Place
 from .plan import Plan
-from .space import PathSpace, shape_id, turned
+from .space import TOLERANCE, PathSpace, turned
 
 #: Angles, in radians, by which perturbations turn directions. Displacements of light that comes
 #: from infinity, in units of the radius of the scene.
@@ -59,7 +59,7 @@ def grow_from_light(
         is_kept = index == plan.rest
         is_last = index == last
         # What is kept must be found again
-        is_there = dr.norm(si.p - place.p) <= 1e-3 * si.t
+        is_there = dr.norm(si.p - place.p) <= TOLERANCE * si.t
         active &= si.is_valid() & (~is_kept | is_there)
 
         # ----- Where does the path go on? -----
@@ -78,9 +78,7 @@ def grow_from_light(
         # ----- Store the vertex -----
         p = dr.select(is_kept, place.p, si.p)
         discrete = dr.select(goes_on & is_discrete & ~turns, mi.UInt32(1), 0)
-        memory.places.write(
-            Place(p, shape_id(si), si.prim_index, lobe, discrete), head.at + index, active
-        )
+        memory.places.write(Place(p, lobe, discrete), head.at + index, active)
         is_done |= active & is_last
         active &= goes_on
         ray = si.spawn_ray(d)
@@ -95,7 +93,7 @@ def _begin(space, memory, old, new, plan, ray, numbers, active, begins):
     kinds = space.kinds
     is_infinite = kinds.is_infinite(emitted.index, begins)
     p = dr.select(is_infinite, -emitted.ray.d, emitted.start.p)
-    end = Place(p, shape_id(emitted.start), emitted.start.prim_index, mi.Float(0), mi.UInt32(0))
+    end = Place(p, mi.Float(0), mi.UInt32(0))
     memory.places.write(end, new.at + new.length, begins)
     is_sound = begins & (dr.max(emitted.weight) > 0)
 

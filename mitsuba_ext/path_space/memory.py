@@ -14,16 +14,12 @@ class Place:
 
     Attributes:
         p: The point; for a light at infinity, the direction towards it.
-        shape, prim: The surface: the number of the shape in Mitsuba's registry, and of the
-            primitive. They tell whether a ray has found the vertex again.
         lobe: The number, in [0, 1), that chooses the lobe of the BSDF, where the path is scattered
             by a discrete one.
         is_discrete: Is it scattered by a mirror, smooth glass, or a hole of a mask? 0 or 1.
     """
 
     p: mi.Point3f
-    shape: mi.UInt32
-    prim: mi.UInt32
     lobe: mi.Float
     is_discrete: mi.UInt32
 

@@ -258,8 +258,8 @@ class Mutations:
         return made, first, second
 
     def _part(self, path: Head, choice: mi.Point2f, sample: mi.Float) -> Plan:
-        """Any part of a path but its light alone: the light is made anew, if at all, with the
-        vertex before it."""
+        """Any part of a path, which may be the light alone. What is kept behind it is never the
+        light alone: the walk from the light cannot begin at a given point."""
         length = path.length
         # The first vertex that is replaced, and how many follow it
         keeps = dr.minimum(mi.UInt32(choice.x * mi.Float(length)), length - 1)

@@ -12,10 +12,10 @@ from ..transport.estimator import CameraRays
 from ..transport.heroes import Heroes
 from ..transport.path_decisions import SceneQuery
 from .lights import LightKinds
-from .memory import Head, PathMemory, Place
+from .memory import Head, Place
 
 #: By how much, in units of its length, a ray may miss the end of a segment.
-_TOLERANCE = 1e-3
+TOLERANCE = 1e-3
 
 
 # Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
@@ -87,48 +87,16 @@ class PathSpace:
         film = mi.Point2f((seen.position - self._offset) / self.size)
         return dr.clip(film, 0, 1 - 2.0**-24), seen.active
 
-    def find_again(
-        self, place: Place, ahead: mi.Vector3f, is_direction: mi.Bool, ray: mi.Ray3f, active
-    ) -> tuple[mi.SurfaceInteraction3f, mi.Bool]:
-        """The interaction of a ray that comes to a vertex from its neighbour.
-
-        The ray begins between the two, where nothing is in its way, so that its origin needs no
-        distance from a surface.
-
-        Parameters:
-            place: The vertex.
-            ahead: The neighbour, or the direction towards it.
-            ray: Has the time and the wavelengths of the path.
-        """
-        way = dr.select(is_direction, ahead * (0.01 * self.radius), 0.5 * (ahead - place.p))
-        ray = mi.Ray3f(ray)
-        ray.o, ray.d, ray.maxt = place.p + way, -dr.normalize(way), dr.largest(mi.Float)
-        pi = self.query.closest(self.scene, ray, coherent=False, active=active)
-        si = self.query.interaction(pi, ray)
-        return si, active & is_same(si, dr.norm(way))
-
-    def target(self, memory: PathMemory, head: Head, index: mi.UInt32) -> mi.Point3f:
-        return memory.places[head.at + index].p
-
 
 def is_same(si: mi.SurfaceInteraction3f, distance: mi.Float) -> mi.Bool:
     """Has a ray of which the end is so far away found the vertex there? Where surfaces coincide, it
     may find another one than an earlier ray did: Mitsuba's shadow rays see no difference either."""
-    return si.is_valid() & (dr.abs(si.t - distance) < _TOLERANCE * distance)
+    return si.is_valid() & (dr.abs(si.t - distance) < TOLERANCE * distance)
 
 
-def shape_id(si: mi.SurfaceInteraction3f) -> mi.UInt32:
-    """The number of the shape in Mitsuba's registry."""
-    return dr.reinterpret_array(mi.UInt32, si.shape)
-
-
-def towards(
-    p: mi.Point3f, place: Place, is_direction: mi.Bool
-) -> tuple[mi.Vector3f, mi.Float]:
-    """The direction from ``p`` to a vertex, and the distance."""
-    way = place.p - p
-    distance = dr.norm(way)
-    return dr.select(is_direction, mi.Vector3f(place.p), way / distance), distance
+def towards(p: mi.Point3f, place: Place, is_direction: mi.Bool) -> mi.Vector3f:
+    """The direction from ``p`` to a vertex, which may be a direction itself."""
+    return dr.select(is_direction, mi.Vector3f(place.p), dr.normalize(place.p - p))
 
 
 def turned(d: mi.Vector3f, sample: mi.Point2f, low: float, high: float) -> mi.Vector3f:
