@@ -6,7 +6,8 @@ pilot) at equal samples, by variance and CPU time:
 Writes one row of Markdown for each scene. Errors are those of ``examples/equal_samples.py``, with
 the mean of all images of ``bdpt``; times are the median of the seeds. The efficiency,
 1 / (error · time), is relative to ``path``. ``light_tracer`` is judged by the pixels in which it
-can see everything: those that show no smooth mirror, smooth glass, mask or null surface.
+can see everything: those that show no smooth mirror, smooth glass, mask or null surface. So is
+``bdpt`` once more, in the column ``as seen by light_tracer``.
 
 ``kept`` is the number of seeds for which the pilot of ``auto`` kept light paths. ``predicted`` is
 what it found with the last seed: variance and time of ``bdpt`` in units of those of ``path``.
@@ -42,7 +43,8 @@ INTEGRATORS = {
 }
 
 COLUMNS = ["scene", "`path`: seconds", "error", "`light_tracer`: time", "error", "efficiency"]
-COLUMNS += ["`bdpt`: time", "error", "efficiency", "mean of `path`"]
+COLUMNS += ["`bdpt`: time", "error", "efficiency", "as seen by `light_tracer`"]
+COLUMNS += ["mean of `path`"]
 COLUMNS += ["`auto`: time", "error", "efficiency", "kept", "predicted", "measured"]
 
 
@@ -83,6 +85,7 @@ def cells(renders: dict[str, Renders], visible: np.ndarray) -> list[str]:
         slower, e = ratios(kind, pixels)
         row += [f"{slower:.2f}", f"{e:.2g}", f"{1 / (e * slower):.2g}"]
         if kind == "bdpt":
+            row.append(f"{1 / (ratios(kind, visible)[1] * slower):.2g}")
             row.append(f"{path.mean.mean() / mean.mean():.3f}")
     learned = renders["auto"].learned
     kept = sum(text.startswith("light paths pay") for text in learned)
