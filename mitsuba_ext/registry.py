@@ -39,6 +39,7 @@ _BASES = (
     "mitsuba_ext.composition.chain_integrator",
     "mitsuba_ext.composition.metropolis_integrator",
     "mitsuba_ext.composition.reweighted_camera",
+    "mitsuba_ext.sequences.sequence_sampler",
 )
 
 _registered: set[str] = set()

@@ -111,12 +111,13 @@ def test_mean_is_that_of_path_over_many_seeds(scene: str, name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "sampler"),
     [
-        ("neepp", "multijitter"),
+        ("neepp", "sobol_owen"),
         ("pss_guided", "stratified"),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
             for case in (
-                ("neepp", "ldsampler"), ("pss_guided", "multijitter"), ("tiles", "ldsampler"),
+                ("neepp", "multijitter"), ("neepp", "ldsampler"), ("pss_guided", "multijitter"),
+                ("tiles", "ldsampler"),
             )
         ),
     ],
@@ -192,7 +193,8 @@ def test_image_is_that_of_path_on_film(name: str, which: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "sampler", ["independent", "stratified", "multijitter", "orthogonal", "ldsampler"]
+    "sampler",
+    ["independent", "stratified", "multijitter", "orthogonal", "ldsampler", "sobol_owen"],
 )
 @pytest.mark.parametrize("name", FOLLOWERS)
 def test_image_is_that_of_path_with_sampler(name: str, sampler: str) -> None:

@@ -31,6 +31,8 @@ FORBIDDEN = {
     "composition": set(PLUGINS),
     "pointsets": {"transport", "regions", "lights", "decisions", "composition", "rendering",
                   *PLUGINS},
+    "sequences": {"transport", "regions", "lights", "decisions", "bidirectional", "chains",
+                  "path_space", "composition", "rendering", *PLUGINS},
     "compare": {"transport", "regions", "lights", "decisions", "composition", *PLUGINS},
 }  # fmt: skip
 

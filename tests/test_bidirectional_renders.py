@@ -40,7 +40,9 @@ def _assert_same_seed(image: np.ndarray, other: np.ndarray) -> None:
 # ---- Samplers ----
 
 #: Samples that each can take: 7² is the square of a prime.
-SAMPLERS = {"stratified": 64, "multijitter": 64, "orthogonal": 49, "ldsampler": 64}
+SAMPLERS = {
+    "stratified": 64, "multijitter": 64, "orthogonal": 49, "ldsampler": 64, "sobol_owen": 64,
+}  # fmt: skip
 
 
 @pytest.mark.slow

@@ -19,7 +19,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 FOLDERS = registry.plugin_names()
 FILES = {file.stem: file for folder in FOLDERS for file in registry.plugin_files(folder)}
 README = Path(__file__).parents[1] / "README.md"
-DECISIONS = FOLDERS["samplers"]
+DECISIONS = [name for name in FOLDERS["samplers"] if "DecisionPlugin" in FILES[name].read_text()]
+#: The samplers of sensors.
+SEQUENCES = sorted(set(FOLDERS["samplers"]) - set(DECISIONS))
 #: The integrators that nest no other one.
 WALKS = [
     "auto_path", "composed_path", "erpt", "mlt", "neepp", "pss_guided", "pssmlt",
@@ -44,6 +46,7 @@ VALUES = {
     **dict.fromkeys(["chains", "chain_length", "direct_samples", "luminance_samples"], 3),
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
     **dict.fromkeys(["mutation_size_low", "mutation_size_high"], 0.01),
+    **dict.fromkeys(["sample_count", "seed", "dimensions"], 6),
     "chain_file": "chains.npz", "outliers": 2.0, "p_large": 0.5,
     **dict.fromkeys(["bidirectional_mutation", "lens_perturbation"], True),
     **dict.fromkeys(["multi_chain_perturbation", "caustic_perturbation"], True),
@@ -123,14 +126,14 @@ def test_pages_have_what_their_readers_look_for(name):
         assert "composed_path" in page.summary and "--integrator" in page.text
 
 
-@pytest.mark.parametrize("name", [*WALKS, *DECISIONS])
+@pytest.mark.parametrize("name", [*WALKS, *DECISIONS, *SEQUENCES])
 def test_every_parameter_of_a_page_is_known(name):
     for key in described(name):
         _, unknown = make(name, **{key: VALUES[key], **CONDITIONS.get((name, key), {})})
         assert not unknown
 
 
-@pytest.mark.parametrize("name", [*WALKS, *DECISIONS])
+@pytest.mark.parametrize("name", [*WALKS, *DECISIONS, *SEQUENCES])
 def test_what_str_shows_is_on_the_page_with_the_same_default(name):
     text = str(make(name)[0])
     assert text.startswith(f"{name}[\n")
@@ -166,6 +169,15 @@ def test_examples_are_the_same_as_xml_as_a_dict_and_on_the_command_line(name):
     shown = {str(scene.integrator()), str(mi.load_dict(eval(f"{{{values}}}")))}
     assert {*shown, str(make_named(line).integrator)} == shown and len(shown) == 1
     assert name in shown.pop()
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_examples_of_samplers_are_the_same_as_xml_and_as_a_dict(name):
+    text = pages.read_page(FILES[name]).text
+    (xml,) = re.findall(r"<sampler.*</sampler>", text, re.DOTALL)
+    (values,) = re.findall(r"^ *('type'.*)", text, re.DOTALL | re.MULTILINE)
+    sensor = mi.load_string(f'<sensor version="3.0.0" type="perspective">{xml}</sensor>')
+    assert str(sensor.sampler()) == str(mi.load_dict(eval(f"{{{values}}}")))
 
 
 def test_example_of_the_readme_loads():

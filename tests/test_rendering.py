@@ -142,7 +142,7 @@ class _Recorder:
         return Sample(mi.Color3f(mi.Float(rays.pixel)), mi.Bool(True), zero, zero, zero)
 
 
-@pytest.mark.parametrize("sampler", ["independent", "multijitter", "stratified"])
+@pytest.mark.parametrize("sampler", ["independent", "multijitter", "sobol_owen"])
 def test_a_film_with_more_pixels_than_a_pass_has_lanes_is_rendered_in_parts(scene, sampler):
     """Each pixel has all of its samples, and all of them have numbers of their own."""
     estimator, integrator = _Recorder(), _TwoStages(pilot_spp=1)
@@ -170,7 +170,9 @@ def test_pilot_samples_weigh_as_much_as_the_others(scene):
 
 
 @pytest.mark.usefixtures("small_passes")
-@pytest.mark.parametrize("sampler", ["independent", "stratified", "ldsampler", "multijitter"])
+@pytest.mark.parametrize(
+    "sampler", ["independent", "stratified", "ldsampler", "multijitter", "sobol_owen"]
+)
 def test_pilots_and_passes_keep_the_sample_count(scene, sampler):
     """Stratified samplers too, whose count cannot be cut freely."""
     sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},

@@ -82,7 +82,9 @@ def test_a_short_render_is_that_of_the_integrator():
 
 
 
-@pytest.mark.parametrize("sampler", ["stratified", "multijitter", "orthogonal", "ldsampler"])
+@pytest.mark.parametrize(
+    "sampler", ["stratified", "multijitter", "orthogonal", "ldsampler", "sobol_owen"]
+)
 def test_passes_of_structured_samplers_are_whole_sets(sampler):
     scene = small_scene(3, 2, sampler=sampler)
     passes = SeedPasses(mi.load_dict({"type": "direct"}), scene, scene.sensors()[0], 0)

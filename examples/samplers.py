@@ -1,0 +1,71 @@
+"""Compares samplers at equal samples, by the variance between seeds and CPU time:
+
+    .venv/bin/python examples/samplers.py cornell_box defocus /somewhere/scene.xml --spp 16,64,256
+
+Writes one row of Markdown for each scene and number of samples: error and time of each sampler, in
+units of those of ``independent``. Errors are those of ``examples/equal_samples.py``. Samplers that
+round the number of samples up are credited with what they take: their error is multiplied by it,
+and their time divided.
+"""
+
+from __future__ import annotations
+
+import click
+import numpy as np
+from equal_samples import Renders, error, load, print_header, print_row, render_in_turns, title
+
+import mitsuba as mi  # isort: skip
+
+SAMPLERS = ["independent", "stratified", "multijitter", "orthogonal", "ldsampler", "sobol_owen"]
+OTHERS = ["halton", "hammersley", "faure", "lattice", "latin_hypercube"]
+
+
+@click.command()
+@click.argument("names", nargs=-1, required=True)
+@click.option("--spp", default="16,64,256", help="Numbers of samples per pixel.")
+@click.option("--seeds", default=8)
+@click.option("--size", type=(int, int), default=(64, 36), help="Of the film.")
+@click.option("--max-depth", default=8)
+@click.option("--integrator", default="composed_path")
+@click.option("--variant", default="llvm_ad_rgb")
+@click.option("--all", "has_all", is_flag=True, help=f"Also {', '.join(OTHERS)}.")
+def main(
+    names: tuple[str, ...], spp: str, seeds: int, size: tuple, max_depth: int, integrator: str,
+    variant: str, has_all: bool,
+) -> None:  # fmt: skip
+    """Compares samplers in the scenes NAMES."""
+    mi.set_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error)
+    kinds = [*SAMPLERS, *(OTHERS if has_all else ())]
+    print_header(["scene", "samples", *(f"`{kind}`" for kind in kinds), "time"])
+    for name in names:
+        for count in map(int, spp.split(",")):
+            renders = {
+                kind: _renders(load(name, size, kind), integrator, max_depth, count, seeds)
+                for kind in kinds
+            }
+            mean = np.mean([r.mean for r, _taken in renders.values()], axis=0)
+            first = renders["independent"][0]
+            cells = [
+                f"{error(r.variance, mean) / error(first.variance, mean) * taken / count:.3f}"
+                for r, taken in renders.values()
+            ]
+            times = [
+                f"{r.time / first.time * count / taken:.2f}"
+                for r, taken in list(renders.values())[1:]
+            ]
+            print_row([title(name), str(count), *cells, ", ".join(times)])
+
+
+def _renders(
+    scene: mi.Scene, integrator: str, max_depth: int, spp: int, seeds: int
+) -> tuple[Renders, int]:
+    """Renders, and the samples that they took."""
+    found = render_in_turns(scene, {"": {"type": integrator}}, max_depth, spp, seeds)[""]
+    sampler = scene.sensors()[0].sampler()
+    sampler.set_sample_count(spp)
+    return found, sampler.sample_count()
+
+
+if __name__ == "__main__":
+    main()

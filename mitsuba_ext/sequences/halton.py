@@ -1,0 +1,73 @@
+"""The Halton sequence and the Hammersley set."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .scrambling import fraction, mixed
+
+#: Bases of the dimensions.
+_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
+
+
+class Halton:
+    """The Halton sequence: each dimension is the radical inverse of the index in another prime
+    base.
+
+    Digits are permuted by nested cyclic shifts: by a hash of the digits before, like Owen's
+    scrambling, but among the rotations only.
+
+    Source: J. H. Halton, *On the Efficiency of Certain Quasi-random Sequences of Points in
+    Evaluating Multi-dimensional Integrals*, 1960.
+
+    Parameters:
+        dimensions: Of the sequence: 2, 4, 6 or 8.
+    """
+
+    def __init__(self, dimensions: int) -> None:
+        self.pairs = dimensions // 2
+        self._bases = mi.UInt32(_PRIMES[:dimensions])
+
+    def point(self, index: mi.UInt32, count: int, seed: mi.UInt32) -> mi.UInt32:
+        return mi.permute_kensler(index, count, seed)
+
+    def coordinate(self, point, count, dimension, seed) -> mi.Float:
+        # In lanes that a loop has left, it is 0, by which nothing can be divided
+        base = dr.maximum(dr.gather(mi.UInt32, self._bases, dimension), 2)
+        return radical_inverse(point, count, base, seed)
+
+
+class Hammersley(Halton):
+    """The Hammersley set: the first dimension is the index divided by the number of points, with a
+    random place between it and the next one; the others are those of the Halton sequence.
+
+    Source: J. M. Hammersley, *Monte Carlo Methods for Solving Multivariable Problems*, 1960.
+    """
+
+    def coordinate(self, point, count, dimension, seed) -> mi.Float:
+        inverse = super().coordinate(point, count, dr.maximum(dimension, 1) - 1, seed)
+        regular = (mi.Float(point) + fraction(seed + mixed(point))) / count
+        # Rounding may reach 1
+        return dr.select(dimension == 0, dr.minimum(regular, 1 - 2.0**-24), inverse)
+
+
+def radical_inverse(
+    index: mi.UInt32, count: int, base: mi.UInt32, seed: mi.UInt32
+) -> mi.Float:
+    """The digits of an index below ``count``, behind the point, shifted at random; a random number
+    follows."""
+    count = dr.opaque(mi.UInt32, count)
+    # So many points have been told apart by the digits so far
+    power, digits, rest, word = mi.UInt32(1), mi.UInt32(0), mi.UInt32(index), mixed(seed)
+
+    def step(power, digits, rest, word):
+        digit = rest % base
+        shifted = (digit + word % base) % base
+        return power * base, digits * base + shifted, rest // base, mixed(word + digit + 1)
+
+    power, digits, rest, word = dr.while_loop(
+        (power, digits, rest, word), lambda power, *_: power < count, step, label="digits"
+    )
+    value = (mi.Float(digits) + fraction(word)) / mi.Float(power)
+    return dr.minimum(value, 1 - 2.0**-24)

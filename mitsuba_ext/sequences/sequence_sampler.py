@@ -1,0 +1,150 @@
+"""The base class of samplers that draw points of a sequence.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..parameters import MOST_SPP, read_parameter
+from .scrambling import mixed
+from .sequence import Sequence
+
+#: Distances between the words of sets and of pixels that are hashed.
+_GOLDEN = 0x9E3779B9
+
+
+class SequenceSampler(mi.Sampler):
+    r"""Each pixel has the same sequence, randomized on its own.
+
+    Numbers are drawn in pairs of dimensions; a single number takes the first of a pair. When the
+    dimensions of the sequence are used up, another random copy of it goes on, in another order
+    (Latin supercube sampling).
+
+    .. pluginparameters::
+
+     * - sample_count
+       - |int|
+       - Samples per pixel: any number. (Default: 4)
+     * - seed
+       - |int|
+       - Added to the seed of the render. (Default: 0)
+
+    Parameters:
+        props: The parameters of the scene.
+
+    Attributes:
+        sequence: Where the points come from. The plugin sets it.
+    """
+
+    sequence: Sequence
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.name = props.plugin_name()
+        count = read_parameter(self.name, props, "sample_count", 4, 1, MOST_SPP)
+        base_seed = read_parameter(self.name, props, "seed", 0, 0, 2**32 - 1)
+        # What the base class would read has been checked, and a copy is made from the values
+        plain = mi.Properties("independent")
+        plain["sample_count"], plain["seed"] = count, base_seed
+        super().__init__(plain)
+        self._base_seed = base_seed
+        self._values = {"seed": base_seed}
+        # As far as Python says it; Mitsuba's own integrators take all samples in one wavefront
+        self._per_wavefront: int | None = None
+        self._first = self._pixel_seed = self._offset = self._dimension = mi.UInt32(0)
+        self._step = 1
+
+    def read_dimensions(self, props: mi.Properties) -> int:
+        """How many dimensions the sequence has.
+
+        Raises:
+            ValueError: It is odd, or out of range.
+        """
+        dimensions = read_parameter(self.name, props, "dimensions", 4, 2, 8)
+        if dimensions % 2:
+            raise ValueError(
+                f'"{self.name}": the parameter "dimensions" is {dimensions}; it must be even'
+            )
+        self._values["dimensions"] = dimensions
+        return dimensions
+
+    # ---- Mitsuba's interface ----
+
+    # Methods of the base class call the overrides once more: what stands beside super() runs twice
+
+    def fork(self) -> SequenceSampler:
+        """A sampler with the same parameters, not seeded."""
+        props = mi.Properties(self.name)
+        for key, value in {**self._values, "sample_count": self.sample_count()}.items():
+            props[key] = value
+        return type(self)(props)
+
+    def clone(self) -> SequenceSampler:
+        """A copy that goes on as this one would."""
+        copy = self.fork()
+        if self.wavefront_size() > 0:
+            # So that the base class knows how many lanes there are
+            mi.Sampler.seed(copy, 0, self.wavefront_size())
+        copy._per_wavefront, copy._step = self._per_wavefront, self._step
+        for key in ("_first", "_pixel_seed", "_offset", "_dimension"):
+            setattr(copy, key, mi.UInt32(getattr(self, key)))
+        return copy
+
+    def set_sample_count(self, spp: int) -> None:
+        super().set_sample_count(spp)
+        self._per_wavefront = None
+
+    def set_samples_per_wavefront(self, samples_per_wavefront: int) -> None:
+        super().set_samples_per_wavefront(samples_per_wavefront)
+        self._per_wavefront = samples_per_wavefront
+
+    def seed(self, seed: mi.UInt32 | int, wavefront_size: int = 0xFFFFFFFF) -> None:
+        super().seed(seed, wavefront_size)
+        self._step = self._per_wavefront or self.sample_count()
+        step = dr.opaque(mi.UInt32, self._step)
+        lane = dr.arange(mi.UInt32, self.wavefront_size())
+        pixel = lane // step
+        self._offset = lane - pixel * step
+        # Not a literal: each seed would compile kernels of its own
+        word = mi.UInt32(seed) + self._base_seed
+        dr.make_opaque(word)
+        self._pixel_seed = mixed(mixed(word) + pixel * _GOLDEN)
+        self._first, self._dimension = dr.opaque(mi.UInt32, 0), mi.UInt32(0)
+
+    def advance(self) -> None:
+        # Not the base class's: it calls this once more, and its own state is not used
+        self._first = self._first + dr.opaque(mi.UInt32, self._step)
+        self._dimension = mi.UInt32(0)
+
+    def schedule_state(self) -> None:
+        dr.schedule(self._first, self._dimension)
+
+    def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
+        count = self.sample_count()
+        point, dimension, seed = self._next_pair(count)
+        return self.sequence.coordinate(point, count, dimension, seed)
+
+    def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
+        count = self.sample_count()
+        point, dimension, seed = self._next_pair(count)
+        x = self.sequence.coordinate(point, count, dimension, seed)
+        y = self.sequence.coordinate(point, count, dimension + 1, mixed(seed))
+        return mi.Point2f(x, y)
+
+    def _next_pair(self, count: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """The point, its dimension, and the seed of that."""
+        number = self._dimension
+        self._dimension = number + 1
+        pairs = self.sequence.pairs
+        number_of_set = number // pairs
+        seed = mixed(self._pixel_seed + number_of_set * _GOLDEN)
+        pair = number - number_of_set * pairs
+        point = self.sequence.point(self._first + self._offset, count, seed)
+        return point, 2 * pair, mixed(seed + 1 + pair)
+
+    def to_string(self) -> str:
+        values = {"sample_count": self.sample_count(), **self._values}
+        lines = ",\n".join(f"  {key} = {value}" for key, value in values.items())
+        return f"{self.name}[\n{lines}\n]"

@@ -1,0 +1,57 @@
+"""Faure sequence."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.sequences.faure import Faure
+from mitsuba_ext.sequences.sequence_sampler import SequenceSampler
+
+
+@registry.plugin
+class FaureSampler(SequenceSampler):
+    r"""
+    .. _sampler-faure:
+
+    Faure sequence (:monosp:`faure`)
+    --------------------------------
+
+    Points of the Faure sequence: of all projections on any of its dimensions, as many samples as a
+    power of its base (2, 5, 7 or 11 for 2, 4, 6 or 8 dimensions) are stratified as well as can be.
+
+    .. pluginparameters::
+
+     * - (Common parameters)
+       - |-|
+       - Those of all samplers of this package.
+     * - dimensions
+       - |int|
+       - Dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more of them gets
+         further random copies of the sequence. (Default: 4)
+
+    **Use it when** the number of samples is a power of the base, 25 for example. **Not when** it is
+    another: :monosp:`sobol_owen` then has less error.
+
+    Each pixel has points of its own, each seed has others. For any integrator; those of Mitsuba
+    that split a render into passes (:monosp:`samples_per_pass`) stratify over passes only in part.
+
+    Source: H. Faure, *Discrépance de suites associées à un système de numération (en dimension s)*,
+    Acta Arithmetica 41, 1982.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <sampler type="faure">
+                <integer name="sample_count" value="64"/>
+            </sampler>
+
+        .. code-tab:: python
+
+            'type': 'faure',
+            'sample_count': 64
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.sequence = Faure(self.read_dimensions(props))

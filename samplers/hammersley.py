@@ -1,0 +1,57 @@
+"""Hammersley set."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.sequences.halton import Hammersley
+from mitsuba_ext.sequences.sequence_sampler import SequenceSampler
+
+
+@registry.plugin
+class HammersleySampler(SequenceSampler):
+    r"""
+    .. _sampler-hammersley:
+
+    Hammersley set (:monosp:`hammersley`)
+    -------------------------------------
+
+    Points of the Hammersley set: the first dimension is the sample's number divided by the number
+    of samples, the others are those of :monosp:`halton`.
+
+    .. pluginparameters::
+
+     * - (Common parameters)
+       - |-|
+       - Those of all samplers of this package.
+     * - dimensions
+       - |int|
+       - Dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more of them gets
+         further random copies of the sequence. (Default: 4)
+
+    **Use it when** you compare sequences. **Not when** a render may be cut short by
+    :monosp:`timeout`: the first samples alone are not spread evenly.
+
+    Each pixel has points of its own, each seed has others. For any integrator; those of Mitsuba
+    that split a render into passes (:monosp:`samples_per_pass`) stratify over passes only in part.
+
+    Source: J. M. Hammersley, *Monte Carlo Methods for Solving Multivariable Problems*, Annals of
+    the New York Academy of Sciences 86, 1960.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <sampler type="hammersley">
+                <integer name="sample_count" value="64"/>
+            </sampler>
+
+        .. code-tab:: python
+
+            'type': 'hammersley',
+            'sample_count': 64
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.sequence = Hammersley(self.read_dimensions(props))

@@ -1,0 +1,54 @@
+"""Latin hypercube."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.sequences.latin_hypercube import LatinHypercube
+from mitsuba_ext.sequences.sequence_sampler import SequenceSampler
+
+
+@registry.plugin
+class LatinHypercubeSampler(SequenceSampler):
+    r"""
+    .. _sampler-latin_hypercube:
+
+    Latin hypercube (:monosp:`latin_hypercube`)
+    -------------------------------------------
+
+    Each number of a path is stratified on its own: there is one in each of as many intervals as
+    there are samples.
+
+    .. pluginparameters::
+
+     * - (Common parameters)
+       - |-|
+       - Those of all samplers of this package.
+
+    **Use it when** you compare sequences. **Not when** you want the least error:
+    :monosp:`sobol_owen` stratifies pairs of numbers as well.
+
+    Each pixel has points of its own, each seed has others. For any integrator; those of Mitsuba
+    that split a render into passes (:monosp:`samples_per_pass`) stratify over passes only in part.
+
+    Source: M. D. McKay, R. J. Beckman, W. J. Conover, *A Comparison of Three Methods for Selecting
+    Values of Input Variables in the Analysis of Output from a Computer Code*, Technometrics 21(2),
+    1979.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <sampler type="latin_hypercube">
+                <integer name="sample_count" value="64"/>
+            </sampler>
+
+        .. code-tab:: python
+
+            'type': 'latin_hypercube',
+            'sample_count': 64
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.sequence = LatinHypercube()

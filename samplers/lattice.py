@@ -1,0 +1,57 @@
+"""Rank-1 lattice."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.sequences.lattice import Lattice
+from mitsuba_ext.sequences.sequence_sampler import SequenceSampler
+
+
+@registry.plugin
+class LatticeSampler(SequenceSampler):
+    r"""
+    .. _sampler-lattice:
+
+    Rank-1 lattice (:monosp:`lattice`)
+    ----------------------------------
+
+    Multiples of one vector, modulo 1, each dimension shifted at random. The vector is good for any
+    power of two of samples.
+
+    .. pluginparameters::
+
+     * - (Common parameters)
+       - |-|
+       - Those of all samplers of this package.
+     * - dimensions
+       - |int|
+       - Dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more of them gets
+         further random copies of the sequence. (Default: 4)
+
+    **Use it when** what a pixel sees is smooth. **Not when** edges cross most pixels: points of a
+    lattice lie in rows.
+
+    Each pixel has points of its own, each seed has others. For any integrator; those of Mitsuba
+    that split a render into passes (:monosp:`samples_per_pass`) stratify over passes only in part.
+
+    Source: R. Cools, F. Y. Kuo, D. Nuyens, *Constructing Embedded Lattice Rules for Multivariate
+    Integration*, SIAM J. Sci. Comput. 28(6), 2006.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <sampler type="lattice">
+                <integer name="sample_count" value="64"/>
+            </sampler>
+
+        .. code-tab:: python
+
+            'type': 'lattice',
+            'sample_count': 64
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.sequence = Lattice(self.read_dimensions(props))
