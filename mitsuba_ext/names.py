@@ -95,8 +95,8 @@ def _check_plugin(plugin: Mapping[str, Any], is_nested: bool = False) -> None:
 
 def _ours(is_nested: bool) -> list[str]:
     """The names of our integrators and, with ``is_nested``, of our decisions."""
-    names = registry.plugin_names()
-    return [*names["integrators"], *(names["samplers"] if is_nested else ())]
+    integrators = registry.plugin_names()["integrators"]
+    return [*integrators, *(registry.decision_names() if is_nested else ())]
 
 
 def is_file_of_mitsuba(name: str) -> bool:

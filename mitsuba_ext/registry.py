@@ -66,6 +66,12 @@ def plugin_files(kind: str) -> list[Path]:
     return [files[name] for name in sorted(files) if not name.startswith("_")]
 
 
+def decision_names() -> list[str]:
+    """The plugins that Mitsuba takes for samplers, but that are decisions of the walk."""
+    files = plugin_files("samplers")
+    return [path.stem for path in files if "(DecisionPlugin)" in path.read_text(encoding="utf-8")]
+
+
 def install() -> None:
     """Registers the plugins now, if a variant is active, and whenever one is selected later."""
     import mitsuba as mi

@@ -216,6 +216,7 @@ def test_list_shows_every_plugin(run):
     assert code == 0
     assert re.search(r"neepp +│ integrator +│", out)
     assert re.search(r"guided_directions +│ decision +│", out)
+    assert re.search(r"sobol_owen +│ sampler +│", out)
     for names in registry.plugin_names().values():
         for name in names:
             assert name in out

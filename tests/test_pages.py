@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 FOLDERS = registry.plugin_names()
 FILES = {file.stem: file for folder in FOLDERS for file in registry.plugin_files(folder)}
 README = Path(__file__).parents[1] / "README.md"
-DECISIONS = [name for name in FOLDERS["samplers"] if "DecisionPlugin" in FILES[name].read_text()]
+DECISIONS = registry.decision_names()
 #: The samplers of sensors.
 SEQUENCES = sorted(set(FOLDERS["samplers"]) - set(DECISIONS))
 #: The integrators that nest no other one.

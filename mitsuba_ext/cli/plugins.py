@@ -6,9 +6,6 @@ import click
 
 from .common import console_for_tables
 
-#: What Mitsuba calls a sampler is a decision of the walk here.
-_KINDS = {"samplers": "decision"}
-
 _MITSUBA_PLUGINS = "https://mitsuba.readthedocs.io/en/stable/src/plugin_reference.html"
 _MITSUBA_INTEGRATORS = (
     "https://mitsuba.readthedocs.io/en/stable/src/generated/plugins_integrators.html"
@@ -27,10 +24,12 @@ def list_plugins(name: str | None) -> int:
     console = console_for_tables()
     if name is None:
         overview = Table("plugin", "kind", "what it does")
+        decisions = registry.decision_names()
         for kind, paths in files.items():
             for path in paths:
                 page = pages.read_page(path)
-                overview.add_row(page.name, _KINDS.get(kind, kind[:-1]), page.title or page.summary)
+                what = "decision" if page.name in decisions else kind[:-1]
+                overview.add_row(page.name, what, page.title or page.summary)
         console.print(overview)
         return 0
     file = next((path for paths in files.values() for path in paths if path.stem == name), None)
