@@ -41,7 +41,7 @@ class RedistributionSettings:
         outliers: Samples so many times as bright as their neighbourhood lose what they have beyond
             that to chains. 0 redistributes all energy.
         luminance_samples: Samples that measure brightness first.
-        steps: How numbers are moved.
+        steps: How numbers are moved, where chains change those.
         filters: Of the noise.
     """
 
@@ -79,6 +79,7 @@ class RedistributionRender(ChainRender):
         begin = time.perf_counter()
         statistics.interrupted = True
         seed = stream(self._seed, FIRST_STAGE)
+        target.learn(seed)
         tiles = EvenTiles(self._film, settings.luminance_samples)
         first = Bootstrap(target, seed, settings.luminance_samples, tiles.take)
         statistics.learning_seconds += time.perf_counter() - begin

@@ -16,7 +16,6 @@ from .chain_image import ChainImage
 from .chains import ChainRules, Chains
 from .even_tiles import EvenTiles
 from .numbers import stream
-from .path_target import PathTarget
 from .render import FIRST_STAGE, ChainRender
 from .small_steps import SmallSteps
 from .stored import Arrays
@@ -188,8 +187,7 @@ class MetropolisRender(ChainRender):
         unbiased, if the samples of the image do not decide it. Finds the weights of tiles too."""
         settings = self._settings
         seed, samples = stream(self._seed, FIRST_STAGE), settings.bootstrap
-        if isinstance(self._target, PathTarget):
-            self._target.learn(seed)
+        self._target.learn(seed)
         if not settings.is_even:
             return Bootstrap(self._target, seed, min(samples, _SCALE_SAMPLES)).mean
         tiles = EvenTiles(self._film, samples)

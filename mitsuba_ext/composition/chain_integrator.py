@@ -109,7 +109,7 @@ class ChainIntegrator(WalkIntegrator):
         """A walk with this integrator's decisions, and others."""
         chosen = {slot: p.decision(setting) for slot, p in self.slots.items()}
         decisions.update({slot: decision for slot, decision in chosen.items() if decision})
-        return replace(self.walk(query=self._query(setting.scene), **decisions),
+        return replace(self.walk(query=self.query(setting.scene), **decisions),
                        max_depth=max_depth)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
