@@ -8,8 +8,10 @@ import mitsuba as mi
 
 from mitsuba_ext import registry
 from mitsuba_ext.chains.noise_filters import NoiseFilters
+from mitsuba_ext.chains.path_target import PathTarget
 from mitsuba_ext.chains.redistribution import RedistributionRender, RedistributionSettings
 from mitsuba_ext.chains.small_steps import SmallSteps
+from mitsuba_ext.chains.target import ImageTarget
 from mitsuba_ext.composition.metropolis_integrator import MetropolisIntegrator
 from mitsuba_ext.composition.path_mutations import (
     MOST,
@@ -184,12 +186,14 @@ class EnergyRedistribution(MetropolisIntegrator):
             return path_target(self, setting, self.switches)
         return super().target(setting)
 
-    def chain_render(self, *render: Any) -> RedistributionRender:
+    def chain_render(
+        self, target: ImageTarget | PathTarget, seed: int, *render: Any
+    ) -> RedistributionRender:
         settings = RedistributionSettings(
             self.chain_length, self.mutations_per_pixel, self.outliers, self.luminance_samples,
-            self.steps, self.filters,
+            self.steps, self.filters, self.state_file(target, seed),
         )  # fmt: skip
-        return RedistributionRender(settings, *render)
+        return RedistributionRender(settings, self, target, seed, *render)
 
     def parameters(self) -> dict[str, Any]:
         parameters = {

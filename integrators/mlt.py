@@ -7,6 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext import registry
+from mitsuba_ext.chains.path_target import PathTarget
 from mitsuba_ext.chains.small_steps import SmallSteps
 from mitsuba_ext.chains.visits import ChainSettings, MetropolisRender
 from mitsuba_ext.composition.chain_integrator import ChainIntegrator
@@ -109,11 +110,12 @@ class PathMetropolis(ChainIntegrator):
     def target(self, setting):
         return path_target(self, setting, self.switches)
 
-    def chain_render(self, *render: Any) -> MetropolisRender:
+    def chain_render(self, target: PathTarget, seed: int, *render: Any) -> MetropolisRender:
         settings = ChainSettings(
-            self.chains, self.luminance_samples, self.p_large, SmallSteps(), True, self.two_stage
-        )
-        return MetropolisRender(settings, *render)
+            self.chains, self.luminance_samples, self.p_large, SmallSteps(), True, self.two_stage,
+            self.state_file(target, seed),
+        )  # fmt: skip
+        return MetropolisRender(settings, self, target, seed, *render)
 
     def parameters(self) -> dict[str, Any]:
         return {

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..path_space.memory import PathMemory
+from ..path_space.memory import Head, PathMemory
 from ..path_space.mutations import Mutations, Proposal
 from ..transport.estimator import Sample
 from ..transport.numbers import Numbers
@@ -17,6 +17,21 @@ from .target import Contribution, Found, PlaceWeights, beyond_bound
 
 #: Rounds of learning, and paths of each.
 _ROUNDS, _PATHS = 3, 1 << 15
+
+
+@dataclass
+class PathState:
+    """The state of a chain of paths, without its vertices.
+
+    Attributes:
+        head: The path.
+        found: What it adds to the image.
+        density: The logarithm of its density as a new path.
+    """
+
+    head: Head
+    found: Contribution
+    density: mi.Float
 
 
 @dataclass
@@ -35,6 +50,10 @@ class PathTarget:
 
     #: Paths draw their numbers from one stream, and each has one place on the film.
     has_light_paths = False
+
+    @property
+    def scene(self) -> mi.Scene:
+        return self.mutations.space.scene
 
     @property
     def sensor(self) -> mi.Sensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +18,7 @@ from .even_tiles import EvenTiles
 from .numbers import stream
 from .render import FIRST_STAGE, ChainRender
 from .small_steps import SmallSteps
-from .stored import Arrays
+from .stored import Arrays, StateFile
 from .target import Found, ImageTarget
 
 #: Chains without and with light paths, at least and at most: these need several kernels for each
@@ -32,16 +32,6 @@ _BOOTSTRAP_SHARE, _MOST_BOOTSTRAP = 0.25, 1 << 24
 
 #: Samples that find the scale of MIS weights.
 _SCALE_SAMPLES = 1 << 14
-
-
-class StateFile(Protocol):
-    """Where the state of a render is kept."""
-
-    def load(self) -> Arrays | None:
-        """What was saved; ``None`` if nothing was yet."""
-
-    def save(self, arrays: Arrays) -> None:
-        """Keeps this, and nothing else."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +157,8 @@ class MetropolisRender(ChainRender):
         settings = self._settings
         if settings.is_even:
             self._first_stage()
+        else:
+            self._target.learn(stream(self._seed, FIRST_STAGE))
         image.add_tensors([mi.TensorXf(stored[name]) for name in ("visits", "uniform")])
         rules = ChainRules(settings.large_step, settings.steps, float(stored["uniform_weight"]))
         chains = self._kind(
