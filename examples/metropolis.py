@@ -10,7 +10,7 @@ relative to the mean of all images of ``pssmlt``; times are the median of the se
 1 / (error · time), is relative to ``path``. ``means`` has those of ``path`` and ``bdpt``, relative
 to that of ``pssmlt``: where they are below 1, light is found too rarely for the variance to tell
 the error. With ``--motion`` or ``--paths``, there is a row for each integrator: those that render
-moving shapes, or ``mlt`` and others.
+moving shapes, or chains of paths and others.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ PATHS = {
     "bdpt": {"type": "bdpt"},
     "pssmlt": {"type": "pssmlt"},
     "erpt": {"type": "erpt"},
+    "erpt, paths": {"type": "erpt", "mutations": "path"},
+    "erpt, paths, outliers": {"type": "erpt", "mutations": "path", "outliers": 10.0},
     "mlt": {"type": "mlt"},
 }
 
@@ -72,7 +74,7 @@ COLUMNS.append("accepted")
 @click.command()
 @options
 @click.option("--motion", is_flag=True, help="Compare integrators that render moving shapes.")
-@click.option("--paths", is_flag=True, help="Compare mlt with others.")
+@click.option("--paths", is_flag=True, help="Compare chains of paths with others.")
 def main(
     names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, motion: bool,
     paths: bool,

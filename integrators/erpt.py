@@ -8,8 +8,24 @@ import mitsuba as mi
 
 from mitsuba_ext import registry
 from mitsuba_ext.chains.noise_filters import NoiseFilters
+from mitsuba_ext.chains.path_target import PathTarget
 from mitsuba_ext.chains.redistribution import RedistributionRender, RedistributionSettings
+from mitsuba_ext.chains.small_steps import SmallSteps
+from mitsuba_ext.chains.target import ImageTarget
 from mitsuba_ext.composition.metropolis_integrator import MetropolisIntegrator
+from mitsuba_ext.composition.path_mutations import (
+    MOST,
+    camera_samples,
+    described,
+    path_target,
+    read_switches,
+)
+
+#: Parameters for chains of primary samples alone.
+_PRIMARY = (
+    "bidirectional", "next_event", "mutation_size_low", "mutation_size_high", "proposal_filter",
+    "most_consecutive",
+)  # fmt: skip
 
 
 @registry.plugin
@@ -25,6 +41,11 @@ class EnergyRedistribution(MetropolisIntegrator):
 
     .. pluginparameters::
 
+     * - mutations
+       - |string|
+       - What chains change: :monosp:`primary`, the random numbers of a sample, or :monosp:`path`,
+         the vertices of a light path (:class:`mlt`). Samples then are single paths, each made in
+         one of the ways in which :class:`bdpt` makes it. (Default: primary)
      * - bidirectional
        - |bool|
        - Do chains sample the paths of :class:`bdpt`, else those of :monosp:`path`? A mutation of
@@ -34,7 +55,7 @@ class EnergyRedistribution(MetropolisIntegrator):
        - |float|
        - Samples so many times as bright as their part of the image are outliers: what they have
          beyond that goes to chains; everything else is plain Monte Carlo. 0 gives all energy to
-         chains, as the original does. (Default: 10)
+         chains, as the original does. (Default: 10; with paths 0)
      * - mutations_per_pixel
        - |int|
        - Mutations per pixel, if all energy were redistributed; of the share that is, the same
@@ -63,6 +84,12 @@ class EnergyRedistribution(MetropolisIntegrator):
        - Removes specks, but is **biased**, towards black: of the visits of a chain to a pixel, one
          after the other, only so many are added to the image. The thesis has 10 or 20. 0 stands for
          all. (Default: 0)
+     * - bidirectional_mutation
+       - |bool|
+       - With paths: replace a part of the path by a random walk from both sides? (Default: false)
+     * - lens_perturbation, multi_chain_perturbation, caustic_perturbation
+       - |bool|
+       - With paths: as in :class:`mlt`. (Default: true)
      * - (Common parameters)
        - |several|
        - Those of :class:`MetropolisIntegrator`: direct_samples, next_event, max_depth,
@@ -78,6 +105,10 @@ class EnergyRedistribution(MetropolisIntegrator):
     Chains change the random numbers of a sample by small steps (:class:`pssmlt`), and deposit the
     same energy at each place that they visit. They begin at independent samples, so that there is
     no start-up bias, whatever their length.
+
+    Chains of paths have lens and caustic perturbations. Their paths have up to 32 segments; camera
+    samples find longer ones. Then :monosp:`bidirectional`, :monosp:`next_event`, the sizes of
+    mutations and the filters must not be given.
 
     Source: D. Cline, PhD thesis, 2007, chapter 8; D. Cline, J. Talbot, P. Egbert, *Energy
     Redistribution Path Tracing*, ACM Transactions on Graphics 24(3), 2005; B. Bitterli, W. Jarosz,
@@ -102,7 +133,14 @@ class EnergyRedistribution(MetropolisIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.outliers = self.parameter(props, "outliers", 10.0, minimum=0.0)
+        self.mutations = self.parameter(
+            props, "mutations", "primary", choices=("primary", "path")
+        )
+        if self.has_paths:
+            self._refuse_primary(props)
+        # Single paths are noisier than samples of random walks: nearly all of them are outliers
+        outliers = 0.0 if self.has_paths else 10.0
+        self.outliers = self.parameter(props, "outliers", outliers, minimum=0.0)
         self.mutations_per_pixel = self.parameter(
             props, "mutations_per_pixel", 0, minimum=0, maximum=1 << 24
         )
@@ -110,8 +148,9 @@ class EnergyRedistribution(MetropolisIntegrator):
             props, "chain_length", 100, minimum=1, maximum=1 << 20
         )
         self.luminance_samples = self.read_luminance_samples(props)
-        self.steps = self.read_steps(props)
-        self.filters = self._read_filters(props)
+        self.switches = read_switches(self, props, bidirectional=False) if self.has_paths else None
+        self.steps = SmallSteps() if self.has_paths else self.read_steps(props)
+        self.filters = NoiseFilters() if self.has_paths else self._read_filters(props)
 
     def _read_filters(self, props: mi.Properties) -> NoiseFilters:
         width = self.parameter(props, "proposal_filter", 0, minimum=0, maximum=1 << 10)
@@ -124,16 +163,42 @@ class EnergyRedistribution(MetropolisIntegrator):
             )
         return NoiseFilters(width, most)
 
-    def chain_render(self, *render: Any) -> RedistributionRender:
+    @property
+    def has_paths(self) -> bool:
+        """Do chains change light paths, not primary samples?"""
+        return self.mutations == "path"
+
+    def _refuse_primary(self, props: mi.Properties) -> None:
+        for key in _PRIMARY:
+            if key in props:
+                raise ValueError(
+                    f'"{self.name}": "{key}" is for chains of primary samples; it must '
+                    f'not be given where "mutations" is "path"'
+                )
+
+    def schedule(self, scene, sensor, samples, seed):
+        if not self.has_paths or self.max_depth <= MOST:
+            return super().schedule(scene, sensor, samples, seed)
+        return camera_samples(self, self.setting(scene, sensor, samples, seed))
+
+    def target(self, setting):
+        if self.has_paths:
+            return path_target(self, setting, self.switches)
+        return super().target(setting)
+
+    def chain_render(
+        self, target: ImageTarget | PathTarget, seed: int, *render: Any
+    ) -> RedistributionRender:
         settings = RedistributionSettings(
             self.chain_length, self.mutations_per_pixel, self.outliers, self.luminance_samples,
-            self.steps, self.filters,
+            self.steps, self.filters, self.state_file(target, seed),
         )  # fmt: skip
-        return RedistributionRender(settings, *render)
+        return RedistributionRender(settings, self, target, seed, *render)
 
     def parameters(self) -> dict[str, Any]:
-        return {
+        parameters = {
             **super().parameters(),
+            "mutations": self.mutations,
             "outliers": self.outliers,
             "mutations_per_pixel": self.mutations_per_pixel,
             "chain_length": self.chain_length,
@@ -143,3 +208,7 @@ class EnergyRedistribution(MetropolisIntegrator):
             "proposal_filter": self.filters.width,
             "most_consecutive": self.filters.most_consecutive,
         }
+        if not self.has_paths:
+            return parameters
+        common = {key: value for key, value in parameters.items() if key not in _PRIMARY}
+        return {**common, **described(self.switches)}

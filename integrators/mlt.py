@@ -11,23 +11,13 @@ from mitsuba_ext.chains.path_target import PathTarget
 from mitsuba_ext.chains.small_steps import SmallSteps
 from mitsuba_ext.chains.visits import ChainSettings, MetropolisRender
 from mitsuba_ext.composition.chain_integrator import ChainIntegrator
-from mitsuba_ext.composition.light_side import LightSide
-from mitsuba_ext.path_space.mutations import Mutations, Switches
-from mitsuba_ext.path_space.space import PathSpace
-from mitsuba_ext.rendering.stages import OneStage
-from mitsuba_ext.transport.path_decisions import Weights
-from mitsuba_ext.transport.without_lengths import WithoutLengths
-
-#: Segments of paths that chains sample, at most: memory of each chain grows with it.
-_MOST = 32
-
-#: The parameters that switch mutations, and the attributes of :class:`Switches`.
-_SWITCHES = {
-    "bidirectional_mutation": "bidirectional",
-    "lens_perturbation": "lens",
-    "multi_chain_perturbation": "multi_chain",
-    "caustic_perturbation": "caustic",
-}
+from mitsuba_ext.composition.path_mutations import (
+    MOST,
+    camera_samples,
+    described,
+    path_target,
+    read_switches,
+)
 
 
 @registry.plugin
@@ -110,39 +100,22 @@ class PathMetropolis(ChainIntegrator):
         self.luminance_samples = self.read_luminance_samples(props)
         self.two_stage = self.parameter(props, "two_stage", False)
         self.chains = self.parameter(props, "chains", 0, minimum=0, maximum=1 << 20)
-        chosen = {key: self.parameter(props, key, True) for key in _SWITCHES}
-        self.switches = Switches(**{_SWITCHES[key]: is_on for key, is_on in chosen.items()})
-
-    @property
-    def _least(self) -> int:
-        """Segments of the shortest paths that chains sample."""
-        if self.finds_direct:
-            return 3
-        return 2 if self.hide_emitters else 1
+        self.switches = read_switches(self, props)
 
     def schedule(self, scene, sensor, samples, seed):
-        if self.max_depth <= _MOST:
+        if self.max_depth <= MOST:
             return super().schedule(scene, sensor, samples, seed)
-        weights = WithoutLengths(Weights(), self._least, _MOST)
-        setting = self.setting(scene, sensor, samples, seed)
-        return OneStage(self.composed_walk(setting, self.max_depth, mis=weights))
+        return camera_samples(self, self.setting(scene, sensor, samples, seed))
 
     def target(self, setting):
-        scene, sensor, most = setting.scene, setting.sensor, min(self.max_depth, _MOST)
-        if not scene.emitters() or most < self._least:
-            return None
-        side = LightSide.of(self.name, scene, sensor)
-        space = PathSpace(
-            scene, sensor, side.emission, side.sensor, self._query(scene), setting.spp,
-            self._least, most, self.hide_emitters,
-        )  # fmt: skip
-        return PathTarget(Mutations(space, self.switches))
+        return path_target(self, setting, self.switches)
 
-    def chain_render(self, *render: Any) -> MetropolisRender:
+    def chain_render(self, target: PathTarget, seed: int, *render: Any) -> MetropolisRender:
         settings = ChainSettings(
-            self.chains, self.luminance_samples, self.p_large, SmallSteps(), True, self.two_stage
-        )
-        return MetropolisRender(settings, *render)
+            self.chains, self.luminance_samples, self.p_large, SmallSteps(), True, self.two_stage,
+            self.state_file(target, seed),
+        )  # fmt: skip
+        return MetropolisRender(settings, self, target, seed, *render)
 
     def parameters(self) -> dict[str, Any]:
         return {
@@ -150,6 +123,6 @@ class PathMetropolis(ChainIntegrator):
             "chains": self.chains,
             "p_large": self.p_large,
             "luminance_samples": self.luminance_samples,
-            **{key: getattr(self.switches, name) for key, name in _SWITCHES.items()},
+            **described(self.switches),
             "two_stage": self.two_stage,
         }

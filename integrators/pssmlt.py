@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -10,7 +9,6 @@ import mitsuba as mi
 from mitsuba_ext import registry
 from mitsuba_ext.chains.target import ImageTarget
 from mitsuba_ext.chains.visits import ChainSettings, MetropolisRender
-from mitsuba_ext.composition.chain_file import ChainFile
 from mitsuba_ext.composition.metropolis_integrator import MetropolisIntegrator
 
 
@@ -59,12 +57,6 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
        - |bool|
        - Estimate the brightness of parts of the image first, and spread mutations evenly over them
          instead of by brightness? (Default: false)
-     * - chain_file
-       - |string|
-       - A file. If it is not there, the state of the chains is saved to it in the end, also after
-         Ctrl-C or a time limit. If it is there, the same render (scene, sensor, seed, parameters)
-         goes on from it, up to ``spp``, which may be higher than before; the brightness of the
-         image is known as well as the first render found it. (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`MetropolisIntegrator`: direct_samples, next_event, max_depth,
@@ -105,27 +97,13 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
         self.two_stage = self.parameter(props, "two_stage", False)
         self.steps = self.read_steps(props)
         self.chains = self.parameter(props, "chains", 0, minimum=0, maximum=1 << 20)
-        self.chain_file = self.parameter(props, "chain_file", "")
 
-    def chain_render(self, *render: Any) -> MetropolisRender:
+    def chain_render(self, target: ImageTarget, seed: int, *render: Any) -> MetropolisRender:
         settings = ChainSettings(
             self.chains, self.luminance_samples, self.p_large, self.steps,
-            self.kelemen_style_weights, self.two_stage, self._file(*render),
+            self.kelemen_style_weights, self.two_stage, self.state_file(target, seed),
         )  # fmt: skip
-        return MetropolisRender(settings, *render)
-
-    def _file(self, _: Any, target: ImageTarget, seed: int, *render: Any) -> ChainFile | None:
-        if not self.chain_file:
-            return None
-        self.check_target("chain_file", self.chain_file)
-        parameters = {
-            **self.parameters(), "chain_file": "", "max_depth": self.max_depth,
-            "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters,
-        }  # fmt: skip
-        where = f'"{self.name}": the parameter "chain_file"'
-        return ChainFile(
-            Path(self.chain_file), target.scene, target.sensor, seed, parameters, where
-        )
+        return MetropolisRender(settings, self, target, seed, *render)
 
     def parameters(self) -> dict[str, Any]:
         return {
@@ -137,5 +115,4 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
             "mutation_size_high": self.steps.high,
             "kelemen_style_weights": self.kelemen_style_weights,
             "two_stage": self.two_stage,
-            **({"chain_file": self.chain_file} if self.chain_file else {}),
         }

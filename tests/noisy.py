@@ -41,8 +41,11 @@ class Clock:
         return self.now
 
 
-def noisy_integrator(clock, sigma=1.0, cost=0.01, fixed=0.0, fails_in=None, mean=1.0, calls=None):
-    """Renders ``mean`` with noise of variance σ²/spp, and takes ``fixed + cost · spp`` seconds."""
+def noisy_integrator(
+    clock, sigma=1.0, cost=0.01, fixed=0.0, fails_in=None, mean=1.0, calls=None, is_shared=False
+):
+    """Renders ``mean`` with noise of variance σ²/spp, and takes ``fixed + cost · spp`` seconds. All
+    pixels have the same noise where it ``is_shared``."""
 
     class Noisy(type(mi.load_dict({"type": "prb"}))):
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
@@ -54,7 +57,8 @@ def noisy_integrator(clock, sigma=1.0, cost=0.01, fixed=0.0, fails_in=None, mean
             width, height = scene.sensors()[0].film().crop_size()
             noise = np.random.default_rng([int(seed), spp, int(sigma * 1e6)])
             shape = (int(height), int(width), 3)
-            return mi.TensorXf(mean + sigma * spp**-0.5 * noise.standard_normal(shape))
+            values = noise.standard_normal((1, 1, 1) if is_shared else shape)
+            return mi.TensorXf(np.broadcast_to(mean + sigma * spp**-0.5 * values, shape).copy())
 
         def to_string(self):
             return f"Noisy[{sigma}, {cost}, {fixed}, {mean}]"

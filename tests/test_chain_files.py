@@ -10,11 +10,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import film, sensor, stage
-from statistical import one_thread
+from statistical import one_thread, some
 from test_pssmlt import ALONE, pssmlt
 
 from mitsuba_ext.chains.looped import LoopedChains
 from mitsuba_ext.chains.numbers import generator
+from mitsuba_ext.chains.path_chains import PathChains
 from mitsuba_ext.chains.stored import arrays_of, value_of
 from mitsuba_ext.chains.target import Contribution
 
@@ -27,6 +28,17 @@ _FEW = {"chains": 1024, "luminance_samples": 4096}
 def _render(scene: mi.Scene, file: Path | str, spp: int, seed: int = 5, **parameters: Any) -> Any:
     integrator = pssmlt(**{**_FEW, **ALONE, "chain_file": str(file), **parameters})
     return np.array(integrator.render(scene, seed=seed, spp=spp)), integrator
+
+
+#: Other integrators with chains.
+_OTHERS = {
+    "mlt": {"type": "mlt", **_FEW, **ALONE},
+    "mlt, two stages": {"type": "mlt", "two_stage": True, **_FEW, **ALONE},
+    "erpt": {"type": "erpt", "luminance_samples": 4096, **ALONE},
+    "erpt, everything": {"type": "erpt", "outliers": 0.0, "chain_length": 8, **ALONE},
+    "erpt, paths": {"type": "erpt", "mutations": "path", "outliers": 2.0, **ALONE},
+    "erpt, filters": {"type": "erpt", "proposal_filter": 3, **ALONE},
+}
 
 
 def test_arrays_are_put_together_as_they_were() -> None:
@@ -63,6 +75,30 @@ def test_a_render_goes_on_where_it_was_stopped(tmp_path: Path, parameters: dict)
         assert integrator.statistics.interrupted and 0 < integrator.statistics.spp < spp
         image, integrator = _render(scene, file, spp, **parameters)
     assert integrator.statistics.spp == spp and not integrator.statistics.interrupted
+    np.testing.assert_allclose(image, whole, rtol=1e-3, atol=1e-4 * whole.mean())
+
+
+@pytest.mark.parametrize("which", some("erpt", of=_OTHERS))
+def test_renders_of_other_kinds_go_on_where_they_were_stopped(
+    tmp_path: Path, which: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also those of chains of paths, and of batches."""
+    monkeypatch.setattr("mitsuba_ext.chains.redistribution._BATCH", 32**2)
+    monkeypatch.setattr(PathChains, "launch", 4)
+    scene, file = mi.load_dict(stage()), tmp_path / "chains.npz"
+
+    def made(file: Path | str) -> Any:
+        return mi.load_dict({"max_depth": 4, **_OTHERS[which], "chain_file": str(file)})
+
+    with one_thread():
+        whole = np.array(made("").render(scene, seed=5, spp=32))
+        integrator = made(file)
+        integrator.progress = lambda fraction: integrator.cancel()
+        integrator.render(scene, seed=5, spp=32)
+        assert integrator.statistics.interrupted and 0 < integrator.statistics.spp < 32
+        integrator = made(file)
+        image = np.array(integrator.render(scene, seed=5, spp=32))
+    assert integrator.statistics.spp == 32 and not integrator.statistics.interrupted
     np.testing.assert_allclose(image, whole, rtol=1e-3, atol=1e-4 * whole.mean())
 
 

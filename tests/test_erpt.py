@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hard_cases import stage
+from hard_cases import area, sensor, stage
 from statistical import (
     MANY_SEEDS,
     REFERENCE_SEEDS,
@@ -18,6 +18,7 @@ from statistical import (
     assert_same_quarters,
     batches,
     some,
+    z_exact,
 )
 from techniques import REFERENCE
 from test_chains import TARGETS
@@ -34,7 +35,7 @@ _GLASS = {"type": "sphere", "center": [-0.2, -0.8, 0.4], "radius": 0.3,
 
 
 def erpt(max_depth: int = 4, **parameters: Any) -> Any:
-    defaults = {"bidirectional": False, "luminance_samples": 4096, "chain_length": 20}
+    defaults = {"luminance_samples": 4096, "chain_length": 20}
     return mi.load_dict({"type": "erpt", "max_depth": max_depth, **defaults, **parameters})
 
 
@@ -44,6 +45,8 @@ _SETTINGS = {
     "chains find all light": {"outliers": 1.0, "direct_samples": -1},
     "chains of one mutation": {"outliers": 0.0, "chain_length": 1},
     "bidirectional": {"outliers": 2.0, "bidirectional": True},
+    "paths": {"outliers": 0.0, "mutations": "path"},
+    "outliers of paths": {"outliers": 2.0, "mutations": "path"},
 }
 
 
@@ -52,9 +55,44 @@ def test_redistribution_keeps_the_mean(which: str) -> None:
     scene = mi.load_dict(stage(glass=_GLASS), optimize=False)
     integrator = erpt(**{"direct_samples": 64, **_SETTINGS[which]})
     # Many seeds: a tenth more energy in the chains must be seen
+    precision = 0.02 if "mutations" in _SETTINGS[which] else 0.015
     images = batches(scene, integrator, 32, range(1, 25))
     expected = batches(scene, REFERENCE.make(4), 1024, REFERENCE_SEEDS[:MANY_SEEDS])
-    assert_same_quarters(images, expected, precision=0.015)
+    assert_same_quarters(images, expected, precision)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["lens", "caustic", None])
+def test_a_perturbation_alone_keeps_the_mean(which: str | None) -> None:
+    """Short chains: where these bring paths to, others do not hide. ``None`` has the random walks
+    of :class:`mlt`."""
+    kinds = ("lens", "multi_chain", "caustic")
+    only = {f"{kind}_perturbation": kind == which for kind in kinds}
+    scene = mi.load_dict(stage(glass=_GLASS), optimize=False)
+    integrator = erpt(mutations="path", outliers=1.0, direct_samples=-1, chain_length=4, **only,
+                      bidirectional_mutation=which is None)
+    images = batches(scene, integrator, 32, range(1, 17))
+    expected = batches(scene, REFERENCE.make(4), 512, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert_same_quarters(images, expected, precision=0.03)
+
+
+@pytest.mark.slow
+def test_chains_of_paths_leave_a_furnace_as_it_is() -> None:
+    """A room that reflects half of its light: both parts of it, the outliers' energy too."""
+    room = {"type": "sphere", "radius": 6.0, "flip_normals": True, "emitter": area(1.0),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
+    scene = mi.load_dict({"type": "scene", "room": room, "sensor": sensor()})
+    integrator = erpt(5, mutations="path", outliers=1.0, direct_samples=-1)
+    images = batches(scene, integrator, 16, range(1, 9))
+    z, error = z_exact(images.mean(axis=(1, 2, 3)), 2 - 0.5**4)
+    assert abs(z) < THRESHOLD and error < 0.01
+
+
+@pytest.mark.parametrize("key", ["bidirectional", "next_event", "proposal_filter"])
+def test_what_chains_of_paths_have_no_use_for_is_refused(key: str) -> None:
+    value = {"bidirectional": True, "next_event": "spatial", "proposal_filter": 7}[key]
+    with pytest.raises(RuntimeError, match=f'"{key}" is for chains of primary samples'):
+        erpt(mutations="path", **{key: value})
 
 
 def test_only_outliers_are_redistributed() -> None:

@@ -25,6 +25,7 @@ from test_light_tracer import EMITTERS, MATERIALS, T, _balls
 from mitsuba_ext.chains.numbers import ProposedNumbers, StateNumbers, generator
 from mitsuba_ext.chains.path_target import PathTarget
 from mitsuba_ext.chains.small_steps import SmallSteps
+from mitsuba_ext.composition import path_mutations
 from mitsuba_ext.composition.light_side import LightSide
 from mitsuba_ext.path_space.mutations import Mutations, Switches
 from mitsuba_ext.path_space.space import PathSpace, turned
@@ -191,7 +192,8 @@ def test_sensors(camera: dict[str, Any]) -> None:
 def test_camera_samples_find_paths_that_are_too_long_for_chains(monkeypatch) -> None:
     """In a room that reflects half of the light, which is everywhere the same."""
     integrator = mlt(-1, direct_samples=64)
-    monkeypatch.setattr(sys.modules[type(integrator).__module__], "_MOST", 4)
+    for module in (path_mutations, sys.modules[type(integrator).__module__]):
+        monkeypatch.setattr(module, "MOST", 4)
     room = {"type": "sphere", "radius": 6.0, "flip_normals": True, "emitter": area(1.0),
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
     scene = mi.load_dict({"type": "scene", "room": room, "sensor": sensor()})

@@ -47,7 +47,7 @@ VALUES = {
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
     **dict.fromkeys(["mutation_size_low", "mutation_size_high"], 0.01),
     **dict.fromkeys(["sample_count", "seed", "dimensions"], 6),
-    "chain_file": "chains.npz", "outliers": 2.0, "p_large": 0.5,
+    "chain_file": "chains.npz", "mutations": "path", "outliers": 2.0, "p_large": 0.5,
     **dict.fromkeys(["bidirectional_mutation", "lens_perturbation"], True),
     **dict.fromkeys(["multi_chain_perturbation", "caustic_perturbation"], True),
 }  # fmt: skip
@@ -60,6 +60,9 @@ CONDITIONS = {
     ("guided_directions", "tile"): {"regions": "tiles"},
     **{("neepp", key): {"rejection": True} for key in ("law", "slope", "floor")},
     ("mis_heuristic", "threshold"): {"heuristic": "cutoff"},
+    **{("erpt", f"{kind}_perturbation"): {"mutations": "path"}
+       for kind in ("lens", "multi_chain", "caustic")},
+    ("erpt", "bidirectional_mutation"): {"mutations": "path"},
     ("neepp", "refine"): {"rejection": True, "light_sampling": "uniform"},
 }
 

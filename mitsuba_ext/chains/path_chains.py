@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
@@ -11,49 +9,35 @@ from ..path_space.memory import Head, Logs, PathMemory, Place, stride
 from ..path_space.mutations import NEW_PATH
 from .chains import Chains, Counts
 from .numbers import ProposedNumbers, StateNumbers, stream
-from .target import Contribution
+from .path_target import PathState
 
 #: Streams of numbers that all chains share: of the kinds of mutations, and of places on the film.
 _KIND, _FILM = 6, 7
-
-
-@dataclass
-class _State:
-    """A chain's path, without its vertices.
-
-    Attributes:
-        head: The path.
-        found: What it adds to the image.
-        density: The logarithm of its density as a new path.
-    """
-
-    head: Head
-    found: Contribution
-    density: mi.Float
 
 
 class PathChains(Chains):
     """All mutations of a launch are one traced loop. All chains make the same kind of mutation at a
     time, if their paths allow it: lanes of a processor then do the same. See :class:`Chains`."""
 
+    _parts_of_state = ("_rngs", "_state", "_places", "_logs", "_weight")
+
     def _begin(self, bootstrap, winners):
-        most = self._target.most
-        self._width = stride(most)
-        self._seeds = [dr.opaque(mi.UInt32, stream(self._seed, n)) for n in (_KIND, _FILM)]
-        self._new_path = dr.opaque(mi.Float, self.rules.large_step)
         numbers = bootstrap.numbers(winners)
-        memory, at = PathMemory.of(most), dr.zeros(mi.UInt32, self.count)
+        memory, at = PathMemory.of(self._target.most), dr.zeros(mi.UInt32, self.count)
         memory, _numbers, proposal = self._target.mutations.new_path(
             memory, at, numbers, mi.Bool(True)
         )
         self._state = self._as_state(proposal)
         self._store(memory, self._state.head)
 
-    def _as_state(self, proposal) -> _State:
-        return _State(proposal.head, self._target.contribution(proposal), proposal.log_density)
+    def _as_state(self, proposal) -> PathState:
+        return PathState(proposal.head, self._target.contribution(proposal), proposal.log_density)
 
     def advance(self, steps):
-        counts = self._advance(dr.opaque(mi.UInt32, steps), dr.opaque(mi.UInt32, self.done))
+        seeds = [dr.opaque(mi.UInt32, stream(self._seed, n)) for n in (_KIND, _FILM)]
+        counts = self._advance(
+            dr.opaque(mi.UInt32, steps), dr.opaque(mi.UInt32, self.done), seeds
+        )
         dr.eval(
             self._state, self._weight, self._rngs, self._places, self._logs, counts,
             self._image.tensors(),
@@ -62,7 +46,7 @@ class PathChains(Chains):
         return counts
 
     @dr.syntax
-    def _advance(self, steps: mi.UInt32, done: mi.UInt32) -> Counts:
+    def _advance(self, steps: mi.UInt32, done: mi.UInt32, seeds: list[mi.UInt32]) -> Counts:
         mutations = self._target.mutations
         none, lane = dr.zeros(mi.UInt32, self.count), dr.arange(mi.UInt32, self.count)
         rng, state, weight = mi.PCG32(self._rngs[0]), self._state, mi.Float(self._weight)
@@ -72,9 +56,9 @@ class PathChains(Chains):
         step = mi.UInt32(none)
         while step < steps:
             # ----- Propose -----
-            which = mi.sample_tea_float32(self._seeds[0], done + step)
-            kind = mutations.kind(which, self._new_path)
-            place = mutations.place(lane, self._seeds[1], done + step)
+            which = mi.sample_tea_float32(seeds[0], done + step)
+            kind = mutations.kind(which, self._large_step)
+            place = mutations.place(lane, seeds[1], done + step)
             threshold = rng.next_float32()
             numbers = ProposedNumbers(rng, mi.UInt32(none), mi.UInt32(none), unused)
             memory, numbers, proposal = mutations.mutate(
@@ -128,7 +112,7 @@ class PathChains(Chains):
 
     @dr.syntax
     def _store(self, memory: PathMemory, head: Head) -> None:
-        size = self.count * self._width
+        size = self.count * stride(self._target.most)
         places, logs = dr.zeros(Place, size), dr.zeros(Logs, size)
         lane, count = dr.arange(mi.UInt32, self.count), dr.opaque(mi.UInt32, self.count)
         index = dr.zeros(mi.UInt32, self.count)

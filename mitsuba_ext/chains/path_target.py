@@ -7,16 +7,31 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..path_space.memory import PathMemory
+from ..path_space.memory import Head, PathMemory
 from ..path_space.mutations import Mutations, Proposal
 from ..transport.estimator import Sample
 from ..transport.numbers import Numbers
 from .numbers import ProposedNumbers, StateNumbers, generator, stream
 from .small_steps import SmallSteps
-from .target import Contribution, Found, PlaceWeights
+from .target import Contribution, Found, PlaceWeights, beyond_bound
 
 #: Rounds of learning, and paths of each.
 _ROUNDS, _PATHS = 3, 1 << 15
+
+
+@dataclass
+class PathState:
+    """The state of a chain of paths, without its vertices.
+
+    Attributes:
+        head: The path.
+        found: What it adds to the image.
+        density: The logarithm of its density as a new path.
+    """
+
+    head: Head
+    found: Contribution
+    density: mi.Float
 
 
 @dataclass
@@ -26,13 +41,19 @@ class PathTarget:
     Parameters:
         mutations: Of the paths of the scene.
         weights: Of places on the film; ``None`` where all count the same.
+        bound: The target function is what luminance is beyond it.
     """
 
     mutations: Mutations
     weights: PlaceWeights | None = None
+    bound: float = 0.0
 
     #: Paths draw their numbers from one stream, and each has one place on the film.
     has_light_paths = False
+
+    @property
+    def scene(self) -> mi.Scene:
+        return self.mutations.space.scene
 
     @property
     def sensor(self) -> mi.Sensor:
@@ -46,11 +67,11 @@ class PathTarget:
     def evaluate(self, numbers: Numbers, active: mi.Bool | bool = True) -> Found:
         """What a new path brings; also the place that ``numbers`` have reached, evaluated."""
         proposal, numbers = self._evaluate(numbers, mi.Bool(active))
-        found = self.contribution(proposal)
-        sample = self.sample(proposal)
-        lane = dr.arange(mi.UInt32, dr.width(found.target))
-        dr.eval(found, lane, sample, numbers)
-        return Found(found.target, [found], [lane], sample)
+        brought, sample = self._brought(proposal), self.sample(proposal)
+        target = beyond_bound(brought.target, self.bound)
+        lane = dr.arange(mi.UInt32, dr.width(target))
+        dr.eval(brought, target, lane, sample, numbers)
+        return Found(target, [brought], [lane], sample)
 
     def learn(self, seed: int) -> None:
         """Learns from paths of its own how new paths should be made."""
@@ -70,7 +91,13 @@ class PathTarget:
         return proposal, numbers
 
     def contribution(self, proposal: Proposal) -> Contribution:
-        """What a path adds to the image, as a new path."""
+        """What a path adds to the image, as a new path, with the target function of that."""
+        brought = self._brought(proposal)
+        brought.target = beyond_bound(brought.target, self.bound)
+        return brought
+
+    def _brought(self, proposal: Proposal) -> Contribution:
+        """The same with its luminance, whatever the bound."""
         found = proposal.found
         factor = dr.exp(found.log_geometry - proposal.log_density)
         value = dr.select(found.active, found.value * factor, 0)

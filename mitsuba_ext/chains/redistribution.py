@@ -9,6 +9,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
@@ -18,11 +19,15 @@ from .noise_filters import FilteredChains, FilteredImage, NoiseFilters
 from .numbers import stream
 from .render import FIRST_STAGE, ChainRender
 from .small_steps import SmallSteps
+from .stored import Arrays, StateFile
 from .target import Found
 
 #: Samples of a batch, at most, and with a time limit. Each batch has chains of its own, which take
 #: long where they are few.
 _BATCH, _TIMED_BATCH = 1 << 22, 1 << 19
+
+#: What is known of all batches, besides the image.
+_SUMS = ("samples", "batches", "redistributed", "energy")
 
 #: Chains of a batch, at most.
 _MOST_CHAINS = 1 << 17
@@ -41,8 +46,9 @@ class RedistributionSettings:
         outliers: Samples so many times as bright as their neighbourhood lose what they have beyond
             that to chains. 0 redistributes all energy.
         luminance_samples: Samples that measure brightness first.
-        steps: How numbers are moved.
+        steps: How numbers are moved, where chains change those.
         filters: Of the noise.
+        file: If it has a state, the render goes on from there; it has the last state afterwards.
     """
 
     chain_length: int
@@ -51,6 +57,7 @@ class RedistributionSettings:
     luminance_samples: int
     steps: SmallSteps
     filters: NoiseFilters = NoiseFilters()
+    file: StateFile | None = None
 
 
 class RedistributionRender(ChainRender):
@@ -79,6 +86,7 @@ class RedistributionRender(ChainRender):
         begin = time.perf_counter()
         statistics.interrupted = True
         seed = stream(self._seed, FIRST_STAGE)
+        target.learn(seed)
         tiles = EvenTiles(self._film, settings.luminance_samples)
         first = Bootstrap(target, seed, settings.luminance_samples, tiles.take)
         statistics.learning_seconds += time.perf_counter() - begin
@@ -90,15 +98,18 @@ class RedistributionRender(ChainRender):
         rules = ChainRules(0.0, settings.steps, bound)
         # Energy of a deposit, in units of the target function of a sample
         deposit = self._spp * first.mean / (settings.mutations or self._spp)
-        total = self._spp * self._pixel_count
-        size = min(total, _TIMED_BATCH if self._integrator.timeout > 0 else _BATCH)
+        stored = settings.file.load() if settings.file else None
+        if stored:
+            self._restore(stored, image)
+        left = max(0, self._spp * self._pixel_count - self._samples)
+        size = min(left, _TIMED_BATCH if self._integrator.timeout > 0 else _BATCH)
 
         def act(most: int) -> int:
             self._batch(image, rules, size, deposit)
             return 1
 
         try:
-            is_done = self._repeat(-(-total // size), size, interrupt, act)
+            is_done = left == 0 or self._repeat(-(-left // size), size, interrupt, act)
             statistics.interrupted = not is_done
         finally:
             if self._batches > 0:
@@ -107,6 +118,19 @@ class RedistributionRender(ChainRender):
                 self._report(round(self._samples / self._pixel_count))
                 share = self._redistributed / self._energy if self._energy else 0.0
                 statistics.learned = f"{share:.1%} of the energy was redistributed; {self._rates()}"
+        # Not after an error: a batch may be half done
+        if settings.file:
+            settings.file.save(self._stored(image))
+
+    def _stored(self, image: ChainImage) -> Arrays:
+        """Batches that are done. The next one begins with samples of its own."""
+        tensors = {f"image{n}": np.array(tensor) for n, tensor in enumerate(image.tensors())}
+        return {**tensors, **{key: np.array(getattr(self, f"_{key}")) for key in _SUMS}}
+
+    def _restore(self, stored: Arrays, image: ChainImage) -> None:
+        image.add_tensors([mi.TensorXf(stored[f"image{n}"]) for n in range(len(image.tensors()))])
+        for key in _SUMS:
+            setattr(self, f"_{key}", stored[key].item())
 
     def _image(self) -> ChainImage:
         filters = self._settings.filters

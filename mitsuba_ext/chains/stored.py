@@ -1,28 +1,40 @@
-"""The state of chains as arrays of NumPy, for files."""
+"""The state of a render with chains as arrays of NumPy, for files."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..path_space.memory import Head, Logs, Place
+from .path_target import PathState
 from .target import Contribution
 
 #: Arrays by name.
 Arrays = dict[str, np.ndarray]
 
+class StateFile(Protocol):
+    """Where the state of a render is kept."""
+
+    def load(self) -> Arrays | None:
+        """What was saved; ``None`` if nothing was yet."""
+
+    def save(self, arrays: Arrays) -> None:
+        """Keeps this, and nothing else."""
+
 
 def arrays_of(value: Any, name: str) -> Arrays:
     """The arrays of which ``value`` consists: an array of Dr.Jit, a generator of random numbers,
-    contributions, or a list of such."""
+    what chains keep of paths, or a list of such."""
+    kinds = {made: kind for kind, made in _kinds().items()}
     if isinstance(value, list):
         parts = {str(index): part for index, part in enumerate(value)}
     elif isinstance(value, mi.PCG32):
         parts = {"rng.state": value.state, "rng.inc": value.inc}
-    elif isinstance(value, Contribution):
-        parts = {f"found.{key}": part for key, part in vars(value).items()}
+    elif type(value) in kinds:
+        parts = {f"{kinds[type(value)]}.{key}": part for key, part in vars(value).items()}
     else:
         return {name: value.numpy()}
     found = (arrays_of(part, f"{name}/{key}") for key, part in parts.items())
@@ -39,10 +51,21 @@ def value_of(arrays: Arrays, name: str) -> Any:
     kind, _, is_structure = next(iter(parts)).partition(".")
     if not is_structure:
         return [parts[key] for key in sorted(parts, key=int)]
-    made = dr.zeros({"rng": mi.PCG32, "found": Contribution}[kind])
+    made = dr.zeros(_kinds()[kind])
     for key, part in parts.items():
-        setattr(made, key.partition(".")[2], part)
+        field = key.partition(".")[2]
+        # Arrays do not say whether they are points or colours
+        wanted = type(getattr(made, field))
+        setattr(made, field, part if isinstance(part, wanted) else wanted(part))
     return made
+
+
+def _kinds() -> dict[str, type]:
+    """What files call structures."""
+    return {
+        "rng": mi.PCG32, "found": Contribution, "path": PathState, "head": Head, "place": Place,
+        "logs": Logs,
+    }  # fmt: skip
 
 
 def _array(array: np.ndarray) -> Any:

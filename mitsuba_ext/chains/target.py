@@ -79,7 +79,7 @@ class ImageTarget:
     def __call__(self, numbers: Numbers) -> tuple[Contribution, Sample]:
         """What the camera path finds, with the target function of that, and the whole sample."""
         camera, sample = self._camera(numbers, mi.Bool(True))
-        camera.target = self._beyond_bound(camera.target)
+        camera.target = beyond_bound(camera.target, self.bound)
         return camera, sample
 
     def evaluate(self, numbers: Numbers, active: mi.Bool | bool = True) -> Found:
@@ -97,7 +97,7 @@ class ImageTarget:
             target = mi.Float(target)
             for part, lane in zip(parts[1:], lanes[1:]):
                 dr.scatter_add(target, part.target, lane)
-        target = self._beyond_bound(target)
+        target = beyond_bound(target, self.bound)
         dr.eval(target)
         return Found(target, parts, lanes, sample)
 
@@ -107,10 +107,8 @@ class ImageTarget:
         value = to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
         return self._contribution(rays.position, dr.select(active, value, 0)), sample
 
-    def _beyond_bound(self, luminance: mi.Float) -> mi.Float:
-        if self.bound == 0:
-            return luminance
-        return dr.maximum(luminance - dr.opaque(mi.Float, self.bound), 0)
+    def learn(self, seed: int) -> None:
+        """Estimators of random walks have nothing to learn."""
 
     def _contribution(self, position: mi.Point2f, value: mi.Color3f) -> Contribution:
         """What is not finite counts as black: it is no place to stay."""
@@ -132,3 +130,10 @@ class ImageTarget:
         pixel = mi.UInt32(corner.y * width + corner.x)
         lanes = Lanes(pixel, corner + mi.Point2i(film.crop_offset()), mi.UInt32(0))
         return camera_rays(self.sensor, lanes, drawn, self.spp)
+
+
+def beyond_bound(luminance: mi.Float, bound: float) -> mi.Float:
+    """What luminance is beyond a bound; all of it, if that is 0."""
+    if bound == 0:
+        return luminance
+    return dr.maximum(luminance - dr.opaque(mi.Float, bound), 0)

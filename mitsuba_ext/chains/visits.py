@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,10 +16,9 @@ from .chain_image import ChainImage
 from .chains import ChainRules, Chains
 from .even_tiles import EvenTiles
 from .numbers import stream
-from .path_target import PathTarget
 from .render import FIRST_STAGE, ChainRender
 from .small_steps import SmallSteps
-from .stored import Arrays
+from .stored import Arrays, StateFile
 from .target import Found, ImageTarget
 
 #: Chains without and with light paths, at least and at most: these need several kernels for each
@@ -33,16 +32,6 @@ _BOOTSTRAP_SHARE, _MOST_BOOTSTRAP = 0.25, 1 << 24
 
 #: Samples that find the scale of MIS weights.
 _SCALE_SAMPLES = 1 << 14
-
-
-class StateFile(Protocol):
-    """Where the state of a render is kept."""
-
-    def load(self) -> Arrays | None:
-        """What was saved; ``None`` if nothing was yet."""
-
-    def save(self, arrays: Arrays) -> None:
-        """Keeps this, and nothing else."""
 
 
 @dataclass(frozen=True)
@@ -168,6 +157,8 @@ class MetropolisRender(ChainRender):
         settings = self._settings
         if settings.is_even:
             self._first_stage()
+        else:
+            self._target.learn(stream(self._seed, FIRST_STAGE))
         image.add_tensors([mi.TensorXf(stored[name]) for name in ("visits", "uniform")])
         rules = ChainRules(settings.large_step, settings.steps, float(stored["uniform_weight"]))
         chains = self._kind(
@@ -188,8 +179,7 @@ class MetropolisRender(ChainRender):
         unbiased, if the samples of the image do not decide it. Finds the weights of tiles too."""
         settings = self._settings
         seed, samples = stream(self._seed, FIRST_STAGE), settings.bootstrap
-        if isinstance(self._target, PathTarget):
-            self._target.learn(seed)
+        self._target.learn(seed)
         if not settings.is_even:
             return Bootstrap(self._target, seed, min(samples, _SCALE_SAMPLES)).mean
         tiles = EvenTiles(self._film, samples)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -23,6 +24,7 @@ from ..rendering.interrupts import deferred_interrupt
 from ..rendering.stages import OneStage
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.walk import Walk
+from .chain_file import ChainFile
 from .decision_parameters import Setting
 from .walk_integrator import WalkIntegrator
 
@@ -55,11 +57,19 @@ class ChainIntegrator(WalkIntegrator):
        - Camera samples per pixel for visible lights and direct light, which :monosp:`path` finds
          well; the chains find the rest. 0 stands for a quarter of ``spp``, and 16 at least; −1
          leaves all light to the chains. (Default: 0)
+     * - chain_file
+       - |string|
+       - A file. If it is not there, the state of the chains and what they have found is saved to it
+         in the end, also after Ctrl-C or a time limit. If it is there, the same render (scene,
+         sensor, seed, parameters) goes on from it, up to ``spp``, which may be higher than before.
+         Where chains find the whole image (:class:`pssmlt`, :class:`mlt`), its brightness stays
+         known as well as the first render found it. (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
 
     Attributes:
+        chain_file: Where the state of a render is kept; empty for nowhere.
         direct_samples: Camera samples per pixel; 0 for as many as suit the render, −1 where chains
             find all light.
     """
@@ -69,21 +79,44 @@ class ChainIntegrator(WalkIntegrator):
         self.direct_samples = self.parameter(
             props, "direct_samples", 0, minimum=-1, maximum=1 << 20
         )
+        self.chain_file = self.parameter(props, "chain_file", "")
 
     def read_luminance_samples(self, props: mi.Properties) -> int:
         """The parameter ``luminance_samples``."""
         return self.parameter(props, "luminance_samples", 100_000, minimum=1, maximum=1 << 26)
 
-    def chain_render(self, *render: Any) -> ChainRender:
-        """The render of the chains, of which the parameters are those of :class:`ChainRender`."""
+    def chain_render(
+        self, target: ImageTarget | PathTarget, seed: int, *render: Any
+    ) -> ChainRender:
+        """The render of the chains, of which the parameters are those of :class:`ChainRender`, but
+        for the integrator."""
         raise NotImplementedError
+
+    def state_file(self, target: ImageTarget | PathTarget, seed: int) -> ChainFile | None:
+        """Where the state of a render is kept, if that is wanted.
+
+        Raises:
+            ValueError: It cannot be kept there.
+        """
+        if not self.chain_file:
+            return None
+        self.check_target("chain_file", self.chain_file)
+        parameters = {
+            **self.parameters(), "chain_file": "", "max_depth": self.max_depth,
+            "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters,
+        }  # fmt: skip
+        where = f'"{self.name}": the parameter "chain_file"'
+        return ChainFile(
+            Path(self.chain_file), target.scene, target.sensor, seed, parameters, where
+        )
 
     def target(self, setting: Setting) -> ImageTarget | PathTarget | None:
         """What chains sample; ``None`` where they have nothing to find."""
         raise NotImplementedError
 
     def parameters(self) -> dict[str, Any]:
-        return {"direct_samples": self.direct_samples, **super().parameters()}
+        file = {"chain_file": self.chain_file} if self.chain_file else {}
+        return {"direct_samples": self.direct_samples, **file, **super().parameters()}
 
     @property
     def finds_direct(self) -> bool:
@@ -109,7 +142,7 @@ class ChainIntegrator(WalkIntegrator):
         """A walk with this integrator's decisions, and others."""
         chosen = {slot: p.decision(setting) for slot, p in self.slots.items()}
         decisions.update({slot: decision for slot, decision in chosen.items() if decision})
-        return replace(self.walk(query=self._query(setting.scene), **decisions),
+        return replace(self.walk(query=self.query(setting.scene), **decisions),
                        max_depth=max_depth)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
@@ -127,7 +160,7 @@ class ChainIntegrator(WalkIntegrator):
         statistics, camera_spp = self.statistics, self.statistics.spp
         is_interrupted = False
         if target is not None and not self.is_cancelled:
-            chains = self.chain_render(self, target, seed, spp, camera_spp, statistics, start)
+            chains = self.chain_render(target, seed, spp, camera_spp, statistics, start)
             with deferred_interrupt() as interrupt:
                 chains.run(interrupt)
             is_interrupted = interrupt.is_set()

@@ -175,7 +175,7 @@ class WalkIntegrator(StagedIntegrator):
             learned = functools.partial(learned_file.save, path, scene, made_by)
         schedule = Schedule(
             self.name, self.slots, setting, len(pilots), self.estimators(scene, sensor),
-            self._query(scene), restored, learned,
+            self.query(scene), restored, learned,
         )  # fmt: skip
         self.learners = schedule.learners
         return schedule
@@ -197,7 +197,7 @@ class WalkIntegrator(StagedIntegrator):
         setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1)
         decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}
         decisions = {slot: decision for slot, decision in decisions.items() if decision}
-        walk = self.walk(query=self._query(scene), **decisions)
+        walk = self.walk(query=self.query(scene), **decisions)
         sample = walk(scene, sampler, CameraRays(ray), mi.Bool(active))
         return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
 
@@ -224,7 +224,7 @@ class WalkIntegrator(StagedIntegrator):
     def _described_slots(self) -> dict[str, str]:
         return {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
 
-    def _query(self, scene: mi.Scene) -> SceneQuery:
+    def query(self, scene: mi.Scene) -> SceneQuery:
         """How rays meet ``scene``. The output variables are Mitsuba's, which knows no motion."""
         if self._aovs is not None:
             refuse_movers(scene, f'"{self.name}": the parameter "aovs"', "leave it out")

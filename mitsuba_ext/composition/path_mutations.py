@@ -1,0 +1,69 @@
+"""What integrators with chains of light paths have in common."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from ..chains.path_target import PathTarget
+from ..path_space.mutations import Mutations, Switches
+from ..path_space.space import PathSpace
+from ..rendering.stages import OneStage
+from ..transport.path_decisions import Weights
+from ..transport.without_lengths import WithoutLengths
+from .decision_parameters import Setting
+from .light_side import LightSide
+
+#: Segments of paths that chains sample, at most: memory of each chain grows with it.
+MOST = 32
+
+#: The parameters that switch mutations, and the attributes of :class:`Switches`.
+_SWITCHES = {
+    "bidirectional_mutation": "bidirectional",
+    "lens_perturbation": "lens",
+    "multi_chain_perturbation": "multi_chain",
+    "caustic_perturbation": "caustic",
+}
+
+
+def read_switches(integrator: Any, props: mi.Properties, **defaults: bool) -> Switches:
+    """The parameters that switch mutations. ``defaults`` are those of the attributes of
+    :class:`Switches`, where not all are on."""
+    chosen = {
+        name: integrator.parameter(props, key, defaults.get(name, True))
+        for key, name in _SWITCHES.items()
+    }
+    return Switches(**chosen)
+
+
+def described(switches: Switches) -> dict[str, bool]:
+    """The parameters, by name."""
+    return {key: getattr(switches, name) for key, name in _SWITCHES.items()}
+
+
+def path_target(integrator: Any, setting: Setting, switches: Switches) -> PathTarget | None:
+    """What chains of paths sample; ``None`` where they have nothing to find."""
+    scene, sensor = setting.scene, setting.sensor
+    least, most = _least(integrator), min(setting.max_depth, MOST)
+    if not scene.emitters() or most < least:
+        return None
+    side = LightSide.of(integrator.name, scene, sensor)
+    space = PathSpace(
+        scene, sensor, side.emission, side.sensor, integrator.query(scene), setting.spp,
+        least, most, integrator.hide_emitters,
+    )  # fmt: skip
+    return PathTarget(Mutations(space, switches))
+
+
+def camera_samples(integrator: Any, setting: Setting) -> OneStage:
+    """Those that find direct light and, of paths that are longer than chains sample, all."""
+    weights = WithoutLengths(Weights(), _least(integrator), MOST)
+    return OneStage(integrator.composed_walk(setting, setting.max_depth, mis=weights))
+
+
+def _least(integrator: Any) -> int:
+    """Segments of the shortest paths that chains sample."""
+    if integrator.finds_direct:
+        return 3
+    return 2 if integrator.hide_emitters else 1
