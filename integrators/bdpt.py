@@ -174,6 +174,14 @@ class BidirectionalIntegrator(WalkIntegrator):
         }
 
     @property
+    def needs_equal_samples(self) -> str:
+        if self.light_image:
+            return 'its light paths find light for all pixels: set "light_image" to false'
+        if self.technique_images:
+            return 'its images of techniques count all samples alike: leave "technique_images" out'
+        return super().needs_equal_samples
+
+    @property
     def sample_cost(self) -> int:
         return max(3, super().sample_cost)
 

@@ -119,6 +119,10 @@ class LightTracerIntegrator(WalkIntegrator):
         layout = Layout(len(mi.Spectrum()), 0, True)
         return _PASS_BYTES // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
 
+    @property
+    def needs_equal_samples(self) -> str:
+        return "its light paths find light for all pixels"
+
     def schedule(self, scene, sensor, samples, seed) -> OneStage:
         if not ConnectableSensor.can_connect(sensor):
             raise NotImplementedError(

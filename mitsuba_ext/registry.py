@@ -38,6 +38,7 @@ _BASES = (
     "mitsuba_ext.composition.walk_integrator",
     "mitsuba_ext.composition.chain_integrator",
     "mitsuba_ext.composition.metropolis_integrator",
+    "mitsuba_ext.composition.wrapping_integrator",
     "mitsuba_ext.composition.reweighted_camera",
     "mitsuba_ext.sequences.sequence_sampler",
 )

@@ -159,7 +159,7 @@ def third_pass_gets(request, monkeypatch):
     """What makes every third pass of 4 samples get signals, 10 ms from each other; returns the
     integrator."""
     job, lengths = {
-        "path": (seed_passes.SeedPasses, seed_passes), "composed_path": (rendering._Job, plan),
+        "path": (seed_passes.SeedPasses, seed_passes), "composed_path": (rendering.Job, plan),
     }[request.param]  # fmt: skip
     monkeypatch.setattr(lengths, "_PASS_SAMPLES", {dr.JitBackend.LLVM: 4 * 8 * 6})
     monkeypatch.setattr(lengths, "_PASS_SPP", 1)

@@ -14,7 +14,9 @@ LLVM_VARIANTS = [name for name in runtime.SUPPORTED_VARIANTS if name.startswith(
 
 #: Some integrators have no depth of their own: they nest another one.
 LOAD_ALL = """
-WRAPPERS = ("variance", "reweighted_lens", "reweighted_time", "reweighted_wavelength")
+WRAPPERS = (
+    "adaptive", "variance", "reweighted_lens", "reweighted_time", "reweighted_wavelength",
+)
 
 def load_all():
     from mitsuba_ext import registry

@@ -103,7 +103,7 @@ def test_passes_of_large_films_keep_the_samples_of_a_pixel_together(scene, sampl
     """But for samplers that hold a state for each sample."""
     sensor = mi.load_dict({"type": "perspective", "sampler": {"type": sampler},
                            "film": {"type": "hdrfilm", "width": 2048, "height": 1024}})
-    job = rendering._Job(_path(), scene, sensor, 0, spp)
+    job = rendering.Job(_path(), scene, sensor, 0, spp)
     assert job.plan.stages == (spp,) and job.plan.pass_length(spp) == length
 
 
@@ -111,7 +111,7 @@ def test_passes_of_expensive_samples_are_shorter(scene):
     """Else a pass would last minutes, in which nothing can stop it."""
     def length(**parameters):
         integrator = mi.load_dict({"type": "reweighted_direct", **parameters})
-        job = rendering._Job(integrator, scene, scene.sensors()[0], 0, 1 << 20)
+        job = rendering.Job(integrator, scene, scene.sensors()[0], 0, 1 << 20)
         return job.plan.pass_length(1 << 20)
 
     assert length(light_samples=1024) <= length(light_samples=1) / 60
@@ -126,7 +126,7 @@ def test_absurd_numbers_of_samples_are_refused(scene, name, spp):
     large = mi.load_dict({"type": "perspective",
                           "film": {"type": "hdrfilm", "width": 2048, "height": 1024}})
     with pytest.raises(ValueError, match="2097152 pixels are too many: give at most 16777216"):
-        rendering._Job(_path(), scene, large, 0, 2**30)
+        rendering.Job(_path(), scene, large, 0, 2**30)
 
 
 class _Recorder:
@@ -191,7 +191,7 @@ class _Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, compiling: int = 0) -> None:
         self.now, self.compiling = 0.0, compiling
-        run_pass = rendering._Job._run_pass
+        run_pass = rendering.Job._run_pass
 
         def run_on_clock(job, stage, spp):
             run_pass(job, stage, spp)
@@ -199,7 +199,7 @@ class _Clock:
             self.now += 5.0 if self.compiling >= 0 else 0.1 * spp
             return self.compiling >= 0
 
-        monkeypatch.setattr(rendering._Job, "_run_pass", run_on_clock)
+        monkeypatch.setattr(rendering.Job, "_run_pass", run_on_clock)
         monkeypatch.setattr(rendering.time, "perf_counter", lambda: self.now)
         monkeypatch.setattr(time_budget, "_SHORT_PASS", 1)
 

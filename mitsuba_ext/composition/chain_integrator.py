@@ -123,6 +123,10 @@ class ChainIntegrator(WalkIntegrator):
         """Do camera samples find direct light?"""
         return self.direct_samples >= 0
 
+    @property
+    def needs_equal_samples(self) -> str:
+        return "its chains find light for all pixels"
+
     def schedule(self, scene, sensor, samples, seed) -> OneStage:
         """Of the camera samples."""
         setting = self.setting(scene, sensor, samples, seed)

@@ -10,16 +10,14 @@ from typing import Any
 import mitsuba as mi
 
 from ..decisions.camera.pixel_sets import PixelSets
-from ..garbage import garbage_left_alone
-from ..movers import check_motion_is_seen
-from ..rendering.staged_integrator import NO_LIMIT, StagedIntegrator
-from ..rendering.stages import OneStage, Schedule, Stage
-from ..transport.estimator import CameraRays, Sample
+from ..rendering.staged_integrator import NO_LIMIT
+from ..rendering.stages import Schedule, Stage
 from .camera_numbers import PURPOSES, WeightedNumbers, samples_per_set
 from .decision_parameters import ParameterReader, Setting
+from .wrapping_integrator import WrappingIntegrator
 
 
-class ReweightedCamera(StagedIntegrator):
+class ReweightedCamera(WrappingIntegrator):
     """Renders with a nested integrator, for camera rays of which one number (or two) comes from
     weighted sets.
 
@@ -55,37 +53,26 @@ class ReweightedCamera(StagedIntegrator):
     purpose: str
 
     def __init__(self, props: mi.Properties) -> None:
-        if "hide_emitters" in props:
-            raise ValueError(
-                f'"{props.plugin_name()}": "hide_emitters" is for the nested integrator to know'
-            )
         super().__init__(props)
         reader = ParameterReader(self.name, props)
         self.numbers = WeightedNumbers(reader, PURPOSES[self.purpose].weights)
-        self.nested = self._nested(props)
+
+    def accepts(self, nested: mi.SamplingIntegrator) -> bool:
+        return self.purpose not in _purposes(nested)
 
     # ---- What the base class asks for ----
-
-    def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
-        return self.nested.pilots(scene, pixel_count, spp) if self._is_staged else []
-
-    @property
-    def sample_cost(self) -> int:
-        return self.nested.sample_cost if self._is_staged else 1
 
     def samples_per_set(self, spp: int) -> int:
         return samples_per_set(spp, self.timeout > 0)
 
+    @property
+    def needs_equal_samples(self) -> str:
+        return "its sets of numbers belong together"
+
     def schedule(
         self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
     ) -> Schedule:
-        if self._is_staged:
-            # Sets of all purposes must be cut alike
-            self.nested.timeout = self.timeout
-            schedule = self.nested.schedule(scene, sensor, samples, seed)
-        else:
-            check_motion_is_seen(self.nested, scene)
-            schedule = OneStage(_NestedEstimator(self.nested, sensor.get_medium()))
+        schedule = super().schedule(scene, sensor, samples, seed)
         setting = Setting(
             scene, sensor, seed, NO_LIMIT, NO_LIMIT, sum(samples), is_timed=self.timeout > 0
         )
@@ -96,46 +83,12 @@ class ReweightedCamera(StagedIntegrator):
         nested = str(self.nested).replace("\n", "\n  ")
         return {**self.numbers.parameters(), "nested": nested}
 
-    def sample(self, scene, sampler, ray, medium=None, active=True):
-        """A sample of the nested integrator: the ray is another's."""
-        return self.nested.sample(scene, sampler, ray, medium, active)
-
-    def aov_names(self) -> list[str]:
-        return self.nested.aov_names()
-
-    def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
-        return self.nested.sample_aovs(scene, sampler, ray) if self._is_staged else []
-
-    # ---- Helpers ----
-
-    def _nested(self, props: mi.Properties) -> mi.SamplingIntegrator:
-        children = [child for _, child in props.objects()]
-        if (
-            len(children) != 1
-            or not isinstance(children[0], mi.SamplingIntegrator)
-            or isinstance(children[0], mi.CppADIntegrator)
-            or self.purpose in _purposes(children[0])
-        ):
-            found = ", ".join(child.class_name() for child in children) or "none"
-            raise ValueError(
-                f'"{self.name}": exactly one integrator that samples camera rays, such as "path" '
-                f'or "volpath", must be nested in it (none for gradients, and none in which a '
-                f'"{self.name}" is nested already); found {found}'
-            )
-        return children[0]
-
-    @property
-    def _is_staged(self) -> bool:
-        """Is the nested integrator one of ours, which can learn in pilots?"""
-        # Not by class: once another variant is selected, the module's name is that one's class
-        return hasattr(self.nested, "schedule")
-
 
 def _purposes(integrator: mi.Integrator) -> list[str]:
     """What an integrator, and those that are nested in it, take from weighted sets."""
-    if not hasattr(integrator, "purpose"):
-        return []
-    return [integrator.purpose, *_purposes(integrator.nested)]
+    nested = getattr(integrator, "nested", None)
+    own = [integrator.purpose] if hasattr(integrator, "purpose") else []
+    return own + (_purposes(nested) if nested is not None else [])
 
 
 class _Reweighted:
@@ -155,17 +108,3 @@ class _Reweighted:
         if not stage.is_scout:
             setattr(stage.camera, self._purpose, self._numbers)
         return stage
-
-
-class _NestedEstimator:
-    """Draws the samples of an integrator. All four wavelengths survive in it."""
-
-    def __init__(self, nested: mi.SamplingIntegrator, medium: mi.Medium | None) -> None:
-        self._nested, self._medium = nested, medium
-
-    def __call__(
-        self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
-    ) -> Sample:
-        with garbage_left_alone():
-            L, valid, aovs = self._nested.sample(scene, sampler, rays.ray, self._medium, active)
-        return Sample(L, valid, aovs=aovs)

@@ -152,6 +152,13 @@ class WalkIntegrator(StagedIntegrator):
         is_needed = any(slot in PURPOSES for slot in self.slots)
         return samples_per_set(spp, self.timeout > 0) if is_needed else 1
 
+    @property
+    def needs_equal_samples(self) -> str:
+        for slot in self.slots:
+            if slot in PURPOSES:
+                return f'the sets of numbers of "{slot}" belong together: leave the parameter out'
+        return ""
+
     def schedule(
         self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
     ) -> Schedule:

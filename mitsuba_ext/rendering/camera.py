@@ -62,6 +62,12 @@ def lanes_of(
     index = lane - pixel * dr.opaque(mi.UInt32, spp_per_pass) + dr.opaque(mi.UInt32, first)
     if pixels is not None:
         pixel += dr.opaque(mi.UInt32, pixels.start)
+    return lanes_at(film, pixel, index)
+
+
+def lanes_at(film: mi.Film, pixel: mi.UInt32, index: mi.UInt32) -> Lanes:
+    """Lanes for these samples of these pixels."""
+    width, _height = film_extent(film)
     y = pixel // width
     corner = mi.Vector2i(mi.Int32(pixel - y * width), mi.Int32(y))
     if film.sample_border():
@@ -166,22 +172,29 @@ def sample_rays(
 
 
 def put(
-    film: mi.Film, block: mi.ImageBlock, rays: CameraRays, sample: Sample, aovs: list[mi.Float]
+    film: mi.Film,
+    block: mi.ImageBlock,
+    rays: CameraRays,
+    sample: Sample,
+    aovs: list[mi.Float],
+    count: mi.Float | float = 1.0,
 ) -> None:
     """Puts samples into an image block, in the channels that the film asks for, but for their
-    splats. ``aovs`` has one value per channel that the integrator announced to ``film.prepare``."""
-    L = sample.L * rays.importance * rays.weight
-    alpha = dr.select(sample.valid, mi.Float(rays.weight), 0)
-    aovs = [value * rays.weight for value in aovs]
+    splats. ``aovs`` has one value per channel that the integrator announced to ``film.prepare``.
+    Each sample counts as many as ``count``: the film divides by the sum of these."""
+    weight = rays.weight * count
+    L = sample.L * rays.importance * weight
+    alpha = dr.select(sample.valid, mi.Float(weight), 0)
+    aovs = [value * weight for value in aovs]
     wavelengths = rays.ray.wavelengths
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         values = film.prepare_sample(
-            L, wavelengths, block.channel_count(), weight=1, alpha=alpha, active=sample.valid
+            L, wavelengths, block.channel_count(), weight=count, alpha=alpha, active=sample.valid
         )
         block.put(rays.position, values)
     else:
         block.put(
-            rays.position, [*_channels(film, L, wavelengths, alpha), mi.Float(1.0), *aovs]
+            rays.position, [*_channels(film, L, wavelengths, alpha), mi.Float(count), *aovs]
         )
 
 

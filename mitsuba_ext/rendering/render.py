@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport import heroes
+from ..transport.estimator import CameraRays, Sample
 from . import camera
 from .filter_weights import put_splats
 from .interrupts import deferred_interrupt
@@ -94,11 +95,12 @@ def render(
     spp: int,
     develop: bool,
     evaluate: bool,
+    job: type[Job] | None = None,
 ) -> mi.TensorXf:
     """Renders ``scene`` with the estimators that ``integrator.schedule()`` makes.
 
-    Parameters are those of ``mi.Integrator.render``. The statistics are left in
-    ``integrator.statistics``.
+    Parameters are those of ``mi.Integrator.render``, and ``job``: what distributes the samples, if
+    that is not the same for all pixels. The statistics are left in ``integrator.statistics``.
 
     Raises:
         ValueError: There is no such sensor, ``spp`` is out of range, the film has more pixels than
@@ -107,7 +109,7 @@ def render(
         KeyboardInterrupt: Ctrl-C; the film then holds the image of the finished passes.
     """
     sensor = camera.find_sensor(scene, sensor)
-    job = _Job(integrator, scene, sensor, seed, spp)
+    job = (job or Job)(integrator, scene, sensor, seed, spp)
     try:
         with deferred_interrupt() as interrupt:
             job.run(interrupt)
@@ -121,7 +123,7 @@ def render(
     return image
 
 
-class _Job:
+class Job:
     """One call of :func:`render`."""
 
     def __init__(self, integrator, scene, sensor, seed, spp) -> None:
@@ -256,21 +258,28 @@ class _Job:
         rays = camera.sample_rays(
             self.sensor, sampler, spp, self.plan.spp, stage.camera, self.statistics.spp, pixels
         )
-        sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
-        if dr.grad_enabled(sample.L):
-            raise self.integrator.no_gradients()
-        aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
-        camera.put(self.film, self.block, rays, sample, aovs)
+        sample = self._sample(stage, sampler, rays)
         for splats in sample.splats:
             if self.splats is None:
                 self.splats = self.film.create_block()
                 self.splats.set_coalesce(False)
             camera.put_splats(self.film, self.splats, splats)
-        self._count(sample)
         if self.plan.structured:
             sampler.advance()
             sampler.schedule_state()
         dr.eval(self.block.tensor(), self.splats and self.splats.tensor(), self.tally)
+
+    def _sample(
+        self, stage: Stage, sampler: mi.Sampler, rays: CameraRays, count: mi.Float | float = 1.0
+    ) -> Sample:
+        """Puts the samples of these rays into the block, but for their splats."""
+        sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
+        if dr.grad_enabled(sample.L):
+            raise self.integrator.no_gradients()
+        aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
+        camera.put(self.film, self.block, rays, sample, aovs, count)
+        self._count(sample)
+        return sample
 
     def _part_sampler(self, spp: int, part: int) -> mi.Sampler:
         if self.plan.structured:

@@ -74,6 +74,12 @@ class StagedIntegrator(mi.SamplingIntegrator):
         """
         return 1
 
+    @property
+    def needs_equal_samples(self) -> str:
+        """Why all pixels must get the same number of samples; empty if they need not. It ends a
+        sentence in an error message, and says what to change."""
+        return ""
+
     def schedule(
         self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
     ) -> Schedule:

@@ -1,0 +1,112 @@
+"""The base class of integrators that draw the samples of a nested one.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from ..garbage import garbage_left_alone
+from ..movers import check_motion_is_seen
+from ..rendering.staged_integrator import StagedIntegrator
+from ..rendering.stages import OneStage, Schedule
+from ..transport.estimator import CameraRays, Sample
+
+
+class WrappingIntegrator(StagedIntegrator):
+    """An integrator whose samples are those of a nested one: ours, which may learn in pilots, or
+    Mitsuba's.
+
+    Attributes:
+        nested: The nested integrator.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        if "hide_emitters" in props:
+            raise ValueError(
+                f'"{props.plugin_name()}": "hide_emitters" is for the nested integrator to know'
+            )
+        super().__init__(props)
+        self.nested = self._nested(props)
+
+    # ---- What a subclass says ----
+
+    def accepts(self, nested: mi.SamplingIntegrator) -> bool:
+        """Can this integrator be nested?"""
+        return True
+
+    # ---- What the base class asks for ----
+
+    def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
+        return self.nested.pilots(scene, pixel_count, spp) if self._is_staged else []
+
+    @property
+    def sample_cost(self) -> int:
+        return self.nested.sample_cost if self._is_staged else 1
+
+    @property
+    def most_lanes(self) -> int:
+        return self.nested.most_lanes if self._is_staged else super().most_lanes
+
+    @property
+    def needs_equal_samples(self) -> str:
+        return self.nested.needs_equal_samples if self._is_staged else ""
+
+    def schedule(
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
+    ) -> Schedule:
+        if self._is_staged:
+            # Sets of all purposes must be cut alike
+            self.nested.timeout = self.timeout
+            return self.nested.schedule(scene, sensor, samples, seed)
+        check_motion_is_seen(self.nested, scene)
+        return OneStage(_NestedEstimator(self.nested, sensor.get_medium()))
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """A sample of the nested integrator: the ray is another's."""
+        return self.nested.sample(scene, sampler, ray, medium, active)
+
+    def aov_names(self) -> list[str]:
+        return self.nested.aov_names()
+
+    def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
+        return self.nested.sample_aovs(scene, sampler, ray) if self._is_staged else []
+
+    # ---- Helpers ----
+
+    def _nested(self, props: mi.Properties) -> mi.SamplingIntegrator:
+        children = [child for _, child in props.objects()]
+        if (
+            len(children) != 1
+            or not isinstance(children[0], mi.SamplingIntegrator)
+            or isinstance(children[0], mi.CppADIntegrator)
+            or not self.accepts(children[0])
+        ):
+            found = ", ".join(child.class_name() for child in children) or "none"
+            raise ValueError(
+                f'"{self.name}": exactly one integrator that samples camera rays, such as "path" '
+                f'or "volpath", must be nested in it (none for gradients, and none in which a '
+                f'"{self.name}" is nested already); found {found}'
+            )
+        return children[0]
+
+    @property
+    def _is_staged(self) -> bool:
+        """Is the nested integrator one of ours, which can learn in pilots?"""
+        # Not by class: once another variant is selected, the module's name is that one's class
+        return hasattr(self.nested, "schedule")
+
+
+class _NestedEstimator:
+    """Draws the samples of an integrator. All four wavelengths survive in it."""
+
+    def __init__(self, nested: mi.SamplingIntegrator, medium: mi.Medium | None) -> None:
+        self._nested, self._medium = nested, medium
+
+    def __call__(
+        self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
+    ) -> Sample:
+        with garbage_left_alone():
+            L, valid, aovs = self._nested.sample(scene, sampler, rays.ray, self._medium, active)
+        return Sample(L, valid, aovs=aovs)

@@ -1,0 +1,147 @@
+"""A render whose samples go where the error is."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import camera
+from .pixel_moments import PixelMoments
+from .render import Job, kernel_cache_misses
+from .sample_allocation import SampleAllocation
+from .stages import Stage
+from .time_budget import TimeBudget
+
+#: The first pass, and each of the others, has this share of all samples by default.
+_PASS_SHARE = 8
+
+#: Sets of a stratified sampler in the first pass: their scatter shows the variance.
+_SETS = 4
+
+
+class AdaptiveJob(Job):
+    """One render of :class:`~mitsuba_ext.integrators.adaptive`, whose attributes ``threshold``,
+    ``pass_spp`` and ``counts_samples`` it reads.
+
+    The pilots of the nested integrator and the first pass take the same number of samples of every
+    pixel, and all others as many as :class:`SampleAllocation` says.
+    """
+
+    def __init__(self, integrator, scene, sensor, seed, spp) -> None:
+        super().__init__(integrator, scene, sensor, seed, spp)
+        spp, pilot_spp = self.plan.spp, sum(self.plan.stages[:-1])
+        self._pass_spp = min(integrator.pass_spp or -(-spp // _PASS_SHARE), spp)
+        self._set_size = 1
+        if self.plan.structured:
+            # Each pass has sets of its own, with a sampler of its own
+            self.sampler.set_sample_count(max(1, self._pass_spp // _SETS))
+            self._set_size = self.sampler.sample_count()
+            self.sampler.set_samples_per_wavefront(self._set_size)
+            self.plan = replace(self.plan, structured=False)
+        first = max(pilot_spp, self._pass_spp)
+        self._rest_of_first = first - pilot_spp
+        self._pixels = camera.film_extent(self.film)
+        self.moments = PixelMoments(*self._pixels, self._set_size)
+        self.allocation = SampleAllocation(
+            self.moments, spp, first, integrator.threshold, self._set_size
+        )
+        self.budget = TimeBudget(integrator.timeout, self.start, self.plan.pixel_count, first)
+        most = min(self.plan.limit * self.plan.pixel_count, integrator.most_lanes)
+        self._most_sets = max(1, most // self._set_size)
+        self._seconds_per_sample = 0.0
+
+    def _run_stage(
+        self, stage: Stage, samples: int, is_last: bool, interrupt: threading.Event
+    ) -> None:
+        if not is_last:
+            super()._run_stage(stage, samples, False, interrupt)
+            return
+        if self._rest_of_first > 0:
+            super()._run_stage(stage, self._rest_of_first, False, interrupt)
+        total = self.plan.spp * self.plan.pixel_count
+        while self.allocation.is_active.any() and not self._stopped(interrupt):
+            left = total - int(self.moments.count.sum())
+            if left <= 0:
+                break
+            budget = left if (fits := self._samples_that_fit()) is None else min(left, fits)
+            passes = max(1, round(budget / (self._pass_spp * self.plan.pixel_count)))
+            sets, weight = self.allocation.next(budget / passes, passes == 1, 1 / passes)
+            self._run_sets(stage, sets, weight)
+            if self.integrator.progress is not None:
+                is_done = passes == 1 or not self.allocation.is_active.any()
+                done = int(self.moments.count.sum())
+                self.integrator.progress(1.0 if is_done else done / (done + left))
+        self.statistics.interrupted = self._stopped(interrupt) and bool(
+            self.allocation.is_active.any()
+        )
+
+    def _samples_that_fit(self) -> float | None:
+        """Into the time left; ``None`` where there is no limit, or the speed is not known."""
+        if not self.budget.is_limited or self._seconds_per_sample == 0:
+            return None
+        return max(1.0, (self.budget.end - time.perf_counter()) / self._seconds_per_sample)
+
+    def _run_pass(self, stage: Stage, spp: int) -> bool:
+        """Renders ``spp`` samples of every pixel."""
+        return self._run_sets(stage, *self.allocation.first(spp))
+
+    def _run_sets(self, stage: Stage, sets: np.ndarray, weight: np.ndarray) -> bool:
+        """Renders so many sets of each pixel into the block; did it have to compile a kernel?"""
+        begin, misses = time.perf_counter(), kernel_cache_misses()
+        pixels = np.repeat(np.arange(len(sets), dtype=np.uint32), sets)
+        table = mi.Float(weight.astype(np.float32))
+        for start in range(0, len(pixels), self._most_sets):
+            self._run_part_of_sets(stage, pixels[start : start + self._most_sets], table)
+        seconds, compiled = time.perf_counter() - begin, kernel_cache_misses() > misses
+        if compiled:
+            self.statistics.compile_seconds += seconds
+        elif len(pixels):
+            self._seconds_per_sample = seconds / (len(pixels) * self._set_size)
+        self.statistics.spp = round(self.moments.count.sum() / self.plan.pixel_count)
+        return compiled
+
+    def _run_part_of_sets(self, stage: Stage, pixels: np.ndarray, weight: mi.Float) -> None:
+        size = len(pixels) * self._set_size
+        sampler = self.sampler.clone()
+        seed = self.plan.seed
+        if self.statistics.passes > 0:
+            seed = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(self.statistics.passes))[0][0]
+        sampler.seed(dr.opaque(mi.UInt32, seed), size)
+        lane = dr.arange(mi.UInt32, size)
+        in_set = lane // dr.opaque(mi.UInt32, self._set_size)
+        pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), in_set)
+        lanes = camera.lanes_at(self.film, pixel, dr.zeros(mi.UInt32, size))
+        numbers = camera.draw_numbers(self.sensor, sampler, lanes, stage.camera)
+        rays = camera.camera_rays(self.sensor, lanes, numbers, self.plan.spp)
+        sample = self._sample(stage, sampler, rays, dr.gather(mi.Float, weight, pixel))
+        # dr.mean() would write the number of lanes into the kernel: a kernel for each pass
+        brightness = dr.sum(sample.L * rays.importance) / len(sample.L)
+        dr.eval(brightness, self.block.tensor(), self.tally)
+        dr.sync_thread()
+        self.moments.add(pixels, np.broadcast_to(brightness.numpy(), size))
+        self.statistics.passes += 1
+        self.statistics.rays["camera"] += size
+
+    def fill_film(self) -> None:
+        if self.integrator.counts_samples:
+            self._put_counts()
+        super().fill_film()
+
+    def _put_counts(self) -> None:
+        """Fills the last channel of the block, which the film divides by the weights of samples."""
+        width, height = self._pixels
+        tensor = self.block.tensor()
+        shape = tuple(tensor.shape)
+        top, left = ((height - shape[0]) // 2, (width - shape[1]) // 2)
+        count = self.moments.count.reshape(height, width)
+        count = count[top : top + shape[0], left : left + shape[1]]
+        values = np.array(tensor)
+        weights = 4 if mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha) else 3
+        values[..., -1] = count * values[..., weights]
+        offset = self.block.offset()
+        self.block = mi.ImageBlock(mi.TensorXf(values), offset=offset)
