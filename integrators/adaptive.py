@@ -88,8 +88,8 @@ class AdaptiveSampling(WrappingIntegrator):
 
     Source: D. Cline, PhD thesis, 2007, section 5.5; the parameters have the names of Mitsuba's pull
     request 1731. D. Kirk, J. Arvo, *Unbiased Sampling Techniques for Image Synthesis*, SIGGRAPH
-    1991 (the bias). C. Stein, *A Two-Sample Test for a Linear Hypothesis Whose Power is Independent of
-    the Variance*, Annals of Mathematical Statistics 16(3), 1945 (a last sample whose size is
+    1991 (the bias). C. Stein, *A Two-Sample Test for a Linear Hypothesis Whose Power is Independent
+    of the Variance*, Annals of Mathematical Statistics 16(3), 1945 (a last sample whose size is
     decided before). Weights of passes are ours.
 
     .. tabs::
