@@ -16,8 +16,7 @@ from equal_samples import Renders, error, load, print_header, print_row, render_
 
 import mitsuba as mi  # isort: skip
 
-SAMPLERS = ["independent", "stratified", "multijitter", "orthogonal", "ldsampler", "sobol_owen"]
-OTHERS = ["halton", "hammersley", "faure", "lattice", "latin_hypercube"]
+SAMPLERS = "stratified,multijitter,orthogonal,ldsampler,sobol_owen"
 
 
 @click.command()
@@ -28,15 +27,15 @@ OTHERS = ["halton", "hammersley", "faure", "lattice", "latin_hypercube"]
 @click.option("--max-depth", default=8)
 @click.option("--integrator", default="composed_path")
 @click.option("--variant", default="llvm_ad_rgb")
-@click.option("--all", "has_all", is_flag=True, help=f"Also {', '.join(OTHERS)}.")
+@click.option("--samplers", default=SAMPLERS, help="Besides independent.")
 def main(
     names: tuple[str, ...], spp: str, seeds: int, size: tuple, max_depth: int, integrator: str,
-    variant: str, has_all: bool,
+    variant: str, samplers: str,
 ) -> None:  # fmt: skip
     """Compares samplers in the scenes NAMES."""
     mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
-    kinds = [*SAMPLERS, *(OTHERS if has_all else ())]
+    kinds = ["independent", *samplers.split(",")]
     print_header(["scene", "samples", *(f"`{kind}`" for kind in kinds), "time"])
     for name in names:
         for count in map(int, spp.split(",")):
