@@ -92,14 +92,15 @@ class EnergyRedistribution(MetropolisIntegrator):
        - With paths: as in :class:`mlt`. (Default: true)
      * - (Common parameters)
        - |several|
-       - Those of :class:`MetropolisIntegrator`: direct_samples, next_event, max_depth,
-         rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
+         max_depth, rr_depth, hide_emitters, timeout, aovs.
 
     ``spp`` is the number of independent samples per pixel.
 
     **Use it when** an image of :monosp:`path` is fine but for bright spots that need very many
     samples: caustics that are seen through water or glass, light through a small hole; with
-    ``bidirectional``, when that is so of :class:`bdpt`. **Not when** there are none: it then is
+    ``bidirectional``, when that is so of :class:`bdpt`. With ``mutations=path``, also for caustics
+    of small lamps, and light through gaps. **Not when** there are no bright spots: it then is
     :monosp:`path` at a somewhat higher price.
 
     Chains change the random numbers of a sample by small steps (:class:`pssmlt`), and deposit the

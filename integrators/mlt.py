@@ -65,8 +65,8 @@ class PathMetropolis(ChainIntegrator):
          instead of by brightness? (Default: false)
      * - (Common parameters)
        - |several|
-       - Those of :class:`ChainIntegrator`: direct_samples, max_depth, rr_depth, hide_emitters,
-         timeout, aovs.
+       - Those of :class:`ChainIntegrator`: direct_samples, chain_file, max_depth, rr_depth,
+         hide_emitters, timeout, aovs.
 
     ``spp`` is the number of mutations per pixel. New paths are independent samples besides, and
     count as such. Chains sample paths of up to 32 segments; camera samples find longer ones, if

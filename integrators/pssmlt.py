@@ -59,8 +59,8 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
          instead of by brightness? (Default: false)
      * - (Common parameters)
        - |several|
-       - Those of :class:`MetropolisIntegrator`: direct_samples, next_event, max_depth,
-         rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
+         max_depth, rr_depth, hide_emitters, timeout, aovs.
 
     ``spp`` is the number of mutations per pixel.
 

@@ -33,7 +33,6 @@ def _render(scene: mi.Scene, file: Path | str, spp: int, seed: int = 5, **parame
 #: Other integrators with chains.
 _OTHERS = {
     "mlt": {"type": "mlt", **_FEW, **ALONE},
-    "mlt, two stages": {"type": "mlt", "two_stage": True, **_FEW, **ALONE},
     "erpt": {"type": "erpt", "luminance_samples": 4096, **ALONE},
     "erpt, everything": {"type": "erpt", "outliers": 0.0, "chain_length": 8, **ALONE},
     "erpt, paths": {"type": "erpt", "mutations": "path", "outliers": 2.0, **ALONE},

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hard_cases import area, rectangle, sensor, stage
+from hard_cases import area, lookat, rectangle, sensor, stage
 from statistical import (
     MANY_SEEDS,
     REFERENCE_SEEDS,
@@ -27,6 +27,7 @@ from mitsuba_ext.chains.path_target import PathTarget
 from mitsuba_ext.chains.small_steps import SmallSteps
 from mitsuba_ext.composition import path_mutations
 from mitsuba_ext.composition.light_side import LightSide
+from mitsuba_ext.path_space.evaluation import _lobe_ratio
 from mitsuba_ext.path_space.mutations import Mutations, Switches
 from mitsuba_ext.path_space.space import PathSpace, turned
 from mitsuba_ext.path_space.techniques import Techniques
@@ -135,6 +136,50 @@ def test_a_mutation_alone_leaves_the_image_as_it_is(name: str) -> None:
     images = batches(scene, mlt(5, p_large=0.02, **ALONE, **only), 64, range(1, 17))
     expected = batches(scene, path(5), 512, REFERENCE_SEEDS[:MANY_SEEDS])
     assert_same_quarters(images, expected, precision=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "spp"), [("lens_perturbation", 64), ("caustic_perturbation", 512)]
+)
+def test_perturbations_of_a_floor_at_a_small_angle_leave_the_image_as_it_is(
+    name: str, spp: int
+) -> None:
+    """From the nearest to the farthest part of the floor, the geometric factor of a direction of
+    the camera, and of the lamp, changes by orders of magnitude: chains drift where it is missing.
+    """
+    lamp = {"type": "sphere", "center": [0, 0, 0.3], "radius": 0.05, "emitter": area(5.0)}
+    view = lookat([0, -2, 0.25], [0, 0, 0], [0, 0, 1])
+    scene = mi.load_dict(stage(block=None, wall=None, light=lamp, camera=sensor(to_world=view)),
+                         optimize=False)
+    only = {key: key == name for key in SWITCHES}
+    chains = mlt(2, p_large=0.0, chains=256, luminance_samples=1 << 14, hide_emitters=True,
+                 **ALONE, **only)
+    images = batches(scene, chains, spp, range(1, 9))
+    hidden = mi.load_dict({"type": "path", "max_depth": 2, "hide_emitters": True})
+    expected = batches(scene, hidden, 512, REFERENCE_SEEDS[:MANY_SEEDS])
+    # Rows of pixels count the same: light that goes from one to another must be seen
+    rows = expected.mean(axis=(0, 2, 3), keepdims=True)
+    weights = np.where(rows > 0.01 * rows.max(), 1 / np.maximum(rows, 1e-9), 0)
+    assert_same_quarters(images * weights, expected * weights, precision=0.03)
+
+
+def test_solid_angles_change_at_refraction_as_the_lobe_ratio_says() -> None:
+    """Of a cone of directions around one, by finite differences."""
+    bsdf = mi.load_dict({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0})
+    for cosine in (0.8, -0.8):
+        wi = dr.normalize(mi.Vector3f(0.6 + mi.Float(0, 2e-3, 0), mi.Float(0, 0, 2e-3), cosine))
+        si = dr.zeros(mi.SurfaceInteraction3f, 3)
+        si.wi = wi
+        bs, _weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(0.999), mi.Point2f(0.5), True)
+        before, behind = (
+            np.linalg.norm(np.cross(d[1] - d[0], d[2] - d[0]))
+            for d in (x.numpy().T.astype(np.float64) for x in (wi, bs.wo))
+        )
+        ratio = np.exp(_lobe_ratio(si, bs).numpy()[0])
+        assert (bs.wo.z * cosine < 0).numpy().all()
+        assert ratio == pytest.approx(behind / before, rel=0.02)
+        assert abs(ratio - 1) > 0.2
 
 
 _LAMPS = {

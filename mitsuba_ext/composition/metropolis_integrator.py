@@ -32,8 +32,8 @@ class MetropolisIntegrator(ChainIntegrator):
          nothing. (Default: that of :monosp:`path`)
      * - (Common parameters)
        - |several|
-       - Those of :class:`ChainIntegrator`: direct_samples, max_depth, rr_depth, hide_emitters,
-         timeout, aovs.
+       - Those of :class:`ChainIntegrator`: direct_samples, chain_file, max_depth, rr_depth,
+         hide_emitters, timeout, aovs.
 
     Attributes:
         bidirectional: Do chains sample paths from both ends?
