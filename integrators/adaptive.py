@@ -50,9 +50,12 @@ class AdaptiveSampling(WrappingIntegrator):
          :monosp:`path`, :monosp:`volpath` or one of ours. A :monosp:`timeout` of its own is
          ignored.
 
-    **Use it when** some parts of the image are much noisier than others: caustics, glass and
-    mirrors before plain walls, penumbrae, objects before a plain background. **Not when** noise is
-    about the same everywhere, or a stratified sampler does better than independent samples.
+    **Use it when** the worst pixels count, some parts of the image are much noisier than others,
+    and their samples take no longer; or a :monosp:`threshold` is to end the render. **Not when**
+    the mean error counts, noise is about the same everywhere, noisy pixels are also the slow ones
+    (things before an empty background), or a stratified sampler does better than independent
+    samples. ``docs/results.md`` has figures: in the three scenes measured, at equal time, the 95th
+    percentile of the errors was 0.93 to 1.21 of that of uniform samples, and the mean 1.06 to 1.31.
 
     The samples of the sensor (:monosp:`spp`) are the mean over all pixels. The first pass takes the
     same number of each pixel, and so do the pilots of a nested integrator that learns. Each later
@@ -88,8 +91,8 @@ class AdaptiveSampling(WrappingIntegrator):
 
     Source: D. Cline, PhD thesis, 2007, section 5.5; the parameters have the names of Mitsuba's pull
     request 1731. D. Kirk, J. Arvo, *Unbiased Sampling Techniques for Image Synthesis*, SIGGRAPH
-    1991 (the bias). C. Stein, *A Two-Sample Test for a Linear Hypothesis Whose Power is Independent of
-    the Variance*, Annals of Mathematical Statistics 16(3), 1945 (a last sample whose size is
+    1991 (the bias). C. Stein, *A Two-Sample Test for a Linear Hypothesis Whose Power is Independent
+    of the Variance*, Annals of Mathematical Statistics 16(3), 1945 (a last sample whose size is
     decided before). Weights of passes are ours.
 
     .. tabs::
