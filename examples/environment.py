@@ -46,6 +46,7 @@ INTEGRATORS = {
     "path": {"type": "path"},
     "16 connections": {"type": "composed_path", "connections": 16},
     "resampled": {"type": "composed_path", "next_event": "resampled"},
+    "portals": {"type": "composed_path", "next_event": "portals"},
     "two_stage 1": {"type": "two_stage", "light_samples": 1},
     "two_stage 16": {"type": "two_stage", "light_samples": 16},
 }

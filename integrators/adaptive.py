@@ -50,9 +50,12 @@ class AdaptiveSampling(WrappingIntegrator):
          :monosp:`path`, :monosp:`volpath` or one of ours. A :monosp:`timeout` of its own is
          ignored.
 
-    **Use it when** some parts of the image are much noisier than others: caustics, glass and
-    mirrors before plain walls, penumbrae, objects before a plain background. **Not when** noise is
-    about the same everywhere, or a stratified sampler does better than independent samples.
+    **Use it when** the worst pixels count, some parts of the image are much noisier than others,
+    and their samples take no longer; or a :monosp:`threshold` is to end the render. **Not when**
+    the mean error counts, noise is about the same everywhere, noisy pixels are also the slow ones
+    (things before an empty background), or a stratified sampler does better than independent
+    samples. ``docs/results.md`` has figures: in the three scenes measured, at equal time, the 95th
+    percentile of the errors was 0.93 to 1.21 of that of uniform samples, and the mean 1.06 to 1.31.
 
     The samples of the sensor (:monosp:`spp`) are the mean over all pixels. The first pass takes the
     same number of each pixel, and so do the pilots of a nested integrator that learns. Each later

@@ -94,7 +94,8 @@ def test_weights_that_a_purpose_cannot_have_are_refused(monkeypatch) -> None:
     ("guided_directions", "directions"), ("learned_lights", "next_event"),
     ("visibility_roulette", "shadow_test"), ("weighted_connections", "connections"),
     ("mis_heuristic", "mis"), ("resampled_lights", "next_event"),
-    ("two_stage_lights", "next_event"), ("weighted_numbers", "aperture"),
+    ("two_stage_lights", "next_event"), ("portal_lights", "next_event"),
+    ("weighted_numbers", "aperture"),
 ])  # fmt: skip
 def test_a_decision_is_no_sampler_of_a_sensor(plugin: str, slot: str) -> None:
     camera = {**sensor(), "sampler": {"type": plugin}}

@@ -15,12 +15,14 @@ from ..decisions.next_event.environment_partition import MOST_SPLITS
 from ..decisions.next_event.light_map_learner import LightMapLearner
 from ..decisions.next_event.light_table import TABLE_BYTES, LightTable, OneRow
 from ..decisions.next_event.linear_lights import LinearChoice
+from ..decisions.next_event.portal_sampling import PortalSampling
 from ..decisions.next_event.resampled_lights import ResampledLights
 from ..decisions.next_event.two_stage import TwoStage
 from ..errors import InputError
 from ..files import check_target
 from ..lights.light_cells import LightCells
 from ..lights.weights import VoxelRows, power_weights, spatial_weights
+from ..portals import portals
 from ..regions.voxel_grid import VoxelGrid
 from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
@@ -196,6 +198,24 @@ class TwoStageLights(DecisionParameters):
         return TwoStage(setting.scene, self.splits, self.vertices == "all")
 
 
+class PortalLights(DecisionParameters):
+    """Directions of the environment through portals. The attributes are the parameters of the
+    plugin ``portal_lights``; see there."""
+
+    name = "portal_lights"
+    slots = ("next_event",)
+    camera_paths_only = True
+
+    def __init__(self, read: ParameterReader) -> None:
+        self.share = read("share", 0.9, minimum=0.0, maximum=0.99)
+
+    def decision(self, setting: Setting) -> Any | None:
+        scene = setting.scene
+        if scene.environment() is None or not portals(scene) or self.share == 0:
+            return None
+        return PortalSampling(scene, self.share)
+
+
 #: What lights can be learned for, the default first.
 TARGETS = ("contribution", "visibility")
 
@@ -213,6 +233,7 @@ METHODS: dict[str, Callable[[ParameterReader], DecisionParameters] | None] = {
 CAMERA_METHODS: dict[str, Callable[[ParameterReader], DecisionParameters]] = {
     "resampled": ResampledLightsChoice,
     "two_stage": TwoStageLights,
+    "portals": PortalLights,
 }
 
 

@@ -17,6 +17,7 @@ from .next_event import (
     CAMERA_METHODS,
     METHODS,
     LearnedLights,
+    PortalLights,
     ResampledLightsChoice,
     SpatialLights,
     TwoStageLights,
@@ -50,8 +51,8 @@ _ALL_SLOTS = {**SLOTS, **BIDIRECTIONAL_SLOTS}
 
 #: What can be nested into a slot, of this package.
 _PLUGINS: tuple[type[DecisionParameters], ...] = (
-    Guided, LearnedLights, SpatialLights, ResampledLightsChoice, TwoStageLights, Connections,
-    MisHeuristic, RejectedShadowRays, WeightedNumbers,
+    Guided, LearnedLights, SpatialLights, ResampledLightsChoice, TwoStageLights, PortalLights,
+    Connections, MisHeuristic, RejectedShadowRays, WeightedNumbers,
 )  # fmt: skip
 
 

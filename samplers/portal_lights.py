@@ -1,0 +1,71 @@
+"""Directions of the environment through portals."""
+
+from __future__ import annotations
+
+from mitsuba_ext import registry
+from mitsuba_ext.composition.decision_plugin import DecisionPlugin
+from mitsuba_ext.composition.next_event import PortalLights
+
+
+@registry.plugin
+class PortalLightsPlugin(DecisionPlugin):
+    r"""
+    .. _sampler-portal_lights:
+
+    Portal-masked environment sampling (:monosp:`portal_lights`)
+    ------------------------------------------------------------
+
+    A decision for the slot :monosp:`next_event` of :monosp:`composed_path`. From each vertex, it
+    samples the part of the environment that is seen through the openings that shapes of the type
+    :monosp:`portal` mark, in proportion to what is emitted there.
+
+    .. pluginparameters::
+
+     * - share
+       - |float|
+       - Of the connections to the environment, those that go through portals, 0 to 0.99. The others
+         are those of :monosp:`path`, which find what no portal shows. (Default: 0.9)
+
+    **Use it when** a room is lit through windows by a sky (:monosp:`envmap`, :monosp:`sunsky`,
+    :monosp:`constant`). **Not when** most of the picture is outdoors: what lies in front of a
+    portal is sampled as by :monosp:`path`, at some cost. Not for :monosp:`bdpt` and other
+    integrators with light paths.
+
+    For each orientation of portals, the environment is stored in coordinates in which what is seen
+    through a portal, from any point, is an axis-aligned rectangle, with a summed-area table in
+    double precision: as many texels along half a turn as the map has columns, 256 to 2048 (12 bytes
+    each). A portal is chosen by the sum over its rectangle. Only the edges of the portal count:
+    what stands in the opening or before it is not known. The part of a portal that lies below the
+    surface at a vertex is sampled in vain.
+
+    The density is exact and known in every direction, so that BSDF samples take part by MIS. Where
+    no portal is seen from inside, and for lights other than the environment, the choice is that of
+    :monosp:`path`. So it is in scenes without portals or environment.
+
+    Source: B. Bitterli, J. Novák, W. Jarosz, *Portal-Masked Environment Map Sampling*, Computer
+    Graphics Forum 34(4), 2015. The share of ordinary samples is ours.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="composed_path">
+                <sampler name="next_event" type="portal_lights">
+                    <float name="share" value="0.8"/>
+                </sampler>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'composed_path',
+            'next_event': {
+                'type': 'portal_lights',
+                'share': 0.8
+            }
+
+        .. code-tab:: bash
+
+            mitsuba-ext render scenes/portal_room.xml -o image.exr \
+                --integrator "composed_path:next_event=[portal_lights:share=0.8]"
+    """
+
+    kind = PortalLights
