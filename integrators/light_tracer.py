@@ -133,7 +133,7 @@ class LightTracerIntegrator(WalkIntegrator):
             check_takes_splats(sensor.film())
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
-        query = self._query(scene)
+        query = self.query(scene)
         target, walk = ConnectableSensor(sensor), None
         if scene.emitters() and self.max_depth > 1:
             self._warn_of_hidden(scene)
