@@ -86,7 +86,7 @@ REGRESSIONS = {
         Regression("light_tracer", "glass_lamp"),
         Regression("pssmlt", "cornell_box", {"bidirectional": False, "chains": 1024}),
         Regression("erpt", "cornell_box", {"outliers": 2.0}),
-        Regression("mlt", "cornell_box", {"chains": 1024}),
+        Regression("mlt", "cornell_box", {"chains": 1024}, is_slow=True),
     )
 }  # fmt: skip
 

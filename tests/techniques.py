@@ -352,7 +352,7 @@ TECHNIQUES: dict[str, Technique] = {
     "erpt": Technique(
         "erpt", {"bidirectional": False, "direct_samples": 128, "outliers": 2.0}, is_plugin=True,
         makes_splats=True,
-        checks=Checks(furnaces=["furnace_glass"], cases=("no_light", "materials")),
+        checks=Checks(furnaces=["furnace_glass"], cases=["no_light"]),
         thorough=Checks(
             ["cornell_box", "mirrors_and_glass"], ["llvm_ad_spectral"], FURNACES[2:], [2, -1],
             # Its mean is known to 3.5 % only
@@ -361,12 +361,10 @@ TECHNIQUES: dict[str, Technique] = {
     ),
     "mlt": Technique(
         "mlt", {"direct_samples": 128, "chains": 1024}, is_plugin=True, makes_splats=True,
-        checks=Checks(
-            furnaces=["furnace_glass"], depths=[-1], cases=("no_light", "materials", "plain"),
-        ),
+        checks=Checks(cases=("no_light", "plain")),
         thorough=Checks(
-            [], ["llvm_ad_spectral"], FURNACES[2:4], [2],
-            ("directional_light", "smooth_normal_lamp", "mirror_ring", "floor_under_water",
+            [], ["llvm_ad_spectral"], FURNACES[2:4], [2, -1],
+            ("materials", "directional_light", "smooth_normal_lamp", "mirror_ring", "floor_under_water",
              "closed_box", "degenerate_triangles", "thin_lens", "hidden_emitters"),
         ),
     ),

@@ -191,7 +191,8 @@ _LAMPS = {
 }
 
 
-@pytest.mark.parametrize("name", some("point", of=_LAMPS))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", _LAMPS)
 def test_mutations_keep_caustics(name: str) -> None:
     scene = mi.load_dict({**_balls(SPECULAR["glass"]()), "light": _LAMPS[name]()}, optimize=False)
     images = batches(scene, mlt(5, p_large=0.05), 128, range(1, 17))
@@ -200,6 +201,7 @@ def test_mutations_keep_caustics(name: str) -> None:
     assert_same_quarters(images, expected, precision=0.02)
 
 
+@pytest.mark.slow
 def test_short_renders_are_right_on_average() -> None:
     """Of one mutation per pixel."""
     scene = mi.load_dict(stage(), optimize=False)
@@ -234,6 +236,7 @@ def test_sensors(camera: dict[str, Any]) -> None:
     assert_same_quarters(images, expected, precision=0.03)
 
 
+@pytest.mark.slow
 def test_camera_samples_find_paths_that_are_too_long_for_chains(monkeypatch) -> None:
     """In a room that reflects half of the light, which is everywhere the same."""
     integrator = mlt(-1, direct_samples=64)
