@@ -364,8 +364,9 @@ TECHNIQUES: dict[str, Technique] = {
         checks=Checks(cases=("no_light", "plain")),
         thorough=Checks(
             [], ["llvm_ad_spectral"], FURNACES[2:4], [2, -1],
-            ("materials", "directional_light", "smooth_normal_lamp", "mirror_ring", "floor_under_water",
-             "closed_box", "degenerate_triangles", "thin_lens", "hidden_emitters"),
+            ("materials", "directional_light", "smooth_normal_lamp", "mirror_ring",
+             "floor_under_water", "closed_box", "degenerate_triangles", "thin_lens",
+             "hidden_emitters"),
         ),
     ),
 }  # fmt: skip
