@@ -27,9 +27,9 @@ class PortalLightsPlugin(DecisionPlugin):
          are those of :monosp:`path`, which find what no portal shows. (Default: 0.9)
 
     **Use it when** a room is lit through windows by a sky (:monosp:`envmap`, :monosp:`sunsky`,
-    :monosp:`constant`). **Not when** most of the picture is outdoors: what lies in front of a
-    portal is sampled as by :monosp:`path`, at some cost. Not for :monosp:`bdpt` and other
-    integrators with light paths.
+    :monosp:`constant`). **Not when** a sun shines in: the light of its patch makes most of
+    the noise, which portals do not reduce, and a sample takes two to four times as long; or when
+    most of the picture is outdoors. Not for :monosp:`bdpt` and other integrators with light paths.
 
     For each orientation of portals, the environment is stored in coordinates in which what is seen
     through a portal, from any point, is an axis-aligned rectangle, with a summed-area table in
