@@ -1,7 +1,7 @@
 # Needs: Debian or Ubuntu, make, apt, Python >= 3.9 with venv. (On other systems, install an LLVM
 # library by hand: mitsuba_ext/llvm.py says which ones work.)
 #
-#   make demo    compares our integrator with `path` on two of our scenes, in about three minutes
+#   make demo    compares our integrator with `path` on two of our scenes, in three to seven minutes
 #   make test    runs the default tests, on all cores
 #   make test-slow  runs the long statistical tests, and other slow tests
 #   make bench   runs the benchmarks on our scenes, and on ../shared/scenes if it exists; writes a
