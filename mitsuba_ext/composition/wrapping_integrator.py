@@ -86,7 +86,7 @@ class WrappingIntegrator(StagedIntegrator):
             found = ", ".join(child.class_name() for child in children) or "none"
             raise ValueError(
                 f'"{self.name}": exactly one integrator that samples camera rays, such as "path" '
-                f'or "volpath", must be nested in it (none for gradients, and none in which a '
+                f'or "volpath", must be nested in it (none for gradients, and none in which '
                 f'"{self.name}" is nested already); found {found}'
             )
         return children[0]
