@@ -4,17 +4,21 @@ by variance and CPU time, start-up included:
     .venv/bin/python examples/metropolis.py caustic ring /somewhere/scene.xml --size 192 108
     .venv/bin/python examples/metropolis.py fast_balls fan --motion --max-depth 4
     .venv/bin/python examples/metropolis.py ring keyhole --paths
+    .venv/bin/python examples/metropolis.py caustic --paths --region 0.2 0.5 0.8 0.9
 
 Writes one row of Markdown for each scene. Errors are those of ``examples/equal_samples.py``,
 relative to the mean of all images of ``pssmlt``; times are the median of the seeds. The efficiency,
 1 / (error · time), is relative to ``path``. ``means`` has those of ``path`` and ``bdpt``, relative
 to that of ``pssmlt``: where they are below 1, light is found too rarely for the variance to tell
 the error. With ``--motion`` or ``--paths``, there is a row for each integrator: those that render
-moving shapes, or chains of paths and others.
+moving shapes, or chains of paths and others; ``--region`` counts the errors of a part of the image.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 from equal_samples import (
     Renders,
     error,
@@ -75,9 +79,11 @@ COLUMNS.append("accepted")
 @options
 @click.option("--motion", is_flag=True, help="Compare integrators that render moving shapes.")
 @click.option("--paths", is_flag=True, help="Compare chains of paths with others.")
+@click.option("--region", type=(float,) * 4, default=(0, 0, 1, 1),
+              help="Left, top, right, bottom of what counts, in units of the film's size.")
 def main(
     names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, motion: bool,
-    paths: bool,
+    paths: bool, region: tuple,
 ) -> None:
     """Compares the integrators on the scenes NAMES."""
     mi.set_variant("llvm_ad_rgb")
@@ -89,12 +95,23 @@ def main(
                 print_motion(name, size, max_depth, spp, seeds)
             else:
                 renders = render_in_turns(load(name, size), PATHS, max_depth, spp, seeds)
-                print_each(title(name), renders, "mlt")
+                print_each(title(name), part(renders, region), "mlt")
         return
     print_header(COLUMNS)
     for name in names:
         renders = render_in_turns(load(name, size), INTEGRATORS, max_depth, spp, seeds)
         print_row([title(name), *cells(renders)])
+
+
+def part(renders: dict[str, Renders], region: tuple) -> dict[str, Renders]:
+    """The same with a region of the images: its left, top, right and bottom, from 0 to 1."""
+
+    def cut(image: np.ndarray) -> np.ndarray:
+        height, width = image.shape[:2]
+        left, top, right, bottom = np.rint(np.multiply(region, [width, height] * 2)).astype(int)
+        return image[top:bottom, left:right]
+
+    return {k: replace(r, images=[cut(image) for image in r.images]) for k, r in renders.items()}
 
 
 def cells(renders: dict[str, Renders]) -> list[str]:

@@ -363,6 +363,20 @@ def test_the_mean_of_the_bootstrap_is_that_of_the_target() -> None:
         assert abs(z) < THRESHOLD and error < 0.01, (name, z, error)
 
 
+def test_the_bootstrap_knows_the_error_of_its_mean() -> None:
+    """As that of samples without strata, which these are where only the other numbers matter."""
+
+    def rare(numbers: Any) -> tuple[Contribution, Sample]:
+        place, x = numbers.next_2d(), numbers.next_1d()
+        return _found(place.x, place.y, dr.select(x < 0.1, mi.Float(1), 0))
+
+    found = [Bootstrap(_Target(rare), seed, 400) for seed in range(1, 65)]
+    spread = np.std([samples.mean for samples in found], ddof=1) / 0.1
+    # sqrt(0.9 / 0.1 / 400) = 0.15
+    assert 0.75 < spread / 0.15 < 1.25
+    assert abs(np.mean([samples.error for samples in found]) / 0.15 - 1) < 0.05
+
+
 # ---- Filters ----
 
 

@@ -284,6 +284,19 @@ def test_statistics_count_rays_and_acceptance() -> None:
     assert 0 < statistics.rays["shadow"] <= statistics.connections
     accepted = [float(x) for x in re.findall(r"([\d.]+)% of", statistics.learned)]
     assert len(accepted) == 2 and 0 < accepted[0] < accepted[1] < 100
+    assert re.search(r"; brightness known to 0\.\d%$", statistics.learned)
+
+
+def test_a_warning_tells_that_the_brightness_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the standard error of the samples from which chains started."""
+    said: list[str] = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: level < mi.LogLevel.Warn or
+                        said.append(text))  # fmt: skip
+    scene = mi.load_dict(stage())
+    for samples in (16, 100_000):
+        integrator = pssmlt(**ALONE, chains=16, luminance_samples=samples)
+        batches(scene, integrator, 1, [1])
+        assert len(said) == 1 and '"luminance_samples"' in said[0], said
 
 
 # ---- Errors ----

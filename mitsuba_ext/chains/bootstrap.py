@@ -38,6 +38,7 @@ class Bootstrap:
     Attributes:
         count: How many there are: a square.
         mean: The mean of the target function.
+        error: The standard error of ``mean``, relative to it, as of samples without strata.
     """
 
     def __init__(
@@ -60,8 +61,11 @@ class Bootstrap:
             if take is not None:
                 take(found)
         values = np.concatenate(values)[: self.count]
-        self._sums = np.cumsum(values.astype(np.float64))
+        values = values.astype(np.float64)
+        self._sums = np.cumsum(values)
         self.mean = float(self._sums[-1]) / self.count
+        deviation = float(np.std(values)) / math.sqrt(self.count)
+        self.error = deviation / self.mean if self.mean > 0 else 0.0
         # Rounding must not choose a black sample
         self._last = int(np.searchsorted(self._sums, self._sums[-1]))
         self._offset = float(mi.sample_tea_float32(mi.UInt32(seed), _CHOICE)[0])

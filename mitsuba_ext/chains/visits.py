@@ -30,6 +30,9 @@ _CHAINS, _LENGTH = {False: (1 << 14, 1 << 16), True: (1 << 16, 1 << 18)}, 64
 #: brightness of what chains find.
 _BOOTSTRAP_SHARE, _MOST_BOOTSTRAP = 0.25, 1 << 24
 
+#: The largest standard error of the brightness without a warning.
+_UNSURE = 0.05
+
 #: Samples that find the scale of MIS weights.
 _SCALE_SAMPLES = 1 << 14
 
@@ -64,10 +67,12 @@ class Start:
     Attributes:
         mean: Of the target function.
         count: How many there are.
+        error: The standard error of the mean, relative to it.
     """
 
     mean: float
     count: int
+    error: float
 
 
 class MetropolisRender(ChainRender):
@@ -146,7 +151,7 @@ class MetropolisRender(ChainRender):
 
         bootstrap = Bootstrap(self._target, self._seed, samples, take)
         statistics.rays["camera"] += bootstrap.count
-        start = Start(bootstrap.mean, bootstrap.count)
+        start = Start(bootstrap.mean, bootstrap.count, bootstrap.error)
         if bootstrap.mean == 0:
             return None, start
         winners = bootstrap.choose(count)
@@ -164,13 +169,14 @@ class MetropolisRender(ChainRender):
         chains = self._kind(
             self._target, image, rules, None, None, self._seed, stored=stored
         )
-        return chains, Start(float(stored["mean"]), int(stored["samples"]))
+        start = Start(float(stored["mean"]), int(stored["samples"]), float(stored["error"]))
+        return chains, start
 
     def _stored(self, chains: Chains, image: ChainImage, start: Start) -> Arrays:
         visits, uniform = (np.array(tensor) for tensor in image.tensors())
         return {
             "visits": visits, "uniform": uniform, "mean": np.array(start.mean),
-            "samples": np.array(start.count),
+            "samples": np.array(start.count), "error": np.array(start.error),
             "uniform_weight": np.array(chains.rules.uniform_weight), **chains.stored(),
         }  # fmt: skip
 
@@ -201,7 +207,13 @@ class MetropolisRender(ChainRender):
         uniform_factor = chains.rules.uniform_weight * camera_samples / uniform
         image.write(visit_factor, uniform_factor, self._camera_spp)
         self._report(round(mutations / self._pixel_count))
-        self._statistics.learned = self._rates()
+        self._statistics.learned = f"{self._rates()}; brightness known to {start.error:.1%}"
+        if start.error > _UNSURE:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"What the chains found may be too bright or too dark as a whole: the standard error "
+                f'of its brightness is {start.error:.0%}. More "luminance_samples" know it better.',
+            )
 
 
 class _StoppedError(Exception):
