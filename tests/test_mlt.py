@@ -99,6 +99,18 @@ def test_new_paths_find_light_by_way_of_a_material(name: str) -> None:
     assert_new_paths_estimate(mi.load_dict(scene, optimize=False), "path", most=5)
 
 
+def test_a_surface_close_before_another_one_is_not_taken_for_it() -> None:
+    """A lamp with a shade of two layers, nearer to each other than the lengths of rays from far
+    away can tell."""
+    thin = {"type": "principledthin", "diff_trans": 1.0, "eta": 1.01, "roughness": 1.0}
+    at = [-0.5, -0.5, 1.2]
+    ball = {"type": "sphere", "center": at}
+    layers = {str(n): {**ball, "radius": r, "bsdf": thin} for n, r in enumerate((0.4, 0.3985))}
+    lamp = {**ball, "radius": 0.1, "emitter": area(20.0)}
+    scene = mi.load_dict(stage(light=lamp, **layers), optimize=False)
+    assert_new_paths_estimate(scene, "path", most=4)
+
+
 def test_learned_techniques_find_the_same_light_with_less_variance() -> None:
     scene = mi.load_dict(_balls(SPECULAR["glass"]()), optimize=False)
     of = target(scene, 3, 6)

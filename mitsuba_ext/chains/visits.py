@@ -211,8 +211,9 @@ class MetropolisRender(ChainRender):
         if start.error > _UNSURE:
             mi.Log(
                 mi.LogLevel.Warn,
-                f"What the chains found may be too bright or too dark as a whole: the standard error "
-                f'of its brightness is {start.error:.0%}. More "luminance_samples" know it better.',
+                f"What the chains found may be too bright or too dark as a whole: the standard "
+                f"error of its brightness is {start.error:.0%}. More "
+                f'"luminance_samples" know it better.',
             )
 
 

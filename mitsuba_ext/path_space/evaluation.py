@@ -15,7 +15,7 @@ from .light_subpaths import HIGH, LOW
 from .lights import light_start_densities
 from .memory import Head, Logs, PathMemory, Place, log
 from .plan import Plan
-from .space import TOLERANCE, PathSpace, is_same, towards, turned
+from .space import PathSpace, is_same, towards, turned
 
 #: Stands for a surface that does not shine.
 NO_LIGHT = 0xFFFFFFFF
@@ -99,10 +99,15 @@ def trace_from_camera(
         is_infinite = kinds.is_infinite(emitter, is_end)
         is_direction = is_end & (is_infinite | kinds.is_beam(emitter, is_end))
         distance = dr.norm(si.p - p_before)
-        found = is_new | is_same(si, dr.norm(place.p - ray.o))
+        target = memory.places[at + index + 1]
+        next_is_end = index + 1 == length
+        grows = (index + 1 > plan.keeps) & (index + 1 <= plan.grown)
+        towards_light = next_is_end & ~grows
+        given = towards_light & kinds.is_infinite(emitter, towards_light)
+        ahead = dr.select(is_end | grows | given, dr.inf, dr.norm(target.p - place.p))
+        found = is_new | is_same(si, place.p, dr.minimum(distance, ahead))
         shines = (light != NO_LIGHT) & (light == emitter)
-        is_there = is_infinite | is_new | (dr.norm(si.p - place.p) < TOLERANCE * distance)
-        ends = dr.select(unhittable, ~is_new, shines & is_there)
+        ends = dr.select(unhittable, ~is_new, shines & (is_infinite | found))
         active &= dr.select(is_end, ends, si.is_valid() & found)
 
         # ----- The densities of the segment that ends here -----
@@ -130,7 +135,6 @@ def trace_from_camera(
 
         # ----- Where does the path go on? -----
         bsdf = si.bsdf(ray)
-        grows = (index + 1 > plan.keeps) & (index + 1 <= plan.grown)
         walks = grows & ~plan.perturbs
         number, sample = numbers.next_1d(), numbers.next_2d()
         lobe = dr.select(walks, number, place.lobe)
@@ -139,10 +143,6 @@ def trace_from_camera(
         joins = (index == plan.grown) | (index == plan.grown + 1)
         was_discrete = (place.is_discrete == 1) & ~joins
         is_discrete = dr.select(walks, is_sampled_discrete, was_discrete)
-        next_is_end = index + 1 == length
-        target = memory.places[at + index + 1]
-        towards_light = next_is_end & ~grows
-        given = towards_light & kinds.is_infinite(emitter, towards_light)
         next_d = towards(si.p, target, given)
         is_given = mi.Bool(False)
         if dr.hint(kinds.has_unhittable, mode="scalar"):

@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..transport.numbers import Numbers
 from .memory import Head, PathMemory, Place
 from .plan import Plan
-from .space import TOLERANCE, PathSpace, turned
+from .space import PathSpace, is_same, turned
 
 #: Angles, in radians, by which perturbations turn directions. Displacements of light that comes
 #: from infinity, in units of the radius of the scene.
@@ -59,8 +59,7 @@ def grow_from_light(
         is_kept = index == plan.rest
         is_last = index == last
         # What is kept must be found again
-        is_there = dr.norm(si.p - place.p) <= TOLERANCE * si.t
-        active &= si.is_valid() & (~is_kept | is_there)
+        active &= si.is_valid() & (~is_kept | is_same(si, place.p, si.t))
 
         # ----- Where does the path go on? -----
         lobe, sample = numbers.next_1d(), numbers.next_2d()

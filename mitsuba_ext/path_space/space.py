@@ -14,8 +14,9 @@ from ..transport.path_decisions import SceneQuery
 from .lights import LightKinds
 from .memory import Head, Place
 
-#: By how much, in units of its length, a ray may miss the end of a segment.
-TOLERANCE = 1e-3
+#: By how much, in units of the shortest segment that meets there, a ray may miss a vertex: more
+#: would change the geometric factors of the path.
+_MISS = 0.1
 
 
 # Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
@@ -88,10 +89,15 @@ class PathSpace:
         return dr.clip(film, 0, 1 - 2.0**-24), seen.active
 
 
-def is_same(si: mi.SurfaceInteraction3f, distance: mi.Float) -> mi.Bool:
-    """Has a ray of which the end is so far away found the vertex there? Where surfaces coincide, it
-    may find another one than an earlier ray did: Mitsuba's shadow rays see no difference either."""
-    return si.is_valid() & (dr.abs(si.t - distance) < TOLERANCE * distance)
+def is_same(si: mi.SurfaceInteraction3f, p: mi.Point3f, reach: mi.Float) -> mi.Bool:
+    """Has a ray found the vertex at ``p``, as far as its numbers are exact? A surface close before
+    it is another vertex: the densities of the path hold for the one that was sampled.
+
+    Parameters:
+        reach: The length of the shortest segment that ends at the vertex.
+    """
+    exact = mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)) + si.t)
+    return si.is_valid() & (dr.norm(si.p - p) <= dr.minimum(exact, _MISS * reach))
 
 
 def towards(p: mi.Point3f, place: Place, is_direction: mi.Bool) -> mi.Vector3f:
