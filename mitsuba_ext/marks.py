@@ -135,7 +135,7 @@ def _lock(folder: Path) -> TextIO | None:
             process = file.read() or "unknown"  # the other process has not written it yet
             file.close()
             raise InputError(
-                f"{folder}: another comparison is running in this folder (process {process}): wait "
+                f"{folder}: another process uses this folder (process {process}): wait "
                 f"for its end, or name another folder"
             ) from None
         except OSError:  # a file system without locks

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from conftest import PATH
 
-from mitsuba_ext.cli.common import _import_module as import_plugin
 from mitsuba_ext.compare import InputError, load_scene
 from mitsuba_ext.plugin_text import parse_plugin
 from mitsuba_ext.rendering.aovs import AOV_TYPES
 from mitsuba_ext.scenes import one_line
 from mitsuba_ext.specifications import make_named
+from mitsuba_ext.variants import _import_module as import_plugin
 
 import mitsuba as mi  # isort: skip
 

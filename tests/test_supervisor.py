@@ -181,7 +181,7 @@ def holder(tmp_path: Path):
 
 
 def test_folder_in_use_is_refused_until_its_process_is_gone(holder, tmp_path, monkeypatch):
-    with pytest.raises(InputError, match=rf"another comparison .* \(process {holder.pid}\)"):
+    with pytest.raises(InputError, match=rf"another process .* \(process {holder.pid}\)"):
         with marks.in_use(tmp_path):
             pass
     with monkeypatch.context() as patch:  # a worker, whose supervisor holds the lock

@@ -18,6 +18,7 @@ from ..errors import InputError, InstallationError
 from .common import INTERRUPTED, say
 from .compare import compare
 from .diff import diff
+from .merge import merge
 from .plugins import list_plugins
 from .render import render
 from .supervisor import SUPERVISED
@@ -37,7 +38,7 @@ def doctor() -> int:
     return doctor_module.main()
 
 
-for command in (render, compare, diff, list_plugins, doctor):
+for command in (render, merge, compare, diff, list_plugins, doctor):
     cli.add_command(command)
 
 

@@ -1,12 +1,11 @@
-"""What the commands share: types of options, selection of the variant, output to the terminal."""
+"""What the commands share: types of options, output to the terminal."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import re
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +40,38 @@ class Numbers(click.ParamType):
         if not re.fullmatch(r"[1-9]\d*(,[1-9]\d*)*", value):
             self.fail(f'expected something like 4,16,64, found "{value}"', param, ctx)
         return tuple(map(int, value.split(",")))
+
+
+@dataclass(frozen=True)
+class Interval:
+    """How often a render is kept: every so many seconds, or samples per pixel."""
+
+    seconds: float = 0.0
+    spp: int = 0
+
+    @classmethod
+    def parse(cls, text: str) -> Interval:
+        """Of text such as ``60s``, ``10m`` or ``100spp``.
+
+        Raises:
+            ValueError: It is none.
+        """
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|m|h|spp)", text)
+        if not match or float(match[1]) == 0 or (match[2] == "spp" and "." in match[1]):
+            raise ValueError(f'expected something like 60s, 10m or 100spp, found "{text}"')
+        if match[2] == "spp":
+            return cls(spp=int(match[1]))
+        return cls(seconds=float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2]])
+
+
+class Every(click.ParamType):
+    name = "interval"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Interval:
+        try:
+            return value if isinstance(value, Interval) else Interval.parse(value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
 
 
 class FilledPath(click.Path):
@@ -87,38 +118,6 @@ def scene_options(command: Callable) -> Callable:
     ):
         command = decorator(command)
     return command
-
-
-def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
-    """Selects a variant, then imports the modules: their classes bind to it."""
-    import mitsuba as mi
-
-    from ..errors import InputError
-    from ..scenes import one_line
-
-    if variant not in mi.variants():
-        raise InputError(f'unknown variant "{variant}" (there are: {", ".join(mi.variants())})')
-    try:
-        mi.set_variant(variant)
-    except (ImportError, RuntimeError) as error:
-        raise InputError(f'the variant "{variant}" does not start: {one_line(error)}') from error
-    if plugins:
-        sys.path.insert(0, "")  # modules in the current folder, as with python -m
-    for name in plugins:
-        try:
-            _import_module(name)
-        except Exception as error:  # a module may raise anything
-            raise InputError(f'the plugin "{name}": {one_line(error)}') from error
-
-
-def _import_module(name: str) -> None:
-    path = Path(name)
-    if path.suffix != ".py":
-        importlib.import_module(name)
-        return
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = sys.modules[path.stem] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
 
 
 def kernels_compiled() -> int:

@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from ..names import check_integrator
+from ..variants import select_variant
 from . import supervisor
 from .common import (
     INTERRUPTED,
@@ -18,7 +19,6 @@ from .common import (
     Numbers,
     say,
     scene_options,
-    select_variant,
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,13 +10,15 @@ import click
 
 from ..names import check_integrator
 from ..parameters import MOST_SPP
+from ..variants import select_variant
 from .common import (
     MAX_SEED,
+    Every,
     FilledPath,
+    Interval,
     kernels_compiled,
     say,
     scene_options,
-    select_variant,
 )
 from .stopping import stopping
 
@@ -48,6 +51,27 @@ from .stopping import stopping
     "-s", "--sensor", "sensor_index", type=click.IntRange(min=0), metavar="N",
     help="Sensor to render, counted from 0. [default: the first]",
 )
+@click.option(
+    "--checkpoint", type=FilledPath(), metavar="DIR",
+    help="A folder that keeps the render. The same command goes on from there.",
+)
+@click.option(
+    "--every", type=Every(), default="60s", metavar="TIME", show_default=True,
+    help="With --checkpoint: how often to keep it, and to write FILE: 60s, 10m, 2h or 100spp.",
+)
+@click.option(
+    "--add", type=click.IntRange(1, MOST_SPP), metavar="N",
+    help="With --checkpoint: samples per pixel, besides those that are there.",
+)
+@click.option(
+    "--until", type=click.FloatRange(min=0, min_open=True), metavar="RELMSE",
+    help="End when the relative error, as the variance of the batches announces it, is RELMSE. "
+    "--spp and --time limit it.",
+)
+@click.option(
+    "--workers", type=click.IntRange(1, 1024), metavar="N",
+    help="Render in N processes of this machine.",
+)
 @scene_options
 @click.argument("scene", type=FilledPath())
 def render(
@@ -58,6 +82,11 @@ def render(
     seconds: float | None,
     seed: int,
     sensor_index: int | None,
+    checkpoint: Path | None,
+    every: Interval,
+    add: int | None,
+    until: float | None,
+    workers: int | None,
     size: tuple[int, int] | None,
     definitions: Sequence[tuple[str, str]],
     plugins: Sequence[str],
@@ -71,6 +100,10 @@ def render(
 
     Mitsuba's own integrators render in passes. A structured sampler stratifies the samples of a
     pass (64 per pixel or more, 16 for large images), not those of the whole render.
+
+    With --checkpoint, --until or --workers, all integrators render in batches, which are
+    independent renders with seeds of their own. An EXR then holds the variance of the image too.
+    What an integrator learns in the first batch, the others use. SIGUSR1 keeps the render at once.
     """
     if specification and not plugins:
         check_integrator(specification)
@@ -78,19 +111,50 @@ def render(
 
     check_scene_file(scene)
     from ..compare import images, machine
+    from ..long_renders.batch_renderer import RenderRequest
+    from .long_job import LongJob, LongOptions
     from .render_job import RenderJob
 
-    if spp is not None and seconds is not None:
+    if spp is not None and seconds is not None and until is None:
         raise click.UsageError("--spp and --time exclude each other")
+    if add is not None and checkpoint is None:
+        raise click.UsageError("--add needs --checkpoint: the folder with the samples so far")
+    if add is not None and spp is not None:
+        raise click.UsageError("--add and --spp exclude each other")
     images.check_target(output)
+
+    def write(target: Path) -> None:
+        metadata = {
+            "scene": str(scene),
+            "scene_parameters": dict(definitions),
+            "integrator": job.name,
+            "parameters": job.parameters,
+            "seed": seed,
+            "spp": job.spp,
+            "seconds": job.seconds,
+            "interrupted": job.is_interrupted,
+            "versions": machine.versions(),
+            **job.about(),
+        }
+        images.write_film(target, job.film, metadata, job.variance())
+
     with stopping() as stop:
         job = None
         try:
             select_variant(variant, plugins)
             compiled = kernels_compiled()
-            job = RenderJob.load(
-                scene, size, dict(definitions), specification, sensor_index, seed
-            )
+            if checkpoint or until or workers:
+                job = LongJob(
+                    RenderRequest(
+                        str(scene), size, tuple(definitions), specification, sensor_index or 0,
+                        seed, variant, tuple(plugins),
+                    ),
+                    LongOptions(checkpoint, every, add, until, workers or 0),
+                )  # fmt: skip
+            else:
+                job = RenderJob.load(
+                    scene, size, dict(definitions), specification, sensor_index, seed
+                )
             is_new = kernels_compiled() > compiled
             images.check_film(output, job.film, job.integrator.aov_names())
             for remark in job.remarks(is_sensor_chosen=sensor_index is not None):
@@ -98,7 +162,7 @@ def render(
             if is_new:
                 # The render's kernels take longer to compile, and nothing can be printed meanwhile
                 say("compiling kernels (later renders like this one find them in a cache)")
-            job.run(spp, seconds)
+            job.run(spp, seconds, functools.partial(write, output), warn)
         except (KeyboardInterrupt, OSError) as error:
             # After SIGHUP, showing progress on the closed terminal raises an OSError
             if isinstance(error, OSError) and not stop.is_asked:
@@ -111,20 +175,9 @@ def render(
 
         stop.wait()
         target = output
-        if job.is_interrupted and output.exists():
+        if job.is_interrupted and output.exists() and not checkpoint:
             target = output.with_name(f"{output.stem}.partial{output.suffix}")
-        metadata = {
-            "scene": str(scene),
-            "scene_parameters": dict(definitions),
-            "integrator": job.name,
-            "parameters": job.parameters,
-            "seed": seed,
-            "spp": job.spp,
-            "seconds": job.seconds,
-            "interrupted": job.is_interrupted,
-            "versions": machine.versions(),
-        }
-        images.write_film(target, job.film, metadata)
+        write(target)
         bad, pixel_count = images.count_non_finite(job.film)
         if bad:
             warn(f"{bad} of {pixel_count} pixels of {target} are NaN or infinite")

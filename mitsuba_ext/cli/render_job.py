@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,9 @@ class RenderJob:
             remarks.append(f"the scene has {count} sensors: the first is rendered (see --sensor)")
         return remarks
 
-    def run(self, spp: int | None, seconds: float | None) -> None:
+    def run(
+        self, spp: int | None, seconds: float | None, *_while_it_runs: Callable
+    ) -> None:
         """Renders ``spp`` samples per pixel (by default, the number of the sampler), or as many as
         fit into ``seconds``. After Ctrl-C, passes end with :attr:`is_interrupted` set; integrators
         that do not handle it raise ``KeyboardInterrupt``.
@@ -134,6 +136,14 @@ class RenderJob:
         timing.timed_render(
             self.integrator, self._loaded.scene, self._seed, spp or 0, self._sensor_index
         )
+
+    def variance(self) -> dict[str, np.ndarray]:
+        """Channels with the variance of the image: it is not known."""
+        return {}
+
+    def about(self) -> dict[str, Any]:
+        """What the metadata of the image say besides."""
+        return {}
 
     # ---- How far it got ----
 

@@ -117,9 +117,14 @@ def count_non_finite(film: mi.Film) -> tuple[int, int]:
     return int(np.count_nonzero(bad)), bad.size
 
 
-def write_film(path: Path, film: mi.Film, metadata: Mapping[str, object]) -> None:
-    """Writes the image of a film: all channels to an EXR, RGB to HDR and PFM, 8-bit sRGB to the
-    other formats."""
+def write_film(
+    path: Path,
+    film: mi.Film,
+    metadata: Mapping[str, object],
+    others: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Writes the image of a film: all channels to an EXR, also ``others``, which are arrays
+    (height, width); RGB to HDR and PFM, 8-bit sRGB to the other formats."""
     import mitsuba as mi
 
     bitmap = film.bitmap()
@@ -127,7 +132,8 @@ def write_film(path: Path, film: mi.Film, metadata: Mapping[str, object]) -> Non
     if suffix == ".exr":
         # The film's own bitmap may be of half precision
         names = [entry.name for entry in bitmap.struct_()]
-        write_exr(path, np.array(film.develop()), names, metadata)
+        layers = [np.array(film.develop()), *(x[..., None] for x in (others or {}).values())]
+        write_exr(path, np.concatenate(layers, axis=2), [*names, *(others or {})], metadata)
         return
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         bitmap = bitmap.split()[0][1]  # the image without its AOVs

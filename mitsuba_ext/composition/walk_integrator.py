@@ -136,6 +136,11 @@ class WalkIntegrator(StagedIntegrator):
 
     # ---- What the render asks for ----
 
+    @property
+    def can_learn(self) -> bool:
+        """Do ``save_learned`` and ``load_learned`` mean anything?"""
+        return bool(self._pilot_spp)
+
     def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
         self.learners = {}
         if self.save_learned:

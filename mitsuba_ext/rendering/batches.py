@@ -7,7 +7,7 @@ through ``sample()`` (light tracing, Metropolis) or whose samples depend on each
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -20,8 +20,8 @@ from .camera import find_sensor
 
 
 class Batches:
-    """Running mean and variance of batches. Its memory and its cost per batch do not grow with
-    their number.
+    """Running mean and variance of batches, each weighted by its samples. Its memory and its cost
+    per batch do not grow with their number.
 
     Attributes:
         channels: Names of the channels: those of the film's image, then the integrator's AOVs.
@@ -32,30 +32,66 @@ class Batches:
     def __init__(self, channels: Sequence[str], image_channel_count: int) -> None:
         self.channels = tuple(channels)
         self.image_channel_count = image_channel_count
-        self.spp = 0
-        # Count, mean, sum of squared deviations
-        self._state = (0, np.float64(0), np.float64(0))
+        # Count, samples, mean, sum of squared deviations, each times the batch's samples
+        self._state = (0, 0, np.float64(0), np.float64(0))
 
     def add(self, image: np.ndarray, spp: int) -> None:
         """Adds the image of a batch."""
         # Welford's update in double precision, which avoids the difference of large sums
-        count, mean, squares = self._state
+        count, samples, mean, squares = self._state
         with np.errstate(invalid="ignore", over="ignore"):  # pixels may be infinite
             deviation = image.astype(np.float64) - mean
-            mean = mean + deviation / (count + 1)
-            squares = squares + deviation * (image - mean)
+            mean = mean + deviation * (spp / (samples + spp))
+            squares = squares + spp * deviation * (image - mean)
         # In one assignment, because Ctrl-C may interrupt at any time
-        self._state = (count + 1, mean, squares)
-        self.spp += spp
+        self._state = (count + 1, samples + spp, mean, squares)
+
+    def plus(self, other: Batches) -> Batches:
+        """The batches of both, which must be independent."""
+        (count, samples, mean, squares), (more, added, its_mean, its_squares) = (
+            self._state, other._state
+        )  # fmt: skip
+        total, share = Batches(self.channels, self.image_channel_count), 0.0
+        if added:
+            share = added / (samples + added)
+        with np.errstate(invalid="ignore", over="ignore"):
+            deviation = its_mean - mean
+            total._state = (
+                count + more,
+                samples + added,
+                mean + deviation * share,
+                squares + its_squares + deviation**2 * (samples * share),
+            )
+        return total
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that :meth:`from_arrays` needs."""
+        count, samples, mean, squares = self._state
+        return {
+            "channels": np.array(self.channels), "mean": np.asarray(mean),
+            "image_channel_count": np.array(self.image_channel_count),
+            "count": np.array(count), "samples": np.array(samples),
+            "weighted_squares": np.asarray(squares),
+        }  # fmt: skip
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Batches:
+        """Batches as they were.
+
+        Raises:
+            KeyError: An array is missing.
+        """
+        batches = cls(arrays["channels"].tolist(), int(arrays["image_channel_count"]))
+        batches._state = (
+            int(arrays["count"]), int(arrays["samples"]), arrays["mean"],
+            arrays["weighted_squares"],
+        )  # fmt: skip
+        return batches
 
     def save(self, path: Path) -> None:
         """Writes the batches to a file that :meth:`load` reads."""
-        count, mean, squares = self._state
         with open(path, "wb") as file:
-            np.savez(
-                file, channels=self.channels, image_channel_count=self.image_channel_count,
-                spp=self.spp, count=count, mean=mean, squares=squares,
-            )
+            np.savez(file, **self.arrays())
 
     @classmethod
     def load(cls, path: Path) -> Batches:
@@ -65,10 +101,11 @@ class Batches:
             OSError, ValueError, KeyError, zipfile.BadZipFile: The file is missing or damaged.
         """
         with np.load(path) as stored:
-            batches = cls(stored["channels"].tolist(), int(stored["image_channel_count"]))
-            batches.spp = int(stored["spp"])
-            batches._state = (int(stored["count"]), stored["mean"], stored["squares"])
-        return batches
+            return cls.from_arrays(stored)
+
+    @property
+    def spp(self) -> int:
+        return self._state[1]
 
     @property
     def count(self) -> int:
@@ -78,15 +115,15 @@ class Batches:
     def mean(self) -> np.ndarray:
         """Array (height, width, channels), double precision. A pixel that is NaN or infinite in any
         batch is not finite."""
-        return self._state[1]
+        return self._state[2]
 
     @property
     def variance(self) -> np.ndarray:
         """Unbiased estimate of the variance of :attr:`mean`, same shape; NaN after one batch."""
-        count, mean, squares = self._state
+        count, samples, mean, squares = self._state
         if count < 2:
             return np.full_like(mean, np.nan)
-        return squares / (count - 1) / count
+        return squares / (count - 1) / samples
 
 
 def each_batch(
@@ -123,8 +160,8 @@ def each_batch(
         yield batches
 
 
-def batch_seeds(seed: int | mi.UInt32, count: int) -> list[int]:
-    """Seeds of ``count`` batches of a render with the given seed.
+def batch_seeds(seed: int | mi.UInt32, count: int, first: int = 0) -> list[int]:
+    """Seeds of ``count`` batches of a render with the given seed, from number ``first`` on.
 
     They are hashes of 32 bits. With consecutive seeds, renders with neighbouring seeds would share
     batches, and Mitsuba's stratified samplers give pixel p at seed s + spp the numbers of pixel
@@ -134,7 +171,8 @@ def batch_seeds(seed: int | mi.UInt32, count: int) -> list[int]:
     if isinstance(seed, mi.UInt32):
         seed = seed[0]
     seed = operator.index(seed) & 0xFFFFFFFF
-    return mi.sample_tea_32(mi.UInt32(seed), dr.arange(mi.UInt32, count))[1].numpy().tolist()
+    index = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+    return mi.sample_tea_32(dr.opaque(mi.UInt32, seed), index)[1].numpy().tolist()
 
 
 def sample_count(sensor: mi.Sensor, spp: int) -> int:

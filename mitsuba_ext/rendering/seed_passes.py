@@ -1,9 +1,7 @@
 """Renders with Mitsuba's own integrators in passes, so that the render can be stopped.
 
 Their ``render()`` takes all samples at once, however long that lasts, and ignores Ctrl-C meanwhile.
-Here, each pass calls it for some of the samples, with a seed of its own. A film holds, for each
-pixel, the weighted sum of its samples and the sum of their weights. These sums are added over the
-passes, which gives the film of a single render of all samples, for every reconstruction filter.
+Here, each pass calls it for some of the samples, with a seed of its own.
 """
 
 from __future__ import annotations
@@ -14,13 +12,13 @@ from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..garbage import garbage_left_alone
 from ..movers import check_motion_is_seen
 from ..nesting import with_nested
 from .batches import sample_count
 from .camera import film_extent
+from .film_sums import FilmSums
 from .interrupts import deferred_interrupt
 from .plan import check_extent
 from .render import kernel_cache_misses
@@ -97,10 +95,13 @@ class SeedPasses:
         check_extent(sensor.film())
         self._integrator, self._scene, self._sensor, self._seed = integrator, scene, sensor, seed
         self._film = sensor.film()
-        self._sum: np.ndarray | float = 0.0
-        self._has_weights = True
-        self.passes = self.spp = 0
+        self._sums = FilmSums()
+        self.passes = 0
         self.interrupted = False
+
+    @property
+    def spp(self) -> int:
+        return self._sums.spp
 
     def run(
         self,
@@ -136,7 +137,7 @@ class SeedPasses:
         finally:
             self._sensor.sampler().set_sample_count(asked)  # Mitsuba's integrators change it
             if self.passes > 0:
-                self._fill_film()
+                self._sums.fill(self._film, self._integrator.aov_names())
 
     def _run_pass(self, spp: int) -> tuple[float, bool]:
         """Adds a pass; returns its seconds, and whether it compiled a kernel."""
@@ -146,28 +147,12 @@ class SeedPasses:
         # render() develops the film, because "prb" refuses develop=False
         with garbage_left_alone():
             self._integrator.render(self._scene, self._sensor, seed, spp)
-        contents = np.array(self._film.develop(raw=True), dtype=np.float64)
+        self._sums.add(self._film, spp)
         elapsed, compiled = time.perf_counter() - begin, kernel_cache_misses() > misses
-        # A light tracer leaves an image, but no weights
-        self._has_weights = bool(contents[..., self._weight_channel()].any())
-        self._sum += contents if self._has_weights else contents * spp
         self.passes += 1
-        self.spp += spp
         return elapsed, compiled
-
-    def _fill_film(self) -> None:
-        """Replaces the content of the film, the last pass, by the sum of all passes."""
-        contents = self._sum if self._has_weights else self._sum / self.spp
-        self._film.prepare(self._integrator.aov_names())
-        tensor = mi.TensorXf(contents.astype(np.float32))
-        self._film.put_block(mi.ImageBlock(tensor, offset=self._film.crop_offset()))
 
     def _scattered_seed(self) -> int:
         # A hash, and different from the seeds of batches (see batch_seeds)
         stream = mi.UInt32(self.passes + _STREAM)
         return mi.sample_tea_32(mi.UInt32(self._seed), stream)[1][0]
-
-    def _weight_channel(self) -> int:
-        if mi.has_flag(self._film.flags(), mi.FilmFlags.Special):
-            return self._film.base_channels_count()
-        return 4 if mi.has_flag(self._film.flags(), mi.FilmFlags.Alpha) else 3

@@ -1,0 +1,246 @@
+"""A render that can be gone on with, divided, and ended when it is good enough."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
+from ..long_renders.folder import CheckpointFolder
+from ..long_renders.long_render import Goal, LongRender
+from ..long_renders.state import RenderState
+from ..long_renders.workers import Workers
+from ..progress import progress_bars
+from ..rendering.interrupts import deferred_interrupt
+from ..scene_remarks import scene_remarks
+from .common import Interval
+
+
+@dataclass(frozen=True)
+class LongOptions:
+    """What a long render is asked for, besides what to render.
+
+    Attributes:
+        folder: Where it is kept; ``None`` for nowhere.
+        every: How often.
+        add: Samples per pixel besides those that are there; ``None`` for none.
+        until: The relative error at which it ends; ``None`` for none.
+        workers: Processes that render; 0 for this one.
+    """
+
+    folder: Path | None = None
+    every: Interval = Interval(seconds=60)
+    add: int | None = None
+    until: float | None = None
+    workers: int = 0
+
+
+class LongJob:
+    """A render in batches, and its progress.
+
+    Attributes:
+        integrator, name, parameters: The integrator, its name and its parameters.
+        film: The film that holds the image.
+        is_interrupted: Did a signal end the render before its goal was reached?
+        seconds: Wall clock of the render.
+    """
+
+    def __init__(self, request: RenderRequest, options: LongOptions) -> None:
+        """
+        Raises:
+            InputError: The scene, the integrator or the sensor cannot be used.
+        """
+        self._options = options
+        self._folder = CheckpointFolder(options.folder) if options.folder else None
+        # Without a folder, what is learned is forgotten with this object
+        self._temporary = tempfile.TemporaryDirectory()
+        folder = CheckpointFolder(Path(self._temporary.name))
+        learned = (self._folder or folder).learned
+        # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR file
+        threads = max(2, (os.cpu_count() or 1) // options.workers) if options.workers else 0
+        self._request = replace(request, learned=str(learned.absolute()), threads=threads)
+        self._renderer = BatchRenderer(self._request)
+        named = self._renderer.named
+        self.integrator, self.name, self.parameters = (
+            named.integrator, named.name, named.parameters
+        )  # fmt: skip
+        self.film = self._renderer.sensor.film()
+        self.is_interrupted, self.seconds = False, 0.0
+        self._state, self._render = RenderState(), None
+
+    def remarks(self, is_sensor_chosen: bool) -> list[str]:
+        """Warnings about what the image will not show."""
+        scene = self._renderer.loaded.scene
+        remarks = scene_remarks(scene, self._renderer.sensor, self.integrator, self.name)
+        if (count := len(scene.sensors())) > 1 and not is_sensor_chosen:
+            remarks.append(f"the scene has {count} sensors: the first is rendered (see --sensor)")
+        return remarks
+
+    def run(
+        self, spp: int | None, seconds: float | None, write: Callable[[], None],
+        warn: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        """Goes on with what is in the folder.
+
+        Args:
+            spp: Samples per pixel of the whole image. Default: the number of the sampler, if
+                nothing else ends the render.
+            seconds: Of this call.
+            write: Writes the image of the film.
+            warn: Shows a sentence.
+
+        Raises:
+            InputError: The folder holds another render, or the integrator cannot render the scene.
+        """
+        begin = time.perf_counter()
+        with self._folder.in_use() if self._folder else contextlib.nullcontext():
+            try:
+                if self._folder:
+                    self._folder.describe(self._renderer.description())
+                    self._state = self._folder.load()
+                    if not self._state.has_taught:
+                        # It would depend on the numbers of a batch that is still to come
+                        self._folder.learned.unlink(missing_ok=True)
+                self._run(spp, seconds, write, warn)
+            finally:
+                self.seconds = time.perf_counter() - begin
+
+    def _run(self, spp, seconds, write, warn) -> None:
+        options, state = self._options, self._state
+        if options.add:
+            spp = state.spp + options.add
+        elif spp is None and options.until is None and seconds is None:
+            spp = self._renderer.sensor.sampler().sample_count()
+        last = _Last(state.spp)
+
+        def keep() -> None:
+            last.mark(state.spp)
+            if not state.done:
+                return
+            state.fill(self.film)
+            self.seconds = time.perf_counter() - last.begin
+            write()
+            if self._folder:
+                self._folder.save(state)
+
+        with progress_bars() as bars, _asked_to_keep() as asked:
+            bar = bars.add_task(self.name, total=None)
+
+            def progress(render: LongRender) -> None:
+                text = f"{self.name}, {state.spp} spp"
+                if (error := render.error) is not None:
+                    text += f", relMSE about {error:.2g}"
+                bars.update(
+                    bar, description=text, completed=state.spp, total=render.goal_spp or None
+                )
+                if asked() or (self._folder and last.is_due(options.every, state.spp)):
+                    try:
+                        keep()
+                    except OSError as problem:
+                        warn(f"the render could not be kept: {problem}; it goes on")
+
+            self._render = LongRender(self._renderer, self._request, state, progress)
+            goal = Goal(spp, options.until, seconds)
+            is_reached = False
+            try:
+                with deferred_interrupt() as interrupt, self._executor() as executor:
+                    is_reached = self._render.run(
+                        goal, interrupt.is_set, executor, options.workers or 1
+                    )
+            except KeyboardInterrupt:
+                if not state.done:
+                    raise
+            self.is_interrupted = not is_reached
+        if state.done:
+            state.fill(self.film)
+        if self._folder:
+            self._folder.save(state)
+
+    @contextlib.contextmanager
+    def _executor(self) -> Iterator[Any]:
+        if not self._options.workers:
+            yield None
+            return
+        executor = Workers(self._options.workers)
+        try:
+            yield executor
+        finally:
+            executor.shutdown(cancel_futures=True)
+
+    # ---- How far it got ----
+
+    @property
+    def spp(self) -> int:
+        """Samples per pixel in the image."""
+        return self._state.spp
+
+    def how_far(self) -> str:
+        goal = self._render.goal_spp if self._render else 0
+        return f"after {self.spp} of {goal} spp" if goal else f"after {self.spp} spp"
+
+    def has_image(self) -> bool:
+        """Are there samples?"""
+        return bool(self._state.done)
+
+    def is_complete(self) -> bool:
+        return not self.is_interrupted
+
+    def variance(self) -> dict[str, Any]:
+        """Channels with the variance of the image, by name."""
+        batches = self._state.images
+        if batches is None or batches.count < 2:
+            return {}
+        colours = [name for name in batches.channels[: batches.image_channel_count] if name != "A"]
+        return {f"variance.{name}": batches.variance[..., n] for n, name in enumerate(colours)}
+
+    def about(self) -> Mapping[str, Any]:
+        """What the metadata of the image say besides."""
+        return {"batches": len(self._state.done)}
+
+
+class _Last:
+    """When a render was kept last."""
+
+    def __init__(self, spp: int) -> None:
+        self.begin = time.perf_counter()
+        self.mark(spp)
+
+    def mark(self, spp: int) -> None:
+        self._time, self._spp = time.perf_counter(), spp
+
+    def is_due(self, every: Interval, spp: int) -> bool:
+        if every.spp:
+            return spp - self._spp >= every.spp
+        return time.perf_counter() - self._time >= every.seconds
+
+
+@contextlib.contextmanager
+def _asked_to_keep() -> Iterator[Callable[[], bool]]:
+    """While active, SIGUSR1 asks to keep the render after the running batch, and to go on. Yields a
+    function that says whether that was asked since the last time."""
+    asked: list[int] = []
+    number = getattr(signal, "SIGUSR1", None)
+    if number is None:
+        yield lambda: False
+        return
+    try:
+        before = signal.signal(number, lambda *_: asked.append(1))
+    except ValueError:  # not the main thread
+        yield lambda: False
+        return
+
+    def take() -> bool:
+        was, asked[:] = bool(asked), []
+        return was
+
+    try:
+        yield take
+    finally:
+        signal.signal(number, before)

@@ -1,0 +1,42 @@
+"""``mitsuba-ext merge``: the samples of several renders in one image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from .common import FilledPath, say
+
+
+@click.command(short_help="Merge renders that --checkpoint has kept.")
+@click.option(
+    "-o", "--output", type=FilledPath(), required=True, metavar="DIR",
+    help="The folder to make; render --checkpoint DIR goes on with it, and writes the image.",
+)
+@click.argument("folders", type=FilledPath(), nargs=-1, required=True, metavar="DIR…")
+def merge(folders: Sequence[Path], output: Path) -> int:
+    """Merge the samples of renders that ``render --checkpoint DIR`` has kept: of the same scene, by
+    the same integrator, with different seeds. Each counts by its samples."""
+    from ..errors import InputError
+    from ..long_renders.folder import CheckpointFolder, check_same
+
+    if len(folders) < 2:
+        raise click.UsageError("there is nothing to merge with: name two folders or more")
+    if output.exists():
+        raise InputError(f"{output}: exists already")
+    first, *others = (CheckpointFolder(folder) for folder in folders)
+    description, state = first.description(), first.load()
+    for other in others:
+        check_same(description, other.description(), first.path, free=["seed"])
+        try:
+            state = state.plus(other.load())
+        except InputError as error:
+            raise InputError(f"{first.path} and {other.path}: {error}") from None
+    target = CheckpointFolder(output)
+    with target.in_use():
+        target.describe(description)
+        target.save(state)
+    say(f"{output}: {state.spp} spp in {len(state.done)} batches", err=False)
+    return 0

@@ -1,0 +1,180 @@
+"""Renders one batch after the other, in any process."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..compare.machine import versions
+from ..content_hash import hash_code
+from ..errors import InputError
+from ..rendering.batches import batch_seeds, each_batch, sample_count
+from ..rendering.camera import film_extent
+from ..rendering.film_sums import FilmSums
+from ..rendering.seed_passes import can_render, is_independent, pass_length
+from ..scenes import LoadedScene, load_scene, one_line
+from ..specifications import NamedIntegrator, make_named
+from ..variants import select_variant
+from .state import Batch, BatchResult
+
+#: About how many samples a batch of ours has: each traces its kernels anew, and begins its chains.
+_SAMPLES = {dr.JitBackend.LLVM: 1 << 22, dr.JitBackend.CUDA: 1 << 25}
+
+#: Samples per pixel of a batch of ours, at least, and of one whose samples are stratified.
+_SPP, _STRUCTURED_SPP = 16, 64
+
+#: Samples per pixel of the batch that the others learn from, if there are so many.
+_LEARNING_SPP = 128
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """What to render. It can be sent to other processes, and to other machines that see its files.
+
+    Attributes:
+        scene: The file.
+        size, definitions: Of the image, and values of the file's ``$name`` parameters.
+        specification: The integrator; ``None`` for the scene's.
+        sensor: Its number.
+        seed: Of the random numbers.
+        variant, plugins: Mitsuba's variant, and modules that register other plugins.
+        learned: A file of what the integrator has learned; empty for none. It need not be there
+            yet: the first batch makes it.
+        threads: Of a process; 0 for as many as there are cores.
+    """
+
+    scene: str
+    size: tuple[int, int] | None = None
+    definitions: tuple[tuple[str, str], ...] = ()
+    specification: str | None = None
+    sensor: int = 0
+    seed: int = 0
+    variant: str = "llvm_ad_rgb"
+    plugins: tuple[str, ...] = ()
+    learned: str = ""
+    threads: int = 0
+
+
+class BatchRenderer:
+    """Renders the batches of a request.
+
+    Parameters:
+        request: What to render; its variant is the active one.
+
+    Attributes:
+        loaded, named: The scene and the integrator.
+        sensor: The sensor.
+
+    Raises:
+        InputError: The scene, the integrator or the sensor cannot be used.
+    """
+
+    def __init__(self, request: RenderRequest) -> None:
+        self._request, chosen = request, request.specification
+        path = Path(request.scene)
+        self.loaded: LoadedScene = load_scene(
+            path, request.size, dict(request.definitions), keep_integrator=chosen is None
+        )
+        if chosen is None:
+            integrator = self.loaded.scene.integrator()
+            if integrator is None:
+                raise InputError(f"{path}: the scene has no integrator: name one with --integrator")
+            self.named = NamedIntegrator(
+                self.loaded.integrator_name, self.loaded.integrator_name,
+                dict(self.loaded.settings), integrator, hash_code([type(integrator)]) or "",
+            )  # fmt: skip
+        else:
+            self.named = make_named(chosen, self.loaded.settings)
+        sensors = self.loaded.scene.sensors()
+        if request.sensor >= len(sensors):
+            raise InputError(
+                f"{path}: there is no sensor {request.sensor}: the scene has {len(sensors)}"
+            )
+        self.sensor = sensors[request.sensor]
+        integrator = self.named.integrator
+        # Its own file, if it has one, holds for all batches already
+        self._learns = bool(
+            request.learned
+            and getattr(integrator, "can_learn", False)
+            and not integrator.save_learned
+            and not integrator.load_learned
+        )
+
+    @property
+    def must_learn(self) -> bool:
+        """Does the next batch teach those after it?"""
+        return self._learns and not Path(self._request.learned).exists()
+
+    def description(self) -> dict[str, Any]:
+        """What the image depends on, but for the number of samples."""
+        request, film = self._request, self.sensor.film()
+        return {
+            "scene": self.loaded.source,
+            "scene files hash": self.loaded.content_hash,
+            "size": "x".join(map(str, film.crop_size())),
+            "integrator": self.named.name,
+            "parameters": self.named.parameters,
+            "integrator hash": self.named.identity,
+            "sensor": request.sensor,
+            "seed": request.seed,
+            "versions": {k: v for k, v in versions().items() if k not in ("numpy", "python")},
+        }
+
+    def length(self, spp: int) -> int:
+        """The samples per pixel of the next batch, of ``spp`` that are left. It does not depend on
+        the speed, so that the same command gives the same image."""
+        if can_render(self.named.integrator):
+            return min(pass_length(self.sensor), spp)
+        limit = _SAMPLES[dr.backend_v(mi.Float)] // math.prod(film_extent(self.sensor.film()))
+        limit = max(limit, _SPP if is_independent(self.sensor) else _STRUCTURED_SPP)
+        if self.must_learn:
+            limit = max(limit, _LEARNING_SPP)
+        return min(sample_count(self.sensor, 1 << (limit.bit_length() - 1)), spp)
+
+    def render(self, batch: Batch) -> BatchResult:
+        """
+        Raises:
+            InputError: The integrator cannot render this scene.
+            KeyboardInterrupt: The batch was interrupted: it is lost.
+        """
+        integrator, film = self.named.integrator, self.sensor.film()
+        file, teaches = self._request.learned, self.must_learn
+        if self._learns:
+            integrator.load_learned = "" if teaches else file
+            integrator.save_learned = file if teaches else ""
+        seed = batch_seeds(batch.seed, 1, batch.index)[0]
+        try:
+            batches = each_batch(integrator, self.loaded.scene, self.sensor, batch.spp, [seed])
+            images = next(batches)
+        except (ValueError, TypeError, RuntimeError) as error:
+            raise InputError(
+                f'{self.loaded.source}: "{self.named.name}": {one_line(error)}'
+            ) from error
+        sums = FilmSums()
+        sums.add(film, images.spp)
+        return BatchResult(
+            batch._replace(spp=images.spp), sums.contents.astype(np.float32), sums.has_weights,
+            images.mean.astype(np.float32), images.channels, images.image_channel_count,
+            tuple(integrator.aov_names()), teaches and Path(file).exists(),
+        )  # fmt: skip
+
+
+@functools.lru_cache(maxsize=1)
+def _renderer(request: RenderRequest) -> BatchRenderer:
+    select_variant(request.variant, request.plugins)
+    if request.threads:
+        dr.set_thread_count(request.threads)
+    return BatchRenderer(request)
+
+
+def render_batch(request: RenderRequest, batch: Batch) -> BatchResult:
+    """Renders a batch in this process, which keeps the scene for the next one: what a worker
+    does."""
+    return _renderer(request).render(batch)

@@ -1,0 +1,151 @@
+"""The folder in which a render is kept."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import marks
+from ..errors import InputError
+from ..files import make_folder, replacing
+from .state import RenderState
+
+#: What is rendered; the state; the one before it; what the integrator has learned.
+_DESCRIPTION, _STATE, _BEFORE = "render.json", "state.npz", "state.before.npz"
+_LEARNED = "learned.npz"
+
+#: Number of the format of these files.
+_FORMAT = 1
+
+
+class CheckpointFolder:
+    """A folder with the state of a render, from which it can go on.
+
+    A new state replaces the old one in one step, and the one before stays: whatever ends the
+    process, and at any moment, one of both is whole.
+
+    Parameters:
+        path: The folder, which is made if it is missing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @property
+    def learned(self) -> Path:
+        """The file of what the integrator has learned."""
+        return self.path / _LEARNED
+
+    def in_use(self):
+        """A context in which no other process can use the folder."""
+        make_folder(self.path)
+        return marks.in_use(self.path)
+
+    def describe(self, description: Mapping[str, Any]) -> None:
+        """Says what is rendered.
+
+        Raises:
+            InputError: Something else was rendered before in this folder.
+        """
+        file = self.path / _DESCRIPTION
+        if not file.exists():
+            if (self.path / _STATE).exists():
+                raise InputError(f"{file}: is missing: the folder cannot be used any more")
+            with replacing(file) as temporary:
+                temporary.write_text(json.dumps(description, indent=1, default=str))
+                _flush(temporary)
+            return
+        check_same(self.description(), json.loads(json.dumps(description, default=str)), self.path)
+
+    def description(self) -> dict[str, Any]:
+        """What is rendered.
+
+        Raises:
+            InputError: This is no such folder, or it is damaged.
+        """
+        file = self.path / _DESCRIPTION
+        if not file.exists():
+            raise InputError(f"{self.path}: has no {_DESCRIPTION}: no render is kept here")
+        try:
+            return json.loads(file.read_text())
+        except (OSError, ValueError) as error:
+            raise InputError(f"{file}: cannot be read ({error})") from None
+
+    def load(self) -> RenderState:
+        """The newest state that is whole; an empty one if there is none.
+
+        Raises:
+            InputError: There are states, but all of them are damaged.
+        """
+        found = [self.path / name for name in (_STATE, _BEFORE)]
+        found = [file for file in found if file.exists()]
+        for file in found:
+            arrays = _read(file)
+            if arrays is not None:
+                return RenderState.from_arrays(arrays)
+        if found:
+            raise InputError(f"{found[0]}: is damaged: delete {self.path}, and begin again")
+        return RenderState()
+
+    def save(self, state: RenderState) -> None:
+        """Keeps a state.
+
+        Raises:
+            OSError: It cannot be written; the one before is still there.
+        """
+        file = self.path / _STATE
+        temporary = self.path / f".{_STATE}"
+        try:
+            with temporary.open("wb") as stream:
+                np.savez(stream, format=np.array(_FORMAT), **state.arrays())
+                stream.flush()
+                os.fsync(stream.fileno())
+            if file.exists():
+                os.replace(file, self.path / _BEFORE)
+            os.replace(temporary, file)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def check_same(
+    before: Mapping[str, Any], now: Mapping[str, Any], where: object, free: Sequence[str] = ()
+) -> None:
+    """
+    Args:
+        before, now: Descriptions of renders.
+        where: What the error calls the first.
+        free: Keys that may differ. The name of the scene's file may always.
+
+    Raises:
+        InputError: They are not the same; the sentence names what differs.
+    """
+    for key in dict.fromkeys([*before, *now]):
+        if key not in ("scene", *free) and before.get(key) != now.get(key):
+            change = f"{before.get(key)} there, {now.get(key)} here"
+            # Hashes tell nobody anything
+            if key.endswith("hash"):
+                key, change = key.removesuffix("hash").strip(), "its files or code have changed"
+            raise InputError(
+                f'{where}: holds another render: "{key}" differs ({change}); use another folder, '
+                f"or make it the same again"
+            )
+
+
+def _read(file: Path) -> dict[str, np.ndarray] | None:
+    """The arrays of a file; ``None`` if it is damaged."""
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        return arrays if int(arrays.pop("format")) == _FORMAT else None
+    except Exception:  # NumPy, zipfile and zlib raise a dozen kinds; a checksum is in the file
+        return None
+
+
+def _flush(path: Path) -> None:
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())

@@ -1,0 +1,140 @@
+"""What has been rendered so far: sums over batches, and which batches these are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import mitsuba as mi
+import numpy as np
+
+from ..errors import InputError
+from ..rendering.batches import Batches
+from ..rendering.film_sums import FilmSums
+
+
+class Batch(NamedTuple):
+    """A part of a render.
+
+    Attributes:
+        seed: Of the render.
+        index: The number of the batch among those of this seed.
+        spp: Samples per pixel.
+    """
+
+    seed: int
+    index: int
+    spp: int
+
+
+class BatchResult(NamedTuple):
+    """What a batch has brought.
+
+    Attributes:
+        batch: Which one.
+        contents, has_weights: See :class:`~mitsuba_ext.rendering.film_sums.FilmSums`.
+        image: The developed film with its AOVs: [height, width, channel].
+        channels, image_channel_count: See :class:`~mitsuba_ext.rendering.batches.Batches`.
+        aov_names: Channels besides those of the image.
+        has_taught: Has it made the file of what the integrator has learned?
+    """
+
+    batch: Batch
+    contents: np.ndarray
+    has_weights: bool
+    image: np.ndarray
+    channels: tuple[str, ...]
+    image_channel_count: int
+    aov_names: tuple[str, ...]
+    has_taught: bool
+
+
+class RenderState:
+    """Sums over batches. Its size does not depend on how many there are, but for 12 bytes each.
+
+    Attributes:
+        done: The batches, in the order in which they were added.
+        film: The sum of what they have left in the film.
+        images: Mean and variance of their images; ``None`` before the first.
+        aov_names: Channels besides those of the image.
+        has_taught: Is there a batch among them that the others use what it has learned from?
+    """
+
+    def __init__(self) -> None:
+        self.done: list[Batch] = []
+        self.has_taught = False
+        self.film, self.images = FilmSums(), None
+        self.aov_names: tuple[str, ...] = ()
+
+    @property
+    def spp(self) -> int:
+        """Samples per pixel of all batches."""
+        return self.film.spp
+
+    def add(self, result: BatchResult) -> None:
+        images = self.images or Batches(result.channels, result.image_channel_count)
+        images.add(result.image, result.batch.spp)
+        film = FilmSums()
+        film.contents, film.has_weights = result.contents.astype(np.float64), result.has_weights
+        film.spp = result.batch.spp
+        self.film = self.film.plus(film)
+        self.images, self.aov_names = images, result.aov_names
+        self.done.append(result.batch)
+        self.has_taught |= result.has_taught
+
+    def plus(self, other: RenderState) -> RenderState:
+        """The batches of both.
+
+        Raises:
+            InputError: Both have the same batch, or they have other channels.
+        """
+        shared = {batch[:2] for batch in self.done} & {batch[:2] for batch in other.done}
+        if shared:
+            seed = min(shared)[0]
+            raise InputError(f"both have samples of seed {seed}: render one with another --seed")
+        if self.images is None or other.images is None:
+            return other if self.images is None else self
+        if self.images.channels != other.images.channels:
+            raise InputError("they have different channels")
+        total = RenderState()
+        total.done = [*self.done, *other.done]
+        total.film, total.images = self.film.plus(other.film), self.images.plus(other.images)
+        total.aov_names = self.aov_names
+        return total
+
+    def fill(self, film: mi.Film) -> None:
+        """Replaces the contents of a film by the image of all batches."""
+        self.film.fill(film, self.aov_names)
+
+    # ---- As arrays ----
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that :meth:`from_arrays` needs."""
+        images = self.images.arrays() if self.images else {}
+        return {
+            **{f"images.{name}": array for name, array in images.items()},
+            "done": np.array(self.done, dtype=np.uint32).reshape(-1, 3),
+            "contents": np.asarray(self.film.contents),
+            "has_weights": np.array(self.film.has_weights),
+            "spp": np.array(self.film.spp),
+            "has_taught": np.array(self.has_taught),
+            "aov_names": np.array(self.aov_names, dtype=str),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> RenderState:
+        """
+        Raises:
+            KeyError: An array is missing.
+        """
+        state = cls()
+        state.done = [Batch(*row) for row in arrays["done"].tolist()]
+        state.film.contents = arrays["contents"]
+        state.film.has_weights, state.film.spp = bool(arrays["has_weights"]), int(arrays["spp"])
+        state.aov_names = tuple(arrays["aov_names"].tolist())
+        state.has_taught = bool(arrays["has_taught"])
+        if state.done:
+            prefix = "images."
+            parts = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+            state.images = Batches.from_arrays(parts)
+        return state
