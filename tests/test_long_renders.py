@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 from conftest import PATH, in_subprocess
 
-from mitsuba_ext.cli import long_job
 from mitsuba_ext.cli.common import Interval
 from mitsuba_ext.compare import InputError, load_reference, metrics, read_exr
 from mitsuba_ext.long_renders import batch_renderer, long_render
@@ -89,10 +88,13 @@ def test_a_render_that_goes_on_is_the_one_that_was_not_stopped(
     request = request_of(specification)
     whole = rendered(request)
     folder = CheckpointFolder(tmp_path / "kept")
-    for more in (1, 2, 9):
+    for most in (1, 3, 9):
         state = folder.load()
-        most = len(state.done) + more
-        rendered(request, state, is_stopped=lambda: len(state.done) >= most)
+
+        def is_stopped(state=state, most=most) -> bool:
+            return len(state.done) >= most
+
+        rendered(request, state, is_stopped=is_stopped)
         with folder.in_use():
             folder.save(state)
     state = folder.load()
@@ -233,8 +235,9 @@ def test_two_processes_cannot_use_a_folder(request_of, tmp_path):
 def test_what_is_learned_is_learned_once(run, make_scene, scenes, tmp_path, monkeypatch):
     monkeypatch.setattr(batch_renderer, "_LEARNING_SPP", 16)
     scene, kept = scenes / "cornell_box.xml", tmp_path / "kept"
-    command = ("render", scene, "-o", tmp_path / "a.exr", "--size", "8x6", "--integrator",
-               "composed_path:max_depth=3,next_event=contribution", "--checkpoint", kept)  # fmt: skip
+    learner = "composed_path:max_depth=3,next_event=contribution"
+    command = ("render", scene, "-o", tmp_path / "a.exr", "--size", "8x6",
+               "--integrator", learner, "--checkpoint", kept)  # fmt: skip
     seen = []
     render = BatchRenderer.render
 

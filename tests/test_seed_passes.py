@@ -115,7 +115,7 @@ def test_time_fixes_the_number_of_passes_by_the_first_that_compiles_nothing(monk
         return (2.0, True) if passes.passes == 1 else (2.0 if passes.passes == 2 else 1.0, False)
 
     monkeypatch.setattr(passes, "_run_pass", run_pass)
-    monkeypatch.setattr(passes, "_fill_film", lambda: None)
+    monkeypatch.setattr(passes._sums, "fill", lambda *_: None)
     passes.run(0, seconds=9.0)
     assert passes.passes == 4
 

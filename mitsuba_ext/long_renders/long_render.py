@@ -79,12 +79,14 @@ class LongRender:
             workers: How many batches the executor renders at a time.
         """
         self._goal, self.goal_spp = goal, goal.spp or 0
-        results = self._here() if executor is None else self._elsewhere(executor, workers)
+        results = self._here()
+        if executor is not None:
+            results = self._elsewhere(executor, workers, is_stopped)
         begin, warm, count = time.perf_counter(), 0.0, 0
         while not self._is_reached():
-            if is_stopped():
+            if is_stopped() or (result := next(results, None)) is None:
                 return False
-            self.state.add(next(results))
+            self.state.add(result)
             count += 1
             if count == 1:
                 # Its kernels may have been compiled
@@ -132,7 +134,9 @@ class LongRender:
         for batch in self._batches():
             yield self._renderer.render(batch)
 
-    def _elsewhere(self, executor: Executor, workers: int) -> Iterator[BatchResult]:
+    def _elsewhere(
+        self, executor: Executor, workers: int, is_stopped: Callable[[], bool]
+    ) -> Iterator[BatchResult]:
         """The same, by others, some of which may fail."""
         batches, running, done = self._batches(), {}, {}
         tries: dict[Batch, int] = {}
@@ -153,6 +157,8 @@ class LongRender:
                     batch = running.pop(future)
                     if (failure := _failure(future)) is None:
                         done[batch] = future.result()
+                    elif is_stopped():  # the workers may have got the same signal
+                        return
                     elif tries[batch] < _TRIES:
                         submit(batch)
                     else:

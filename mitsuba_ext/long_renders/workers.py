@@ -48,7 +48,8 @@ class Workers(Executor):
 def _start(parent: int) -> None:
     """Leaves signals to the parent, and ends with it."""
     for number in interrupts.SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
+        if number != signal.SIGTERM:  # by which the pool ends its processes
+            signal.signal(number, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it has ended meanwhile
