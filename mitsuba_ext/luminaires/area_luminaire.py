@@ -16,10 +16,8 @@ class AreaLuminaire(mi.Emitter):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.name = props.plugin_name()
-        if props.has_property("to_world"):
-            raise ValueError(
-                f'"{self.name}": has no to_world; the light is where its shape is'
-            )
+        if "to_world" in props:
+            raise ValueError(f'"{self.name}": has no to_world; the light is where its shape is')
         self.radiance = props.get_emissive_texture("radiance", 1.0)
         flags = int(mi.EmitterFlags.Surface)
         if self.radiance.is_spatially_varying():

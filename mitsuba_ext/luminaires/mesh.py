@@ -10,7 +10,7 @@ from ..solid_angles.spherical_triangle import SphericalTriangle, spherical_trian
 from .surface import Surface, SurfacePoint
 
 #: Meshes with more triangles are not sampled by solid angle: each sample asks all triangles.
-MOST_TRIANGLES = 64
+MOST_TRIANGLES = 16
 
 #: Floats of a triangle in the table: a corner, two edges, a sign; and three normals.
 _WORDS = 20
@@ -28,7 +28,7 @@ class MeshSurface(Surface):
         super().__init__(shape)
         table, areas, self._is_smooth = _table(shape)
         self._table = mi.Float(table.ravel())
-        self._count = dr.opaque(mi.UInt32, len(table))
+        self._count = len(table)
         share = np.cumsum(areas) / max(areas.sum(), 1e-300)
         self._share = mi.Float(np.append(0, share).astype(np.float32))
 
@@ -53,39 +53,24 @@ class MeshSurface(Surface):
         triangle.half_angle = dr.select(faces & active, triangle.half_angle, 0)
         return triangle
 
-    def _solid_angle(self, p: mi.Point3f) -> mi.Float:
-        """The sum over all triangles, halved."""
-        width = dr.width(p)
-
-        def add(index, total):
-            triangle = self._triangle(index, p, mi.Bool(True))
-            return index + 1, total + triangle.half_angle
-
-        index = dr.zeros(mi.UInt32, width)
-        state = dr.while_loop(
-            (index, dr.zeros(mi.Float, width)), lambda i, _: i < self._count, add
-        )
-        return state[1]
+    def _sums(self, p: mi.Point3f) -> list[mi.Float]:
+        """Half of the solid angle of the first, the first two, … triangles."""
+        sums = []
+        for index in range(self._count):
+            half_angle = self._triangle(mi.UInt32(index), p, mi.Bool(True)).half_angle
+            sums.append(sums[-1] + half_angle if sums else half_angle)
+        return sums
 
     def sample(self, p, sample, active):
-        total = self._solid_angle(p)
+        sums = self._sums(p)
+        total = sums[-1]
         target = sample.x * total
-        width = max(dr.width(p), dr.width(sample))
-
-        def search(index, chosen, passed, before):
-            half_angle = self._triangle(index, p, mi.Bool(True)).half_angle
-            # The last one with a solid angle is taken if rounding leaves no other
-            is_met = (passed <= target) & (half_angle > 0)
-            chosen = dr.select(is_met, index, chosen)
-            before = dr.select(is_met, passed, before)
-            return index + 1, chosen, passed + half_angle, before
-
-        index, zero = dr.zeros(mi.UInt32, width), dr.zeros(mi.Float, width)
-        _, chosen, _, before = dr.while_loop(
-            (index, dr.zeros(mi.UInt32, width), zero, dr.zeros(mi.Float, width)),
-            lambda i, _c, passed, _b: (i < self._count) & (passed <= target),
-            search,
-        )
+        # The first triangle with which the sum exceeds the target
+        chosen, before = mi.UInt32(0), mi.Float(0)
+        for sum in sums[:-1]:
+            is_passed = (sum <= target) & (sum < total)
+            chosen = dr.select(is_passed, chosen + 1, chosen)
+            before = dr.select(is_passed, sum, before)
         triangle = self._triangle(chosen, p, active)
         x = dr.clip((target - before) / dr.maximum(triangle.half_angle, 1e-37), 0, 1)
         prim_uv = mi.Point2f(*triangle.sample(mi.Point2f(x, sample.y)))
@@ -93,12 +78,12 @@ class MeshSurface(Surface):
         return SurfacePoint(self._point(chosen, prim_uv, active), pdf)
 
     def pdf(self, p, ds):
-        total = 2 * self._solid_angle(p)
+        total = 2 * self._sums(p)[-1]
         return dr.select(total > 0, dr.rcp(dr.maximum(total, 1e-37)), 0)
 
     def sample_area(self, sample, active):
         index = dr.binary_search(
-            0, len(self._share) - 2,
+            0, self._count - 1,
             lambda i: dr.gather(mi.Float, self._share, i + 1) <= sample.y,
         )  # fmt: skip
         low, high = (dr.gather(mi.Float, self._share, i) for i in (index, index + 1))

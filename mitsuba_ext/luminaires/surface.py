@@ -8,7 +8,6 @@ import drjit as dr
 import mitsuba as mi
 
 
-
 @dataclass
 class SurfacePoint:
     """A point of a light.
