@@ -2,10 +2,11 @@
 
     .venv/bin/python examples/area_lights.py
 
-Each scene is a diffuse floor under one light that the camera does not see. Writes one row of
-Markdown for each: the variance of ``area`` over that of ``solid_angle_area`` (between seeds, the
-mean over pixels), the time of ``solid_angle_area`` over that of ``area`` (the least of renders that
-take turns), and the efficiency that follows from both.
+Each scene is a diffuse floor under one light that the camera does not see, with posts that cast
+shadows (``--posts 0`` leaves them out). Writes one row of Markdown for each: the variance of
+``area`` over that of ``solid_angle_area`` (between seeds, the mean over pixels), the time of
+``solid_angle_area`` over that of ``area`` (the least of renders that take turns), and the
+efficiency that follows from both.
 """
 
 from __future__ import annotations
@@ -45,10 +46,11 @@ LIGHTS: dict[str, tuple[str, list[float], float]] = {
 @click.option("--sampler", default="independent")
 @click.option("--spp", default=16)
 @click.option("--seeds", default=12)
+@click.option("--posts", default=5, help="In each of two directions.")
 @click.option("--size", default=128, help="Edge of the film, in pixels.")
 def main(
     names: tuple[str, ...], integrator: str, emitter: str, sampling: str, sampler: str, spp: int,
-    seeds: int, size: int,
+    seeds: int, posts: int, size: int,
 ) -> None:  # fmt: skip
     """Compares the scenes whose names begin with one of NAMES (all, if there is none)."""
     mi.set_variant("llvm_ad_rgb")
@@ -61,7 +63,7 @@ def main(
         kinds: list[dict[str, Any]] = [{"type": "area"}, {"type": emitter}]
         if sampling:
             kinds[1]["sampling"] = sampling
-        scenes = [_scene(kind, *light, sampler, size) for kind in kinds]
+        scenes = [_scene(kind, *light, sampler, posts, size) for kind in kinds]
         images, seconds = [[], []], [[], []]
         for seed in range(seeds + 1):
             for k, scene in enumerate(scenes):
@@ -79,8 +81,9 @@ def main(
 
 
 def _scene(
-    emitter: dict[str, Any], shape: str, scale: list[float], height: float, sampler: str, size: int
-) -> mi.Scene:
+    emitter: dict[str, Any], shape: str, scale: list[float], height: float, sampler: str,
+    posts: int, size: int,
+) -> mi.Scene:  # fmt: skip
     T = mi.ScalarTransform4f
     # A strip stands upright and shines along the floor, of which the camera sees the part before it
     is_upright = shape == "wall"
@@ -97,7 +100,18 @@ def _scene(
         "sampler": {"type": sampler},
     }
     floor = {"type": "rectangle", "to_world": T().scale([5, 5, 1])}
-    scene = {"type": "scene", "camera": camera, "floor": floor, "lamp": lamp}
+    # Flat enough to stand below the lights
+    top = 0.008 if shape == "sphere" else 0.06
+    things = {
+        f"post{i}": {
+            "type": "cube",
+            "to_world": T().translate([0.4 * (i % posts - posts // 2),
+                                       0.4 * (i // posts - posts // 2), top / 2])
+            .scale([0.04, 0.04, top / 2]),
+        }
+        for i in range(posts * posts)
+    }  # fmt: skip
+    scene = {"type": "scene", "camera": camera, "floor": floor, "lamp": lamp, **things}
     return mi.load_dict(scene, optimize=False)
 
 

@@ -26,12 +26,13 @@ class AreaLuminaire(mi.Emitter):
 
     # ---- For derived classes ----
 
-    def profile(self, wo: mi.Vector3f) -> mi.Float:
-        """The factor of the radiance in the local direction ``wo`` (z along the normal)."""
+    def profile(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """The factor of the radiance in the direction ``si.wi``."""
         return mi.Float(1)
 
     def sample_profile(self, sample: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
-        """A local direction for light that leaves, and its density per solid angle."""
+        """A direction for light that leaves (z along the normal), and its density per solid
+        angle."""
         wo = mi.warp.square_to_cosine_hemisphere(sample)
         return wo, mi.warp.square_to_cosine_hemisphere_pdf(wo)
 
@@ -43,7 +44,7 @@ class AreaLuminaire(mi.Emitter):
 
     def eval(self, si, active=True):
         cosine = mi.Frame3f.cos_theta(si.wi)
-        radiance = self.radiance.eval(si, active) * self.profile(si.wi)
+        radiance = self.radiance.eval(si, active) * self.profile(si)
         return dr.select(mi.Bool(active) & (cosine > 0), radiance, 0)
 
     def sample_direction(self, it, sample, active=True):
@@ -98,7 +99,7 @@ class AreaLuminaire(mi.Emitter):
         si.wavelengths = wavelengths
         density = point.pdf * pdf
         shines = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (density > 0)
-        scale = self.profile(si.wi) * local.z / dr.select(shines, density, 1)
+        scale = self.profile(si) * local.z / dr.select(shines, density, 1)
         return si.spawn_ray(d), dr.select(shines, radiance * scale, 0)
 
     def sample_wavelengths(self, si, sample, active=True):
