@@ -37,9 +37,9 @@ SAMPLES = 1 << 14
 UNLIKELY = 1e-6
 
 
-def light(shape: dict[str, Any], radiance: Any = None) -> mi.Scene:
+def light(shape: dict[str, Any], radiance: Any = None, **parameters: Any) -> mi.Scene:
     """A scene of one light, which must be kept: an emitter does not keep its shape."""
-    emitter = {"type": NAME, "radiance": radiance or rgb(1.0)}
+    emitter = {"type": NAME, "radiance": radiance or rgb(1.0), **parameters}
     return mi.load_dict({"type": "scene", "light": {**shape, "emitter": emitter}})
 
 
@@ -66,7 +66,10 @@ def seen_from(centre: np.ndarray, axes: np.ndarray, gap: float = 0.0) -> np.ndar
     return np.array(points).astype(np.float32).astype(np.float64)
 
 
-def assert_exact(scene: mi.Scene, points: np.ndarray, cells, cell, bound: float) -> None:
+def assert_exact(
+    scene: mi.Scene, points: np.ndarray, cells, cell, bound: float,
+    normals: np.ndarray | None = None,
+) -> None:  # fmt: skip
     """At each point, the weights of the samples in each cell of the light sum to its solid angle,
     densities are those with which samples were found, and weights are bounded.
 
@@ -74,8 +77,11 @@ def assert_exact(scene: mi.Scene, points: np.ndarray, cells, cell, bound: float)
         cells: For a point, the solid angles of the cells.
         cell: For samples of a point (and their points on the light), their cells.
         bound: The largest weight, in units of the mean.
+        normals: Of the surfaces that are lit.
     """
     it, sample = lanes(points)
+    if normals is not None:
+        it.n = mi.Normal3f(np.repeat(normals, SAMPLES, axis=0).T.astype(np.float32))
     emitter = scene.emitters()[0]
     ds, weight = emitter.sample_direction(it, sample)
     again = emitter.pdf_direction(it, ds)
@@ -132,6 +138,33 @@ def test_a_rectangle_is_sampled_by_solid_angle(shear: float) -> None:
         lambda p: parallelogram_cells(centre - x - y - p, 2 * x, 2 * y),
         lambda p, on_light, uv: cell_of(uv), 1.001,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("tilt", [0, 50, 100, 180])
+def test_a_rectangle_is_sampled_by_projected_solid_angle(tilt: int) -> None:
+    """Receivers that look at the light, past it so that the horizon cuts it, and away from it."""
+    to_world = turned().scale([0.5, 0.3, 1])
+    x, y, n, centre = np.array(to_world.matrix, dtype=np.float64)[:3].T
+    axes = np.stack([v / np.linalg.norm(v) for v in (x, y, n)], axis=1)
+    points = seen_from(centre, axes)
+    to_light = (centre - points) / np.linalg.norm(centre - points, axis=1, keepdims=True)
+    across = np.cross(to_light, [0.48, 0.6, 0.64])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    normals = np.cos(np.radians(tilt)) * to_light + np.sin(np.radians(tilt)) * across
+    assert_exact(
+        light({"type": "rectangle", "to_world": to_world}, sampling="projected"), points,
+        lambda p: parallelogram_cells(centre - x - y - p, 2 * x, 2 * y),
+        lambda p, on_light, uv: cell_of(uv), 10.01, normals,
+    )  # fmt: skip
+
+
+def test_projected_samples_of_an_even_receiver_have_almost_equal_weights() -> None:
+    scene = light({"type": "rectangle"}, sampling="projected")
+    it, sample = lanes(np.array([[0.5, 0.2, 0.4]]))
+    it.n = mi.Normal3f(0.6, 0, -0.8)
+    ds, weight = scene.emitters()[0].sample_direction(it, sample)
+    received = np.array(weight)[0] * np.maximum(0, np.array(dr.dot(ds.d, it.n)))
+    assert received.max() / received.mean() < 1.2
 
 
 def test_a_triangle_is_sampled_by_solid_angle() -> None:
@@ -276,8 +309,11 @@ def test_positions_are_uniform_on_the_surface(name: str) -> None:
 
 def lit(emitter: str, name: str, transform: mi.ScalarTransform4f, radiance: Any, **changes: Any):
     """A stage under a light that nearly touches the block."""
+    kind, _, sampling = emitter.partition(":")
     lamp = {**shape(name, transform, **changes), "bsdf": diffuse(0.0),
-            "emitter": {"type": emitter, "radiance": radiance}}  # fmt: skip
+            "emitter": {"type": kind, "radiance": radiance}}  # fmt: skip
+    if sampling:
+        lamp["emitter"]["sampling"] = sampling
     return mi.load_dict(stage(light=lamp, camera=sensor(film=film(8, 8))), optimize=False)
 
 
@@ -288,14 +324,14 @@ def down(*scale: float) -> mi.ScalarTransform4f:
 
 def assert_like_area(
     integrator: dict[str, Any], name: str, transform: mi.ScalarTransform4f, radiance: Any = None,
-    spp: int = 256, seeds: int = 8, error: float = 0.02, **changes: Any,
+    spp: int = 256, seeds: int = 8, error: float = 0.02, kind: str = NAME, **changes: Any,
 ) -> None:  # fmt: skip
     images = [
         batches(
             lit(emitter, name, transform, radiance or rgb(2, 1, 0.5), **changes),
             mi.load_dict(integrator), spp, range(first, first + seeds),
         )
-        for emitter, first in ((NAME, 1), ("area", 1001))
+        for emitter, first in ((kind, 1), ("area", 1001))
     ]  # fmt: skip
     assert_same_quarters(*images, precision=error)
 
@@ -316,6 +352,17 @@ def test_images_have_the_mean_of_area(name: str) -> None:
 ])  # fmt: skip
 def test_integrators_have_the_mean_of_area(integrator: str, name: str) -> None:
     assert_like_area({"type": integrator, "max_depth": 3}, name, down(0.3, 0.3, 0.1), error=0.05)
+
+
+@pytest.mark.parametrize("integrator", [
+    "path", *(pytest.param(n, marks=pytest.mark.slow) for n in ("neepp", "bdpt"))
+])  # fmt: skip
+def test_projected_samples_have_the_mean_of_area(integrator: str) -> None:
+    """The light stands upright: the floor's horizon and the wall's cut it."""
+    T = mi.ScalarTransform4f
+    upright = T().translate([-0.3, 0.6, 0.1]).rotate([1, 0, 0], 90).scale([0.5, 0.3, 1])
+    method = {"type": integrator, "max_depth": 3, "hide_emitters": True}
+    assert_like_area(method, "rectangle", upright, error=0.05, kind=f"{NAME}:projected")
 
 
 @pytest.mark.slow
@@ -392,6 +439,14 @@ def test_shapes_whose_solid_angle_is_unknown_are_refused() -> None:
     scene = light({"type": "cylinder"})
     with pytest.raises(RuntimeError, match='solid angle of a shape "Cylinder"'):
         scene.emitters()[0].sample_direction(*lanes(np.ones((1, 3))))
+
+
+def test_only_rectangles_are_sampled_by_projected_solid_angle() -> None:
+    scene = light({"type": "disk"}, sampling="projected")
+    with pytest.raises(RuntimeError, match='"projected" needs a rectangle, found "Disk"'):
+        scene.emitters()[0].sample_direction(*lanes(np.ones((1, 3))))
+    with pytest.raises(RuntimeError, match='sampling must be "solid_angle" or "projected"'):
+        light({"type": "rectangle"}, sampling="cosine")
 
 
 def test_a_light_without_a_shape_is_refused() -> None:

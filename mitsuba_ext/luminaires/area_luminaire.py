@@ -11,7 +11,13 @@ from mitsuba_ext.luminaires.surfaces import surface
 
 class AreaLuminaire(mi.Emitter):
     """An emitter on a shape: a spectrum or texture of radiance, times what :meth:`profile` says of
-    the direction. Light leaves to the side of the shading normal, as from Mitsuba's ``area``."""
+    the direction. Light leaves to the side of the shading normal, as from Mitsuba's ``area``.
+
+    Attributes:
+        is_projected: Are polygons sampled by projected solid angle?
+    """
+
+    is_projected = False
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -40,7 +46,7 @@ class AreaLuminaire(mi.Emitter):
 
     def _surface(self) -> Surface:
         # Not kept: the shape may be moved. What is read here costs nothing in the kernel
-        return surface(self.name, self.get_shape())
+        return surface(self.name, self.get_shape(), self.is_projected)
 
     def eval(self, si, active=True):
         cosine = mi.Frame3f.cos_theta(si.wi)
@@ -49,7 +55,7 @@ class AreaLuminaire(mi.Emitter):
 
     def sample_direction(self, it, sample, active=True):
         active = mi.Bool(active)
-        point = self._surface().sample(it.p, sample, active)
+        point = self._surface().sample(it, sample, active)
         si = point.si
         si.time, si.wavelengths = it.time, it.wavelengths
         ds = dr.zeros(mi.DirectionSample3f, dr.width(si.p))
@@ -66,7 +72,7 @@ class AreaLuminaire(mi.Emitter):
 
     def pdf_direction(self, it, ds, active=True):
         is_seen = mi.Bool(active) & (dr.dot(ds.d, ds.n) < 0)
-        pdf = self._surface().pdf(it.p, ds)
+        pdf = self._surface().pdf(it, ds)
         return dr.select(is_seen & dr.isfinite(pdf), pdf, 0)
 
     def eval_direction(self, it, ds, active=True):

@@ -28,7 +28,8 @@ class DiskSurface(Surface):
     def _normal(self) -> mi.Normal3f:
         return self.shape.sample_position(0, mi.Point2f(0.5)).n
 
-    def sample(self, p, sample, active):
+    def sample(self, it, sample, active):
+        p = it.p
         normal = self._normal()
         cone = self._seen_from(p, normal)
         offset = cone.sample(sample)
@@ -41,7 +42,8 @@ class DiskSurface(Surface):
         si.uv = mi.Point2f(dr.minimum(dr.hypot(local.x, local.y), 1), angle)
         return SurfacePoint(si, cone.pdf(si.p - p))
 
-    def pdf(self, p, ds):
+    def pdf(self, it, ds):
+        p = it.p
         return self._seen_from(p, self._normal()).pdf(ds.p - p)
 
 

@@ -61,7 +61,8 @@ class MeshSurface(Surface):
             sums.append(sums[-1] + half_angle if sums else half_angle)
         return sums
 
-    def sample(self, p, sample, active):
+    def sample(self, it, sample, active):
+        p = it.p
         sums = self._sums(p)
         total = sums[-1]
         target = sample.x * total
@@ -77,7 +78,8 @@ class MeshSurface(Surface):
         pdf = dr.select(total > 0, dr.rcp(dr.maximum(2 * total, 1e-37)), 0)
         return SurfacePoint(self._point(chosen, prim_uv, active), pdf)
 
-    def pdf(self, p, ds):
+    def pdf(self, it, ds):
+        p = it.p
         total = 2 * self._sums(p)[-1]
         return dr.select(total > 0, dr.rcp(dr.maximum(total, 1e-37)), 0)
 

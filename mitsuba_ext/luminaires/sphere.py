@@ -34,7 +34,8 @@ class SphereSurface(Surface):
     def _cone(self, p: mi.Point3f) -> Cone:
         return cone(self._centre - p, self._radius)
 
-    def sample(self, p, sample, active):
+    def sample(self, it, sample, active):
+        p = it.p
         seen = self._cone(p)
         normal, pdf = seen.sample(sample), dr.rcp(seen.solid_angle)
         if self._shines_inwards:
@@ -45,7 +46,8 @@ class SphereSurface(Surface):
             pdf = dr.select(is_inside, from_inside, pdf)
         return SurfacePoint(self._point(normal, active), pdf)
 
-    def pdf(self, p, ds):
+    def pdf(self, it, ds):
+        p = it.p
         pdf = dr.rcp(self._cone(p).solid_angle)
         if self._shines_inwards:
             from_inside = per_solid_angle(dr.rcp(self.area()), ds.d * ds.dist, ds.n)

@@ -32,14 +32,14 @@ class Surface:
     def __init__(self, shape: mi.Shape) -> None:
         self.shape = shape
 
-    def sample(self, p: mi.Point3f, sample: mi.Point2f, active: mi.Bool) -> SurfacePoint:
-        """A point to connect ``p`` with, and its density per solid angle at ``p``."""
+    def sample(self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool) -> SurfacePoint:
+        """A point to connect ``it`` with, and its density per solid angle there."""
         point = self.sample_area(sample, active)
-        point.pdf = per_solid_angle(point.pdf, point.si.p - p, point.si.n)
+        point.pdf = per_solid_angle(point.pdf, point.si.p - it.p, point.si.n)
         return point
 
-    def pdf(self, p: mi.Point3f, ds: mi.DirectionSample3f) -> mi.Float:
-        """The density with which :meth:`sample`, at ``p``, finds the point of ``ds``."""
+    def pdf(self, it: mi.Interaction3f, ds: mi.DirectionSample3f) -> mi.Float:
+        """The density with which :meth:`sample`, at ``it``, finds the point of ``ds``."""
         return per_solid_angle(dr.rcp(self.area()), ds.d * ds.dist, ds.n)
 
     def sample_area(self, sample: mi.Point2f, active: mi.Bool) -> SurfacePoint:

@@ -6,17 +6,18 @@ import mitsuba as mi
 
 from .disk import DiskSurface, is_round
 from .mesh import MOST_TRIANGLES, MeshSurface, triangle_count
-from .rectangle import RectangleSurface
+from .rectangle import ProjectedRectangleSurface, RectangleSurface
 from .sphere import SphereSurface
 from .surface import Surface
 
 
-def surface(name: str, shape: mi.Shape | None) -> Surface:
+def surface(name: str, shape: mi.Shape | None, is_projected: bool = False) -> Surface:
     """How points of a shape are sampled for a light.
 
     Parameters:
         name: Of the light's plugin, for errors.
         shape: What emits.
+        is_projected: By projected solid angle?
 
     Raises:
         NotImplementedError: Nothing is known of the solid angle of this shape.
@@ -26,7 +27,12 @@ def surface(name: str, shape: mi.Shape | None) -> Surface:
         raise RuntimeError(f'"{name}": the light needs a shape: put it into one')
     kind = mi.ShapeType(int(shape.shape_type()))
     if kind == mi.ShapeType.Rectangle:
-        return RectangleSurface(shape)
+        return (ProjectedRectangleSurface if is_projected else RectangleSurface)(shape)
+    if is_projected:
+        raise NotImplementedError(
+            f'"{name}": sampling "projected" needs a rectangle, found "{shape.class_name()}"; use '
+            f'"solid_angle"'
+        )
     if kind == mi.ShapeType.Sphere:
         return SphereSurface(shape)
     if kind == mi.ShapeType.Disk:
