@@ -25,7 +25,7 @@ class EllipticalCone:
     Attributes:
         frame: The axes x and y of the ellipse, and the axis of the cone.
         tan_x, tan_y: Half-axes of the ellipse; tan_x ≤ tan_y.
-        radius: Of the disk.
+        radius: Of the disk. The lengths below are in units of it.
         along, height: From the origin to the point where the axis meets the disk: how far along the
             disk, away from the origin, and how far at right angles to it.
         shift: From the centre of the disk to this point, in the same direction.
@@ -65,8 +65,8 @@ class EllipticalCone:
         to_plane = dr.maximum(self.height - x * self.along, 1e-37)
         x_disk = self.shift + x * distance_2 / to_plane
         y_disk = y * self.height * dr.sqrt(distance_2) / to_plane
-        outside = dr.maximum(dr.hypot(x_disk, y_disk) / self.radius, 1)
-        return (x_disk * self.side + y_disk * self.frame.t) / outside
+        outside = dr.maximum(dr.hypot(x_disk, y_disk), 1)
+        return (x_disk * self.side + y_disk * self.frame.t) * (self.radius / outside)
 
     def pdf(self, d: mi.Vector3f) -> mi.Float:
         """The density, per solid angle, with which :meth:`sample` finds a direction in the cone.
@@ -94,23 +94,25 @@ def elliptical_cone(
     diameter whose ends are P and Q. The axis of the cone bisects the angle between them, and the
     ellipse follows from their distances alone.
     """
-    # In the plane of symmetry: the centre lies at x along the disk, and at the height h
+    # In units of the radius, and in the plane of symmetry: the centre lies at x along the disk, and
+    # at the height h
+    centre = centre / radius
     h = dr.dot(centre, normal)
     normal, h = dr.select(h < 0, -normal, normal), dr.abs(h)
     along = centre - h * normal
     x = dr.norm(along)
     side = dr.select(x > 1e-6 * h, along / x, mi.Frame3f(normal).s)
-    # |P|² |Q|² = w² + 4 R² h². (|P| + |Q|)² - 4 R² = 2 (d + w) and 4 R² - (|P| - |Q|)² = 2 (d - w);
-    # the smaller of the two is 4 R² h² over the larger one
-    w = (x - radius) * (x + radius) + dr.square(h)
-    d = dr.sqrt(dr.square(w) + dr.square(2 * radius * h))
+    # |P|² |Q|² = w² + 4 h². (|P| + |Q|)² - 4 = 2 (d + w) and 4 - (|P| - |Q|)² = 2 (d - w);
+    # the smaller of d + w and d - w is 4 h² over the larger one
+    w = (x - 1) * (x + 1) + dr.square(h)
+    d = dr.sqrt(dr.square(w) + dr.square(2 * h))
     large = dr.maximum(d + dr.abs(w), 1e-37)
-    small = dr.square(2 * radius * h) / large
+    small = dr.square(2 * h) / large
     plus, minus = dr.select(w > 0, large, small), dr.select(w > 0, small, large)
     plus = dr.maximum(plus, 1e-37)
-    tan_x, tan_y = dr.sqrt(minus / plus), radius * dr.sqrt(2 / plus)
+    tan_x, tan_y = dr.sqrt(minus / plus), dr.sqrt(2 / plus)
     # The axis meets the disk at q from its centre, towards the origin
-    q = -4 * dr.square(radius) * x / dr.maximum(2 * plus + 4 * dr.square(radius), 1e-37)
+    q = -4 * x / (2 * plus + 4)
     axis = centre + q * side
     axis /= dr.maximum(dr.norm(axis), 1e-37)
     y = dr.cross(normal, side)

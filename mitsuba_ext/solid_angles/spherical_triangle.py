@@ -19,7 +19,7 @@ _TINY = 1e-37
 
 @dataclass
 class SphericalTriangle:
-    """What a flat triangle subtends at the origin.
+    """What a flat triangle subtends at the origin. Lengths have a unit of its own.
 
     Attributes:
         a, b, c: Its corners.
@@ -97,6 +97,9 @@ def spherical_triangle(
 ) -> SphericalTriangle:
     """The triangle with the corners ``a``, ``b``, ``c`` as seen from the origin; see
     :class:`SphericalTriangle`."""
+    # In units of the greatest distance: products of lengths then are floats in scenes of any scale
+    unit = dr.rcp(dr.maximum(dr.maximum(dr.norm(a), dr.norm(b)), dr.maximum(dr.norm(c), _TINY)))
+    a, b, c, ba, ac = (v * unit for v in (a, b, c, ba, ac))
     lengths = mi.Vector3f(dr.norm(a), dr.norm(b), dr.norm(c))
     # The distance of the plane is least inexact by the nearest corner
     nearest = dr.select(lengths.x < lengths.y, a, b)
@@ -104,9 +107,9 @@ def spherical_triangle(
     product = lengths.x * lengths.y * lengths.z
     volume = dr.abs(dr.dot(nearest, dr.cross(ba, ac))) / dr.maximum(product, _TINY)
     lengths = dr.maximum(lengths, _TINY)
-    unit = [v / length for v, length in zip((a, b, c), lengths)]
+    x, y, z = (v / length for v, length in zip((a, b, c), lengths))
     # Eq. 8 of A. Van Oosterom and J. Strackee, The Solid Angle of a Plane Triangle, 1983
-    denominator = 1 + dr.dot(unit[0], unit[1]) + dr.dot(unit[1], unit[2]) + dr.dot(unit[0], unit[2])
+    denominator = 1 + dr.dot(x, y) + dr.dot(y, z) + dr.dot(x, z)
     half_angle = dr.atan2(volume, denominator)
     return SphericalTriangle(a, b, c, ba, ac, lengths, volume, denominator, half_angle)
 
