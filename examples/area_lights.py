@@ -4,7 +4,7 @@
 
 Each scene is a diffuse floor under one light that the camera does not see, with posts that cast
 shadows (``--posts 0`` leaves them out). Writes one row of Markdown for each: the variance of
-``area`` over that of ``solid_angle_area`` (between seeds, the mean over pixels), the time of
+``area`` over that of ``solid_angle_area`` (between seeds, the mean over pixels), the CPU time of
 ``solid_angle_area`` over that of ``area`` (the least of renders that take turns), and the
 efficiency that follows from both.
 """
@@ -67,13 +67,13 @@ def main(
         images, seconds = [[], []], [[], []]
         for seed in range(seeds + 1):
             for k, scene in enumerate(scenes):
-                start = time.perf_counter()
+                start = time.process_time()
                 image = mi.render(scene, integrator=method, spp=spp, seed=1 + 7919 * seed + k)
                 dr.eval(image)
                 dr.sync_thread()
                 # The first render compiles
                 if seed > 0:
-                    seconds[k].append(time.perf_counter() - start)
+                    seconds[k].append(time.process_time() - start)
                     images[k].append(np.array(image, dtype=np.float64))
         variance = [np.var(x, axis=0, ddof=1).mean() for x in images]
         gain, slower = variance[0] / variance[1], min(seconds[1]) / min(seconds[0])

@@ -105,11 +105,11 @@ def test_a_rectangle_is_sampled_by_solid_angle(shear: float) -> None:
 
 
 def test_a_rectangle_is_sampled_by_projected_solid_angle() -> None:
-    """Receivers that look at the light, past it so that the horizon cuts it, and away from it."""
+    """Receivers that look at the light, and past it, so that the horizon cuts it."""
     to_world = turned().scale([0.5, 0.3, 1])
     x, y, n, centre = np.array(to_world.matrix, dtype=np.float64)[:3].T
     axes = np.stack([v / np.linalg.norm(v) for v in (x, y, n)], axis=1)
-    tilts = np.radians([0, 50, 100, 180])
+    tilts = np.radians([20, 95])
     points = np.repeat(seen_from(centre, axes), len(tilts), axis=0)
     tilt = np.tile(tilts, len(points) // len(tilts))[:, None]
     to_light = (centre - points) / np.linalg.norm(centre - points, axis=1, keepdims=True)

@@ -16,11 +16,20 @@ class SphericalPolygon:
 
     Attributes:
         triangles: The triangles (corner 0, corner k, corner k + 1), k = 1, 2, …
-        solid_angle: The sum of theirs.
     """
 
     triangles: list[SphericalTriangle]
-    solid_angle: mi.Float
+
+    @property
+    def solid_angle(self) -> mi.Float:
+        # The half angles are those of complex numbers, whose product has their sum: one arctangent
+        cos, sin = self.triangles[0].denominator, self.triangles[0].volume
+        for triangle in self.triangles[1:]:
+            x, y = triangle.denominator, triangle.volume
+            cos, sin = cos * x - sin * y, cos * y + sin * x
+        angle = dr.atan2(sin, cos)
+        # Rounding, where the polygon fills half of the sphere
+        return 2 * dr.select(angle < -1e-3, angle + dr.two_pi, dr.maximum(angle, 0))
 
     def sample(self, sample: mi.Point2f) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """A point of the polygon, uniformly distributed by solid angle: the number k - 1 of its
@@ -28,7 +37,10 @@ class SphericalPolygon:
 
         The map is continuous: ``sample.x`` moves the end of an arc from corner 0 along the other
         edges of the polygon, and ``sample.y`` moves along the arc."""
-        target = 0.5 * self.solid_angle * sample.x
+        total = self.triangles[0].half_angle
+        for triangle in self.triangles[1:]:
+            total = total + triangle.half_angle
+        target = total * sample.x
         chosen, index, passed = self.triangles[0], mi.UInt32(0), mi.Float(0)
         before = mi.Float(0)
         for k, triangle in enumerate(self.triangles[1:], 1):
@@ -55,7 +67,4 @@ def spherical_polygon(corners: list[mi.Vector3f], edges: list[mi.Vector3f]) -> S
             spherical_triangle(corners[k], corners[0], corners[k + 1], diagonal, edges[k])
         )
         diagonal = diagonal + edges[k]
-    solid_angle = triangles[0].solid_angle
-    for triangle in triangles[1:]:
-        solid_angle = solid_angle + triangle.solid_angle
-    return SphericalPolygon(triangles, solid_angle)
+    return SphericalPolygon(triangles)
