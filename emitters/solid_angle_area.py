@@ -37,7 +37,8 @@ class SolidAngleArea(AreaLuminaire):
     strip along a wall. **Not when** its texture has a small bright part (:monosp:`area` samples the
     texture; here only directions are sampled), or when the integrator learns from parts of lights:
     :monosp:`neepp`, :monosp:`two_stage_lights`, :monosp:`learned_lights` and
-    :monosp:`resampled_lights` divide the lights of :monosp:`area`, and take this one as a whole.
+    :monosp:`resampled_lights` divide the lights of :monosp:`area`, and take this one as a whole;
+    nor for hundreds of small lights: each adds about 3 ms to every pass.
 
     All integrators can use it, those of Mitsuba too, and light paths start from it.
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..solid_angles.projected_polygon import ProjectedPolygon
 from ..solid_angles.spherical_polygon import SphericalPolygon, spherical_polygon
@@ -24,9 +25,10 @@ class RectangleSurface(Surface):
 
     def __init__(self, shape: mi.Shape) -> None:
         super().__init__(shape)
-        to_world = mi.traverse(shape)["to_world"]
-        self._corner = to_world @ mi.Point3f(-1, -1, 0)
-        self._edges = [to_world @ mi.Vector3f(2, 0, 0), to_world @ mi.Vector3f(0, 2, 0)]
+        matrix = mi.traverse(shape)["to_world"].matrix
+        x, y, origin = (_column(matrix, j) for j in (0, 1, 3))
+        self._corner = mi.Point3f(_data(origin - x - y))
+        self._edges = [_data(2 * x), _data(2 * y)]
 
     def _seen_from(self, p: mi.Point3f) -> SphericalPolygon:
         x, y = self._edges
@@ -131,6 +133,17 @@ class ProjectedRectangleSurface(RectangleSurface):
             dr.clip(dr.dot(dr.cross(hit, y), normal) / squared, 0, 1),
             dr.clip(dr.dot(dr.cross(x, hit), normal) / squared, 0, 1),
         )
+
+
+def _column(matrix: mi.Matrix4f, index: int) -> np.ndarray:
+    # Number by number: a matrix cannot be read while Dr.Jit records a call
+    return np.array([float(matrix[i, index][0]) for i in range(3)])
+
+
+def _data(vector: np.ndarray) -> mi.Vector3f:
+    """A vector that is no literal: so the code of all rectangles is the same, and is compiled
+    once."""
+    return mi.Vector3f(*(mi.Float(np.array([x], dtype=np.float32)) for x in vector))
 
 
 @dataclass
