@@ -34,6 +34,7 @@ PICTURES = {
     "shaded_lamp": 192,
     "corridor": 64,
     "night_classroom": 128,
+    "near_lights": 256,
 }
 
 #: Scenes rendered by light paths or chains, or in which nothing is learned of visibility; all

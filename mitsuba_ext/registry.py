@@ -41,6 +41,7 @@ _BASES = (
     "mitsuba_ext.composition.wrapping_integrator",
     "mitsuba_ext.composition.reweighted_camera",
     "mitsuba_ext.sequences.sequence_sampler",
+    "mitsuba_ext.luminaires.area_luminaire",
 )
 
 _registered: set[str] = set()

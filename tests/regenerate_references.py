@@ -77,6 +77,7 @@ REGRESSIONS = {
         Regression("reweighted_lens", "defocus", {"nested": "path"}, spp=512),
         Regression("reweighted_time", "fan", {"nested": "composed_path"}),
         Regression("composed_path", "fast_balls"),
+        Regression("composed_path", "near_lights", max_depth=4, is_slow=True),
         Regression("composed_path", "flint", variant="llvm_ad_spectral"),
         Regression("reweighted_wavelength", "prism", {"nested": "composed_path"},
                    variant="llvm_ad_spectral"),

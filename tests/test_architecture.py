@@ -33,6 +33,10 @@ FORBIDDEN = {
                   *PLUGINS},
     "sequences": {"transport", "regions", "lights", "decisions", "bidirectional", "chains",
                   "path_space", "composition", "rendering", *PLUGINS},
+    "solid_angles": {"transport", "regions", "lights", "luminaires", "decisions", "bidirectional",
+                     "chains", "path_space", "composition", "rendering", *PLUGINS},
+    "luminaires": {"transport", "regions", "lights", "decisions", "bidirectional", "chains",
+                   "path_space", "composition", "rendering", *PLUGINS},
     "compare": {"transport", "regions", "lights", "decisions", "composition", *PLUGINS},
 }  # fmt: skip
 

@@ -1,0 +1,102 @@
+"""Area lights that are sampled by solid angle."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.luminaires.area_luminaire import AreaLuminaire
+
+
+@registry.plugin
+class SolidAngleArea(AreaLuminaire):
+    r"""
+    .. _emitter-solid_angle_area:
+
+    Area light, sampled by solid angle (:monosp:`solid_angle_area`)
+    ---------------------------------------------------------------
+
+    The light of Mitsuba's :monosp:`area`, in its place on a shape, with other samples: connections
+    choose among the directions in which the light is seen from the point that they start from, not
+    among the points of its surface.
+
+    .. pluginparameters::
+
+     * - radiance
+       - |spectrum| or |texture|
+       - Emitted radiance, in W/(m² sr). (Default: 1)
+     * - sampling
+       - |string|
+       - :monosp:`solid_angle`, or :monosp:`projected`: also by the cosine with the normal of the
+         surface that is lit (rectangles only). (Default: solid_angle)
+     * - sampling_weight
+       - |float|
+       - How often the light is chosen, in proportion to the others. (Default: 1)
+
+    **Use it when** a light is large or close, as seen from what it lights: a panel over a table, a
+    strip along a wall. **Not when** its texture has a small bright part (:monosp:`area` samples the
+    texture; here only directions are sampled), or when the integrator learns from parts of lights:
+    :monosp:`neepp`, :monosp:`two_stage_lights`, :monosp:`learned_lights` and
+    :monosp:`resampled_lights` divide the lights of :monosp:`area`, and take this one as a whole;
+    nor for hundreds of small lights: each adds about 3 ms to every pass.
+
+    All integrators can use it, those of Mitsuba too, and light paths start from it.
+
+    - :monosp:`rectangle`, also sheared ones, and meshes of up to 16 triangles: directions are
+      uniformly distributed. A mesh chooses among the triangles that face the point, in proportion
+      to their solid angles; where its triangles hide each other, samples are lost.
+    - :monosp:`disk`: uniform up to a factor between 1 and 1.21. A disk that to_world makes an
+      ellipse, and meshes of more triangles, are sampled by area, as :monosp:`area` does.
+    - :monosp:`sphere`: uniformly in its cone, as :monosp:`area` does; by area if the sphere shines
+      inwards and the point is inside.
+
+    The same density holds for MIS in each of these cases. So the weight of a sample is at most 1.21
+    times the radiance times the solid angle (where directions are sampled).
+
+    :monosp:`projected` makes less noise than :monosp:`solid_angle` on surfaces that are not smooth,
+    most of all where the light stands at right angles to them, but a sample takes longer; do not
+    use it for distant lights. The part of the light above the horizon of the surface, and the part
+    below it (emitters do not know from which side the surface is seen), are sampled by the modulus
+    of the cosine with its geometric normal. A tenth of the samples are those of
+    :monosp:`solid_angle`, so that weights are at most ten times as large as there, also where
+    shading normals or transmission let light in that the cosine does not expect. Lights whose
+    projected solid angle is less than 1e-3, and points in media, get :monosp:`solid_angle`.
+
+    Interpolated normals turn the light of a mesh as rays
+    see it, and have no part in densities. Gradients reach the radiance, but not the shape.
+
+    Errors: other shapes are refused in the first render, and so is :monosp:`projected` on other
+    shapes than :monosp:`rectangle`.
+
+    Source: the course, J. Arvo's part, 4.3 and 4.4; C. Peters, *BRDF Importance Sampling for
+    Polygonal Lights*, ACM TOG 40(4), 2021, for a form of J. Arvo, *Stratified Sampling of Spherical
+    Triangles*, 1995, without angles; disks after I. Guillén et al., *Area-Preserving
+    Parameterizations for Spherical Ellipses*, 2017, with a closed form in the place of the elliptic
+    integral.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <shape type="rectangle">
+                <emitter type="solid_angle_area">
+                    <rgb name="radiance" value="5"/>
+                </emitter>
+            </shape>
+
+        .. code-tab:: python
+
+            'type': 'rectangle',
+            'emitter': {
+                'type': 'solid_angle_area',
+                'radiance': {'type': 'rgb', 'value': 5.0}
+            }
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        sampling = props.get("sampling", "solid_angle")
+        if sampling not in ("solid_angle", "projected"):
+            raise ValueError(
+                f'"{self.name}": sampling must be "solid_angle" or "projected", found "{sampling}"'
+            )
+        self.is_projected = sampling == "projected"
