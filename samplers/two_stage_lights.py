@@ -40,7 +40,8 @@ class TwoStageLightsPlugin(DecisionPlugin):
     Lights other than the environment are chosen as by :monosp:`path`. Without an environment this
     is what :monosp:`path` does. BSDF samples take part by MIS; lobes that are thinner than a texel
     are left to them. The density is positive wherever the map is defined: a hundredth of it follows
-    the map alone. Not for :monosp:`bdpt` and other integrators with light paths.
+    the map alone. The table of the map takes 12 bytes for each of its texels. Not for
+    :monosp:`bdpt` and other integrators with light paths.
 
     Source: D. Cline, P. K. Egbert, J. F. Talbot, D. L. Cardon, *Two Stage Importance Sampling for
     Direct Lighting*, EGSR 2006 (= D. Cline, PhD dissertation, BYU, 2007, chapter 5). The order of
