@@ -263,6 +263,20 @@ TECHNIQUES: dict[str, Technique] = {
             ("materials", "constant_environment"),
         ),
     ),
+    # ``test_visibility_maps.py`` has densities and boxes
+    "triple_product": Technique(
+        "composed_path", {"next_event": "triple_product", "connections": 4},
+        checks=Checks(cases=["no_light"]),
+        thorough=Checks(
+            [], ["llvm_ad_spectral"], ["furnace_convex"], [-1],
+            ("sun_of_one_texel", "constant_environment", "materials", "film_of_one_pixel",
+             "cropped_film", "empty"),
+        ),
+    ),
+    "triple_product_of_directions": Technique(
+        "two_stage", {"visibility": "world", "light_samples": 2, "vertices": "all"},
+        thorough=Checks(cases=("sun_of_one_texel", "materials")),
+    ),
     # ``test_portals.py`` has rooms, furnaces and densities
     "portals": Technique(
         "composed_path", {"next_event": "portals"}, checks=Checks(cases=["no_light"]),
