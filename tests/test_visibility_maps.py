@@ -22,6 +22,7 @@ from mitsuba_ext.decisions.next_event.visibility_maps import (
     Tile,
     VisibilityCounts,
 )
+from mitsuba_ext.rendering.render import kernel_cache_misses
 from mitsuba_ext.transport.path_decisions import LightNumbers
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -196,6 +197,15 @@ def test_a_box_in_which_all_is_equally_bright_stays_so(space: str) -> None:
     images = batches(_box(emitter=area(0.5)), _made(space, max_depth=-1, rr_depth=50), 64, range(4))
     error = images.mean(axis=(1, 2, 3)).std(ddof=1) / 2
     assert abs(images.mean() - 1) < 4 * error + 2e-4 and error < 5e-3
+
+
+@pytest.mark.parametrize("space", ["primary", pytest.param("world", marks=pytest.mark.slow)])
+def test_other_maps_need_no_other_kernels(space: str) -> None:
+    scene, integrator = _box(), _made(space, pilot_spp=2)
+    batches(scene, integrator, 8, [1, 2])
+    before = kernel_cache_misses()
+    batches(scene, integrator, 8, [3, 4])
+    assert kernel_cache_misses() == before
 
 
 def test_without_pilots_it_is_two_stage() -> None:

@@ -215,7 +215,8 @@ class WorldVisibility:
         values = np.stack([weight, weight**2], axis=-1)
         sums[:, 1:, 1:] = values.cumsum(axis=1).cumsum(axis=2)
         self._sums = mi.Float(sums.astype(np.float32).ravel())
-        self._least = float(weight.min())
+        # Opaque: a number that differs from render to render would need another kernel
+        self._least = dr.opaque(mi.Float, float(weight.min()))
         self._counts = counts
         self._x, self._y = counts.columns / columns, counts.rows / rows
 
