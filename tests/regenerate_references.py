@@ -75,6 +75,8 @@ REGRESSIONS = {
         Regression("reweighted_direct", "cornell_box", {"light_samples": 16}, spp=32),
         Regression("two_stage", "window", {"light_samples": 4}, max_depth=3),
         Regression("composed_path", "portal_room", {"next_event": "portals"}, max_depth=3, spp=64),
+        Regression("two_stage", "colonnade", {"light_samples": 4, "visibility": "primary"},
+                   max_depth=2, spp=32),
         Regression("adaptive", "cornell_box", {"nested": "composed_path"}, spp=64),
         Regression("reweighted_lens", "defocus", {"nested": "path"}, spp=512),
         Regression("reweighted_time", "fan", {"nested": "composed_path"}),
