@@ -10,7 +10,8 @@ as in its source, alone and beside one BSDF sample (power heuristic), as in a re
 randomly shifted Hammersley points.
 
 ``images`` renders scenes: error and CPU time of each integrator relative to ``path``, and the
-efficiency 1 / (error · time). Errors are those of ``examples/equal_samples.py``.
+efficiency 1 / (error · time); one of them is ``path`` with the sampler ``multijitter``. Errors are
+those of ``examples/equal_samples.py``.
 """
 
 from __future__ import annotations
@@ -49,7 +50,17 @@ INTEGRATORS = {
     "portals": {"type": "composed_path", "next_event": "portals"},
     "two_stage 1": {"type": "two_stage", "light_samples": 1},
     "two_stage 16": {"type": "two_stage", "light_samples": 16},
-}
+    "triple product 16": {"type": "two_stage", "visibility": "primary"},
+    "half reallocated": {"type": "two_stage", "visibility": "primary", "reallocated": 0.5},
+    "triple product 16, in the world": {
+        "type": "two_stage", "visibility": "world", "splits": 32,
+    },
+    "neepp": {"type": "neepp"},
+}  # fmt: skip
+
+#: ``path`` with this sampler is a rival too.
+SAMPLER = "multijitter"
+STRATIFIED = f"path, {SAMPLER}"
 
 
 def vertex_of(file: str, bsdf: dict) -> tuple[mi.Scene, mi.SurfaceInteraction3f]:
@@ -181,12 +192,21 @@ def vertex(maps: tuple[str, ...]) -> None:
 
 @main.command()
 @options
-def images(names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple) -> None:
+@click.option("--only", multiple=True, type=click.Choice([*list(INTEGRATORS)[1:], STRATIFIED]),
+              help="These integrators.")  # fmt: skip
+def images(
+    names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, only: tuple[str, ...]
+) -> None:
     """Compares integrators on the scenes NAMES."""
-    others = list(INTEGRATORS)[1:]
+    others = list(only) or [STRATIFIED, *list(INTEGRATORS)[1:]]
     print_header(["scene", *(f"{kind}: error | time | efficiency" for kind in others)])
+    chosen = {kind: value for kind, value in INTEGRATORS.items() if kind in ("path", *others)}
     for name in names:
-        renders = render_in_turns(load(name, size), INTEGRATORS, max_depth, spp, seeds)
+        renders = render_in_turns(load(name, size), chosen, max_depth, spp, seeds)
+        if STRATIFIED in others:
+            path = {STRATIFIED: INTEGRATORS["path"]}
+            scene = load(name, size, sampler=SAMPLER)
+            renders |= render_in_turns(scene, path, max_depth, spp, seeds)
         mean = np.mean([r.mean for r in renders.values()], axis=0)
         errors = {kind: error(r.variance, mean) for kind, r in renders.items()}
         cells = [title(name)]

@@ -75,7 +75,9 @@ class AdaptiveSampling(WrappingIntegrator):
     met by estimates, and not for sure: a pixel whose neighbourhood has not met its bright paths
     when that is decided stays noisier. The first pass counts half as much as its share of the
     samples, because it gives noisy pixels no more samples than others. A bright spot of an early
-    pass stays: nothing that a pass has added is taken back.
+    pass stays: nothing that a pass has added is taken back. The source renders pixels anew
+    whose deviation was far above its estimate, with a bias. Here, estimates contain the pixel's own
+    earlier samples, and there are hardly any such pixels.
 
     With a reconstruction filter wider than a pixel, samples are scaled such that all parts of the
     image plane have the same density. As always, the film divides by the sum of filter weights,

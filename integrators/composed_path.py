@@ -40,7 +40,9 @@ class ComposedPath(WalkIntegrator):
          :monosp:`spatial_lights`, :monosp:`linear` (by an estimate for each light at each vertex;
          its cost grows with their number), :monosp:`resampled` (one of several candidates) or a
          nested :monosp:`resampled_lights`, :monosp:`two_stage` (directions of the environment by
-         the product of BSDF and light) or a nested :monosp:`two_stage_lights`. Learned:
+         the product of BSDF and light) or a nested :monosp:`two_stage_lights`, :monosp:`portals`
+         (directions through the portals of a scene) or a nested :monosp:`portal_lights`. Learned:
+         :monosp:`triple_product` (as :monosp:`two_stage`, and by what is visible),
          :monosp:`contribution`, :monosp:`visibility`, or a nested :monosp:`learned_lights`.
          (Default: uniform)
      * - roulette
@@ -76,7 +78,7 @@ class ComposedPath(WalkIntegrator):
        - Samples per pixel from which is learned, at most a quarter of all. They count towards the
          image. Known only where something learns; with 0 nothing is learned. A sampler that is
          stratified over all samples may need longer pilots. (Default: 32 with guided directions,
-         otherwise 16)
+         4 where only :monosp:`triple_product` learns, otherwise 16)
      * - save_learned, load_learned
        - |string|
        - Files. The first is written: what was learned, as a whole. The second is read in place of

@@ -40,12 +40,28 @@ class TwoStage(WalkIntegrator):
        - |string|
        - Which vertices divide the map and have so many connections: the :monosp:`first`, or
          :monosp:`all`. (Default: first)
+     * - visibility
+       - |string|
+       - What first vertices know of what is in between: nothing (:monosp:`unknown`), or what a
+         pilot has learned in maps of random numbers (:monosp:`primary`) or of directions
+         (:monosp:`world`). (Default: unknown)
+     * - reallocated
+       - |float|
+       - With maps: the share of the connections that follows them, 0 to 0.99. (Default: 0.9)
+     * - pilot_spp
+       - |int|
+       - With maps: samples per pixel of the pilot, at most a quarter of all. They count towards the
+         image. (Default: 4)
+     * - save_learned, load_learned
+       - |string|
+       - With maps: as in :class:`composed_path`. (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
 
     **Use it when** you compare methods, or the light of an uneven map on rough metal makes the
-    noise, nothing is in between, and the number of camera samples is limited by something else.
+    noise, and the number of camera samples is limited by something else; with
+    :monosp:`visibility`, when the light comes through a small opening.
     **Not when** time counts: samples have less error than those of :monosp:`path`, but take longer
     by more than that, in all four scenes that were measured.
 

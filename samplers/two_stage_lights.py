@@ -31,20 +31,45 @@ class TwoStageLightsPlugin(DecisionPlugin):
        - |string|
        - Which vertices of a path divide the map: the :monosp:`first`, or :monosp:`all`. At the
          others, lights are chosen as by :monosp:`path`. (Default: first)
+     * - visibility
+       - |string|
+       - What first vertices know of what is in between: nothing (:monosp:`unknown`), or what a
+         pilot has learned in maps of random numbers (:monosp:`primary`) or of directions
+         (:monosp:`world`). (Default: unknown)
+     * - reallocated
+       - |float|
+       - With maps: the share of the connections that follows them, 0 to 0.99. The others know
+         nothing of visibility. (Default: 0.9)
 
     **Use it when** rough metal reflects an uneven map of which it sees most, and each vertex has
     several :monosp:`connections`, which share its partition: that takes longer than a path.
-    **Not when** walls or other things hide the bright parts of the map, as it knows nothing of what
-    is in between; or for lobes that are nearly those of mirrors, which BSDF samples find better.
+    **Not when** walls or other things hide the bright parts of the map, unless
+    :monosp:`visibility` is learned (the word :monosp:`triple_product` stands for this decision with
+    maps in primary space); or for lobes that are nearly those of mirrors, which BSDF samples find
+    better.
+
+    With :monosp:`visibility`, the integrator takes a pilot of :monosp:`pilot_spp` samples per pixel
+    (by default 4, at most a quarter of all; they count towards the image). It counts, for
+    each tile of 8 pixels (larger ones where there would be more than 8192), which shadow rays of
+    first vertices arrive: in 16 x 16 cells of the two random numbers that choose a direction, or in
+    32 x 16 cells of the map. A cell without samples is expected to be like the same cell of the
+    tiles around, and that like its tile. In primary space, the numbers of later samples are
+    distributed in proportion to the root of the visibility. In the world, the rectangles of the
+    partition count by it, and are divided where it varies; give it more :monosp:`splits` then.
+    Densities stay exact and positive, so the image is unbiased whatever the maps say. There is
+    nothing to correct or to make on demand: a map is an array of counters, and shadow rays decide.
 
     Lights other than the environment are chosen as by :monosp:`path`. Without an environment this
     is what :monosp:`path` does. BSDF samples take part by MIS; lobes that are thinner than a texel
     are left to them. The density is positive wherever the map is defined: a hundredth of it follows
-    the map alone. Not for :monosp:`bdpt` and other integrators with light paths.
+    the map alone. The table of the map takes 12 bytes for each of its texels. Not for
+    :monosp:`bdpt` and other integrators with light paths.
 
     Source: D. Cline, P. K. Egbert, J. F. Talbot, D. L. Cardon, *Two Stage Importance Sampling for
     Direct Lighting*, EGSR 2006 (= D. Cline, PhD dissertation, BYU, 2007, chapter 5). The order of
-    the divisions, and BSDF samples in the place of the peaks of known models, are ours.
+    the divisions, and BSDF samples in the place of the peaks of known models, are ours. Maps of
+    visibility: chapter 6 of the dissertation; probabilities in the place of classes, and densities
+    that MIS knows, are ours.
 
     .. tabs::
         .. code-tab:: xml

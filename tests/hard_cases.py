@@ -100,6 +100,18 @@ def _sun_sky() -> Scene:
     return stage(light={**sky, "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90)}, wall=None)
 
 
+def _sky_through_portals() -> Scene:
+    """The same sky, of which two portals that overlap show a part; one lies in the block."""
+    T = mi.ScalarTransform4f
+    places = {
+        "above": T().translate([0.2, 0, 1.5]).rotate([1, 0, 0], 180).scale([1, 0.7, 1]),
+        "higher": T().translate([-0.3, 0, 1.8]).rotate([1, 0, 0], 180).scale(2),
+        "inside": T().translate([0.4, -0.2, 0.2]).scale(0.1),
+    }
+    portals = {name: {"type": "portal", "to_world": place} for name, place in places.items()}
+    return {**_sun_sky(), **portals}
+
+
 def _textured_two_sided_lights() -> Scene:
     T = mi.ScalarTransform4f
     pixels = np.random.default_rng(1).uniform(0, 9, (4, 4, 3))
@@ -234,6 +246,7 @@ HARD_CASES: dict[str, HardCase] = {
     ),  # fmt: skip
     "constant_environment": HardCase(lambda: stage(light={"type": "constant"})),
     "sun_of_one_texel": HardCase(_sun_sky),
+    "sky_through_portals": HardCase(_sky_through_portals),
     "textured_two_sided_lights": HardCase(_textured_two_sided_lights),
     "smooth_normal_lamp": HardCase(
         lambda: stage(light=_octahedron(0.3, (-0.3, 0, 1.5), bsdf=diffuse(0), emitter=area(5.0)))

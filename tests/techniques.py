@@ -57,6 +57,8 @@ class Technique:
     Attributes:
         plugin: The name of the integrator.
         parameters: Its parameters besides ``max_depth``.
+        nested: The integrator whose samples it draws, where it draws those of another one; that one
+            gets ``max_depth`` and what a test says.
         is_plugin: Does it represent its plugin? Then it also gets the tests of seeds, errors,
             gradients and AOVs.
         draws_like_path: At the same seed, does it draw the same numbers as ``path``? Then images
@@ -68,6 +70,7 @@ class Technique:
 
     plugin: str
     parameters: dict[str, Any] = field(default_factory=dict)
+    nested: str = ""
     is_plugin: bool = False
     draws_like_path: bool = False
     makes_splats: bool = False
@@ -76,9 +79,10 @@ class Technique:
 
     def make(self, max_depth: int = -1, **parameters: Any) -> mi.Integrator:
         """The integrator; it replaces the scene's own in ``mi.render``."""
-        return mi.load_dict(
-            {"type": self.plugin, "max_depth": max_depth, **self.parameters, **parameters}
-        )
+        parameters = {"max_depth": max_depth, **parameters}
+        if self.nested:
+            parameters = {"nested": {"type": self.nested, **parameters}}
+        return mi.load_dict({"type": self.plugin, **self.parameters, **parameters})
 
 
 EVERYTHING = Checks(
@@ -99,7 +103,10 @@ _UNLIKE_PATH = (
     "directional_area_light", "smooth_normal_lamp", "scaled_by_1e-3", "moved_by_1e3_sizes",
     "thousand_lights",
 )  # fmt: skip
-_LIGHT_PATHS = tuple(case for case in HARD_CASES if case not in _UNLIKE_PATH)
+_OF_CAMERA_PATHS = ("sky_through_portals",)
+_LIGHT_PATHS = tuple(
+    case for case in HARD_CASES if case not in (*_UNLIKE_PATH, *_OF_CAMERA_PATHS)
+)
 
 #: Behind mirrors, glass, masks and null surfaces, and on a film with a sampled border.
 _UNSEEN_FROM_LIGHTS = {
@@ -110,7 +117,9 @@ _UNSEEN_FROM_LIGHTS = {
 #: Chains do not take a film with a sampled border; and where one pixel is all there is, 128 camera
 #: samples are few.
 _OF_CHAINS = tuple(
-    case for case in HARD_CASES if case not in ("cropped_film", "film_of_one_pixel")
+    case
+    for case in HARD_CASES
+    if case not in ("cropped_film", "film_of_one_pixel", *_OF_CAMERA_PATHS)
 )
 
 _WEIGHED = ("plain", "delta_lights", "constant_environment", "materials")
@@ -253,6 +262,41 @@ TECHNIQUES: dict[str, Technique] = {
             ["sunny_gloss", "window"], ["llvm_ad_spectral"], ["furnace_convex"], [-1],
             ("materials", "constant_environment"),
         ),
+    ),
+    # ``test_visibility_maps.py`` has densities and boxes
+    "triple_product": Technique(
+        "composed_path", {"next_event": "triple_product", "connections": 4},
+        checks=Checks(cases=["no_light"]),
+        thorough=Checks(
+            [], ["llvm_ad_spectral"], ["furnace_convex"], [-1],
+            ("sun_of_one_texel", "constant_environment", "materials", "film_of_one_pixel",
+             "cropped_film", "empty"),
+        ),
+    ),
+    "triple_product_of_directions": Technique(
+        "two_stage", {"visibility": "world", "light_samples": 2, "vertices": "all"},
+        thorough=Checks(cases=("sun_of_one_texel", "materials")),
+    ),
+    # ``test_portals.py`` has rooms, furnaces and densities
+    "portals": Technique(
+        "composed_path", {"next_event": "portals"}, checks=Checks(cases=["no_light"]),
+        thorough=Checks(
+            ["window"], ["llvm_ad_spectral"],
+            cases=("sky_through_portals", "materials", "constant_environment", "empty"),
+        ),
+    ),
+    # ``test_adaptive.py`` has seeds, samplers and films
+    "adaptive": Technique(
+        "adaptive", nested="composed_path",
+        checks=Checks(cases=["no_light", "film_of_one_pixel"]),
+        thorough=Checks(
+            ["cornell_box"], ["llvm_ad_spectral"], ["furnace_box"], [-1],
+            ("sun_of_one_texel", "materials", "film_of_odd_size", "cropped_film", "max_depth_0",
+             "one_sample", "three_samples"),
+        ),
+    ),
+    "adaptive_learning": Technique(
+        "adaptive", nested="neepp", thorough=Checks(cases=["plain", "one_sample"])
     ),
     # How connections and BSDF samples are weighed
     **{

@@ -221,6 +221,19 @@ def test_a_time_limit_ends_with_a_whole_image():
     assert not integrator.statistics.interrupted and integrator.statistics.spp < 1 << 16
     assert_images_are_sound(images)
 
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_spectral_films_show_the_mean_but_no_counts(variant: str) -> None:
+    band = {"type": "irregular", "wavelengths": "400, 500, 600", "values": "0, 1, 0"}
+    spectral = {"type": "specfilm", "width": 6, "height": 5, "rfilter": {"type": "box"},
+                "band": band}  # fmt: skip
+    scene = mi.load_dict(stage(camera=sensor(film=spectral)))
+    images = batches(scene, adaptive(), 128, range(8))
+    path = batches(scene, mi.load_dict({"type": "path", "max_depth": 3}), 512, range(1001, 1009))
+    assert_same_mean(images, path, 0.04)
+    with pytest.raises(Exception, match='"adaptive": the film "SpecFilm".*"count_samples"'):
+        adaptive(count_samples=True).render(scene, spp=4)
+
 
 # ---- Errors ----
 

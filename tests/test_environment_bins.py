@@ -38,6 +38,20 @@ def _with_sun(row: int) -> np.ndarray:
     return image
 
 
+def _sun_on_the_seam() -> np.ndarray:
+    image = 0.1 * _random(32, 64)
+    image[12, 0] = 1e5
+    return image
+
+
+def _black_halves() -> np.ndarray:
+    """The upper one, and the left one of the lower."""
+    image = _random(24, 48)
+    image[:12] = 0
+    image[12:, :24] = 0
+    return image
+
+
 def _half_black() -> np.ndarray:
     image = np.zeros((16, 33, 3))
     image[3:9, 4:12] = _random(6, 8)
@@ -62,6 +76,14 @@ ENVIRONMENTS = {
     "sky without sun": lambda: {"type": "sunsky", "sun_scale": 0.0},
 }
 
+#: For decisions that look at whole maps.
+MORE_ENVIRONMENTS = {
+    **ENVIRONMENTS,
+    "one texel": lambda: _map(np.ones((1, 1, 3))),
+    "sun on the seam": lambda: _map(_sun_on_the_seam()),
+    "black halves": lambda: _map(_black_halves(), to_world=_turned()),
+}
+
 
 def _direction(u: float, v: float) -> list[float]:
     """The direction of a point of a map."""
@@ -72,7 +94,8 @@ def _direction(u: float, v: float) -> list[float]:
 
 #: Axis and half angle, in degrees, of the cone that holds what is small and bright.
 SPOTS = {
-    "sun": (_direction(20.5 / 64, 11 / 31), 9), "sun in the zenith": ([0, 1, 0], 9),
+    "sun": (_direction(20.5 / 64, 11 / 31), 9),
+    "sun on the seam": (_direction(0.5 / 64, 12 / 31), 9), "sun in the zenith": ([0, 1, 0], 9),
     "sky": ([1, 1, 1], 0.4), "sunset": ([1, 0, 0.02], 0.4),
 }  # fmt: skip
 

@@ -336,8 +336,8 @@ class _Recording(LinearChoice):
         self.totals, self.distances = (dr.zeros(mi.Float, self.bounces) for _ in range(2))
         self.previous = dr.zeros(mi.Float, self.bounces)
 
-    def begin(self, sampler, ray):
-        return mi.UInt32(0), super().begin(sampler, ray)
+    def begin(self, sampler, ray, pixel):
+        return mi.UInt32(0), super().begin(sampler, ray, pixel)
 
     def visit(self, state, scene, si, active):
         bounce, before = state

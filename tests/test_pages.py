@@ -41,7 +41,7 @@ VALUES = {
     "aperture": "sobol", "time": "sobol", "wavelength": "sampler", "pattern": "sobol",
     "weights": "torus", "vertices": "all", "law": "affine", "target": "visibility",
     "light_sampling": "visibility", "mis": "balance", "heuristic": "cutoff", "exponent": 3.0,
-    "threshold": 0.2,
+    "threshold": 0.2, "visibility": "primary", "reallocated": 0.5,
     **dict.fromkeys(["bidirectional", "kelemen_style_weights", "two_stage"], True),
     **dict.fromkeys(["chains", "chain_length", "direct_samples", "luminance_samples"], 3),
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
@@ -56,6 +56,9 @@ VALUES = {
 CONDITIONS = {
     **{("composed_path", key): {"next_event": "contribution"}
        for key in ("pilot_spp", "save_learned", "load_learned")},
+    **{("two_stage", key): {"visibility": "primary"}
+       for key in ("reallocated", "pilot_spp", "save_learned", "load_learned")},
+    ("two_stage_lights", "reallocated"): {"visibility": "world"},
     ("pss_guided", "tile"): {"regions": "tiles"},
     ("guided_directions", "tile"): {"regions": "tiles"},
     **{("neepp", key): {"rejection": True} for key in ("law", "slope", "floor")},

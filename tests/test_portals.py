@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 from stage import area, diffuse, film, lookat, rectangle, rgb, sensor
 from statistical import assert_images_are_sound, assert_same_mean, batches
-from test_environment_bins import ENVIRONMENTS, _square
+from test_environment_bins import MORE_ENVIRONMENTS, _square
 
 from mitsuba_ext.decisions.next_event.portal_sampling import PortalSampling
 from mitsuba_ext.lights.portal_maps import PortalMaps
@@ -40,7 +40,7 @@ def _portals() -> dict[str, Any]:
 
 def _scene(environment: str, **others: Any) -> mi.Scene:
     shapes = {**_portals(), "floor": {"type": "sphere", "center": [0, 0, -3]}, **others}
-    return mi.load_dict({"type": "scene", "sky": ENVIRONMENTS[environment](), **shapes})
+    return mi.load_dict({"type": "scene", "sky": MORE_ENVIRONMENTS[environment](), **shapes})
 
 
 def _point(*p: float) -> mi.SurfaceInteraction3f:
@@ -92,7 +92,7 @@ def _histogram(d: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
 
 
 _PAIRS = [("turned", point) for point in _POINTS] + [
-    (environment, "inside") for environment in ENVIRONMENTS if environment != "turned"
+    (environment, "inside") for environment in MORE_ENVIRONMENTS if environment != "turned"
 ]
 
 
@@ -138,6 +138,17 @@ def test_directions_are_distributed_by_the_density(environment: str, point: str)
         used = (expected > 50) & (_histogram(other) > 50)
         chi2 = np.sum((observed - expected)[used] ** 2 / spread[used])
         assert used.any() and stats.chi2.sf(chi2, used.sum()) > 1e-4
+
+
+@pytest.mark.slow
+def test_maps_have_at_most_2048_texels_along_an_axis() -> None:
+    """12 bytes each, for every orientation."""
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((2048, 4096, 3), np.float32))}
+    scene = mi.load_dict({"type": "scene", "sky": sky, **_portals()})
+    maps = PortalMaps(scene, portals(scene))
+    assert maps.resolution == 2048
+    size = 2 * 48 * 2**20  # of the wall, and of the ceiling
+    assert len(maps._sums) * 8 + len(maps._values) * 4 == pytest.approx(size, rel=2e-3)
 
 
 @pytest.mark.parametrize("lamp", [pytest.param(False, marks=pytest.mark.slow), True])
@@ -211,7 +222,7 @@ _MADE = {"type": "composed_path", "max_depth": 3, "next_event": "portals"}
                          for pair in (("constant", 0.3), ("sky", 0.9), ("sun", 0.9)))
 ])  # fmt: skip
 def test_a_room_has_the_mean_of_path(sky: str, share: float) -> None:
-    scene = _room(sky=ENVIRONMENTS[sky]() if sky in ENVIRONMENTS else None)
+    scene = _room(sky=MORE_ENVIRONMENTS[sky]() if sky in MORE_ENVIRONMENTS else None)
     integrator = mi.load_dict({**_MADE, "next_event": {"type": "portal_lights", "share": share}})
     images = batches(scene, integrator, 256, range(4))
     assert_images_are_sound(images)
@@ -240,7 +251,7 @@ def test_portals_reduce_the_error_of_a_room() -> None:
 def test_without_portals_or_environment_it_is_path(missing: str) -> None:
     shapes = {} if missing == "portal" else _portals()
     lamp = {"type": "sphere", "center": [0, 2, 0.5], "emitter": {"type": "area"}}
-    light = ENVIRONMENTS["turned"]() if missing == "portal" else lamp
+    light = MORE_ENVIRONMENTS["turned"]() if missing == "portal" else lamp
     scene = mi.load_dict({"type": "scene", "light": light, "floor": rectangle(bsdf=diffuse(0.5)),
                           "sensor": sensor(film=film(8, 8)), **shapes})  # fmt: skip
     a = batches(scene, mi.load_dict({"type": "path", "max_depth": 3}), 4, [1])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from statistical import batches, load, one_thread, some
-from test_environment_bins import ENVIRONMENTS, SPOTS, _square
+from test_environment_bins import MORE_ENVIRONMENTS, SPOTS, _square
 
 from mitsuba_ext.decisions.next_event.environment_partition import Partitioner
 from mitsuba_ext.decisions.next_event.two_stage import TwoStage
@@ -36,7 +36,7 @@ BSDFS: dict[str, dict[str, Any]] = {
 
 def _scene(environment: str, bsdf: str) -> mi.Scene:
     return mi.load_dict({
-        "type": "scene", "e": ENVIRONMENTS[environment](),
+        "type": "scene", "e": MORE_ENVIRONMENTS[environment](),
         "floor": {"type": "rectangle", "bsdf": BSDFS[bsdf]},
     })  # fmt: skip
 
@@ -73,6 +73,21 @@ def test_shares_are_sums_of_texels(name: str) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-15)
 
 
+@pytest.mark.slow
+def test_a_table_of_a_large_map_needs_96_mib() -> None:
+    """Of 4096 x 2048 texels: 12 bytes each."""
+    pixels = np.random.default_rng(4).random((2048, 4096, 3), dtype=np.float32)
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(pixels)}
+    scene = mi.load_dict({"type": "scene", "e": sky, "ball": {"type": "sphere"}})
+    sums = TexelSums(EnvironmentTexels(scene))
+    assert len(sums._sums) * 8 + len(sums._nodes) * 4 == pytest.approx(96 * 2**20, rel=1e-3)
+    half = sums.rectangle(
+        mi.UInt32(0), mi.UInt32(0), mi.UInt32(4096), mi.UInt32(1024), Corners(0, 0, 0, 0),
+        mi.Bool(True),
+    )  # fmt: skip
+    assert half.share[0] == pytest.approx(0.5, rel=1e-3)
+
+
 # ---- Directions ----
 
 
@@ -94,7 +109,7 @@ def _everywhere(name: str, numbers: mi.PCG32) -> tuple[mi.Vector3f, mi.Float]:
 
 
 _PAIRS = [
-    *(("turned", bsdf) for bsdf in BSDFS), *((name, "metal") for name in ENVIRONMENTS),
+    *(("turned", bsdf) for bsdf in BSDFS), *((name, "metal") for name in MORE_ENVIRONMENTS),
     ("sun", "diffuse"), ("sun in the zenith", "coated"), ("sky", "glass"),
 ]  # fmt: skip
 
@@ -209,7 +224,7 @@ def test_other_lights_are_connected_to_as_well(lamp: str) -> None:
         "point": {"lamp": {"type": "point", "position": [0, 0, 1]}},
     }  # fmt: skip
     scene = mi.load_dict({
-        "type": "scene", "e": ENVIRONMENTS["turned"](), **lamps[lamp],
+        "type": "scene", "e": MORE_ENVIRONMENTS["turned"](), **lamps[lamp],
         "floor": {"type": "rectangle", "bsdf": BSDFS["coated"]},
         "sensor": {"type": "perspective", "fov": 30,
                    "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},

@@ -54,7 +54,7 @@ class _RecordingNextEvent(EmitterSampling):
     def __init__(self, recorder: _Recorder) -> None:
         self.recorder = recorder
 
-    def begin(self, sampler, ray):
+    def begin(self, sampler, ray, pixel):
         return mi.UInt32(0)
 
     def visit(self, state, scene, si, active):

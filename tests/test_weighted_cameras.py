@@ -137,3 +137,11 @@ def test_hard_case_has_the_mean_of_path(case):
     images = batches(scene, integrator, hard.spp, range(1, 1 + hard.seeds))
     path = batches(scene, mi.load_dict({**own, "type": "path"}), 512, [101, 102])
     assert_same_pixels_on_average(images, path, hard.precision, unit=hard.unit)
+
+
+@pytest.mark.parametrize("name", ["lens", "time"])
+@pytest.mark.parametrize("chains", ["pssmlt", "erpt", "mlt"])
+def test_chains_are_refused(name: str, chains: str) -> None:
+    """Only their camera samples would be left: direct light."""
+    with pytest.raises(Exception, match=f'not the whole image of "{chains}": its chains'):
+        mi.load_dict(nest((name,), {"type": chains}))

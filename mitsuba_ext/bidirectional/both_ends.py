@@ -36,8 +36,8 @@ class FromBothEnds(EmitterSampling):
         self._decision = decision
         self.choice_dimension = decision.choice_dimension
 
-    def begin(self, sampler, ray) -> Any:
-        return self._decision.begin(sampler, ray)
+    def begin(self, sampler, ray, pixel=None) -> Any:
+        return self._decision.begin(sampler, ray, pixel)
 
     def visit(self, state, scene, si, active) -> Any:
         return self._decision.visit(state, scene, from_both_ends(si), active)

@@ -69,10 +69,13 @@ class ChainIntegrator(WalkIntegrator):
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
 
     Attributes:
+        missing_in_samples: Why its camera samples alone are not its image.
         chain_file: Where the state of a render is kept; empty for nowhere.
         direct_samples: Camera samples per pixel; 0 for as many as suit the render, −1 where chains
             find all light.
     """
+
+    missing_in_samples = "its chains find the rest"
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -122,10 +125,6 @@ class ChainIntegrator(WalkIntegrator):
     def finds_direct(self) -> bool:
         """Do camera samples find direct light?"""
         return self.direct_samples >= 0
-
-    @property
-    def needs_equal_samples(self) -> str:
-        return "its chains find light for all pixels"
 
     def schedule(self, scene, sensor, samples, seed) -> OneStage:
         """Of the camera samples."""

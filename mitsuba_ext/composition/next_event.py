@@ -18,6 +18,7 @@ from ..decisions.next_event.linear_lights import LinearChoice
 from ..decisions.next_event.portal_sampling import PortalSampling
 from ..decisions.next_event.resampled_lights import ResampledLights
 from ..decisions.next_event.two_stage import TwoStage
+from ..decisions.next_event.visibility_learner import VisibilityLearner
 from ..errors import InputError
 from ..files import check_target
 from ..lights.light_cells import LightCells
@@ -180,6 +181,11 @@ class ResampledLightsChoice(DecisionParameters):
         return ResampledLights(setting.scene, self.candidates)
 
 
+#: What two-stage sampling can learn of visibility, the default first, and the pilots for it.
+VISIBILITIES = ("unknown", "primary", "world")
+_PILOT_SPP = 4
+
+
 class TwoStageLights(DecisionParameters):
     """Directions of the environment by the product of BSDF and light. The attributes are the
     parameters of the plugin ``two_stage_lights``; see there."""
@@ -188,13 +194,39 @@ class TwoStageLights(DecisionParameters):
     slots = ("next_event",)
     camera_paths_only = True
 
-    def __init__(self, read: ParameterReader) -> None:
+    def __init__(self, read: ParameterReader, visibility: str = "") -> None:
         self.splits = read("splits", 16, minimum=0, maximum=MOST_SPLITS)
         self.vertices = read("vertices", "first", choices=("first", "all"))
+        self.visibility = visibility or read("visibility", "unknown", choices=VISIBILITIES)
+        if self.learns:
+            self.reallocated = read("reallocated", 0.9, minimum=0.0, maximum=0.99)
+        read.refuse_without_effect({"reallocated": 'a "visibility" that is learned'})
+
+    @property
+    def learns(self) -> bool:
+        """Does it learn what is visible?"""
+        return self.visibility != "unknown"
+
+    @property
+    def pilot_spp(self) -> int:
+        return _PILOT_SPP if self.learns else 0
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        return self.learns and spp > 0 and scene.environment() is not None
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        if not self.can_learn(setting.scene, setting.pilot_spp):
+            return None
+        return VisibilityLearner(
+            self.visibility, self.splits, self.vertices == "all", self.reallocated,
+            *film_extent(setting.sensor.film()),
+        )  # fmt: skip
 
     def decision(self, setting: Setting) -> Any | None:
         if setting.scene.environment() is None or setting.max_depth < 2:
             return None
+        if self.can_learn(setting.scene, setting.pilot_spp):
+            return None  # the learner has all decisions
         return TwoStage(setting.scene, self.splits, self.vertices == "all")
 
 
@@ -233,6 +265,7 @@ METHODS: dict[str, Callable[[ParameterReader], DecisionParameters] | None] = {
 CAMERA_METHODS: dict[str, Callable[[ParameterReader], DecisionParameters]] = {
     "resampled": ResampledLightsChoice,
     "two_stage": TwoStageLights,
+    "triple_product": lambda read: TwoStageLights(read, "primary"),
     "portals": PortalLights,
 }
 

@@ -44,7 +44,7 @@ class ReweightedCamera(WrappingIntegrator):
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
-         :monosp:`path`, :monosp:`volpath` or one of ours.
+         :monosp:`path`, :monosp:`volpath` or one of ours without chains.
 
     Attributes:
         purpose: The attribute of :class:`CameraSamples` that is taken over.

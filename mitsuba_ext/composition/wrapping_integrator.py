@@ -89,7 +89,13 @@ class WrappingIntegrator(StagedIntegrator):
                 f'or "volpath", must be nested in it (none for gradients, and none in which '
                 f'"{self.name}" is nested already); found {found}'
             )
-        return children[0]
+        nested = children[0]
+        if reason := getattr(nested, "missing_in_samples", ""):
+            raise ValueError(
+                f'"{self.name}" renders with the camera samples of the nested integrator, which '
+                f'are not the whole image of "{nested.name}": {reason}'
+            )
+        return nested
 
     @property
     def _is_staged(self) -> bool:

@@ -78,3 +78,10 @@ class SunDisk:
         # The cosine of the angle is 1 − square / 2
         p *= math.sqrt(self._square) * dr.sqrt(1 - 0.25 * square)
         return mi.Frame3f(self.direction).to_world(mi.Vector3f(p.x, p.y, 1 - 0.5 * square))
+
+    def invert(self, d: mi.Vector3f) -> mi.Point2f:
+        """The sample with which :meth:`sample` gives the direction ``d`` of the disk."""
+        p = mi.Frame3f(self.direction).to_local(d)
+        square = dr.squared_norm(d - self.direction)
+        scale = math.sqrt(self._square) * dr.sqrt(dr.maximum(1 - 0.25 * square, 1e-6))
+        return mi.warp.uniform_disk_to_square_concentric(mi.Point2f(p.x, p.y) / scale)

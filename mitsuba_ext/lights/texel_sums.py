@@ -157,7 +157,7 @@ class TexelSums:
         return d, uv, dr.select(active, probability * density * self._density / sin_theta, 0)
 
     @dr.syntax
-    def pdf(
+    def invert(
         self,
         inside: Rectangle,
         column: mi.UInt32,
@@ -165,17 +165,20 @@ class TexelSums:
         point: mi.Point2f,
         sin_theta: mi.Float,
         active: mi.Bool,
-    ) -> mi.Float:
-        """The density with which :meth:`sample` gives a direction in a rectangle;
-        :meth:`EnvironmentTexels.find` tells where it is."""
-        probability = mi.Float(1)
+    ) -> tuple[mi.Point2f, mi.Float]:
+        """The random numbers with which :meth:`sample` gives a direction in a rectangle, and its
+        density there; :meth:`EnvironmentTexels.find` tells where it is."""
+        probability, first, size = mi.Float(1), mi.Point2f(0), mi.Point2f(1)
         while dr.hint(active & _is_divisible(inside), label="warp back"):
             by_x, low, high, of_low = self._halves(inside, active)
             is_low = dr.select(by_x, column < low.x1, row < low.y1)
-            probability *= dr.select(is_low, of_low, 1 - of_low)
+            of_side = dr.select(is_low, of_low, 1 - of_low)
+            first, size = part_of(first, size, by_x, is_low, of_side)
+            probability *= of_side
             inside = dr.select(is_low, low, high)
-        density = mi.warp.square_to_bilinear_pdf(*self._corners(inside, active), point)
-        return dr.select(active, probability * density * self._density / sin_theta, 0)
+        number, density = mi.warp.bilinear_to_square(*self._corners(inside, active), point)
+        density = probability * density * self._density / sin_theta
+        return first + size * number, dr.select(active, density, 0)
 
     def middle(
         self, r: Rectangle, by_x: mi.Bool
@@ -228,6 +231,25 @@ class TexelSums:
         # All are positive
         mean = 0.25 * (values[0] + values[1] + values[2] + values[3])
         return [value / mean for value in values]
+
+
+def part_of(
+    first: mi.Point2f, size: mi.Point2f, by_x: mi.Bool, is_low: mi.Bool, share: mi.Float
+) -> tuple[mi.Point2f, mi.Point2f]:
+    """The random numbers that lead to one of two halves: the least ones and their range, from those
+    that lead to the whole.
+
+    Parameters:
+        by_x: Do the halves lie side by side along x?
+        is_low: Is it the first one?
+        share: The probability with which it is chosen.
+    """
+    first = first + dr.select(is_low, mi.Point2f(0), size) * _along(by_x, 1 - share, 0)
+    return first, size * _along(by_x, share, 1)
+
+
+def _along(by_x: mi.Bool, value: mi.Float, other: float) -> mi.Point2f:
+    return mi.Point2f(dr.select(by_x, value, other), dr.select(by_x, other, value))
 
 
 def _is_divisible(r: Rectangle) -> mi.Bool:

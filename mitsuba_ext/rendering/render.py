@@ -142,8 +142,8 @@ class Job:
         aovs = integrator.aov_names()
         if aovs and mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
             raise NotImplementedError(
-                f'"{integrator.name}": the parameter "aovs" does not work with the film '
-                f'"{self.film.class_name()}": use an "hdrfilm".'
+                f'"{integrator.name}": the film "{self.film.class_name()}" has no room for more '
+                f'channels ("aovs", "count_samples"): use an "hdrfilm".'
             )
         self.film.prepare(aovs)
         # One part has no range: nothing is added to a pixel's number

@@ -100,8 +100,8 @@ class EmitterSampling:
 
     choice_dimension = 0
 
-    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
-        """The state before the first bounce."""
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None = None) -> Any:
+        """The state before the first bounce of paths that begin in ``pixel`` of the film."""
         return ()
 
     def visit(

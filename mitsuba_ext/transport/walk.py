@@ -111,7 +111,7 @@ class Walk:
         active = mi.Bool(active) & (self.max_depth > 0)
         directions_state = self.directions.begin(sampler, ray, pixel)
         scattering_state = self.scattering.begin(sampler, ray)
-        next_event_state = self.next_event.begin(sampler, ray)
+        next_event_state = self.next_event.begin(sampler, ray, pixel)
         shadow_state = self.shadow_test.begin(sampler, ray)
         roulette_state = self.roulette.begin(sampler, ray, pixel)
         self.observer.begin(dr.width(ray), pixel)

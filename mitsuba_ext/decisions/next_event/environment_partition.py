@@ -12,7 +12,6 @@ writes where the largest one points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -20,7 +19,9 @@ import mitsuba as mi
 
 from ...discrete_sampling import ONE_MINUS_EPSILON
 from ...lights.spectra import brightness
-from ...lights.texel_sums import Corners, Rectangle, TexelSums
+from ...lights.texel_sums import Corners, Rectangle, TexelSums, part_of
+from .partition_parts import Branch, Node, Partition, Peak
+from .visibility_maps import Tile, WorldVisibility
 
 #: The first rectangles of each partition: so many columns and rows at least.
 _GRID = (4, 2)
@@ -53,71 +54,6 @@ _DEFENSIVE = 0.01
 _STEPS = 0.7548776662, 0.5698402910, 0.6180339887
 
 
-@dataclass
-class Peak:
-    """A direction in which a BSDF sample has found light.
-
-    Attributes:
-        column, row: Its texel.
-        value: What is reflected.
-    """
-
-    column: mi.UInt32
-    row: mi.UInt32
-    value: mi.Float
-
-
-@dataclass
-class Node:
-    """A rectangle in local memory.
-
-    Attributes:
-        x, y: First and last + 1 column (row), in 16 bits each.
-        f: The function at the corners.
-        lift: Is added to the function, as it is larger inside than at the corners.
-        share: What the texels emit.
-    """
-
-    x: mi.UInt32
-    y: mi.UInt32
-    f: Corners
-    lift: mi.Float
-    share: mi.Float
-
-    @property
-    def weight(self) -> mi.Float:
-        return self.share * (self.f.mean + self.lift)
-
-
-@dataclass
-class Branch:
-    """The place of a rectangle in the tree.
-
-    Attributes:
-        weight: Of the rectangle, or of its parts together.
-        link: The first of its two parts, which follow each other; 0 for a leaf.
-    """
-
-    weight: mi.Float
-    link: mi.UInt32
-
-
-@dataclass
-class Partition:
-    """A partition of one vertex.
-
-    Attributes:
-        nodes, branches: Local memory (``dr.Local`` of :class:`Node` and :class:`Branch`).
-        floor: Is added to the function everywhere.
-        sun: The probability of the sun's disk.
-    """
-
-    nodes: Any
-    branches: Any
-    floor: mi.Float
-    sun: mi.Float
-
-
 class Partitioner:
     """Makes partitions, and draws directions from them.
 
@@ -125,10 +61,16 @@ class Partitioner:
         sums: Of the environment.
         ctx: For calls of BSDFs.
         splits: How often rectangles of a partition are divided, at most, beyond the first ones.
+        visibility: What is known of what lies in between; rectangles count by how much of them is
+            visible.
     """
 
-    def __init__(self, sums: TexelSums, ctx: mi.BSDFContext, splits: int) -> None:
+    def __init__(
+        self, sums: TexelSums, ctx: mi.BSDFContext, splits: int,
+        visibility: WorldVisibility | None = None,
+    ) -> None:  # fmt: skip
         self._sums, self._ctx, self._texels = sums, ctx, sums.texels
+        self._visibility = visibility
         # The first rectangles are at most so large
         self._width, self._height = (
             max(1, -(-count // parts))
@@ -141,8 +83,10 @@ class Partitioner:
     # ---- Making a partition ----
 
     @dr.syntax
-    def partition(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Partition:
-        """The partition of the vertex ``si``."""
+    def partition(
+        self, si: mi.SurfaceInteraction3f, active: mi.Bool, tile: Tile | None = None
+    ) -> Partition:
+        """The partition of the vertex ``si``; ``tile`` tells the maps of what is visible."""
         nodes = dr.alloc_local(Node, 1 + 2 * self._splits)
         potentials = dr.alloc_local(mi.Float, 1 + 2 * self._splits)
         parents = dr.alloc_local(mi.UInt32, self._splits)
@@ -151,7 +95,7 @@ class Partitioner:
         peaks = [local.read(mi.UInt32(i), active) for i in range(_PEAKS)]
         root = self._root(si, active)
         zero = mi.UInt32(0)
-        whole, potential = self._node(root, peaks)
+        whole, potential = self._node(root, peaks, tile, active)
         nodes.write(whole, zero, active)
         potentials.write(potential, zero, active)
         total, split, next, count = mi.Float(whole.weight), mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
@@ -164,7 +108,9 @@ class Partitioner:
             divides = working & (next < end)
             node = nodes.read(next, divides)
             halves = self._divided(si, node, divides)
-            (low, of_low), (high, of_high) = (self._node(half, peaks) for half in halves)
+            (low, of_low), (high, of_high) = (
+                self._node(half, peaks, tile, divides) for half in halves
+            )
             nodes.write(low, end, divides)
             nodes.write(high, end + 1, divides)
             potentials.write(of_low, end, divides)
@@ -253,7 +199,7 @@ class Partitioner:
         x0, x1, y0, y1 = node.x & 0xFFFF, node.x >> 16, node.y & 0xFFFF, node.y >> 16
         return self._sums.rectangle(x0, y0, x1, y1, node.f, active)
 
-    def _node(self, r: Rectangle, peaks) -> tuple[Node, mi.Float]:
+    def _node(self, r: Rectangle, peaks, tile, active) -> tuple[Node, mi.Float]:
         """A rectangle for local memory, and what is to be gained by dividing it: Eq. 5.3 (Cline),
         with the range in the place of the deviation, and without the area."""
         values = (r.f.v00, r.f.v10, r.f.v01, r.f.v11)
@@ -269,12 +215,17 @@ class Partitioner:
             is_inside &= dr.abs(2 * mi.Float(p.row) + 1 - y_sum) <= height
             peak = dr.maximum(peak, dr.select(is_inside, p.value, 0))
         lift = _LIFT * dr.maximum(peak - most, 0)
-        potential = r.share * (dr.maximum(most, peak) - least)
+        share, range = r.share, dr.maximum(most, peak) - least
+        potential = share * range
+        if self._visibility is not None:
+            seen, deviation = self._visibility.seen(tile, r.x0, r.y0, r.x1, r.y1, active)
+            potential = share * (seen * range + 2 * deviation * (r.f.mean + lift))
+            share *= seen
         is_texel = (r.x1 - r.x0 <= 1) & (r.y1 - r.y0 <= 1)
         potential = dr.select(is_texel, 0, potential)
         potential = dr.select(self._is_large(r), dr.largest(mi.Float), potential)
         x, y = r.x0 | (r.x1 << 16), r.y0 | (r.y1 << 16)
-        return Node(x, y, r.f, lift, r.share), potential
+        return Node(x, y, r.f, lift, share), potential
 
     @dr.syntax
     def _branches(self, nodes, parents, count: mi.UInt32, floor: mi.Float, active) -> Any:
@@ -346,29 +297,46 @@ class Partitioner:
             )
         return d, uv, density
 
-    @dr.syntax
     def pdf(self, made: Partition, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """The density with which :meth:`sample` gives the direction ``d``."""
+        return self.invert(made, d, active)[1]
+
+    @dr.syntax
+    def invert(
+        self, made: Partition, d: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Point2f, mi.Float]:
+        """The random numbers with which :meth:`sample` gives the direction ``d``, and its density.
+        """
         column, row, point, sin_theta = self._texels.find(d)
         nodes, branches, index = made.nodes, made.branches, mi.UInt32(0)
-        branch = branches.read(index, active)
-        root = mi.Float(branch.weight)
+        branch, columns = branches.read(index, active), nodes.read(index, active).x
+        root, first, size = mi.Float(branch.weight), mi.Point2f(0), mi.Point2f(1)
         working = active & (branch.link != 0)
         while dr.hint(working, label="tree"):
             low = nodes.read(branch.link, working)
             # The direction lies in the whole
             is_low = (column < (low.x >> 16)) & (row < (low.y >> 16))
             index = branch.link + dr.select(is_low, mi.UInt32(0), 1)
-            branch = branches.read(index, working)
+            part = branches.read(index, working)
+            by_x = low.x != columns
+            first, size = part_of(first, size, by_x, is_low, part.weight / branch.weight)
+            branch, columns = part, nodes.read(index, working).x
             working &= branch.link != 0
         leaf = self._leaf(nodes.read(index, active), made.floor, active)
-        density = self._sums.pdf(leaf, column, row, point, sin_theta, active)
+        number, density = self._sums.invert(leaf, column, row, point, sin_theta, active)
+        number = first + size * number
         density *= branch.weight / root
         if dr.hint(self._sun_share > 0, mode="scalar"):
-            in_sun = self._texels.sun.contains(d)
-            by_sun = made.sun / self._texels.sun.solid_angle
+            sun = self._texels.sun
+            in_sun, by_sun = sun.contains(d), made.sun / sun.solid_angle
             density = dr.select(in_sun, by_sun, (1 - made.sun) * density)
-        return dr.select(active, density, 0)
+            of_sun = sun.invert(d)
+            number = dr.select(
+                in_sun,
+                mi.Point2f(made.sun * of_sun.x, of_sun.y),
+                mi.Point2f(dr.lerp(made.sun, 1, number.x), number.y),
+            )
+        return number, dr.select(active, density, 0)
 
     def _leaf(self, node: Node, floor: mi.Float, active) -> Rectangle:
         leaf = self._rectangle(node, active)

@@ -73,7 +73,7 @@ class LightTable(EmitterSampling):
         # Opaque: scenes that differ in it only share their kernels
         self._count = dr.opaque(mi.UInt32, cells.count)
 
-    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> mi.UInt32:
+    def begin(self, sampler, ray, pixel=None) -> mi.UInt32:
         return mi.UInt32(0)
 
     def visit(self, state, scene, si, active) -> mi.UInt32:

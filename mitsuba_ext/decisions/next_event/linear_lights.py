@@ -104,7 +104,7 @@ class LinearChoice(EmitterSampling):
         self._candidates = mi.UInt32(candidates.astype(np.uint32))
         self._uniform = mi.Float((positive / len(candidates)).astype(np.float32))
 
-    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
+    def begin(self, sampler, ray, pixel=None) -> Any:
         return Estimates(mi.Normal3f(0), mi.Bool(False), mi.Float(0)) if self.count > 1 else ()
 
     def visit(self, state, scene, si, active):

@@ -38,7 +38,7 @@ class PortalSampling(EmitterSampling):
         self._index = emitters.index(scene.environment())
         self._pointer = self._maps.directions.pointer
 
-    def begin(self, sampler, ray) -> mi.Float64:
+    def begin(self, sampler, ray, pixel=None) -> mi.Float64:
         return mi.Float64(0)
 
     @dr.syntax

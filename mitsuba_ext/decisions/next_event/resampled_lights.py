@@ -77,7 +77,7 @@ class ResampledLights(EmitterSampling):
             mi.UInt32, self._bsdf_count
         )
 
-    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> mi.Float:
+    def begin(self, sampler, ray, pixel=None) -> mi.Float:
         return mi.Float(0)
 
     def remember(self, place, scene, d, pdf, active) -> mi.Float:

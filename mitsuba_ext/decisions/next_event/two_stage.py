@@ -1,6 +1,6 @@
-"""Two-stage importance sampling of an environment.
+"""Two-stage importance sampling of an environment, and what it can know of visibility.
 
-Source: Cline, PhD dissertation, chapter 5.
+Source: Cline, PhD dissertation, chapters 5 and 6.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from ...lights.texel_sums import TexelSums
 from ...transport.heroes import Heroes
 from ...transport.path_decisions import EmitterSampling
 from .environment_partition import Partition, Partitioner
+from .visibility_maps import Cell, PrimaryVisibility, Tile, VisibilityCounts, WorldVisibility
 
 
 @dataclass
@@ -26,11 +27,13 @@ class State:
             the path has left; where ``has_partition``.
         has_partition: Did the last vertex have one?
         is_first: Is there no last vertex?
+        tile: Number of that in which the path begins.
     """
 
     density: mi.Float
     has_partition: mi.Bool
     is_first: mi.Bool
+    tile: mi.UInt32
 
 
 @dataclass
@@ -40,10 +43,12 @@ class Place:
     Attributes:
         partition: Of the environment, where ``has_partition``.
         has_partition: Elsewhere lights are chosen as Mitsuba does.
+        tile: The maps of what is visible.
     """
 
     partition: Partition
     has_partition: mi.Bool
+    tile: Tile
 
 
 class TwoStage(EmitterSampling):
@@ -54,26 +59,47 @@ class TwoStage(EmitterSampling):
         scene: A scene with an environment emitter.
         splits: See :class:`Partitioner`.
         everywhere: Are there partitions at all vertices of a path, not only at the first?
+        counts: Tells connections in which cell they lie.
+        in_primary_space: Are its cells those of random numbers, or of directions?
+        visibility: What was learned of what is visible from first vertices.
+        sums: Of the environment, if they are there.
     """
 
-    def __init__(self, scene: mi.Scene, splits: int, everywhere: bool) -> None:
-        self._everywhere = everywhere
-        self._sums = TexelSums(EnvironmentTexels(scene))
+    def __init__(
+        self,
+        scene: mi.Scene,
+        splits: int,
+        everywhere: bool,
+        counts: VisibilityCounts | None = None,
+        in_primary_space: bool = True,
+        visibility: PrimaryVisibility | WorldVisibility | None = None,
+        sums: TexelSums | None = None,
+    ) -> None:
+        self._everywhere, self._counts = everywhere, counts
+        self._in_primary_space = in_primary_space
+        self._sums = sums or TexelSums(EnvironmentTexels(scene))
         self._texels = self._sums.texels
-        self._partitioner = Partitioner(self._sums, Heroes(scene).context(), splits)
+        is_world = isinstance(visibility, WorldVisibility)
+        self._primary = None if is_world else visibility
+        self._partitioner = Partitioner(
+            self._sums, Heroes(scene).context(), splits, visibility if is_world else None
+        )
         emitters = scene.emitters()
         self.choice_dimension = 1 if len(emitters) > 1 else 0
         self._index = emitters.index(scene.environment())
         self._pointer = self._texels.directions.pointer
 
-    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f) -> State:
-        return State(mi.Float(0), mi.Bool(False), mi.Bool(True))
+    def begin(self, sampler, ray, pixel=None) -> State:
+        has_maps = self._counts is not None and pixel is not None
+        tile = self._counts.tile(pixel) if has_maps else mi.UInt32(0)
+        return State(mi.Float(0), mi.Bool(False), mi.Bool(True), tile)
 
     def visit(self, state, scene, si, active) -> Place:
         has_partition = mi.Bool(active)
         if not self._everywhere:
             has_partition &= state.is_first
-        return Place(self._partitioner.partition(si, has_partition), has_partition)
+        tile = Tile(state.tile, has_partition & state.is_first)
+        return Place(self._partitioner.partition(si, has_partition, tile), has_partition, tile)
 
     def sample(self, place, scene, numbers, si, active):
         inverse, by_product = mi.Float(1), active & place.has_partition
@@ -83,25 +109,44 @@ class TwoStage(EmitterSampling):
             emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active & ~by_product)
         else:
             emitter = self._pointer
-        a, a_weight = self._by_product(place, si, numbers.point, dr.rcp(inverse), by_product)
+        a, a_weight, choice = self._by_product(
+            place, si, numbers.point, dr.rcp(inverse), by_product
+        )
         is_other = active & ~by_product
         b, b_weight = emitter.sample_direction(si, numbers.point, is_other)
         b.pdf = dr.select(is_other, b.pdf / inverse, 0)
         b.emitter = mi.EmitterPtr(emitter)
         b_weight = dr.select(is_other, b_weight * inverse, 0)
-        return dr.select(by_product, a, b), dr.select(by_product, a_weight, b_weight), ()
+        weight = dr.select(by_product, a_weight, b_weight)
+        return dr.select(by_product, a, b), weight, choice
 
     def _by_product(self, place, si, point, probability: mi.Float, active):
+        if self._primary is not None:
+            point, density = self._primary.sample(place.tile, point, active)
+            probability = probability * density
         d, uv, density = self._partitioner.sample(place.partition, point, active)
         ds = self._texels.directions.sample(si, d)
         ds.uv, ds.pdf = uv, dr.select(active, density * probability, 0)
         value = self._texels.radiance(si, ds, active)
-        return ds, dr.select(ds.pdf > 0, value / ds.pdf, 0)
+        choice = ()
+        if self._counts is not None:
+            where = point
+            if not self._in_primary_space:
+                column, row, _point, _sine = self._texels.find(d)
+                where = mi.Point2f(
+                    (mi.Float(column) + 0.5) / self._texels.columns,
+                    (mi.Float(row) + 0.5) / self._texels.rows,
+                )
+            cell = self._counts.cell(place.tile.number, where)
+            choice = Cell(cell, active & place.tile.is_known)
+        return ds, dr.select(ds.pdf > 0, value / ds.pdf, 0), choice
 
     def remember(self, place, scene, d, pdf, active) -> State:
         has_partition = active & place.has_partition
-        density = self._partitioner.pdf(place.partition, d, has_partition)
-        return State(density, has_partition, mi.Bool(False))
+        number, density = self._partitioner.invert(place.partition, d, has_partition)
+        if self._primary is not None:
+            density *= self._primary.density(place.tile, number, has_partition)
+        return State(density, has_partition, mi.Bool(False), place.tile.number)
 
     def density(self, state, scene, ref, si, ds, active):
         by_product = active & state.has_partition & (ds.emitter == self._pointer)
