@@ -75,6 +75,7 @@ REGRESSIONS = {
         Regression("reweighted_direct", "cornell_box", {"light_samples": 16}, spp=32),
         Regression("two_stage", "window", {"light_samples": 4}, max_depth=3),
         Regression("reweighted_lens", "defocus", {"nested": "path"}, spp=512),
+        Regression("ecoc_dof", "defocus", {"nested": "path"}),
         Regression("reweighted_time", "fan", {"nested": "composed_path"}),
         Regression("composed_path", "fast_balls"),
         Regression("composed_path", "flint", variant="llvm_ad_spectral"),
