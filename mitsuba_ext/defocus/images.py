@@ -26,8 +26,12 @@ class Size:
     def pixels(self) -> tuple[mi.UInt32, mi.Vector2i]:
         """The index and the position of each pixel."""
         index = dr.arange(mi.UInt32, self.count)
+        return index, self.position(index)
+
+    def position(self, index: mi.UInt32) -> mi.Vector2i:
+        """The position of the pixel of an index."""
         y = index // self._width
-        return index, mi.Vector2i(mi.Int32(index - y * self._width), mi.Int32(y))
+        return mi.Vector2i(mi.Int32(index - y * self._width), mi.Int32(y))
 
     def index(self, position: mi.Vector2i) -> mi.UInt32:
         """The index of the pixel at a position, or of the nearest one at the border."""

@@ -17,6 +17,9 @@ from .lens_points import RINGS, LensPoints, ring_points
 #: of 4 × 4 pixels (Bayer's matrix): what the 48 points leave out differs from pixel to pixel.
 _TURNS = (0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5)
 
+#: So many pixels around the circle of its own blur a pixel may see besides.
+_MARGIN = 2.0
+
 
 def lens_filter(layers: list[Layer], size: Size) -> mi.Color3f:
     """The picture that a thin lens makes of layers.
@@ -33,12 +36,57 @@ def lens_filter(layers: list[Layer], size: Size) -> mi.Color3f:
         layers: The nearest first.
         size: Of the pictures.
     """
-    lens = LensPoints(ring_points())
-    index, position = size.pixels()
-    place = mi.Point2f(position) + 0.5
-    seen = [_LayerView.of(layer, lens, size, index) for layer in layers]
-    color, covered = _sum(lens, place, _turn(position), size, seen)
-    return color / dr.maximum(covered, 1e-6)
+    return _LensFilter(layers, size).picture()
+
+
+class _LensFilter:
+    def __init__(self, layers: list[Layer], size: Size) -> None:
+        self._size, self._layers = size, layers
+        self._lens = LensPoints(ring_points())
+        self._pyramids = [Pyramid(dr.ravel(layer.color), size) for layer in layers]
+        dr.eval([layer.blur for layer in layers])
+
+    def picture(self) -> mi.Color3f:
+        """Computes the pixels that see the same layers together."""
+        index, position = self._size.pixels()
+        place = mi.Point2f(position) + 0.5
+        present = self._present(place)
+        dr.eval(present)
+        counts = dr.zeros(mi.UInt32, 1 << len(self._layers))
+        dr.scatter_add(counts, mi.UInt32(1), present)
+        picture = dr.zeros(mi.Float, 3 * self._size.count)
+        for bits in np.flatnonzero(counts.numpy()):
+            chosen = dr.compress(present == dr.opaque(mi.UInt32, int(bits)))
+            where = self._size.position(chosen)
+            layers = [k for k in range(len(self._layers)) if bits >> k & 1]
+            seen = [self._view(k, chosen) for k in layers]
+            color, covered = _sum(
+                self._lens, mi.Point2f(where) + 0.5, _turn(where), self._size, seen
+            )
+            dr.scatter(picture, color / dr.maximum(covered, 1e-6), chosen)
+            dr.eval(picture)
+        return dr.gather(mi.Color3f, picture, index)
+
+    def _present(self, place: mi.Point2f) -> mi.UInt32:
+        """Which layers each pixel may see, one bit for each. The last one is everywhere."""
+        last = len(self._layers) - 1
+        present = dr.full(mi.UInt32, 1 << last, self._size.count)
+        for k, (layer, pyramid) in enumerate(zip(self._layers[:last], self._pyramids)):
+            # Four pixels of a copy that is so coarse that they cover the circle
+            reach = dr.abs(layer.blur) + _MARGIN
+            level = mi.UInt32(dr.ceil(dr.log2(2 * reach)))
+            view = pyramid.view(dr.minimum(level, pyramid.level_count - 1))
+            coverage = mi.Float(0)
+            for x in (-1, 1):
+                for y in (-1, 1):
+                    coverage += view.at(place + reach * mi.Vector2f(x, y)).w
+            present |= dr.select(coverage > 0, mi.UInt32(1 << k), 0)
+        return present
+
+    def _view(self, k: int, index: mi.UInt32) -> _LayerView:
+        layer = self._layers[k]
+        blur = dr.gather(mi.Float, layer.blur, index)
+        return _LayerView(blur, layer.blur, self._lens.view(self._pyramids[k], blur))
 
 
 @dataclass
@@ -48,12 +96,6 @@ class _LayerView:
     blur: mi.Float
     blurs: mi.Float
     view: LevelView
-
-    @staticmethod
-    def of(layer: Layer, lens: LensPoints, size: Size, index: mi.UInt32) -> _LayerView:
-        blur = dr.gather(mi.Float, layer.blur, index)
-        pyramid = Pyramid(dr.ravel(layer.color), size)
-        return _LayerView(blur, layer.blur, lens.view(pyramid, blur))
 
 
 def _turn(position: mi.Vector2i) -> mi.Vector2f:
