@@ -19,7 +19,8 @@ def gather_filter(color: mi.Color3f, blur: mi.Float, size: Size) -> mi.Color3f:
 
     What is nearer than the focus is found in a circle of the largest blur around, and counts where
     its own blur reaches the pixel. What is farther is gathered in the circle of the pixel's own
-    blur; what is sharper counts only where its blur reaches the pixel.
+    blur; what is sharper counts only where its blur reaches the pixel. Behind a near pixel, what is
+    far and around it takes its place.
 
     Source: J. J. Guo, PhD thesis, TU Delft, Table 5.1 (*gather*), which leaves the details open;
     these are those of J. Jimenez, *Next Generation Post Processing in Call of Duty*, SIGGRAPH
@@ -33,9 +34,10 @@ def gather_filter(color: mi.Color3f, blur: mi.Float, size: Size) -> mi.Color3f:
     place = mi.Point2f(position) + 0.5
     picture = Pyramid(dr.ravel(mi.Vector4f(color.x, color.y, color.z, blur)), size)
     widest = _largest_around(dr.maximum(blur, 0), size)
-    own = dr.maximum(-dr.gather(mi.Float, blur, index), 0)
+    own = dr.gather(mi.Float, blur, index)
     near, opacity = _near(lens, picture.view(mi.UInt32(0)), place, widest)
-    far = _far(lens, lens.view(picture, own), place, own)
+    # Copies of lower resolution would mix the blurs of what is near and what is far
+    far = _far(lens, picture.view(mi.UInt32(0)), place, own)
     return near * opacity + far * (1 - opacity)
 
 
@@ -62,8 +64,8 @@ def _far(lens, view, place, own):
     while i < lens.count:
         point = lens.at(i)
         found = view.at(place + own * point)
-        distance = own * dr.norm(point)
-        weight = dr.select((found.w <= 0.5) & (-found.w >= distance - 0.5), mi.Float(1), 0)
+        reaches = (own > 0.5) | (-found.w >= dr.abs(own) * dr.norm(point) - 0.5)
+        weight = dr.select((found.w <= 0.5) & reaches, mi.Float(1), 0)
         total += weight * rgb(found)
         weights += weight
         i += 1
