@@ -113,6 +113,16 @@ def test_few_samples_are_enough_and_are_those_of_the_image(spp, hidden_spp):
     assert np.isfinite(image).all() and integrator.statistics.spp == spp
 
 
+def test_a_cancelled_render_is_a_picture_of_what_it_has():
+    scene = mi.load_dict(stage(camera=thin_lens(5, 3)))
+    integrator = ecoc(PATH)
+    integrator.samples_per_pass = 2
+    integrator.progress = lambda done: integrator.cancel()
+    image = rendered(scene, integrator, 8)
+    assert integrator.statistics.interrupted and integrator.statistics.spp == 2
+    assert np.isfinite(image).all() and image.mean() > 0
+
+
 @pytest.mark.slow
 def test_a_perspective_with_a_lens_given_is_a_thin_lens():
     optics = {"aperture_radius": 0.3, "focus_distance": 4.0}

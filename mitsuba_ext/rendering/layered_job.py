@@ -174,20 +174,23 @@ class LayeredJob(Job):
             return
         outside = np.ones_like(self.blurs, dtype=bool)
         outside[self._inside] = False
-        self._run_pixels(outside, None)
+        self._run_pixels(outside, None, interrupt)
         if self.filter.has_layers:
             least = least_blur_around(self.blurs, self.lens.blur_of_sky)
-            self._run_pixels(np.isfinite(least), mi.Float(least.ravel()))
+            self._run_pixels(np.isfinite(least), mi.Float(least.ravel()), interrupt)
 
     # ---- What the film does not show ----
 
-    def _run_pixels(self, chosen: np.ndarray, least: mi.Float | None) -> None:
+    def _run_pixels(self, chosen: np.ndarray, least: mi.Float | None, interrupt) -> None:
         """Takes samples of some pixels: of what is seen first, or where ``least`` is given, of what
         is hidden by something whose blur is larger than that by more than 1."""
         spp = self.integrator.hidden_samples(self.statistics.spp)
         pixels = np.flatnonzero(chosen).astype(np.uint32)
-        per_pass = max(1, _MOST_LANES // spp)
+        most = min(_MOST_LANES // self.integrator.sample_cost, self.integrator.most_lanes)
+        per_pass = max(1, most // spp)
         for start in range(0, len(pixels), per_pass):
+            if self._stopped(interrupt):
+                return
             part = pixels[start : start + per_pass]
             # Numbers that no other part of the render has
             number = (2 if least is None else 3) * 0x40000000 + start
