@@ -205,6 +205,8 @@ def _render_here(variant: str, names: list[str]) -> None:
     mi.set_log_level(mi.LogLevel.Error)  # stdout is for the results, not for warnings
     description = mi.cornell_box()
     description["sensor"]["film"].update(width=32, height=32)
+    # Some integrators ask for a lens
+    description["sensor"].update(type="thinlens", aperture_radius=0.01, focus_distance=3.9)
     scene = mi.load_dict(description)
     for name in names:
         result: dict = {"name": name}

@@ -79,6 +79,7 @@ REGRESSIONS = {
                    max_depth=2, spp=32),
         Regression("adaptive", "cornell_box", {"nested": "composed_path"}, spp=64),
         Regression("reweighted_lens", "defocus", {"nested": "path"}, spp=512),
+        Regression("ecoc_dof", "defocus", {"nested": "path"}),
         Regression("reweighted_time", "fan", {"nested": "composed_path"}),
         Regression("composed_path", "fast_balls"),
         Regression("composed_path", "near_lights", max_depth=4, is_slow=True),

@@ -29,6 +29,8 @@ FORBIDDEN = {
     "path_space": {"decisions", "chains", "composition", *PLUGINS},
     "rendering": {"decisions", "bidirectional", "chains", "path_space", "composition", *PLUGINS},
     "composition": set(PLUGINS),
+    "defocus": {"transport", "regions", "lights", "decisions", "bidirectional", "chains",
+                "path_space", "composition", "rendering", *PLUGINS},
     "pointsets": {"transport", "regions", "lights", "decisions", "composition", "rendering",
                   *PLUGINS},
     "sequences": {"transport", "regions", "lights", "decisions", "bidirectional", "chains",

@@ -1,0 +1,71 @@
+"""The effective circle of confusion: the picture that a lens makes of three layers, as the source
+approximates it."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .images import Pyramid, Size, rgb
+from .layers import IN_FOCUS, Layer, Limits, split
+from .lens_points import LensPoints, disk_mean, ring_points
+from .near_field import near_field
+
+
+def effective_filter(
+    near: Layer | None, rest: list[Layer], size: Size, cap: float
+) -> mi.Color3f:
+    """The picture that a thin lens makes of a near, an in-focus and a far layer.
+
+    The near layer is blurred by a separable filter of one radius, ``cap``. Its opacity α is the
+    part of the lens that it hides from what is behind. A pixel of that is the mean over its
+    effective circle of confusion, at 48 points: the circle of its own blur is smaller by the factor
+    1 - α, and its middle is moved towards the near objects.
+
+    A straight edge that hides the share α of the lens' width leaves a part whose middle is α away
+    from that of the lens. So the circle is moved by α times the radius of the whole one. The source
+    moves it by α times the effective radius, which is α (1 - α) of the whole one: that agrees for
+    small α only. What is itself nearer than the focus is seen on the other side of the lens: its
+    circle is moved away from the near objects.
+
+    Source: J. J. Guo, PhD thesis, TU Delft, chapter 5, Eqs. 5.4 and 5.5.
+
+    Parameters:
+        near: The near layer, if there is one.
+        rest: The other layers, the nearest first.
+        size: Of the pictures.
+        cap: Radius of the near layer's blur, in pixels.
+    """
+    lens = LensPoints(ring_points())
+    index, position = size.pixels()
+    through, color = mi.Float(1), mi.Color3f(0)
+    hidden, direction = mi.Float(0), mi.Vector2f(0)
+    if near is not None:
+        field = near_field(near, size, cap)
+        hidden, direction = field.color.w, field.direction
+        color, through = rgb(field.color), 1 - hidden
+    for layer in rest:
+        radius = dr.gather(mi.Float, layer.blur, index)
+        # A place on the lens: what is behind the focus is seen on the other side. Eq. 5.5 (Guo)
+        middle = mi.Point2f(position) + 0.5 - radius * hidden * direction
+        radius = dr.abs(radius) * (1 - hidden)  # Eq. 5.4
+        view = lens.view(Pyramid(dr.ravel(layer.color), size), radius)
+        found = disk_mean(lens, view, middle, radius)
+        color += through * rgb(found)
+        through *= 1 - found.w
+    return color / dr.maximum(1 - through, 1e-6)
+
+
+def effective_limits(blurs: np.ndarray) -> tuple[Limits, float]:
+    """The limits between the near, the in-focus and the far layer, and the radius of the blur of
+    the near one: the median of its surfaces.
+
+    Parameters:
+        blurs: Signed radii in pixels of what is seen; any sample of the pixels.
+    """
+    near = blurs[blurs > IN_FOCUS]
+    if near.size == 0:
+        return Limits([0.0]), 0.0
+    limit = (*split(near), IN_FOCUS)[0]
+    return Limits([limit, 0.0]), float(np.median(near[near > limit]))

@@ -1,0 +1,139 @@
+"""The filters of this folder by name, and what each needs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .effective import effective_filter, effective_limits
+from .images import Size, rgb
+from .layers import LayerSums, Limits, layers_from_sums, limits_of, sums_of_picture
+from .lens_filter import lens_filter
+from .rivals import gather_filter, one_pass_filter
+from .thin_lens import ThinLens
+
+
+@dataclass
+class Capture:
+    """What was seen from the middle of the lens.
+
+    Attributes:
+        size: Of the picture.
+        sums: Of each layer.
+        blur: Signed radius of the circle of confusion in pixels, of what is seen first.
+    """
+
+    size: Size
+    sums: list[LayerSums]
+    blur: mi.Float
+
+
+class Filter(Protocol):
+    """Makes the picture of a lens from one of its middle.
+
+    Attributes:
+        has_layers: Does it look behind what is seen first?
+    """
+
+    has_layers: bool
+
+    def limits(self, blurs: np.ndarray) -> Limits:
+        """The layers for surfaces of such blurs."""
+
+    def picture(self, capture: Capture) -> mi.Color3f:
+        """Called after :meth:`limits`."""
+
+
+class _Lens:
+    has_layers = True
+
+    def limits(self, blurs: np.ndarray) -> Limits:
+        return limits_of(blurs)
+
+    def picture(self, capture: Capture) -> mi.Color3f:
+        return lens_filter(layers_from_sums(capture.sums, capture.size), capture.size)
+
+
+class _Effective:
+    has_layers = True
+    _cap = 0.0
+
+    def limits(self, blurs: np.ndarray) -> Limits:
+        limits, self._cap = effective_limits(blurs)
+        return limits
+
+    def picture(self, capture: Capture) -> mi.Color3f:
+        layers = layers_from_sums(capture.sums, capture.size)
+        has_near = self._cap > 0 and capture.sums[0].is_there
+        near = layers.pop(0) if has_near else None
+        return effective_filter(near, layers, capture.size, self._cap)
+
+
+class _OfPicture:
+    has_layers = False
+
+    def __init__(self, function: Callable[[mi.Color3f, mi.Float, Size], mi.Color3f]) -> None:
+        self._function = function
+
+    def limits(self, blurs: np.ndarray) -> Limits:
+        return Limits([])
+
+    def picture(self, capture: Capture) -> mi.Color3f:
+        (only,) = layers_from_sums(capture.sums, capture.size)
+        return self._function(rgb(only.color), capture.blur, capture.size)
+
+
+_MAKERS: dict[str, Callable[[], Filter]] = {
+    "lens": _Lens,
+    "effective": _Effective,
+    "gather": lambda: _OfPicture(gather_filter),
+    "one_pass": lambda: _OfPicture(one_pass_filter),
+}
+
+#: What a filter can be called.
+FILTERS = tuple(_MAKERS)
+
+
+def make_filter(name: str) -> Filter:
+    """A filter by one of its names in ``FILTERS``."""
+    return _MAKERS[name]()
+
+
+def defocus(
+    color: mi.TensorXf, depth: mi.TensorXf, lens: ThinLens, filter: str = "lens"
+) -> mi.TensorXf:
+    """The picture that a lens makes of what its middle sees.
+
+    What the picture does not show, behind near objects, is filled in from what is around it.
+
+    Parameters:
+        color: RGB of any range, [y, x, 3].
+        depth: Along the axis of the lens, positive, [y, x]; infinite for the sky.
+        lens: Its ``film_width`` is that of the picture, or wider where the picture is a crop.
+        filter: One of ``FILTERS``.
+
+    Raises:
+        ValueError: The shapes do not match, or there is no such filter.
+    """
+    height, width, *rest = color.shape
+    if rest != [3] or tuple(depth.shape) != (height, width):
+        raise ValueError(
+            f"color has the shape {tuple(color.shape)} and depth {tuple(depth.shape)}: give "
+            f"(height, width, 3) and (height, width)"
+        )
+    if filter not in FILTERS:
+        raise ValueError(f'there is no filter "{filter}"; there are {", ".join(FILTERS)}')
+    size, found = Size(width, height), make_filter(filter)
+    lane = dr.arange(mi.UInt32, size.count)
+    seen = mi.Color3f(*(dr.gather(mi.Float, color.array, 3 * lane + k) for k in range(3)))
+    blur = lens.blur(dr.gather(mi.Float, depth.array, lane))
+    dr.eval(seen, blur)
+    limits = found.limits(blur.numpy())
+    capture = Capture(size, sums_of_picture(seen, blur, limits), blur)
+    picture = found.picture(capture)
+    return mi.TensorXf(dr.ravel(picture), shape=(height, width, 3))

@@ -1,0 +1,178 @@
+"""Images as flat arrays of packets of four numbers, and their pyramids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import drjit as dr
+import mitsuba as mi
+
+T = TypeVar("T")
+
+
+@dataclass
+class Size:
+    """Width and height of an image in pixels. Kernels do not depend on them."""
+
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        self.count = self.width * self.height
+        self._width = dr.opaque(mi.UInt32, self.width)
+        self._last = dr.opaque(mi.Vector2i, [self.width - 1, self.height - 1])
+
+    def pixels(self) -> tuple[mi.UInt32, mi.Vector2i]:
+        """The index and the position of each pixel."""
+        index = dr.arange(mi.UInt32, self.count)
+        return index, self.position(index)
+
+    def position(self, index: mi.UInt32) -> mi.Vector2i:
+        """The position of the pixel of an index."""
+        y = index // self._width
+        return mi.Vector2i(mi.Int32(index - y * self._width), mi.Int32(y))
+
+    def index(self, position: mi.Vector2i) -> mi.UInt32:
+        """The index of the pixel at a position, or of the nearest one at the border."""
+        position = dr.clip(position, 0, self._last)
+        return mi.UInt32(position.y) * self._width + mi.UInt32(position.x)
+
+    def half(self) -> Size:
+        return Size((self.width + 1) // 2, (self.height + 1) // 2)
+
+
+class Pyramid:
+    """An image, and copies of half, a quarter, … of its size: means of 2 × 2 pixels.
+
+    Parameters:
+        data: The image: 4 numbers for each pixel, row by row.
+        size: Its size.
+        most_levels: Copies, at most, the image included.
+    """
+
+    def __init__(self, data: mi.Float, size: Size, most_levels: int = 12) -> None:
+        self.size = size
+        sizes = [size]
+        while len(sizes) < most_levels and sizes[-1].count > 1:
+            sizes.append(sizes[-1].half())
+        starts = [0]
+        for level in sizes:
+            starts.append(starts[-1] + level.count)
+        self.level_count = len(sizes)
+        self._data = dr.empty(mi.Float, 4 * starts[-1])
+        index, _ = size.pixels()
+        dr.scatter(self._data, dr.gather(mi.Vector4f, data, index), index)
+        dr.eval(self._data)
+        for level in range(1, len(sizes)):
+            mean = halved(
+                mi.Vector4f, self._data, sizes[level - 1], dr.opaque(mi.UInt32, starts[level - 1])
+            )
+            start = dr.opaque(mi.UInt32, starts[level])
+            dr.scatter(self._data, mean, start + dr.arange(mi.UInt32, sizes[level].count))
+            dr.eval(self._data)
+        self._starts = mi.UInt32(starts[:-1])
+        self._widths = mi.Int32([level.width for level in sizes])
+        self._heights = mi.Int32([level.height for level in sizes])
+        dr.make_opaque(self._starts, self._widths, self._heights)
+
+    def view(self, level: mi.UInt32) -> LevelView:
+        """The copy number ``level`` in each lane."""
+        return LevelView(
+            self._data, dr.gather(mi.UInt32, self._starts, level),
+            dr.gather(mi.Int32, self._widths, level), dr.gather(mi.Int32, self._heights, level),
+            dr.rcp(mi.Float(1 << level)),
+        )  # fmt: skip
+
+
+@dataclass
+class LevelView:
+    """One level of a pyramid in each lane."""
+
+    data: mi.Float
+    start: mi.UInt32
+    width: mi.Int32
+    height: mi.Int32
+    scale: mi.Float
+
+    def at(self, place: mi.Point2f) -> mi.Vector4f:
+        """The pixel that holds a place, given in pixels of the image from its corner; beyond the
+        border, the nearest pixel."""
+        column = dr.clip(mi.Int32(dr.floor(place.x * self.scale)), 0, self.width - 1)
+        row = dr.clip(mi.Int32(dr.floor(place.y * self.scale)), 0, self.height - 1)
+        return dr.gather(mi.Vector4f, self.data, self.start + mi.UInt32(row * self.width + column))
+
+
+def halved(kind: type[T], flat: mi.Float, size: Size, start: mi.UInt32 | int = 0) -> T:
+    """Means of 2 × 2 pixels of an image that begins at the pixel ``start`` of ``flat``."""
+    _index, position = size.half().pixels()
+    total = kind(0)
+    for at in _four(size, 2 * position):
+        total += dr.gather(kind, flat, start + at)
+    return 0.25 * total
+
+
+def bilinear(kind: type[T], flat: mi.Float, size: Size, place: mi.Point2f) -> T:
+    """An image between the middles of its pixels.
+
+    Parameters:
+        place: In pixels from the corner of the image.
+    """
+    corner = mi.Vector2i(dr.floor(place - 0.5))
+    right = place - 0.5 - mi.Point2f(corner)
+    left = 1 - right
+    weights = [left.x * left.y, right.x * left.y, left.x * right.y, right.x * right.y]
+    total = kind(0)
+    for weight, at in zip(weights, _four(size, corner)):
+        total += weight * dr.gather(kind, flat, at)
+    return total
+
+
+def filled(values: T, weight: mi.Float, size: Size) -> T:
+    """Fills the holes of an image: where ``weight`` is below 1, means of what is around take the
+    rest (Gortler et al., *The Lumigraph*, SIGGRAPH 1996: pull and push).
+
+    Parameters:
+        values: One number or four for each pixel, each already multiplied by its ``weight``.
+        weight: How much is known of each pixel, in [0, 1].
+        size: Of the image.
+
+    Returns:
+        The values; 0 where nothing is known anywhere.
+    """
+    kind = type(values)
+    levels = [(values, weight, size)]
+    while levels[-1][2].count > 1:
+        values, weight, size = levels[-1]
+        flat = dr.ravel(values)
+        dr.eval(flat, weight)
+        _index, position = size.half().pixels()
+        total, known = kind(0), mi.Float(0)
+        for at in _four(size, 2 * position):
+            # A pixel beyond the border is the one at the border again
+            total += dr.gather(kind, flat, at)
+            known += dr.gather(mi.Float, weight, at)
+        # Where more than one of the four is known, these count as one
+        scale = dr.rcp(dr.maximum(known, 1))
+        total, known = total * scale, known * scale
+        dr.eval(total, known)
+        levels.append((total, known, size.half()))
+    total, known, _size = levels.pop()
+    found = dr.select(known > 0, total / dr.maximum(known, 1e-20), 0)
+    while levels:
+        values, weight, size = levels.pop()
+        flat = dr.ravel(found)
+        _index, position = size.pixels()
+        place = (mi.Point2f(position) + 0.5) * 0.5
+        found = values + (1 - weight) * bilinear(kind, flat, size.half(), place)
+        dr.eval(found)
+    return found
+
+
+def _four(size: Size, corner: mi.Vector2i) -> list[mi.UInt32]:
+    return [size.index(corner + mi.Vector2i(x, y)) for y in range(2) for x in range(2)]
+
+
+def rgb(values: mi.Vector4f) -> mi.Color3f:
+    """The first three of four numbers."""
+    return mi.Color3f(values.x, values.y, values.z)

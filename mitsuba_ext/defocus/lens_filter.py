@@ -1,0 +1,137 @@
+"""The picture that a lens makes of layers: for each point of the lens, what hides what."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .images import LevelView, Pyramid, Size, rgb
+from .layers import Layer
+from .lens_points import RINGS, LensPoints, ring_points
+
+#: Neighbouring pixels turn the points by different angles, of which these are the ranks in a square
+#: of 4 × 4 pixels (Bayer's matrix): what the 48 points leave out differs from pixel to pixel.
+_TURNS = (0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5)
+
+#: So many pixels around the circle of its own blur a pixel may see besides.
+_MARGIN = 2.0
+
+
+def lens_filter(layers: list[Layer], size: Size) -> mi.Color3f:
+    """The picture that a thin lens makes of layers.
+
+    From each of 48 points of the lens, each layer is seen at another place. A layer covers what is
+    behind it for this point only. So what is near hides a part of the lens from what is far, which
+    becomes sharper, and shifted. This is a mask of the visible part of the lens for each pixel,
+    where the source has a radius and a shift.
+
+    The place is found in two steps: that for the blur at the pixel, and then that for the blur of
+    the layer there.
+
+    Parameters:
+        layers: The nearest first.
+        size: Of the pictures.
+    """
+    return _LensFilter(layers, size).picture()
+
+
+class _LensFilter:
+    def __init__(self, layers: list[Layer], size: Size) -> None:
+        self._size, self._layers = size, layers
+        self._lens = LensPoints(ring_points())
+        self._pyramids = [Pyramid(dr.ravel(layer.color), size) for layer in layers]
+        dr.eval([layer.blur for layer in layers])
+
+    def picture(self) -> mi.Color3f:
+        """Computes the pixels that see the same layers together."""
+        index, position = self._size.pixels()
+        place = mi.Point2f(position) + 0.5
+        present = self._present(place)
+        dr.eval(present)
+        counts = dr.zeros(mi.UInt32, 1 << len(self._layers))
+        dr.scatter_add(counts, mi.UInt32(1), present)
+        picture = dr.zeros(mi.Float, 3 * self._size.count)
+        for bits in np.flatnonzero(counts.numpy()):
+            chosen = dr.compress(present == dr.opaque(mi.UInt32, int(bits)))
+            where = self._size.position(chosen)
+            layers = [k for k in range(len(self._layers)) if bits >> k & 1]
+            seen = [self._view(k, chosen) for k in layers]
+            color, covered = _sum(
+                self._lens, mi.Point2f(where) + 0.5, _turn(where), self._size, seen
+            )
+            dr.scatter(picture, color / dr.maximum(covered, 1e-6), chosen)
+            dr.eval(picture)
+        return dr.gather(mi.Color3f, picture, index)
+
+    def _present(self, place: mi.Point2f) -> mi.UInt32:
+        """Which layers each pixel may see, one bit for each. The last one is everywhere."""
+        last = len(self._layers) - 1
+        present = dr.full(mi.UInt32, 1 << last, self._size.count)
+        for k, (layer, pyramid) in enumerate(zip(self._layers[:last], self._pyramids)):
+            # Four pixels of a copy that is so coarse that they cover the circle
+            reach = dr.abs(layer.blur) + _MARGIN
+            level = mi.UInt32(dr.ceil(dr.log2(2 * reach)))
+            view = pyramid.view(dr.minimum(level, pyramid.level_count - 1))
+            coverage = mi.Float(0)
+            for x in (-1, 1):
+                for y in (-1, 1):
+                    coverage += view.at(place + reach * mi.Vector2f(x, y)).w
+            present |= dr.select(coverage > 0, mi.UInt32(1 << k), 0)
+        return present
+
+    def _view(self, k: int, index: mi.UInt32) -> _LayerView:
+        layer = self._layers[k]
+        blur = dr.gather(mi.Float, layer.blur, index)
+        return _LayerView(blur, layer.blur, self._lens.view(self._pyramids[k], blur))
+
+
+@dataclass
+class _LayerView:
+    """A layer as a pixel sees it: the pixel's own blur, the blurs of all, the colours."""
+
+    blur: mi.Float
+    blurs: mi.Float
+    view: LevelView
+
+
+def _turn(position: mi.Vector2i) -> mi.Vector2f:
+    """Sine and cosine of the angle by which a pixel turns the points."""
+    ranks = mi.UInt32(np.array(_TURNS, dtype=np.uint32))
+    rank = dr.gather(mi.UInt32, ranks, mi.UInt32((position.y & 3) * 4 + (position.x & 3)))
+    # The rings repeat themselves after this angle
+    whole = 2 * math.pi / math.gcd(*RINGS)
+    return mi.Vector2f(*dr.sincos(mi.Float(rank) * (whole / len(_TURNS))))
+
+
+@dr.syntax
+def _sum(lens, place, turn, size, seen):
+    i, total, covered = mi.UInt32(0), mi.Color3f(0), mi.Float(0)
+    while i < lens.count:
+        color, opacity = _through(place, _turned(lens.at(i), turn), size, seen)
+        total += color
+        covered += opacity
+        i += 1
+    return total, covered
+
+
+def _turned(point: mi.Point2f, turn: mi.Vector2f) -> mi.Point2f:
+    x, y = point.x * turn.y - point.y * turn.x, point.x * turn.x + point.y * turn.y
+    return mi.Point2f(x, y)
+
+
+def _through(
+    place: mi.Point2f, point: mi.Point2f, size: Size, seen: list[_LayerView]
+) -> tuple[mi.Color3f, mi.Float]:
+    """Colour and opacity of all layers, seen from a point of the lens."""
+    through, color = mi.Float(1), mi.Color3f(0)
+    for layer in seen:
+        about = mi.Vector2i(dr.floor(place + layer.blur * point))
+        blur = dr.gather(mi.Float, layer.blurs, size.index(about))
+        found = layer.view.at(place + blur * point)
+        color += through * rgb(found)
+        through *= 1 - found.w
+    return color, 1 - through

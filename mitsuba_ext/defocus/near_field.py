@@ -1,0 +1,91 @@
+"""The blurred near layer: a separable filter of colour, coverage, depth, and of where its objects
+are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .images import Size, bilinear, halved
+from .layers import Layer
+
+#: The window has at most so many pixels to each side: larger ones are those of smaller copies.
+_MOST_TAPS = 12
+
+
+@dataclass
+class NearField:
+    """The filtered near layer.
+
+    Attributes:
+        color: RGB times opacity, and opacity.
+        blur: The largest radius in the window: that of the nearest object, in pixels.
+        direction: Towards the objects in the window: of length 1, or 0 where there are none.
+    """
+
+    color: mi.Vector4f
+    blur: mi.Float
+    direction: mi.Vector2f
+
+
+def near_field(layer: Layer, size: Size, radius: float) -> NearField:
+    """Filters a layer by a Gaussian whose standard deviation is a third of ``radius``, which is
+    that of the window, in pixels.
+
+    Source: J. J. Guo, PhD thesis, TU Delft, section 5.4.1.1, Listing 1 and Eq. 5.5. Wide windows
+    are filtered in a copy of lower resolution.
+    """
+    full, color, blur = size, dr.ravel(layer.color), layer.blur
+    scale = 1
+    while radius / scale > _MOST_TAPS and size.count > 1:
+        dr.eval(color, blur)
+        smaller = halved(mi.Vector4f, color, size)
+        color, blur = dr.ravel(smaller), halved(mi.Float, blur, size)
+        size, scale = size.half(), 2 * scale
+    index, position = size.pixels()
+    coverage = dr.gather(mi.Vector4f, color, index).w
+    around = dr.ravel(mi.Vector4f(0, 0, coverage, blur))
+    taps = dr.opaque(mi.Int32, max(1, round(radius / scale)))
+    factor = dr.opaque(mi.Float, -0.5 / max(radius / scale / 3, 1e-3) ** 2)
+    for axis in (mi.Vector2i(1, 0), mi.Vector2i(0, 1)):
+        dr.make_opaque(axis)
+        dr.eval(color, around)
+        means = _pass(axis, position, size, color, around, taps, factor)
+        color, around = (dr.ravel(values) for values in means)
+    dr.eval(color, around)
+
+    _index, position = full.pixels()
+    place = (mi.Point2f(position) + 0.5) / scale
+    color, found = (bilinear(mi.Vector4f, flat, size, place) for flat in (color, around))
+    length = dr.sqrt(found.x**2 + found.y**2)
+    # Equal on all sides: no direction, but for rounding
+    is_clear = length > 1e-3 * dr.maximum(found.z, 1e-3)
+    direction = mi.Vector2f(found.x, found.y) / dr.select(is_clear, length, 1)
+    return NearField(color, found.w, dr.select(is_clear, direction, 0))
+
+
+@dr.syntax
+def _pass(axis, position, size, color, around, taps, factor):
+    """The filter along an axis.
+
+    Parameters:
+        color: RGB times coverage, and coverage: a Gaussian mean.
+        around: The sum of the offsets of what is covered, in x and y; of the coverage; and the
+            largest blur. Every pixel of the window counts as much.
+    """
+    i = -taps
+    mean, weights = mi.Vector4f(0), mi.Float(0)
+    offset, covered, largest = mi.Vector2f(0), mi.Float(0), mi.Float(-dr.inf)
+    while i <= taps:
+        at = size.index(position + i * axis)
+        weight = dr.exp(factor * mi.Float(i * i))
+        mean += weight * dr.gather(mi.Vector4f, color, at)
+        weights += weight
+        found = dr.gather(mi.Vector4f, around, at)
+        offset += mi.Vector2f(found.x, found.y) + found.z * mi.Vector2f(i * axis)
+        covered += found.z
+        largest = dr.maximum(largest, found.w)
+        i += 1
+    return mean / weights, mi.Vector4f(offset.x, offset.y, covered, largest)

@@ -1,0 +1,64 @@
+"""How far a thin lens blurs a point of the scene."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass(frozen=True)
+class ThinLens:
+    """A thin lens before a film.
+
+    Light that reaches the pixel x through the point u of the unit disk (the aperture) passes the
+    depth z where the middle of the lens sees the position x + u · blur(z). So a point is blurred to
+    a disk, its circle of confusion, of the radius \\|blur(z)\\|.
+
+    Attributes:
+        aperture_radius: In units of the scene.
+        focus_distance: Depth of what is in focus, along the axis of the lens; may be infinite.
+        fov: Angle that the film's width sees, in degrees.
+        film_width: Pixels of the whole film, not of a crop window.
+    """
+
+    aperture_radius: float
+    focus_distance: float
+    fov: float
+    film_width: int
+
+    def __post_init__(self) -> None:
+        for name, accepted in (
+            ("aperture_radius", 0 <= self.aperture_radius < math.inf),
+            ("focus_distance", self.focus_distance > 0),
+            ("fov", 0 < self.fov < 180),
+            ("film_width", self.film_width >= 1),
+        ):
+            if not accepted:
+                raise ValueError(f'a thin lens cannot have "{name}" = {getattr(self, name)}')
+
+    @property
+    def pixels_per_disparity(self) -> float:
+        """By how many pixels the edge of the aperture and its middle see a point apart that is at
+        inverse depth 1, with the focus at infinity."""
+        width = 2 * math.tan(math.radians(self.fov) / 2)
+        return self.aperture_radius * self.film_width / width
+
+    @property
+    def blur_of_sky(self) -> float:
+        """:meth:`blur` at infinity."""
+        return -self.pixels_per_disparity / self.focus_distance
+
+    def blur(self, depth: mi.Float) -> mi.Float:
+        """The radius of the circle of confusion in pixels, with a sign: positive for what is nearer
+        than the focus distance.
+
+        Parameters:
+            depth: Along the axis of the lens, positive; may be infinite.
+        """
+        # The reciprocal of infinity is not 0 in all backends
+        inverse = dr.select(dr.isfinite(depth), dr.rcp(depth), 0)
+        # Eq. 5.3 (Guo), on the film instead of on the focal plane, which is focus_distance away
+        return self.pixels_per_disparity * inverse + self.blur_of_sky
