@@ -323,7 +323,7 @@ def test_a_full_disk_costs_an_interval_at_most(run, make_scene, tmp_path, monkey
 
     def full(*arguments, **arrays):
         calls.append(1)
-        if len(calls) in (2, 3):
+        if len(calls) in (2, 3, 5):
             raise OSError(28, "No space left on device")
         savez(*arguments, **arrays)
 
@@ -340,8 +340,15 @@ def test_a_full_disk_costs_an_interval_at_most(run, make_scene, tmp_path, monkey
     monkeypatch.setattr(CheckpointFolder, "save", watched)
     code, out, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
                          "--checkpoint", kept, "--every", "16spp")  # fmt: skip
-    assert code == 0 and err.count("No space left") == 2 and "64 spp" in out
+    assert code == 0 and err.count("No space left") == 3 and "64 spp" in out
     assert spps == [16, 16, 16, 64, 64] and not list(kept.glob(".state*"))
+    assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64
+
+
+def test_variants_without_batches_are_named(run, make_scene, tmp_path):
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--until", 0.1,
+                       "--variant", "scalar_rgb")  # fmt: skip
+    assert code == 2 and 'a variant such as "llvm_ad_rgb"' in err
 
 
 def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkeypatch):

@@ -122,20 +122,19 @@ class LongJob:
 
         def keep() -> None:
             last.mark(state.spp)
-            if not state.done:
-                return
+            if self._folder:
+                self._folder.save(state)
             state.fill(self.film)
             self.seconds = time.perf_counter() - last.begin
             write()
-            if self._folder:
-                self._folder.save(state)
 
         with progress_bars() as bars, _asked_to_keep() as asked:
             bar = bars.add_task(self.name, total=None)
 
             def progress(render: LongRender) -> None:
                 text = f"{self.name}, {state.spp} spp"
-                if (error := render.error) is not None:
+                # It takes as long as a small batch
+                if options.until and (error := render.error) is not None:
                     text += f", relMSE about {error:.2g}"
                 bars.update(
                     bar, description=text, completed=state.spp, total=render.goal_spp or None
@@ -161,7 +160,11 @@ class LongJob:
         if state.done:
             state.fill(self.film)
         if self._folder:
-            self._folder.save(state)
+            try:
+                self._folder.save(state)
+            except OSError as problem:
+                # The image may have room
+                warn(f"the render could not be kept: {problem}")
 
     @contextlib.contextmanager
     def _executor(self) -> Iterator[Any]:

@@ -77,6 +77,10 @@ class BatchRenderer:
     """
 
     def __init__(self, request: RenderRequest) -> None:
+        if not dr.is_jit_v(mi.Float):
+            raise InputError(
+                f'batches need a variant such as "llvm_ad_rgb", and not "{mi.variant()}"'
+            )
         self._request, chosen = request, request.specification
         path = Path(request.scene)
         self.loaded: LoadedScene = load_scene(
