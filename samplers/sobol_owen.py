@@ -36,9 +36,10 @@ class SobolSampler(SequenceSampler):
          pixels cancel: what is left is fine-grained noise, which blurs away. (Default: false)
      * - film_width
        - |int|
-       - Width of the image in pixels (of the crop window, with the border where that is sampled):
-         only for :monosp:`blue_noise` with an integrator of Mitsuba. Those of this package know it.
-         (Default: 0, not known)
+       - Width of the image in pixels (of the crop window, with the border where that is sampled),
+         for :monosp:`blue_noise` with :monosp:`mi.render` and an integrator of Mitsuba. Those of
+         this package, :monosp:`mitsuba-ext render` and comparisons find it out. (Default: 0, not
+         known)
 
     **Use it when** you would use :monosp:`multijitter`, above all if time, aperture and film make
     the noise together, if the number of samples is no square, or if pilots learn: they are the

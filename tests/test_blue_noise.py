@@ -61,8 +61,8 @@ def test_ranges_of_the_samples_of_a_pixel_are_nets() -> None:
 
 
 def test_numbers_of_a_pixel_are_uniform() -> None:
-    """Chi² over 4000 squares of 128 x 128 pixels, whose sequences are independent."""
-    squares, cells = 4000, 16
+    """Chi² over 2500 squares of 128 x 128 pixels, whose sequences are independent."""
+    squares, cells = 2500, 16
     sampler = _made(2, 128 * squares)
     sampler.seed(0, 2 * 128 * squares)
     points = _points(sampler, 128 * squares, 3)[0].reshape(squares, 128, 2, 6)
@@ -151,16 +151,27 @@ def test_a_render_of_ours_knows_the_film() -> None:
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6)
 
 
+def test_batches_tell_an_integrator_of_mitsuba_the_film() -> None:
+    from mitsuba_ext.rendering.batches import each_batch
+
+    made = mi.load_dict({"type": "path"})
+    scene = mi.load_dict(_room({}, blue_noise=True))
+    (batches,) = each_batch(made, scene, 0, 4, [3])
+    told = mi.load_dict(_room({}, blue_noise=True, film_width=16))
+    image = np.array(mi.render(told, integrator=made, seed=3))
+    np.testing.assert_allclose(batches.mean, image, rtol=1e-4, atol=1e-6)
+
+
 def test_renders_have_the_quarters_of_independent_samples() -> None:
     made = mi.load_dict({"type": "path", "max_depth": 3})
     images = []
     for sampler in ({"type": "independent"}, {"blue_noise": True, "film_width": 16}):
         scene = mi.load_dict(_room({}, **sampler))
-        seeds = range(101, 101 + 7919 * 40, 7919)
+        seeds = range(101, 101 + 7919 * 24, 7919)
         images.append(
             np.array([np.array(mi.render(scene, integrator=made, seed=s, spp=6)) for s in seeds])
         )
-    assert_same_quarters(images[1], images[0], 0.03)
+    assert_same_quarters(images[1], images[0], 0.04)
     means = [x.mean(axis=(1, 2, 3)) for x in images]
     assert means[1].var() < means[0].var()
 
