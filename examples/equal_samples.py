@@ -37,8 +37,9 @@ def options(command: Callable) -> Callable:
 
 
 def load(name: str, size: tuple[int, int], sampler: str = "") -> mi.Scene:
-    """A file, or one of our scenes by its name, with another sampler than its own if that is given.
-    Scenes made elsewhere call the film's size resx and resy."""
+    """A file, or one of our scenes by its name, with another sampler than its own if that is given:
+    "sobol_owen", or with parameters "sobol_owen:dimensions=2:blue_noise=true". Scenes made
+    elsewhere call the film's size resx and resy."""
     file = Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml"
     text, (width, height) = file.read_text(), size
     parameters = {"width": width, "height": height, "rfilter": "box"}
@@ -49,7 +50,13 @@ def load(name: str, size: tuple[int, int], sampler: str = "") -> mi.Scene:
     if not sampler:
         return mi.load_file(str(file), **parameters)
     mi.file_resolver().prepend(str(file.parent))
-    text = re.sub(r'<sampler type="\w+"', f'<sampler type="{sampler}"', text)
+    kind, *parameters_of_sampler = sampler.split(":")
+    children = ""
+    for parameter in parameters_of_sampler:
+        key, value = parameter.split("=")
+        tag = "boolean" if value in ("true", "false") else "integer"
+        children += f'<{tag} name="{key}" value="{value}"/>'
+    text = re.sub(r'<sampler type="\w+"\s*>', f'<sampler type="{kind}">{children}', text)
     return mi.load_string(text, **{k: str(v) for k, v in parameters.items()})
 
 

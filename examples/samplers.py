@@ -6,6 +6,12 @@ Writes one row of Markdown for each scene and number of samples: error and time 
 units of those of ``independent``. Errors are those of ``examples/equal_samples.py``. Samplers that
 round the number of samples up are credited with what they take: their error is multiplied by it,
 and their time divided.
+
+Samplers may have parameters. Noise that blurs away is compared by ``--blur``, the standard
+deviation in pixels of a Gaussian filter of the images:
+
+    .venv/bin/python examples/samplers.py cornell_box --spp 1,4,16 --blur 2 \\
+        --samplers sobol_owen,sobol_owen:blue_noise=true
 """
 
 from __future__ import annotations
@@ -13,6 +19,7 @@ from __future__ import annotations
 import click
 import numpy as np
 from equal_samples import Renders, error, load, print_header, print_row, render_in_turns, title
+from scipy.ndimage import gaussian_filter
 
 import mitsuba as mi  # isort: skip
 
@@ -28,9 +35,10 @@ SAMPLERS = "stratified,multijitter,orthogonal,ldsampler,sobol_owen"
 @click.option("--integrator", default="composed_path")
 @click.option("--variant", default="llvm_ad_rgb")
 @click.option("--samplers", default=SAMPLERS, help="Besides independent.")
+@click.option("--blur", default=0.0, help="Compare blurred images: of so many pixels.")
 def main(
     names: tuple[str, ...], spp: str, seeds: int, size: tuple, max_depth: int, integrator: str,
-    variant: str, samplers: str,
+    variant: str, samplers: str, blur: float,
 ) -> None:  # fmt: skip
     """Compares samplers in the scenes NAMES."""
     mi.set_variant(variant)
@@ -43,6 +51,8 @@ def main(
                 kind: _renders(load(name, size, kind), integrator, max_depth, count, seeds)
                 for kind in kinds
             }
+            for r, _taken in renders.values():
+                r.images = [gaussian_filter(image, (blur, blur, 0)) for image in r.images]
             mean = np.mean([r.mean for r, _taken in renders.values()], axis=0)
             first = renders["independent"][0]
             cells = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -222,3 +223,12 @@ def _room(sampler: str) -> dict[str, Any]:
 def test_bad_parameters_are_named(parameters: dict[str, Any], what: str) -> None:
     with pytest.raises((RuntimeError, ValueError), match=what):
         mi.load_dict({"type": "sobol_owen", **parameters})
+
+
+def test_many_samples_of_halton_have_an_interval_each() -> None:
+    """With 2^30 samples, powers of the bases have more than 32 bits."""
+    from mitsuba_ext.sequences.halton import Halton
+
+    point = dr.arange(mi.UInt32, 19**2) + 2**30 - 19**2
+    x = Halton(8).coordinate(point, 2**30, mi.UInt32(7), dr.full(mi.UInt32, 5, 19**2))
+    assert np.bincount((np.array(x) * 19**2).astype(int)).tolist() == [1] * 19**2

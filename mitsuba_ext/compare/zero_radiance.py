@@ -29,6 +29,7 @@ def zero_radiance_share(integrator: mi.Integrator, scene: mi.Scene, seed: int) -
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()
+        camera.tell_film(sampler, sensor.film())
         sampler.seed(seed, width * height * spp)
         rays = camera.sample_rays(sensor, sampler, spp, spp, CameraSamples())
         L = integrator.sample(scene, sampler, rays.ray, None, mi.Bool(True))[0]

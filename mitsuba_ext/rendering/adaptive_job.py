@@ -37,6 +37,9 @@ class AdaptiveJob(Job):
         spp, pilot_spp = self.plan.spp, sum(self.plan.stages[:-1])
         self._pass_spp = min(integrator.pass_spp or -(-spp // _PASS_SHARE), spp)
         self._set_size = 1
+        if hasattr(self.sampler, "set_film"):
+            # The scatter of a pixel's sets shows the variance only if they are independent
+            self.sampler.set_film(0)
         if self.plan.structured:
             # Each pass has sets of its own, with a sampler of its own
             self.sampler.set_sample_count(max(1, self._pass_spp // _SETS))

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..garbage import garbage_left_alone
 from ..movers import check_motion_is_seen
-from .camera import find_sensor
+from .camera import film_told, find_sensor
 
 
 class Batches:
@@ -193,7 +193,7 @@ def _render(
     sampler = sensor.sampler()
     before = sampler.sample_count()
     try:
-        with dr.suspend_grad(), garbage_left_alone():
+        with dr.suspend_grad(), garbage_left_alone(), film_told(sensor):
             # "prb" refuses develop=False
             return integrator.render(
                 scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=True

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import drjit as dr
@@ -32,6 +34,25 @@ def film_extent(film: mi.Film) -> tuple[int, int]:
     border = 2 * film.rfilter().border_size() if film.sample_border() else 0
     width, height = film.crop_size()
     return int(width) + border, int(height) + border
+
+
+def tell_film(sampler: mi.Sampler, film: mi.Film, first: int = 0) -> None:
+    """Tells a sampler which pixels its lanes stand for, if it asks (``sobol_owen`` does): those of
+    the film row by row, from number ``first`` on."""
+    if hasattr(sampler, "set_film"):
+        sampler.set_film(film_extent(film)[0], first)
+
+
+@contextmanager
+def film_told(sensor: mi.Sensor) -> Iterator[None]:
+    """The same for integrators of Mitsuba, which tell samplers nothing."""
+    sampler = sensor.sampler()
+    tell_film(sampler, sensor.film())
+    try:
+        yield
+    finally:
+        if hasattr(sampler, "set_film"):
+            sampler.set_film(None)
 
 
 @dataclass

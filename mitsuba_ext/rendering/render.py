@@ -172,6 +172,7 @@ class Job:
         seed = self.plan.seed
         if index > 0:
             seed = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(index))[0][0]
+        camera.tell_film(sampler, self.film, 0 if pixels is None else pixels.start)
         sampler.seed(dr.opaque(mi.UInt32, seed), self._lanes(spp, pixels))
 
     def run(self, interrupt: threading.Event) -> None:

@@ -17,7 +17,7 @@ from ..garbage import garbage_left_alone
 from ..movers import check_motion_is_seen
 from ..nesting import with_nested
 from .batches import sample_count
-from .camera import film_extent
+from .camera import film_extent, film_told
 from .film_sums import FilmSums
 from .interrupts import deferred_interrupt
 from .plan import check_extent
@@ -126,7 +126,7 @@ class SeedPasses:
         self.interrupted = True  # until all passes are finished
         asked = self._sensor.sampler().sample_count()
         try:
-            with deferred_interrupt() as interrupt:
+            with deferred_interrupt() as interrupt, film_told(self._sensor):
                 while self.interrupted and not interrupt.is_set():
                     rest = length if seconds is not None else spp - self.spp
                     elapsed, compiled = self._run_pass(min(length, rest))

@@ -10,6 +10,10 @@ from .scrambling import fraction, mixed
 #: Bases of the dimensions.
 _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
 
+#: So many intervals are told apart: the numbers have 24 bits, and the next power of the largest
+#: base still fits into 32.
+_MOST_INTERVALS = 1 << 24
+
 
 class Halton:
     """The Halton sequence: each dimension is the radical inverse of the index in another prime
@@ -57,7 +61,7 @@ def radical_inverse(
 ) -> mi.Float:
     """The digits of an index below ``count``, behind the point, shifted at random; a random number
     follows."""
-    count = dr.opaque(mi.UInt32, count)
+    count = dr.opaque(mi.UInt32, min(count, _MOST_INTERVALS))
     # So many points have been told apart by the digits so far
     power, digits, rest, word = mi.UInt32(1), mi.UInt32(0), mi.UInt32(index), mixed(seed)
 
@@ -69,5 +73,6 @@ def radical_inverse(
     power, digits, rest, word = dr.while_loop(
         (power, digits, rest, word), lambda power, *_: power < count, step, label="digits"
     )
-    value = (mi.Float(digits) + fraction(word)) / mi.Float(power)
+    # Points that share an interval (the digits left tell them apart) get different random numbers
+    value = (mi.Float(digits) + fraction(word + mixed(rest))) / mi.Float(power)
     return dr.minimum(value, 1 - 2.0**-24)

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..parameters import MOST_SPP, read_parameter
+from .pixel_order import level_count, shuffled, z_order
 from .scrambling import mixed
 from .sequence import Sequence
 
@@ -17,7 +18,8 @@ _GOLDEN = 0x9E3779B9
 
 
 class SequenceSampler(mi.Sampler):
-    r"""Each pixel has the same sequence, randomized on its own.
+    r"""Each pixel has the same sequence, randomized on its own. With blue noise, pixels share the
+    points of one sequence instead (``pixel_order.py``).
 
     Numbers are drawn in pairs of dimensions; a single number takes the first of a pair. When the
     dimensions of the sequence are used up, another random copy of it goes on, in another order
@@ -37,9 +39,12 @@ class SequenceSampler(mi.Sampler):
 
     Attributes:
         sequence: Where the points come from. The plugin sets it.
+        blue_noise: Do pixels share a sequence? For sequences of which aligned ranges of 2^k points
+            are well distributed.
     """
 
     sequence: Sequence
+    blue_noise = False
 
     def __init__(self, props: mi.Properties) -> None:
         self.name = props.plugin_name()
@@ -55,6 +60,9 @@ class SequenceSampler(mi.Sampler):
         self._per_wavefront: int | None = None
         self._first = self._pixel_seed = self._offset = self._dimension = mi.UInt32(0)
         self._step = 1
+        # What set_film() said, and whether pixels share a sequence since the last seed()
+        self._film: tuple[int, int] | None = None
+        self._is_shared = False
 
     def read_dimensions(self, props: mi.Properties) -> int:
         """How many dimensions the sequence has.
@@ -70,6 +78,23 @@ class SequenceSampler(mi.Sampler):
         self._values["dimensions"] = dimensions
         return dimensions
 
+    def read_blue_noise(self, props: mi.Properties) -> None:
+        """Whether pixels share a sequence, and the width of the film for integrators of Mitsuba."""
+        self.blue_noise = read_parameter(self.name, props, "blue_noise", False)
+        width = read_parameter(self.name, props, "film_width", 0, 0, 2**31 - 1)
+        self._values.update(blue_noise=self.blue_noise, film_width=width)
+
+    def set_film(self, width: int | None, first: int = 0) -> None:
+        """Says which pixels the lanes stand for when the sampler is seeded: those of a film, row by
+        row.
+
+        Parameters:
+            width: Pixels of a row. With 0, lanes stand for something else: there is no blue noise.
+                With ``None``, the parameter ``film_width`` counts, as at first.
+            first: The pixel of the first lane.
+        """
+        self._film = None if width is None else (width, first)
+
     # ---- Mitsuba's interface ----
 
     # Methods of the base class call the overrides once more: what stands beside super() runs twice
@@ -79,7 +104,9 @@ class SequenceSampler(mi.Sampler):
         props = mi.Properties(self.name)
         for key, value in {**self._values, "sample_count": self.sample_count()}.items():
             props[key] = value
-        return type(self)(props)
+        fork = type(self)(props)
+        fork._film = self._film
+        return fork
 
     def clone(self) -> SequenceSampler:
         """A copy that goes on as this one would."""
@@ -88,6 +115,7 @@ class SequenceSampler(mi.Sampler):
             # So that the base class knows how many lanes there are
             mi.Sampler.seed(copy, 0, self.wavefront_size())
         copy._per_wavefront, copy._step = self._per_wavefront, self._step
+        copy._is_shared = self._is_shared
         for key in ("_first", "_pixel_seed", "_offset", "_dimension"):
             setattr(copy, key, mi.UInt32(getattr(self, key)))
         return copy
@@ -111,7 +139,43 @@ class SequenceSampler(mi.Sampler):
         word = mi.UInt32(seed) + self._base_seed
         dr.make_opaque(word)
         self._pixel_seed = mixed(mixed(word) + pixel * _GOLDEN)
+        # A single pixel has no neighbours; mi.render() seeds one lane at its end
+        shares = self.blue_noise and self.wavefront_size() > self._step
+        width, first = self._find_film() if shares else (0, 0)
+        self._is_shared = width > 0
+        if self._is_shared:
+            self._order_pixels(pixel + dr.opaque(mi.UInt32, first), width, mixed(word))
         self._first, self._dimension = dr.opaque(mi.UInt32, 0), mi.UInt32(0)
+
+    def _find_film(self) -> tuple[int, int]:
+        """The arguments of :meth:`set_film`.
+
+        Raises:
+            ValueError: The width of the film is not known, or is wrong.
+        """
+        if self._film is not None:
+            return self._film
+        width, pixels = self._values["film_width"], self.wavefront_size() // self._step
+        if width == 0:
+            raise ValueError(
+                f'"{self.name}": the parameter "blue_noise" needs "film_width", the width of the '
+                f"image in pixels, as this integrator does not say it"
+            )
+        if pixels % width:
+            raise ValueError(
+                f'"{self.name}": the parameter "film_width" is {width}; it must be the width of '
+                f"the image, which has {pixels} pixels"
+            )
+        return width, 0
+
+    def _order_pixels(self, pixel: mi.UInt32, width: int, word: mi.UInt32) -> None:
+        """Gives each pixel its share of the points of one sequence."""
+        levels = level_count(self.sample_count())
+        order = z_order(pixel, dr.opaque(mi.UInt32, width), levels)
+        # The same for all pixels of a tile
+        self._pixel_seed = mixed(word + order.tile * _GOLDEN)
+        place = shuffled(order.place, levels, self._pixel_seed)
+        self._offset += place * dr.opaque(mi.UInt32, self.sample_count())
 
     def advance(self) -> None:
         # Not the base class's: it calls this once more, and its own state is not used
@@ -122,16 +186,21 @@ class SequenceSampler(mi.Sampler):
         dr.schedule(self._first, self._dimension)
 
     def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
-        count = self.sample_count()
+        count = self._point_count()
         point, dimension, seed = self._next_pair(count)
         return self.sequence.coordinate(point, count, dimension, seed)
 
     def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
-        count = self.sample_count()
+        count = self._point_count()
         point, dimension, seed = self._next_pair(count)
         x = self.sequence.coordinate(point, count, dimension, seed)
         y = self.sequence.coordinate(point, count, dimension + 1, mixed(seed))
         return mi.Point2f(x, y)
+
+    def _point_count(self) -> int:
+        """Points of the sequence of a pixel, or of the pixels that share one."""
+        count = self.sample_count()
+        return count << (2 * level_count(count)) if self._is_shared else count
 
     def _next_pair(self, count: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
         """The point, its dimension, and the seed of that."""
