@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ..errors import InputError
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
+from ..long_renders.dask_cluster import dask_cluster
 from ..long_renders.folder import CheckpointFolder
 from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
@@ -33,6 +37,7 @@ class LongOptions:
         add: Samples per pixel besides those that are there; ``None`` for none.
         until: The relative error at which it ends; ``None`` for none.
         workers: Processes that render; 0 for this one.
+        dask: The address of a Dask scheduler whose workers render; empty for none.
     """
 
     folder: Path | None = None
@@ -40,6 +45,7 @@ class LongOptions:
     add: int | None = None
     until: float | None = None
     workers: int = 0
+    dask: str = ""
 
 
 class LongJob:
@@ -55,7 +61,8 @@ class LongJob:
     def __init__(self, request: RenderRequest, options: LongOptions) -> None:
         """
         Raises:
-            InputError: The scene, the integrator or the sensor cannot be used.
+            InputError: The scene, the integrator or the sensor cannot be used, or what is learned
+                cannot be sent to the workers.
         """
         self._options = options
         self._folder = CheckpointFolder(options.folder) if options.folder else None
@@ -67,6 +74,15 @@ class LongJob:
         threads = max(2, (os.cpu_count() or 1) // options.workers) if options.workers else 0
         self._request = replace(request, learned=str(learned.absolute()), threads=threads)
         self._renderer = BatchRenderer(self._request)
+        if options.dask:
+            if self._renderer.must_learn and not self._folder:
+                raise InputError(
+                    f'"{self._renderer.named.name}" learns: with --dask, it needs --checkpoint, a '
+                    f"folder that the workers see too"
+                )
+            # Workers have another current folder, and perhaps other files
+            description = json.dumps(self._renderer.description(), default=str)
+            self._request = replace(_absolute(self._request), description=description)
         named = self._renderer.named
         self.integrator, self.name, self.parameters = (
             named.integrator, named.name, named.parameters
@@ -150,10 +166,19 @@ class LongJob:
             goal = Goal(spp, options.until, seconds)
             is_reached = False
             try:
-                with deferred_interrupt() as interrupt, self._executor() as executor:
-                    is_reached = self._render.run(
-                        goal, interrupt.is_set, executor, options.workers or 1
-                    )
+                with deferred_interrupt() as interrupt, self._executor() as (executor, n, check):
+
+                    def is_stopped() -> bool:
+                        check()
+                        return interrupt.is_set()
+
+                    is_reached = self._render.run(goal, is_stopped, executor, n)
+                if not state.done:  # stopped before others had finished a batch
+                    raise KeyboardInterrupt
+            except InputError:  # the scheduler or too many workers are gone
+                if self._folder and state.done:
+                    self._folder.save(state)
+                raise
             except KeyboardInterrupt:
                 if not state.done:
                     raise
@@ -164,15 +189,19 @@ class LongJob:
             self._folder.save(state)
 
     @contextlib.contextmanager
-    def _executor(self) -> Iterator[Any]:
-        if not self._options.workers:
-            yield None
-            return
-        executor = Workers(self._options.workers)
-        try:
-            yield executor
-        finally:
-            executor.shutdown(cancel_futures=True)
+    def _executor(self) -> Iterator[tuple[Executor | None, int, Callable[[], None]]]:
+        """Who renders, how many batches at a time, and a function that fails if these are gone."""
+        if self._options.dask:
+            with dask_cluster(self._options.dask) as cluster:
+                yield cluster
+        elif self._options.workers:
+            executor = Workers(self._options.workers)
+            try:
+                yield executor, self._options.workers, lambda: None
+            finally:
+                executor.shutdown(cancel_futures=True)
+        else:
+            yield None, 1, lambda: None
 
     # ---- How far it got ----
 
@@ -203,6 +232,19 @@ class LongJob:
     def about(self) -> Mapping[str, Any]:
         """What the metadata of the image say besides."""
         return {"batches": len(self._state.done)}
+
+
+def _absolute(request: RenderRequest) -> RenderRequest:
+    """A request whose files are found from any folder."""
+
+    def absolute(name: str) -> str:
+        path = Path(name)
+        return str(path.absolute()) if path.suffix and path.is_file() else name
+
+    return replace(
+        request, scene=absolute(request.scene), plugins=tuple(map(absolute, request.plugins)),
+        specification=request.specification and absolute(request.specification),
+    )  # fmt: skip
 
 
 class _Last:

@@ -72,6 +72,10 @@ from .stopping import stopping
     "--workers", type=click.IntRange(1, 1024), metavar="N",
     help="Render in N processes of this machine.",
 )
+@click.option(
+    "--dask", metavar="ADDRESS",
+    help="Render on the workers of the Dask scheduler at ADDRESS: tcp://host:port.",
+)
 @scene_options
 @click.argument("scene", type=FilledPath())
 def render(
@@ -87,6 +91,7 @@ def render(
     add: int | None,
     until: float | None,
     workers: int | None,
+    dask: str | None,
     size: tuple[int, int] | None,
     definitions: Sequence[tuple[str, str]],
     plugins: Sequence[str],
@@ -101,9 +106,9 @@ def render(
     Mitsuba's own integrators render in passes. A structured sampler stratifies the samples of a
     pass (64 per pixel or more, 16 for large images), not those of the whole render.
 
-    With --checkpoint, --until or --workers, all integrators render in batches, which are
-    independent renders with seeds of their own. An EXR then holds the variance of the image too.
-    What an integrator learns in the first batch, the others use. SIGUSR1 keeps the render at once.
+    With --checkpoint, --until, --workers or --dask, all integrators render in batches: independent
+    renders with seeds of their own. An EXR then holds the variance of the image too. What an
+    integrator learns in the first batch, the others use. SIGUSR1 keeps the render at once.
     """
     if specification and not plugins:
         check_integrator(specification)
@@ -121,6 +126,8 @@ def render(
         raise click.UsageError("--add needs --checkpoint: the folder with the samples so far")
     if add is not None and spp is not None:
         raise click.UsageError("--add and --spp exclude each other")
+    if workers is not None and dask is not None:
+        raise click.UsageError("--workers and --dask exclude each other")
     images.check_target(output)
 
     def write(target: Path) -> None:
@@ -143,13 +150,13 @@ def render(
         try:
             select_variant(variant, plugins)
             compiled = kernels_compiled()
-            if checkpoint or until or workers:
+            if checkpoint or until or workers or dask:
                 job = LongJob(
                     RenderRequest(
                         str(scene), size, tuple(definitions), specification, sensor_index or 0,
                         seed, variant, tuple(plugins),
                     ),
-                    LongOptions(checkpoint, every, add, until, workers or 0),
+                    LongOptions(checkpoint, every, add, until, workers or 0, dask or ""),
                 )  # fmt: skip
             else:
                 job = RenderJob.load(
