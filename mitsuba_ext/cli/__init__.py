@@ -17,6 +17,7 @@ from .. import __version__
 from ..errors import InputError, InstallationError
 from .common import INTERRUPTED, say
 from .compare import compare
+from .denoise import denoise
 from .diff import diff
 from .merge import merge
 from .plugins import list_plugins
@@ -38,7 +39,7 @@ def doctor() -> int:
     return doctor_module.main()
 
 
-for command in (render, merge, compare, diff, list_plugins, doctor):
+for command in (render, merge, denoise, compare, diff, list_plugins, doctor):
     cli.add_command(command)
 
 

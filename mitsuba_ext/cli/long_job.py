@@ -53,6 +53,7 @@ class LongJob:
 
     Attributes:
         integrator, name, parameters: The integrator, its name and its parameters.
+        scene, sensor: What it renders.
         film: The film that holds the image.
         is_interrupted: Did a signal end the render before its goal was reached?
         seconds: Wall clock of the render.
@@ -87,7 +88,8 @@ class LongJob:
         self.integrator, self.name, self.parameters = (
             named.integrator, named.name, named.parameters
         )  # fmt: skip
-        self.film = self._renderer.sensor.film()
+        self.scene, self.sensor = self._renderer.loaded.scene, self._renderer.sensor
+        self.film = self.sensor.film()
         self.is_interrupted, self.seconds = False, 0.0
         self._state, self._render = RenderState(), None
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -21,6 +22,9 @@ from .common import (
     scene_options,
 )
 from .stopping import stopping
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @click.command(short_help="Render a scene to an image.")
@@ -76,6 +80,11 @@ from .stopping import stopping
     "--dask", metavar="ADDRESS",
     help="Render on the workers of the Dask scheduler at ADDRESS: tcp://host:port.",
 )
+@click.option(
+    "--denoise", is_flag=True,
+    help="Denoise the image in the end, guided by the albedo and the normals of what the camera "
+    "sees. The image itself is kept in NAME.noisy.exr.",
+)
 @scene_options
 @click.argument("scene", type=FilledPath())
 def render(
@@ -92,6 +101,7 @@ def render(
     until: float | None,
     workers: int | None,
     dask: str | None,
+    denoise: bool,
     size: tuple[int, int] | None,
     definitions: Sequence[tuple[str, str]],
     plugins: Sequence[str],
@@ -115,6 +125,7 @@ def render(
     from ..scenes import check_scene_file
 
     check_scene_file(scene)
+    from .. import denoising
     from ..compare import images, machine
     from ..long_renders.batch_renderer import RenderRequest
     from .long_job import LongJob, LongOptions
@@ -129,9 +140,14 @@ def render(
     if workers is not None and dask is not None:
         raise click.UsageError("--workers and --dask exclude each other")
     images.check_target(output)
+    noisy = output.with_name(f"{output.stem}.noisy.exr")
+    if denoise:
+        denoising.denoiser()
+        images.check_target(noisy)
+    guides = {}
 
-    def write(target: Path) -> None:
-        metadata = {
+    def metadata() -> dict[str, object]:
+        return {
             "scene": str(scene),
             "scene_parameters": dict(definitions),
             "integrator": job.name,
@@ -143,7 +159,9 @@ def render(
             "versions": machine.versions(),
             **job.about(),
         }
-        images.write_film(target, job.film, metadata, job.variance())
+
+    def write(target: Path, others: Mapping[str, np.ndarray] | None = None) -> None:
+        images.write_film(target, job.film, metadata(), {**job.variance(), **(others or {})})
 
     with stopping() as stop:
         job = None
@@ -169,6 +187,8 @@ def render(
             if is_new:
                 # The render's kernels take longer to compile, and nothing can be printed meanwhile
                 say("compiling kernels (later renders like this one find them in a cache)")
+            if denoise:
+                guides = denoising.render_guides(job.scene, job.sensor, seed)
             job.run(spp, seconds, functools.partial(write, output), warn)
         except (KeyboardInterrupt, OSError) as error:
             # After SIGHUP, showing progress on the closed terminal raises an OSError
@@ -184,7 +204,11 @@ def render(
         target = output
         if job.is_interrupted and output.exists() and not checkpoint:
             target = output.with_name(f"{output.stem}.partial{output.suffix}")
-        write(target)
+        if denoise:
+            write(noisy, guides)
+            denoising.denoise_file(noisy, target, metadata())
+        else:
+            write(target)
         bad, pixel_count = images.count_non_finite(job.film)
         if bad:
             warn(f"{bad} of {pixel_count} pixels of {target} are NaN or infinite")

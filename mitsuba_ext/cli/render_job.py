@@ -27,6 +27,7 @@ class RenderJob:
 
     Attributes:
         integrator, name, parameters: The integrator, its name and its parameters.
+        scene, sensor: What it renders.
         film: The film that holds the image.
         is_interrupted: Did a signal end the render before all samples were taken?
         seconds: Wall clock of the render.
@@ -40,6 +41,7 @@ class RenderJob:
         self.is_interrupted, self.seconds = False, 0.0
         self._loaded, self._sensor_index, self._seed = loaded, sensor_index, seed
         self._sensor = loaded.scene.sensors()[sensor_index]
+        self.scene, self.sensor = loaded.scene, self._sensor
         self.film = self._sensor.film()
         self._wanted: int | None = None  # samples per pixel, where it is known
         self._is_measuring = False
