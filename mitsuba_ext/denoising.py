@@ -43,6 +43,16 @@ def denoiser() -> ModuleType:
     return mitsuba_oidn
 
 
+def remark(film: mi.Film) -> str | None:
+    """What a user should know about the film of an image to be denoised."""
+    if film.rfilter().radius() > 0.5 + 1e-3:
+        return (
+            f'denoising works badly with the reconstruction filter "{film.rfilter().class_name()}" '
+            f"of the film, which gives neighbours the same noise: use a film with a box filter"
+        )
+    return None
+
+
 def render_guides(scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> dict[str, np.ndarray]:
     """Albedo and shading normal where the camera's rays hit first, also on mirrors and glass.
     Replaces the contents of the film.

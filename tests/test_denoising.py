@@ -79,6 +79,13 @@ def test_without_the_package_one_sentence_says_what_to_install(
         assert code == 2 and "pip install 'mitsuba_ext[denoise]'" in err and err.count("\n") == 1
 
 
+def test_a_filter_that_correlates_pixels_is_named(run, make_scene, tmp_path, calls):
+    scene = make_scene()
+    scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))
+    code, _, err = run("render", scene, "-o", tmp_path / "a.exr", "--denoise")
+    assert code == 0 and "use a film with a box filter" in err
+
+
 @pytest.mark.slow
 def test_denoising_removes_noise(run, scenes, tmp_path):
     pytest.importorskip("mitsuba_oidn")

@@ -28,7 +28,12 @@ from .supervisor import SUPERVISED
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="mitsuba-ext")
 def cli() -> None:
-    """Light transport techniques for Mitsuba 3."""
+    """Light transport techniques for Mitsuba 3.
+
+    Exit codes: 0; 1 (an image with NaN or infinite pixels, a comparison in which something failed,
+    a problem that the doctor found); 2 (bad input, in one line on stderr); 130, 143 and 129
+    (Ctrl-C, SIGTERM and SIGHUP, with the image so far).
+    """
 
 
 @click.command(short_help="Check the installation.")

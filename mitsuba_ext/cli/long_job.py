@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import signal
 import tempfile
@@ -21,10 +22,10 @@ from ..long_renders.folder import CheckpointFolder
 from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
 from ..long_renders.workers import Workers
-from ..progress import progress_bars
 from ..rendering.interrupts import deferred_interrupt
 from ..scene_remarks import scene_remarks
 from .common import Interval
+from .reports import Report, Speed, time_left
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,9 @@ class LongJob:
         learned = (self._folder or folder).learned
         # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR file
         threads = max(2, (os.cpu_count() or 1) // options.workers) if options.workers else 0
-        self._request = replace(request, learned=str(learned.absolute()), threads=threads)
+        self._request = replace(
+            request, learned=str(learned.absolute()), threads=request.threads or threads
+        )
         self._renderer = BatchRenderer(self._request)
         if options.dask:
             if self._renderer.must_learn and not self._folder:
@@ -102,9 +105,8 @@ class LongJob:
         return remarks
 
     def run(
-        self, spp: int | None, seconds: float | None, write: Callable[[], None],
-        warn: Callable[[str], None],
-    ) -> None:  # fmt: skip
+        self, spp: int | None, seconds: float | None, write: Callable[[], None], report: Report
+    ) -> None:
         """Goes on with what is in the folder.
 
         Args:
@@ -112,7 +114,7 @@ class LongJob:
                 nothing else ends the render.
             seconds: Of this call.
             write: Writes the image of the film.
-            warn: Shows a sentence.
+            report: Is told how far it is.
 
         Raises:
             InputError: The folder holds another render, or the integrator cannot render the scene.
@@ -126,11 +128,11 @@ class LongJob:
                     if not self._state.has_taught:
                         # It would depend on the numbers of a batch that is still to come
                         self._folder.learned.unlink(missing_ok=True)
-                self._run(spp, seconds, write, warn)
+                self._run(spp, seconds, write, report)
             finally:
                 self.seconds = time.perf_counter() - begin
 
-    def _run(self, spp, seconds, write, warn) -> None:
+    def _run(self, spp, seconds, write, report) -> None:
         options, state = self._options, self._state
         if options.add:
             spp = state.spp + options.add
@@ -148,21 +150,32 @@ class LongJob:
             if self._folder:
                 self._folder.save(state)
 
-        with progress_bars() as bars, _asked_to_keep() as asked:
-            bar = bars.add_task(self.name, total=None)
+        speed, pixel_count = Speed(), math.prod(self.film.crop_size())
+
+        with report.bars() as bars, _asked_to_keep() as asked:
+            bar = bars.add_task(self.name, total=None, left="")
 
             def progress(render: LongRender) -> None:
-                text = f"{self.name}, {state.spp} spp"
+                text, left = f"{self.name}, {state.spp} spp", None
+                if (per_second := speed(state.spp)) is not None:
+                    text += f", {per_second * pixel_count / 1e6:.3g} million samples/s"
+                    left = render.spp_left and render.spp_left / per_second
                 if (error := render.error) is not None:
                     text += f", relMSE about {error:.2g}"
                 bars.update(
-                    bar, description=text, completed=state.spp, total=render.goal_spp or None
-                )
+                    bar, description=text, completed=state.spp, total=render.goal_spp or None,
+                    left=time_left(left),
+                )  # fmt: skip
+                report.progress(
+                    spp=state.spp, goal_spp=render.goal_spp or None, relmse=error,
+                    samples_per_second=per_second and per_second * pixel_count,
+                    seconds=time.perf_counter() - last.begin, seconds_left=left,
+                )  # fmt: skip
                 if asked() or (self._folder and last.is_due(options.every, state.spp)):
                     try:
                         keep()
                     except OSError as problem:
-                        warn(f"the render could not be kept: {problem}; it goes on")
+                        report.warn(f"the render could not be kept: {problem}; it goes on")
 
             self._render = LongRender(self._renderer, self._request, state, progress)
             goal = Goal(spp, options.until, seconds)

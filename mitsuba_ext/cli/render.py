@@ -85,6 +85,16 @@ if TYPE_CHECKING:
     help="Denoise the image in the end, guided by the albedo and the normals of what the camera "
     "sees. The image itself is kept in NAME.noisy.exr.",
 )
+@click.option("--quiet", is_flag=True, help="Show warnings and errors only.")
+@click.option(
+    "--json", "as_json", is_flag=True,
+    help="Print JSON objects to stdout, one a line: events of progress, warnings, and the end.",
+)
+@click.option(
+    # With one thread, Mitsuba 3.9.1 hangs when it reads or writes an EXR file
+    "--threads", type=click.IntRange(min=2), metavar="N",
+    help="Threads of each process, at least 2.  [default: all cores, divided among --workers]",
+)
 @scene_options
 @click.argument("scene", type=FilledPath())
 def render(
@@ -102,6 +112,9 @@ def render(
     workers: int | None,
     dask: str | None,
     denoise: bool,
+    quiet: bool,
+    as_json: bool,
+    threads: int | None,
     size: tuple[int, int] | None,
     definitions: Sequence[tuple[str, str]],
     plugins: Sequence[str],
@@ -130,7 +143,9 @@ def render(
     from ..long_renders.batch_renderer import RenderRequest
     from .long_job import LongJob, LongOptions
     from .render_job import RenderJob
+    from .reports import Report
 
+    report = Report(quiet, as_json)
     if spp is not None and seconds is not None and until is None:
         raise click.UsageError("--spp and --time exclude each other")
     if add is not None and checkpoint is None:
@@ -167,12 +182,16 @@ def render(
         job = None
         try:
             select_variant(variant, plugins)
+            if threads:
+                import drjit as dr
+
+                dr.set_thread_count(threads)
             compiled = kernels_compiled()
             if checkpoint or until or workers or dask:
                 job = LongJob(
                     RenderRequest(
                         str(scene), size, tuple(definitions), specification, sensor_index or 0,
-                        seed, variant, tuple(plugins),
+                        seed, variant, tuple(plugins), threads=threads or 0,
                     ),
                     LongOptions(checkpoint, every, add, until, workers or 0, dask or ""),
                 )  # fmt: skip
@@ -183,13 +202,15 @@ def render(
             is_new = kernels_compiled() > compiled
             images.check_film(output, job.film, job.integrator.aov_names())
             for remark in job.remarks(is_sensor_chosen=sensor_index is not None):
-                warn(remark)
+                report.warn(remark)
+            if denoise and (remark := denoising.remark(job.film)):
+                report.warn(remark)
             if is_new:
                 # The render's kernels take longer to compile, and nothing can be printed meanwhile
-                say("compiling kernels (later renders like this one find them in a cache)")
+                report.note("compiling kernels (later renders like this one find them in a cache)")
             if denoise:
                 guides = denoising.render_guides(job.scene, job.sensor, seed)
-            job.run(spp, seconds, functools.partial(write, output), warn)
+            job.run(spp, seconds, functools.partial(write, output), report)
         except (KeyboardInterrupt, OSError) as error:
             # After SIGHUP, showing progress on the closed terminal raises an OSError
             if isinstance(error, OSError) and not stop.is_asked:
@@ -211,16 +232,13 @@ def render(
             write(target)
         bad, pixel_count = images.count_non_finite(job.film)
         if bad:
-            warn(f"{bad} of {pixel_count} pixels of {target} are NaN or infinite")
+            report.warn(f"{bad} of {pixel_count} pixels of {target} are NaN or infinite")
+        figures = {"file": str(target), "spp": job.spp, "seconds": job.seconds, "bad_pixels": bad}
         if job.is_interrupted:
             older = "" if target == output else f" ({output} is an older image, and was kept)"
-            say(f"interrupted {job.how_far()}: {target}{older}")
+            report.end(f"interrupted {job.how_far()}: {target}{older}", True, **figures)
             return stop.exit_code
     is_slow = kernels_compiled() > compiled and not is_new  # else it was printed above
     remark = " (compiled kernels: the next such render starts faster)" if is_slow else ""
-    say(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}", err=False)
+    report.end(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}", **figures)
     return 1 if bad else 0
-
-
-def warn(text: str) -> None:
-    say(f"mitsuba-ext: warning: {text}")

@@ -110,6 +110,15 @@ class LongRender:
         rgb = [images.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance)]
         return metrics.reference_noise(*rgb)
 
+    @property
+    def spp_left(self) -> int | None:
+        """Samples per pixel that are still to come, as far as it is known: until an error is
+        reached, as many as its fall with 1/n announces."""
+        found = [self.goal_spp - self.state.spp] if self.goal_spp else []
+        if self._goal.error and (error := self.error) is not None:
+            found.append(round(self.state.spp * (error / self._goal.error - 1)))
+        return max(0, min(found)) if found else None
+
     # ---- Helpers ----
 
     def _is_reached(self) -> bool:
