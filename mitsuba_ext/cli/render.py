@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -21,10 +21,14 @@ from .common import (
     say,
     scene_options,
 )
+from .frames import FrameRange, Picture, Sensors, pictures
 from .stopping import stopping
 
 if TYPE_CHECKING:
     import numpy as np
+
+    from .long_job import LongOptions
+    from .reports import Report
 
 
 @click.command(short_help="Render a scene to an image.")
@@ -52,8 +56,15 @@ if TYPE_CHECKING:
     show_default=True, help="Seed of the random numbers.",
 )
 @click.option(
-    "-s", "--sensor", "sensor_index", type=click.IntRange(min=0), metavar="N",
-    help="Sensor to render, counted from 0. [default: the first]",
+    "-s", "--sensor", "sensors", type=Sensors(), metavar="N,…|all",
+    help="Sensors to render, counted from 0. Several images are called NAME.sensorN.EXT. [default: "
+    "the first]",
+)
+@click.option(
+    "--frames", type=FrameRange(), metavar="A:B",
+    help="Render the frames A to B, both included, to image.####.exr. In -D, {…} is an expression "
+    "of frame: -D 'angle={3.6 * frame}'. Frames that exist are skipped. Frame n has the seed N + "
+    "n.",
 )
 @click.option(
     "--checkpoint", type=FilledPath(), metavar="DIR",
@@ -104,7 +115,8 @@ def render(
     spp: int | None,
     seconds: float | None,
     seed: int,
-    sensor_index: int | None,
+    sensors: tuple[int, ...] | None,
+    frames: range | None,
     checkpoint: Path | None,
     every: Interval,
     add: int | None,
@@ -138,11 +150,7 @@ def render(
     from ..scenes import check_scene_file
 
     check_scene_file(scene)
-    from .. import denoising
-    from ..compare import images, machine
-    from ..long_renders.batch_renderer import RenderRequest
-    from .long_job import LongJob, LongOptions
-    from .render_job import RenderJob
+    from .long_job import LongOptions
     from .reports import Report
 
     report = Report(quiet, as_json)
@@ -154,16 +162,74 @@ def render(
         raise click.UsageError("--add and --spp exclude each other")
     if workers is not None and dask is not None:
         raise click.UsageError("--workers and --dask exclude each other")
+    is_long = checkpoint or until or workers or dask
+    order = _Order(
+        scene, specification, spp, seconds, size, variant, denoise, threads,
+        LongOptions(checkpoint, every, add, until, workers or 0, dask or "") if is_long else None,
+        is_one_of_many=frames is not None or (sensors is not None and len(sensors) != 1),
+    )  # fmt: skip
+    if order.is_one_of_many and checkpoint:
+        raise click.UsageError("--checkpoint keeps one image: it excludes --frames and sensors")
+    if sensors == ():
+        sensors = _all_sensors(scene, definitions, variant, plugins, frames)
+    result = 0
+    chosen = list(pictures(output, definitions, sensors or [None], seed, frames))
+    for picture in chosen:
+        if order.is_one_of_many and picture.output.exists():
+            report.note(f"{picture.output}: exists already")
+            continue
+        code = _render_image(order, picture, plugins, report)
+        plugins = ()  # they are registered
+        if code > 1:
+            return code
+        result = max(result, code)
+    return result
+
+
+class _Order(NamedTuple):
+    """What all images of a call have in common; see the options."""
+
+    scene: Path
+    specification: str | None
+    spp: int | None
+    seconds: float | None
+    size: tuple[int, int] | None
+    variant: str
+    denoise: bool
+    threads: int | None
+    long: LongOptions | None
+    is_one_of_many: bool
+
+
+def _all_sensors(scene, definitions, variant, plugins, frames) -> list[int]:
+    """The numbers of a scene's sensors, in the first of the frames."""
+    from ..scenes import load_scene
+
+    select_variant(variant, plugins)
+    (picture,) = pictures(Path("#"), definitions, [None], 0, frames and frames[:1])
+    loaded = load_scene(scene, parameters=dict(picture.definitions), keep_integrator=False)
+    return list(range(len(loaded.scene.sensors())))
+
+
+def _render_image(
+    order: _Order, picture: Picture, plugins: Sequence[str], report: Report
+) -> int:
+    """Renders an image and returns the exit code."""
+    from .. import denoising
+    from ..compare import images, machine
+    from ..long_renders.batch_renderer import RenderRequest
+    from .long_job import LongJob
+    from .render_job import RenderJob
+
+    output, definitions, sensor_index, seed = picture
     images.check_target(output)
-    noisy = output.with_name(f"{output.stem}.noisy.exr")
-    if denoise:
+    if order.denoise:
         denoising.denoiser()
-        images.check_target(noisy)
     guides = {}
 
     def metadata() -> dict[str, object]:
         return {
-            "scene": str(scene),
+            "scene": str(order.scene),
             "scene_parameters": dict(definitions),
             "integrator": job.name,
             "parameters": job.parameters,
@@ -181,36 +247,40 @@ def render(
     with stopping() as stop:
         job = None
         try:
-            select_variant(variant, plugins)
-            if threads:
+            select_variant(order.variant, plugins)
+            if order.threads:
                 import drjit as dr
 
-                dr.set_thread_count(threads)
+                dr.set_thread_count(order.threads)
             compiled = kernels_compiled()
-            if checkpoint or until or workers or dask:
+            if order.long:
                 job = LongJob(
                     RenderRequest(
-                        str(scene), size, tuple(definitions), specification, sensor_index or 0,
-                        seed, variant, tuple(plugins), threads=threads or 0,
+                        str(order.scene), order.size, definitions, order.specification,
+                        sensor_index or 0, seed, order.variant, tuple(plugins),
+                        threads=order.threads or 0,
                     ),
-                    LongOptions(checkpoint, every, add, until, workers or 0, dask or ""),
+                    order.long,
                 )  # fmt: skip
             else:
                 job = RenderJob.load(
-                    scene, size, dict(definitions), specification, sensor_index, seed
+                    order.scene, order.size, dict(definitions), order.specification,
+                    sensor_index, seed,
                 )
             is_new = kernels_compiled() > compiled
             images.check_film(output, job.film, job.integrator.aov_names())
             for remark in job.remarks(is_sensor_chosen=sensor_index is not None):
                 report.warn(remark)
-            if denoise and (remark := denoising.remark(job.film)):
+            if order.denoise and (remark := denoising.remark(job.film)):
                 report.warn(remark)
             if is_new:
                 # The render's kernels take longer to compile, and nothing can be printed meanwhile
                 report.note("compiling kernels (later renders like this one find them in a cache)")
-            if denoise:
+            if order.denoise:
                 guides = denoising.render_guides(job.scene, job.sensor, seed)
-            job.run(spp, seconds, functools.partial(write, output), report)
+            # A frame that is there counts as finished
+            current = (lambda: None) if order.is_one_of_many else functools.partial(write, output)
+            job.run(order.spp, order.seconds, current, report)
         except (KeyboardInterrupt, OSError) as error:
             # After SIGHUP, showing progress on the closed terminal raises an OSError
             if isinstance(error, OSError) and not stop.is_asked:
@@ -223,9 +293,11 @@ def render(
 
         stop.wait()
         target = output
-        if job.is_interrupted and output.exists() and not checkpoint:
+        is_kept = order.long is not None and order.long.folder is not None
+        if job.is_interrupted and (output.exists() or order.is_one_of_many) and not is_kept:
             target = output.with_name(f"{output.stem}.partial{output.suffix}")
-        if denoise:
+        if order.denoise:
+            noisy = target.with_name(f"{target.stem}.noisy.exr")
             write(noisy, guides)
             denoising.denoise_file(noisy, target, metadata())
         else:
@@ -236,6 +308,7 @@ def render(
         figures = {"file": str(target), "spp": job.spp, "seconds": job.seconds, "bad_pixels": bad}
         if job.is_interrupted:
             older = "" if target == output else f" ({output} is an older image, and was kept)"
+            older = older if output.exists() else ""
             report.end(f"interrupted {job.how_far()}: {target}{older}", True, **figures)
             return stop.exit_code
     is_slow = kernels_compiled() > compiled and not is_new  # else it was printed above
