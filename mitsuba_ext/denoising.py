@@ -44,7 +44,15 @@ def denoiser() -> ModuleType:
 
 
 def remark(film: mi.Film) -> str | None:
-    """What a user should know about the film of an image to be denoised."""
+    """What a user should know about the film of an image to be denoised.
+
+    Raises:
+        InputError: It has no RGB.
+    """
+    import mitsuba as mi
+
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        raise InputError(f'the film "{film.class_name()}" has no RGB image to denoise')
     if film.rfilter().radius() > 0.5 + 1e-3:
         return (
             f'denoising works badly with the reconstruction filter "{film.rfilter().class_name()}" '

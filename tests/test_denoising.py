@@ -5,10 +5,12 @@ from __future__ import annotations
 import sys
 from types import SimpleNamespace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.compare import images, read_exr
+from mitsuba_ext import denoising
+from mitsuba_ext.compare import InputError, images, read_exr
 from mitsuba_ext.compare.metrics import relative_mse
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -84,6 +86,14 @@ def test_a_filter_that_correlates_pixels_is_named(run, make_scene, tmp_path, cal
     scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))
     code, _, err = run("render", scene, "-o", tmp_path / "a.exr", "--denoise")
     assert code == 0 and "use a film with a box filter" in err
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_a_film_without_rgb_is_refused_before_the_render(variant):
+    band = {"type": "regular", "wavelength_min": 400.0, "wavelength_max": 500.0, "values": "1,1"}
+    film = mi.load_dict({"type": "specfilm", "band": band})
+    with pytest.raises(InputError, match="no RGB image to denoise"):
+        denoising.remark(film)
 
 
 @pytest.mark.slow
