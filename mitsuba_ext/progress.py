@@ -47,17 +47,18 @@ def reporting(progress: bool | Callable[[Step], None]) -> Iterator[Callable[[Ste
 
 
 @contextlib.contextmanager
-def progress_bars(*columns: ProgressColumn) -> Iterator[Progress]:
+def progress_bars(*columns: ProgressColumn, is_shown: bool = True) -> Iterator[Progress]:
     """Progress bars on stderr, if that is a terminal.
 
     Args:
         columns: Columns after the label, the bar and the elapsed time. Default: rich's estimate of
             the remaining time.
+        is_shown: ``False`` for bars that nobody sees.
     """
     from rich import progress as bars
     from rich.console import Console
 
-    terminal = sys.stderr.isatty()
+    terminal = is_shown and sys.stderr.isatty()
     console = Console(stderr=True, quiet=not terminal)
     columns = (
         bars.TextColumn("{task.description}", markup=False),

@@ -17,6 +17,7 @@ from .. import __version__
 from ..errors import InputError, InstallationError
 from .common import INTERRUPTED, say
 from .compare import compare
+from .denoise import denoise
 from .diff import diff
 from .merge import merge
 from .plugins import list_plugins
@@ -27,7 +28,12 @@ from .supervisor import SUPERVISED
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="mitsuba-ext")
 def cli() -> None:
-    """Light transport techniques for Mitsuba 3."""
+    """Light transport techniques for Mitsuba 3.
+
+    Exit codes: 0; 1 (an image with NaN or infinite pixels, a comparison in which something failed,
+    a problem that the doctor found); 2 (bad input, in one line on stderr); 130, 143 and 129
+    (Ctrl-C, SIGTERM and SIGHUP, with the image so far).
+    """
 
 
 @click.command(short_help="Check the installation.")
@@ -38,7 +44,7 @@ def doctor() -> int:
     return doctor_module.main()
 
 
-for command in (render, merge, compare, diff, list_plugins, doctor):
+for command in (render, merge, denoise, compare, diff, list_plugins, doctor):
     cli.add_command(command)
 
 

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import math
 import os
 import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ..errors import InputError
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
+from ..long_renders.dask_cluster import dask_cluster
 from ..long_renders.folder import CheckpointFolder
 from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
 from ..long_renders.workers import Workers
-from ..progress import progress_bars
 from ..rendering.interrupts import deferred_interrupt
 from ..scene_remarks import scene_remarks
 from .common import Interval
+from .reports import Report, Speed, time_left
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,7 @@ class LongOptions:
         add: Samples per pixel besides those that are there; ``None`` for none.
         until: The relative error at which it ends; ``None`` for none.
         workers: Processes that render; 0 for this one.
+        dask: The address of a Dask scheduler whose workers render; empty for none.
     """
 
     folder: Path | None = None
@@ -40,6 +46,7 @@ class LongOptions:
     add: int | None = None
     until: float | None = None
     workers: int = 0
+    dask: str = ""
 
 
 class LongJob:
@@ -47,6 +54,7 @@ class LongJob:
 
     Attributes:
         integrator, name, parameters: The integrator, its name and its parameters.
+        scene, sensor: What it renders.
         film: The film that holds the image.
         is_interrupted: Did a signal end the render before its goal was reached?
         seconds: Wall clock of the render.
@@ -55,7 +63,8 @@ class LongJob:
     def __init__(self, request: RenderRequest, options: LongOptions) -> None:
         """
         Raises:
-            InputError: The scene, the integrator or the sensor cannot be used.
+            InputError: The scene, the integrator or the sensor cannot be used, or what is learned
+                cannot be sent to the workers.
         """
         self._options = options
         self._folder = CheckpointFolder(options.folder) if options.folder else None
@@ -65,13 +74,25 @@ class LongJob:
         learned = (self._folder or folder).learned
         # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR file
         threads = max(2, (os.cpu_count() or 1) // options.workers) if options.workers else 0
-        self._request = replace(request, learned=str(learned.absolute()), threads=threads)
+        self._request = replace(
+            request, learned=str(learned.absolute()), threads=request.threads or threads
+        )
         self._renderer = BatchRenderer(self._request)
+        if options.dask:
+            if self._renderer.must_learn and not self._folder:
+                raise InputError(
+                    f'"{self._renderer.named.name}" learns: with --dask, it needs --checkpoint, a '
+                    f"folder that the workers see too"
+                )
+            # Workers have another current folder, and perhaps other files
+            description = json.dumps(self._renderer.description(), default=str)
+            self._request = replace(_absolute(self._request), description=description)
         named = self._renderer.named
         self.integrator, self.name, self.parameters = (
             named.integrator, named.name, named.parameters
         )  # fmt: skip
-        self.film = self._renderer.sensor.film()
+        self.scene, self.sensor = self._renderer.loaded.scene, self._renderer.sensor
+        self.film = self.sensor.film()
         self.is_interrupted, self.seconds = False, 0.0
         self._state, self._render = RenderState(), None
 
@@ -84,9 +105,8 @@ class LongJob:
         return remarks
 
     def run(
-        self, spp: int | None, seconds: float | None, write: Callable[[], None],
-        warn: Callable[[str], None],
-    ) -> None:  # fmt: skip
+        self, spp: int | None, seconds: float | None, write: Callable[[], None], report: Report
+    ) -> None:
         """Goes on with what is in the folder.
 
         Args:
@@ -94,7 +114,7 @@ class LongJob:
                 nothing else ends the render.
             seconds: Of this call.
             write: Writes the image of the film.
-            warn: Shows a sentence.
+            report: Is told how far it is.
 
         Raises:
             InputError: The folder holds another render, or the integrator cannot render the scene.
@@ -108,11 +128,11 @@ class LongJob:
                     if not self._state.has_taught:
                         # It would depend on the numbers of a batch that is still to come
                         self._folder.learned.unlink(missing_ok=True)
-                self._run(spp, seconds, write, warn)
+                self._run(spp, seconds, write, report)
             finally:
                 self.seconds = time.perf_counter() - begin
 
-    def _run(self, spp, seconds, write, warn) -> None:
+    def _run(self, spp, seconds, write, report) -> None:
         options, state = self._options, self._state
         if options.add:
             spp = state.spp + options.add
@@ -128,31 +148,52 @@ class LongJob:
             self.seconds = time.perf_counter() - last.begin
             write()
 
-        with progress_bars() as bars, _asked_to_keep() as asked:
-            bar = bars.add_task(self.name, total=None)
+        speed, pixel_count = Speed(), math.prod(self.film.crop_size())
+
+        with report.bars() as bars, _asked_to_keep() as asked:
+            bar = bars.add_task(self.name, total=None, left="")
 
             def progress(render: LongRender) -> None:
-                text = f"{self.name}, {state.spp} spp"
+                text, left = f"{self.name}, {state.spp} spp", None
+                if (per_second := speed(state.spp)) is not None:
+                    text += f", {per_second * pixel_count / 1e6:.3g} million samples/s"
+                    left = render.spp_left and render.spp_left / per_second
                 # It takes as long as a small batch
-                if options.until and (error := render.error) is not None:
+                error = render.error if options.until else None
+                if error is not None:
                     text += f", relMSE about {error:.2g}"
                 bars.update(
-                    bar, description=text, completed=state.spp, total=render.goal_spp or None
-                )
+                    bar, description=text, completed=state.spp, total=render.goal_spp or None,
+                    left=time_left(left),
+                )  # fmt: skip
+                report.progress(
+                    spp=state.spp, goal_spp=render.goal_spp or None, relmse=error,
+                    samples_per_second=per_second and per_second * pixel_count,
+                    seconds=time.perf_counter() - last.begin, seconds_left=left,
+                )  # fmt: skip
                 if asked() or (self._folder and last.is_due(options.every, state.spp)):
                     try:
                         keep()
                     except OSError as problem:
-                        warn(f"the render could not be kept: {problem}; it goes on")
+                        report.warn(f"the render could not be kept: {problem}; it goes on")
 
             self._render = LongRender(self._renderer, self._request, state, progress)
             goal = Goal(spp, options.until, seconds)
             is_reached = False
             try:
-                with deferred_interrupt() as interrupt, self._executor() as executor:
-                    is_reached = self._render.run(
-                        goal, interrupt.is_set, executor, options.workers or 1
-                    )
+                with deferred_interrupt() as interrupt, self._executor() as (executor, n, check):
+
+                    def is_stopped() -> bool:
+                        check()
+                        return interrupt.is_set()
+
+                    is_reached = self._render.run(goal, is_stopped, executor, n)
+                if not state.done:  # stopped before others had finished a batch
+                    raise KeyboardInterrupt
+            except InputError:  # the scheduler or too many workers are gone
+                if self._folder and state.done:
+                    self._folder.save(state)
+                raise
             except KeyboardInterrupt:
                 if not state.done:
                     raise
@@ -164,18 +205,22 @@ class LongJob:
                 self._folder.save(state)
             except OSError as problem:
                 # The image may have room
-                warn(f"the render could not be kept: {problem}")
+                report.warn(f"the render could not be kept: {problem}")
 
     @contextlib.contextmanager
-    def _executor(self) -> Iterator[Any]:
-        if not self._options.workers:
-            yield None
-            return
-        executor = Workers(self._options.workers)
-        try:
-            yield executor
-        finally:
-            executor.shutdown(cancel_futures=True)
+    def _executor(self) -> Iterator[tuple[Executor | None, int, Callable[[], None]]]:
+        """Who renders, how many batches at a time, and a function that fails if these are gone."""
+        if self._options.dask:
+            with dask_cluster(self._options.dask) as cluster:
+                yield cluster
+        elif self._options.workers:
+            executor = Workers(self._options.workers)
+            try:
+                yield executor, self._options.workers, lambda: None
+            finally:
+                executor.shutdown(cancel_futures=True)
+        else:
+            yield None, 1, lambda: None
 
     # ---- How far it got ----
 
@@ -206,6 +251,19 @@ class LongJob:
     def about(self) -> Mapping[str, Any]:
         """What the metadata of the image say besides."""
         return {"batches": len(self._state.done)}
+
+
+def _absolute(request: RenderRequest) -> RenderRequest:
+    """A request whose files are found from any folder."""
+
+    def absolute(name: str) -> str:
+        path = Path(name)
+        return str(path.absolute()) if path.suffix and path.is_file() else name
+
+    return replace(
+        request, scene=absolute(request.scene), plugins=tuple(map(absolute, request.plugins)),
+        specification=request.specification and absolute(request.specification),
+    )  # fmt: skip
 
 
 class _Last:

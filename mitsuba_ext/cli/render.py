@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -20,7 +21,14 @@ from .common import (
     say,
     scene_options,
 )
+from .frames import FrameRange, Picture, Sensors, pictures
 from .stopping import stopping
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from .long_job import LongOptions
+    from .reports import Report
 
 
 @click.command(short_help="Render a scene to an image.")
@@ -48,8 +56,15 @@ from .stopping import stopping
     show_default=True, help="Seed of the random numbers.",
 )
 @click.option(
-    "-s", "--sensor", "sensor_index", type=click.IntRange(min=0), metavar="N",
-    help="Sensor to render, counted from 0. [default: the first]",
+    "-s", "--sensor", "sensors", type=Sensors(), metavar="N,…|all",
+    help="Sensors to render, counted from 0. Several images are called NAME.sensorN.EXT. [default: "
+    "the first]",
+)
+@click.option(
+    "--frames", type=FrameRange(), metavar="A:B",
+    help="Render the frames A to B, both included, to image.####.exr. In -D, {…} is an expression "
+    "of frame: -D 'angle={3.6 * frame}'. Frames that exist are skipped. Frame n has the seed N + "
+    "n.",
 )
 @click.option(
     "--checkpoint", type=FilledPath(), metavar="DIR",
@@ -72,6 +87,25 @@ from .stopping import stopping
     "--workers", type=click.IntRange(1, 1024), metavar="N",
     help="Render in N processes of this machine.",
 )
+@click.option(
+    "--dask", metavar="ADDRESS",
+    help="Render on the workers of the Dask scheduler at ADDRESS: tcp://host:port.",
+)
+@click.option(
+    "--denoise", is_flag=True,
+    help="Denoise the image in the end, guided by the albedo and the normals of what the camera "
+    "sees. The image itself is kept in NAME.noisy.exr.",
+)
+@click.option("--quiet", is_flag=True, help="Show warnings and errors only.")
+@click.option(
+    "--json", "as_json", is_flag=True,
+    help="Print JSON objects to stdout, one a line: events of progress, warnings, and the end.",
+)
+@click.option(
+    # With one thread, Mitsuba 3.9.1 hangs when it reads or writes an EXR file
+    "--threads", type=click.IntRange(min=2), metavar="N",
+    help="Threads of each process, at least 2.  [default: all cores, divided among --workers]",
+)
 @scene_options
 @click.argument("scene", type=FilledPath())
 def render(
@@ -81,12 +115,18 @@ def render(
     spp: int | None,
     seconds: float | None,
     seed: int,
-    sensor_index: int | None,
+    sensors: tuple[int, ...] | None,
+    frames: range | None,
     checkpoint: Path | None,
     every: Interval,
     add: int | None,
     until: float | None,
     workers: int | None,
+    dask: str | None,
+    denoise: bool,
+    quiet: bool,
+    as_json: bool,
+    threads: int | None,
     size: tuple[int, int] | None,
     definitions: Sequence[tuple[str, str]],
     plugins: Sequence[str],
@@ -101,31 +141,95 @@ def render(
     Mitsuba's own integrators render in passes. A structured sampler stratifies the samples of a
     pass (64 per pixel or more, 16 for large images), not those of the whole render.
 
-    With --checkpoint, --until or --workers, all integrators render in batches, which are
-    independent renders with seeds of their own. An EXR then holds the variance of the image too.
-    What an integrator learns in the first batch, the others use. SIGUSR1 keeps the render at once.
+    With --checkpoint, --until, --workers or --dask, all integrators render in batches: independent
+    renders with seeds of their own. An EXR then holds the variance of the image too. What an
+    integrator learns in the first batch, the others use. SIGUSR1 keeps the render at once.
     """
     if specification and not plugins:
         check_integrator(specification)
     from ..scenes import check_scene_file
 
     check_scene_file(scene)
-    from ..compare import images, machine
-    from ..long_renders.batch_renderer import RenderRequest
-    from .long_job import LongJob, LongOptions
-    from .render_job import RenderJob
+    from .long_job import LongOptions
+    from .reports import Report
 
+    report = Report(quiet, as_json)
     if spp is not None and seconds is not None and until is None:
         raise click.UsageError("--spp and --time exclude each other")
     if add is not None and checkpoint is None:
         raise click.UsageError("--add needs --checkpoint: the folder with the samples so far")
     if add is not None and spp is not None:
         raise click.UsageError("--add and --spp exclude each other")
-    images.check_target(output)
+    if workers is not None and dask is not None:
+        raise click.UsageError("--workers and --dask exclude each other")
+    is_long = checkpoint or until or workers or dask
+    order = _Order(
+        scene, specification, spp, seconds, size, variant, denoise, threads,
+        LongOptions(checkpoint, every, add, until, workers or 0, dask or "") if is_long else None,
+        is_one_of_many=frames is not None or (sensors is not None and len(sensors) != 1),
+    )  # fmt: skip
+    if order.is_one_of_many and checkpoint:
+        raise click.UsageError("--checkpoint keeps one image: it excludes --frames and sensors")
+    if sensors == ():
+        sensors = _all_sensors(scene, definitions, variant, plugins, frames)
+    result = 0
+    chosen = list(pictures(output, definitions, sensors or [None], seed, frames))
+    for picture in chosen:
+        if order.is_one_of_many and picture.output.exists():
+            report.note(f"{picture.output}: exists already")
+            continue
+        code = _render_image(order, picture, plugins, report)
+        plugins = ()  # they are registered
+        if code > 1:
+            return code
+        result = max(result, code)
+    return result
 
-    def write(target: Path) -> None:
-        metadata = {
-            "scene": str(scene),
+
+class _Order(NamedTuple):
+    """What all images of a call have in common; see the options."""
+
+    scene: Path
+    specification: str | None
+    spp: int | None
+    seconds: float | None
+    size: tuple[int, int] | None
+    variant: str
+    denoise: bool
+    threads: int | None
+    long: LongOptions | None
+    is_one_of_many: bool
+
+
+def _all_sensors(scene, definitions, variant, plugins, frames) -> list[int]:
+    """The numbers of a scene's sensors, in the first of the frames."""
+    from ..scenes import load_scene
+
+    select_variant(variant, plugins)
+    (picture,) = pictures(Path("#"), definitions, [None], 0, frames and frames[:1])
+    loaded = load_scene(scene, parameters=dict(picture.definitions), keep_integrator=False)
+    return list(range(len(loaded.scene.sensors())))
+
+
+def _render_image(
+    order: _Order, picture: Picture, plugins: Sequence[str], report: Report
+) -> int:
+    """Renders an image and returns the exit code."""
+    from .. import denoising
+    from ..compare import images, machine
+    from ..long_renders.batch_renderer import RenderRequest
+    from .long_job import LongJob
+    from .render_job import RenderJob
+
+    output, definitions, sensor_index, seed = picture
+    images.check_target(output)
+    if order.denoise:
+        denoising.denoiser()
+    guides = {}
+
+    def metadata() -> dict[str, object]:
+        return {
+            "scene": str(order.scene),
             "scene_parameters": dict(definitions),
             "integrator": job.name,
             "parameters": job.parameters,
@@ -136,33 +240,47 @@ def render(
             "versions": machine.versions(),
             **job.about(),
         }
-        images.write_film(target, job.film, metadata, job.variance())
+
+    def write(target: Path, others: Mapping[str, np.ndarray] | None = None) -> None:
+        images.write_film(target, job.film, metadata(), {**job.variance(), **(others or {})})
 
     with stopping() as stop:
         job = None
         try:
-            select_variant(variant, plugins)
+            select_variant(order.variant, plugins)
+            if order.threads:
+                import drjit as dr
+
+                dr.set_thread_count(order.threads)
             compiled = kernels_compiled()
-            if checkpoint or until or workers:
+            if order.long:
                 job = LongJob(
                     RenderRequest(
-                        str(scene), size, tuple(definitions), specification, sensor_index or 0,
-                        seed, variant, tuple(plugins),
+                        str(order.scene), order.size, definitions, order.specification,
+                        sensor_index or 0, seed, order.variant, tuple(plugins),
+                        threads=order.threads or 0,
                     ),
-                    LongOptions(checkpoint, every, add, until, workers or 0),
+                    order.long,
                 )  # fmt: skip
             else:
                 job = RenderJob.load(
-                    scene, size, dict(definitions), specification, sensor_index, seed
+                    order.scene, order.size, dict(definitions), order.specification,
+                    sensor_index, seed,
                 )
             is_new = kernels_compiled() > compiled
             images.check_film(output, job.film, job.integrator.aov_names())
             for remark in job.remarks(is_sensor_chosen=sensor_index is not None):
-                warn(remark)
+                report.warn(remark)
+            if order.denoise and (remark := denoising.remark(job.film)):
+                report.warn(remark)
             if is_new:
                 # The render's kernels take longer to compile, and nothing can be printed meanwhile
-                say("compiling kernels (later renders like this one find them in a cache)")
-            job.run(spp, seconds, functools.partial(write, output), warn)
+                report.note("compiling kernels (later renders like this one find them in a cache)")
+            if order.denoise:
+                guides = denoising.render_guides(job.scene, job.sensor, seed)
+            # A frame that is there counts as finished
+            current = (lambda: None) if order.is_one_of_many else functools.partial(write, output)
+            job.run(order.spp, order.seconds, current, report)
         except (KeyboardInterrupt, OSError) as error:
             # After SIGHUP, showing progress on the closed terminal raises an OSError
             if isinstance(error, OSError) and not stop.is_asked:
@@ -175,21 +293,25 @@ def render(
 
         stop.wait()
         target = output
-        if job.is_interrupted and output.exists() and not checkpoint:
+        is_kept = order.long is not None and order.long.folder is not None
+        if job.is_interrupted and (output.exists() or order.is_one_of_many) and not is_kept:
             target = output.with_name(f"{output.stem}.partial{output.suffix}")
-        write(target)
+        if order.denoise:
+            noisy = target.with_name(f"{target.stem}.noisy.exr")
+            write(noisy, guides)
+            denoising.denoise_file(noisy, target, metadata())
+        else:
+            write(target)
         bad, pixel_count = images.count_non_finite(job.film)
         if bad:
-            warn(f"{bad} of {pixel_count} pixels of {target} are NaN or infinite")
+            report.warn(f"{bad} of {pixel_count} pixels of {target} are NaN or infinite")
+        figures = {"file": str(target), "spp": job.spp, "seconds": job.seconds, "bad_pixels": bad}
         if job.is_interrupted:
             older = "" if target == output else f" ({output} is an older image, and was kept)"
-            say(f"interrupted {job.how_far()}: {target}{older}")
+            older = older if output.exists() else ""
+            report.end(f"interrupted {job.how_far()}: {target}{older}", True, **figures)
             return stop.exit_code
     is_slow = kernels_compiled() > compiled and not is_new  # else it was printed above
     remark = " (compiled kernels: the next such render starts faster)" if is_slow else ""
-    say(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}", err=False)
+    report.end(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}", **figures)
     return 1 if bad else 0
-
-
-def warn(text: str) -> None:
-    say(f"mitsuba-ext: warning: {text}")

@@ -14,12 +14,12 @@ from rich.progress import Progress
 
 from ..compare import timing
 from ..errors import InputError
-from ..progress import progress_bars
 from ..rendering.batches import sample_count
 from ..rendering.seed_passes import SeedPasses, can_render, is_independent
 from ..scene_remarks import scene_remarks
 from ..scenes import LoadedScene, load_scene, one_line
 from ..specifications import make_named
+from .reports import Report, Speed, time_left
 
 
 class RenderJob:
@@ -27,6 +27,7 @@ class RenderJob:
 
     Attributes:
         integrator, name, parameters: The integrator, its name and its parameters.
+        scene, sensor: What it renders.
         film: The film that holds the image.
         is_interrupted: Did a signal end the render before all samples were taken?
         seconds: Wall clock of the render.
@@ -40,6 +41,7 @@ class RenderJob:
         self.is_interrupted, self.seconds = False, 0.0
         self._loaded, self._sensor_index, self._seed = loaded, sensor_index, seed
         self._sensor = loaded.scene.sensors()[sensor_index]
+        self.scene, self.sensor = loaded.scene, self._sensor
         self.film = self._sensor.film()
         self._wanted: int | None = None  # samples per pixel, where it is known
         self._is_measuring = False
@@ -80,11 +82,11 @@ class RenderJob:
         return remarks
 
     def run(
-        self, spp: int | None, seconds: float | None, *_while_it_runs: Callable
+        self, spp: int | None, seconds: float | None, _write: Callable[[], None], report: Report
     ) -> None:
         """Renders ``spp`` samples per pixel (by default, the number of the sampler), or as many as
-        fit into ``seconds``. After Ctrl-C, passes end with :attr:`is_interrupted` set; integrators
-        that do not handle it raise ``KeyboardInterrupt``.
+        fit into ``seconds``, and tells ``report`` how far it is. After Ctrl-C, passes end with
+        :attr:`is_interrupted` set; integrators that do not handle it raise ``KeyboardInterrupt``.
 
         Raises:
             InputError: The integrator cannot render this scene.
@@ -93,7 +95,7 @@ class RenderJob:
         """
         begin = time.perf_counter()
         try:
-            with progress_bars() as bars:
+            with report.bars() as bars:
                 if can_render(self.integrator):
                     self._passes = SeedPasses(
                         self.integrator, self._loaded.scene, self._sensor, self._seed
@@ -101,7 +103,7 @@ class RenderJob:
                 if seconds is not None and not (self._passes and is_independent(self._sensor)):
                     spp, seconds = self._measured(seconds, bars), None
                     begin = time.perf_counter()
-                self._render(spp, seconds, bars)
+                self._render(spp, seconds, bars, report)
         except (ValueError, TypeError, RuntimeError) as error:
             message = f'{self._loaded.source}: "{self.name}": {one_line(error)}'
             raise InputError(message) from error
@@ -110,7 +112,7 @@ class RenderJob:
 
     def _measured(self, seconds: float, bars: Progress) -> int:
         self._is_measuring = True
-        bar = bars.add_task("measuring the speed", total=None)
+        bar = bars.add_task("measuring the speed", total=None, left="")
         spp = timing.samples_for(
             seconds, self.integrator, self._loaded.scene, self._seed, self._sensor_index
         )
@@ -118,11 +120,20 @@ class RenderJob:
         self._is_measuring = False
         return spp
 
-    def _render(self, spp: int | None, seconds: float | None, bars: Progress) -> None:
-        bar = bars.add_task(self.name, total=None)
+    def _render(
+        self, spp: int | None, seconds: float | None, bars: Progress, report: Report
+    ) -> None:
+        bar = bars.add_task(self.name, total=None, left="")
+        begin, speed = time.perf_counter(), Speed()
 
         def progress(done: float) -> None:
-            bars.update(bar, total=1.0, completed=done)
+            per_second = speed(done)
+            left = (1 - done) / per_second if per_second else None
+            bars.update(bar, total=1.0, completed=done, left=time_left(left))
+            report.progress(
+                done=done, spp=self._passes.spp if self._passes else None,
+                seconds=time.perf_counter() - begin, seconds_left=left,
+            )  # fmt: skip
 
         self._wanted = spp
         if self._passes is not None:

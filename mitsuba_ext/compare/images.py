@@ -137,7 +137,24 @@ def write_film(
         return
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         bitmap = bitmap.split()[0][1]  # the image without its AOVs
-    eight_bit = suffix not in (".hdr", ".pfm")
+    _save_converted(bitmap, path)
+
+
+def write_rgb(path: Path, pixels: np.ndarray, metadata: Mapping[str, object]) -> None:
+    """Writes linear RGB, (height, width, 3), as :func:`write_film` does."""
+    import mitsuba as mi
+
+    if path.suffix.lower() == ".exr":
+        write_exr(path, pixels, "RGB", metadata)
+    else:
+        pixels = np.ascontiguousarray(pixels, dtype=np.float32)
+        _save_converted(mi.Bitmap(pixels, mi.Bitmap.PixelFormat.RGB), path)
+
+
+def _save_converted(bitmap: mi.Bitmap, path: Path) -> None:
+    import mitsuba as mi
+
+    eight_bit = path.suffix.lower() not in (".hdr", ".pfm")
     component = mi.Struct.Type.UInt8 if eight_bit else mi.Struct.Type.Float32
     _save(bitmap.convert(mi.Bitmap.PixelFormat.RGB, component, eight_bit), path)
 

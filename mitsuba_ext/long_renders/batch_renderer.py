@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import functools
+import json
 import math
+import platform
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from ..rendering.seed_passes import can_render, is_independent, pass_length
 from ..scenes import LoadedScene, load_scene, one_line
 from ..specifications import NamedIntegrator, make_named
 from ..variants import select_variant
+from .folder import difference
 from .state import Batch, BatchResult
 
 #: About how many samples a batch of ours has: each traces its kernels anew, and begins its chains.
@@ -48,6 +52,8 @@ class RenderRequest:
         learned: A file of what the integrator has learned; empty for none. It need not be there
             yet: the first batch makes it.
         threads: Of a process; 0 for as many as there are cores.
+        description: What the image depends on, as JSON: a process that finds other files or
+            another version of this package refuses. Empty for what each process finds.
     """
 
     scene: str
@@ -60,6 +66,7 @@ class RenderRequest:
     plugins: tuple[str, ...] = ()
     learned: str = ""
     threads: int = 0
+    description: str = ""
 
 
 class BatchRenderer:
@@ -175,10 +182,21 @@ def _renderer(request: RenderRequest) -> BatchRenderer:
     select_variant(request.variant, request.plugins)
     if request.threads:
         dr.set_thread_count(request.threads)
-    return BatchRenderer(request)
+    renderer = BatchRenderer(request)
+    if request.description:
+        found = json.loads(json.dumps(renderer.description(), default=str))
+        if wrong := difference(json.loads(request.description), found):
+            raise InputError(f"the worker {platform.node()} would render another image: {wrong}")
+    return renderer
+
+
+#: Held while a batch is rendered: a worker of Dask has several threads, and Dr.Jit uses all cores
+#: for each batch.
+_rendering = threading.Lock()
 
 
 def render_batch(request: RenderRequest, batch: Batch) -> BatchResult:
     """Renders a batch in this process, which keeps the scene for the next one: what a worker
     does."""
-    return _renderer(request).render(batch)
+    with _rendering:
+        return _renderer(request).render(batch)

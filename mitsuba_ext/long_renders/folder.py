@@ -124,16 +124,22 @@ def check_same(
     Raises:
         InputError: They are not the same; the sentence names what differs.
     """
+    if found := difference(before, now, free):
+        raise InputError(
+            f"{where}: holds another render: {found}; use another folder, or make it the same again"
+        )
+
+
+def difference(before: Mapping[str, Any], now: Mapping[str, Any], free: Sequence[str] = ()) -> str:
+    """Says in which key two descriptions of renders differ; empty if they are the same."""
     for key in dict.fromkeys([*before, *now]):
         if key not in ("scene", *free) and before.get(key) != now.get(key):
             change = f"{before.get(key)} there, {now.get(key)} here"
             # Hashes tell nobody anything
             if key.endswith("hash"):
                 key, change = key.removesuffix("hash").strip(), "its files or code have changed"
-            raise InputError(
-                f'{where}: holds another render: "{key}" differs ({change}); use another folder, '
-                f"or make it the same again"
-            )
+            return f'"{key}" differs ({change})'
+    return ""
 
 
 def _read(file: Path) -> dict[str, np.ndarray] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from dataclasses import dataclass
 
 from ..compare import images, metrics
@@ -17,6 +17,9 @@ _FEWEST = 8
 
 #: Batches that wait at each worker.
 _QUEUE = 2
+
+#: Seconds between two looks at what others render.
+_PERIOD = 1.0
 
 #: How often a batch is tried before the render is given up.
 _TRIES = 3
@@ -73,7 +76,7 @@ class LongRender:
 
         Args:
             goal: When to end.
-            is_stopped: Asked after each batch.
+            is_stopped: Asked after each batch, and while batches of others are awaited.
             executor: Who renders: functions that it is given must find the same files. ``None`` for
                 this process.
             workers: How many batches the executor renders at a time.
@@ -106,6 +109,15 @@ class LongRender:
             return None
         rgb = [images.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance)]
         return metrics.reference_noise(*rgb)
+
+    @property
+    def spp_left(self) -> int | None:
+        """Samples per pixel that are still to come, as far as it is known: until an error is
+        reached, as many as its fall with 1/n announces."""
+        found = [self.goal_spp - self.state.spp] if self.goal_spp else []
+        if self._goal.error and (error := self.error) is not None:
+            found.append(round(self.state.spp * (error / self._goal.error - 1)))
+        return max(0, min(found)) if found else None
 
     # ---- Helpers ----
 
@@ -153,7 +165,10 @@ class LongRender:
                 order.append(batch)
                 submit(batch)
             while order and order[0] not in done:
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                finished = wait(running, _PERIOD, FIRST_COMPLETED).done
+                if not finished and is_stopped():
+                    return
+                for future in finished:
                     batch = running.pop(future)
                     if (failure := _failure(future)) is None:
                         done[batch] = future.result()
@@ -171,6 +186,8 @@ class LongRender:
 
 def _failure(future: Future) -> BaseException | None:
     """Why a batch failed; raises what is wrong with the input."""
+    if future.cancelled():
+        return CancelledError("its worker is gone")
     error = future.exception()
     if isinstance(error, InputError):
         raise error

@@ -1,0 +1,104 @@
+"""Which images a call of ``render`` makes: of several frames, by several sensors."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+
+from ..errors import InputError
+from .common import MAX_SEED
+
+#: What expressions know, besides the number of the frame.
+_FUNCTIONS = {
+    **{name: value for name, value in vars(math).items() if not name.startswith("_")},
+    "abs": abs, "min": min, "max": max, "round": round, "int": int,
+}  # fmt: skip
+
+
+class FrameRange(click.ParamType):
+    name = "frames"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> range:
+        if isinstance(value, range):
+            return value
+        match = re.fullmatch(r"(\d+):(\d+)", value)
+        if not match or int(match[1]) > int(match[2]):
+            self.fail(f'expected something like 1:100, found "{value}"', param, ctx)
+        return range(int(match[1]), int(match[2]) + 1)
+
+
+class Sensors(click.ParamType):
+    """Numbers of sensors; an empty tuple for all of them."""
+
+    name = "sensors"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, ...]:
+        if isinstance(value, tuple):
+            return value
+        if not re.fullmatch(r"all|\d+(,\d+)*", value):
+            self.fail(f'expected something like 0, 0,2 or all, found "{value}"', param, ctx)
+        return () if value == "all" else tuple(map(int, value.split(",")))
+
+
+class Picture(NamedTuple):
+    """One of the images.
+
+    Attributes:
+        output: Its file.
+        definitions: Values of the scene's ``$name`` parameters.
+        sensor: The number of the sensor; ``None`` for the first.
+        seed: Of the random numbers.
+    """
+
+    output: Path
+    definitions: tuple[tuple[str, str], ...]
+    sensor: int | None
+    seed: int
+
+
+def pictures(
+    output: Path, definitions: Sequence[tuple[str, str]], sensors: Sequence[int | None],
+    seed: int, frames: range | None,
+) -> Iterator[Picture]:  # fmt: skip
+    """The images, frame by frame.
+
+    Args:
+        output: The file, with ``#`` for each digit of the frame.
+        definitions: Values; with frames, ``{…}`` in a value is an expression of ``frame``.
+        sensors: Their numbers. If there are several, the names of files tell which.
+        seed: Of frame 0. Each frame has the next one: noise that stays in place is seen.
+        frames: Their numbers; ``None`` for a single image.
+
+    Raises:
+        InputError: The file has no place for the frame, or an expression is none.
+    """
+    if frames is not None and len(re.findall("#+", output.name)) != 1:
+        raise InputError(f"{output}: needs a place for the number of the frame: image.####.exr")
+    for frame in [None] if frames is None else frames:
+        file, values = output, tuple(definitions)
+        if frame is not None:
+            name = re.sub("#+", lambda m, f=frame: str(f).zfill(len(m[0])), output.name)
+            file = output.with_name(name)
+            values = tuple((key, _evaluated(text, frame)) for key, text in definitions)
+        for sensor in sensors:
+            own = f"{file.stem}.sensor{sensor}{file.suffix}"
+            yield Picture(
+                file.with_name(own) if len(sensors) > 1 else file, values, sensor,
+                (seed + (frame or 0)) % (MAX_SEED + 1),
+            )  # fmt: skip
+
+
+def _evaluated(text: str, frame: int) -> str:
+    def value(match: re.Match) -> str:
+        try:
+            # It is the user's own command line
+            return str(eval(match[1], {"__builtins__": {}, **_FUNCTIONS, "frame": frame}))
+        except Exception as error:  # it may raise anything
+            raise InputError(f'"{text}": frame {frame}: {error}') from None
+
+    return re.sub(r"\{([^{}]*)\}", value, text)

@@ -1,0 +1,91 @@
+"""What a render tells while it runs, and in the end: to people, or to scripts."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import json
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from rich.progress import Progress, TextColumn
+
+from ..progress import progress_bars
+from .common import say
+
+#: Smallest number of seconds between two events of progress.
+_PERIOD = 1.0
+
+
+class Report:
+    """Sentences and bars on the terminal, or events: JSON objects on stdout, one a line.
+
+    Parameters:
+        is_quiet: Only warnings and errors.
+        as_json: Events instead of sentences and bars.
+    """
+
+    def __init__(self, is_quiet: bool = False, as_json: bool = False) -> None:
+        self._is_quiet, self._as_json = is_quiet, as_json
+        self._last = -_PERIOD
+
+    def note(self, text: str) -> None:
+        """Says something that needs no attention, on stderr."""
+        if not self._is_quiet and not self._as_json:
+            say(text)
+
+    def warn(self, text: str) -> None:
+        if self._as_json:
+            self._event("warning", text=text)
+        else:
+            say(f"mitsuba-ext: warning: {text}")
+
+    def progress(self, **figures: Any) -> None:
+        """An event of progress; figures that are ``None`` are left out."""
+        if self._as_json and not self._is_quiet and time.monotonic() - self._last >= _PERIOD:
+            self._last = time.monotonic()
+            self._event("progress", **figures)
+
+    def end(self, text: str, is_interrupted: bool = False, **figures: Any) -> None:
+        """The last sentence or event."""
+        if self._as_json:
+            self._event("end", interrupted=is_interrupted, **figures)
+        elif is_interrupted or not self._is_quiet:
+            say(text, err=is_interrupted)
+
+    @contextlib.contextmanager
+    def bars(self) -> Iterator[Progress]:
+        """Bars, if a terminal shows them. A task has the field ``left``: :func:`time_left`."""
+        column = TextColumn("{task.fields[left]}", markup=False)
+        with progress_bars(column, is_shown=not self._is_quiet and not self._as_json) as bars:
+            yield bars
+
+    def _event(self, event: str, **figures: Any) -> None:
+        known = {key: value for key, value in figures.items() if value is not None}
+        say(json.dumps({"event": event, **known}), err=False)
+
+
+def time_left(seconds: float | None) -> str:
+    """A remaining time for people; empty if it is unknown."""
+    return "" if seconds is None else f"about {datetime.timedelta(seconds=round(seconds))} left"
+
+
+class Speed:
+    """The speed of a render that has done something in between two calls, and the time left. The
+    first part is not counted, because it may compile kernels."""
+
+    def __init__(self) -> None:
+        self._first: tuple[float, float] | None = None
+
+    def __call__(self, done: float) -> float | None:
+        """What is done per second; ``None`` while it is unknown.
+
+        Args:
+            done: How much is done, in any unit.
+        """
+        now = time.perf_counter()
+        if self._first is None:
+            self._first = now, done
+        begin, before = self._first
+        return (done - before) / (now - begin) if done > before and now > begin else None

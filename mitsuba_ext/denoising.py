@@ -1,0 +1,135 @@
+"""Open Image Denoise [1] on rendered images, through the package ``mitsuba-oidn``.
+
+It is guided by the albedo and the shading normal of each pixel, where these are known. A denoised
+image is biased: compare techniques by their own images.
+
+[1] Áfra. Intel Open Image Denoise. https://www.openimagedenoise.org
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .compare import images, reading
+from .errors import InputError, InstallationError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+#: Samples per pixel of the guides.
+_GUIDE_SPP = 32
+
+#: The guides as layers of an EXR: their channels, and the type of ``aov`` that renders them.
+_GUIDES = {"albedo": ("RGB", "albedo"), "normal": ("XYZ", "sh_normal")}
+
+
+def denoiser() -> ModuleType:
+    """
+    Raises:
+        InstallationError: The package is missing, or does not start here.
+    """
+    try:
+        import mitsuba_oidn
+    except (ImportError, OSError) as error:
+        raise InstallationError(
+            f"denoising needs the package mitsuba-oidn (Python 3.10 or later): pip install "
+            f"'mitsuba_ext[denoise]' ({error})"
+        ) from error
+    return mitsuba_oidn
+
+
+def remark(film: mi.Film) -> str | None:
+    """What a user should know about the film of an image to be denoised.
+
+    Raises:
+        InputError: It has no RGB.
+    """
+    import mitsuba as mi
+
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        raise InputError(f'the film "{film.class_name()}" has no RGB image to denoise')
+    if film.rfilter().radius() > 0.5 + 1e-3:
+        return (
+            f'denoising works badly with the reconstruction filter "{film.rfilter().class_name()}" '
+            f"of the film, which gives neighbours the same noise: use a film with a box filter"
+        )
+    return None
+
+
+def render_guides(scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> dict[str, np.ndarray]:
+    """Albedo and shading normal where the camera's rays hit first, also on mirrors and glass.
+    Replaces the contents of the film.
+
+    Returns:
+        Arrays (height, width) by the names of channels: ``albedo.R``, …, ``normal.Z``.
+    """
+    import mitsuba as mi
+
+    aovs = ",".join(f"{name}:{kind}" for name, (_, kind) in _GUIDES.items())
+    integrator = mi.load_dict({"type": "aov", "aovs": aovs})
+    asked = sensor.sampler().sample_count()
+    try:
+        image = np.array(integrator.render(scene, sensor, seed, _GUIDE_SPP))
+    finally:
+        sensor.sampler().set_sample_count(asked)
+    names = [f"{name}.{channel}" for name, (letters, _) in _GUIDES.items() for channel in letters]
+    first = image.shape[2] - len(names)
+    return {name: image[..., first + n] for n, name in enumerate(names)}
+
+
+def denoise_file(source: Path, target: Path, metadata: Mapping[str, object]) -> list[str]:
+    """Denoises an image.
+
+    Args:
+        source: Any image that ``diff`` reads. An EXR may hold guides: layers whose names end with
+            ``albedo`` (R, G, B) and ``normal`` (X, Y, Z).
+        target: Where to write it; its extension says how.
+        metadata: Of an EXR.
+
+    Returns:
+        The layers that guided it.
+
+    Raises:
+        InputError: The image cannot be read.
+        InstallationError: See :func:`denoiser`.
+    """
+    oidn = denoiser()
+    pixels, _, found = reading.read_image(source)
+    channels = {}
+    if source.suffix.lower() == ".exr":
+        channels, _ = images.read_exr(source)
+    guides = {name: _layer(channels, name) for name in _GUIDES}
+    guides = {name: guide for name, guide in guides.items() if guide is not None}
+    # Without the albedo, it accepts no normals
+    if "albedo" not in guides:
+        guides = {}
+    is_linear = source.suffix.lower() in (".exr", ".hdr", ".pfm", ".npy", ".npz")
+    result = oidn.denoise(
+        np.ascontiguousarray(pixels, dtype=np.float32), **guides, hdr=is_linear
+    )
+    result = np.array(result, dtype=np.float32)
+    if not np.isfinite(result).all():
+        raise InputError(f"{source}: cannot be denoised: the result has NaN or infinite pixels")
+    images.write_rgb(
+        target, result,
+        {**metadata, "denoised": f"Open Image Denoise {oidn.oidn_version()}",
+         "denoised_from": str(source), "guides": list(guides)},
+    )  # fmt: skip
+    return list(guides)
+
+
+def _layer(channels: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
+    """The only layer whose name ends so; ``None`` if there are none or several."""
+    letters, _ = _GUIDES[name]
+    ends = {c.rpartition(".")[0] for c in channels if c.rpartition(".")[0].lower().endswith(name)}
+    whole = [end for end in ends if all(f"{end}.{letter}" in channels for letter in letters)]
+    if len(whole) != 1:
+        return None
+    return np.ascontiguousarray(
+        np.stack([channels[f"{whole[0]}.{letter}"] for letter in letters], axis=2)
+    )
