@@ -28,6 +28,7 @@ import click
 import numpy as np
 from equal_samples import (
     SCENES,
+    TRIMMED,
     camera_rays,
     error,
     load,
@@ -75,6 +76,7 @@ INTEGRATORS = {
         "type": "two_stage", "visibility": "world", "splits": 32,
     },
     "neepp": {"type": "neepp"},
+    "neepp that goes on": {"type": "neepp", "grid": 16},
     "learned lights, 16 connections": {
         "type": "composed_path", "next_event": "contribution", "connections": 16,
     },
@@ -229,11 +231,13 @@ def vertex(maps: tuple[str, ...]) -> None:
 
 @main.command()
 @options
+@click.option("--trimmed", default=TRIMMED, help="Share of the largest errors that is left out.")
 @click.option("--only", multiple=True, type=click.Choice([*list(INTEGRATORS)[1:], STRATIFIED]),
               help="These integrators.")  # fmt: skip
 def images(
-    names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, only: tuple[str, ...]
-) -> None:
+    names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, trimmed: float,
+    only: tuple[str, ...],
+) -> None:  # fmt: skip
     """Compares integrators on the scenes NAMES."""
     others = list(only) or [STRATIFIED, *list(INTEGRATORS)[1:]]
     print_header(["scene", *(f"{kind}: error | time | efficiency" for kind in others)])
@@ -245,7 +249,7 @@ def images(
             scene = load(name, size, sampler=SAMPLER)
             renders |= render_in_turns(scene, path, max_depth, spp, seeds)
         mean = np.mean([r.mean for r in renders.values()], axis=0)
-        errors = {kind: error(r.variance, mean) for kind, r in renders.items()}
+        errors = {kind: error(r.variance, mean, trimmed=trimmed) for kind, r in renders.items()}
         cells = [title(name)]
         for kind in others:
             ratio = errors[kind] / errors["path"]
