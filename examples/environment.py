@@ -2,6 +2,7 @@
 
     .venv/bin/python examples/environment.py vertex map.hdr
     .venv/bin/python examples/environment.py images sunny_gloss window
+    .venv/bin/python examples/environment.py floor map.hdr
 
 ``vertex`` looks at one vertex with nothing in between, for several materials: σ/μ of what N
 connections bring together, and the exponent with which it falls from N = 4 to 256. MIS takes N/2
@@ -9,18 +10,34 @@ light samples and N/2 BSDF samples (balance heuristic); two-stage sampling divid
 as in its source, alone and beside one BSDF sample (power heuristic), as in a render. All have
 randomly shifted Hammersley points.
 
-``images`` renders scenes: error and CPU time of each integrator relative to ``path``, and the
+``images`` renders scenes: error and least CPU time of each integrator relative to ``path``, and the
 efficiency 1 / (error · time); one of them is ``path`` with the sampler ``multijitter``. Errors are
 those of ``examples/equal_samples.py``.
+
+``floor`` renders the direct light of three_balls with other floors and maps: σ/μ of the pixels that
+show nothing but the floor, with the same number of connections for each method. After Table 5.1 of
+Cline's dissertation.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import click
 import numpy as np
-from equal_samples import error, load, options, print_header, print_row, render_in_turns, title
+from equal_samples import (
+    SCENES,
+    TRIMMED,
+    camera_rays,
+    error,
+    load,
+    options,
+    print_header,
+    print_row,
+    render_in_turns,
+    title,
+)
 
 import mitsuba_ext  # noqa: F401
 from mitsuba_ext.decisions.next_event.two_stage import TwoStage
@@ -47,6 +64,9 @@ INTEGRATORS = {
     "path": {"type": "path"},
     "16 connections": {"type": "composed_path", "connections": 16},
     "resampled": {"type": "composed_path", "next_event": "resampled"},
+    "resampled 32": {
+        "type": "composed_path", "next_event": {"type": "resampled_lights", "candidates": 32},
+    },
     "portals": {"type": "composed_path", "next_event": "portals"},
     "two_stage 1": {"type": "two_stage", "light_samples": 1},
     "two_stage 16": {"type": "two_stage", "light_samples": 16},
@@ -56,11 +76,30 @@ INTEGRATORS = {
         "type": "two_stage", "visibility": "world", "splits": 32,
     },
     "neepp": {"type": "neepp"},
+    "neepp that goes on": {"type": "neepp", "grid": 16},
+    "learned lights, 16 connections": {
+        "type": "composed_path", "next_event": "contribution", "connections": 16,
+    },
 }  # fmt: skip
 
 #: ``path`` with this sampler is a rival too.
 SAMPLER = "multijitter"
 STRATIFIED = f"path, {SAMPLER}"
+
+#: Floors of ``floor``: that of the scene, and metals. A Blinn lobe of roughness 0.1 in pbrt has the
+#: exponent 10, which is about as wide as α = 0.41.
+FLOORS = {
+    "plastic 0.12": "",
+    **{
+        f"metal {alpha}": '<bsdf type="twosided" id="floor"><bsdf type="roughconductor">'
+        f'<string name="material" value="Ag"/><float name="alpha" value="{alpha}"/></bsdf></bsdf>'
+        for alpha in (0.41, 0.2, 0.12)
+    },
+}
+
+#: In the text of the scene.
+FLOOR = re.compile(r'<bsdf type="twosided" id="floor">.*?</bsdf></bsdf>', re.DOTALL)
+BALLS = re.compile(r'<shape type="sphere">.*?</shape>', re.DOTALL)
 
 
 def vertex_of(file: str, bsdf: dict) -> tuple[mi.Scene, mi.SurfaceInteraction3f]:
@@ -192,11 +231,13 @@ def vertex(maps: tuple[str, ...]) -> None:
 
 @main.command()
 @options
+@click.option("--trimmed", default=TRIMMED, help="Share of the largest errors that is left out.")
 @click.option("--only", multiple=True, type=click.Choice([*list(INTEGRATORS)[1:], STRATIFIED]),
               help="These integrators.")  # fmt: skip
 def images(
-    names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, only: tuple[str, ...]
-) -> None:
+    names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, trimmed: float,
+    only: tuple[str, ...],
+) -> None:  # fmt: skip
     """Compares integrators on the scenes NAMES."""
     others = list(only) or [STRATIFIED, *list(INTEGRATORS)[1:]]
     print_header(["scene", *(f"{kind}: error | time | efficiency" for kind in others)])
@@ -208,13 +249,86 @@ def images(
             scene = load(name, size, sampler=SAMPLER)
             renders |= render_in_turns(scene, path, max_depth, spp, seeds)
         mean = np.mean([r.mean for r in renders.values()], axis=0)
-        errors = {kind: error(r.variance, mean) for kind, r in renders.items()}
+        errors = {kind: error(r.variance, mean, trimmed=trimmed) for kind, r in renders.items()}
         cells = [title(name)]
         for kind in others:
             ratio = errors[kind] / errors["path"]
-            slower = renders[kind].time / renders["path"].time
+            slower = min(renders[kind].seconds) / min(renders["path"].seconds)
             cells.append(f"{ratio:.2f} | {slower:.2f} | {1 / (ratio * slower):.2f}")
         print_row(cells)
+
+
+def floor_scene(file: str, floor: str, with_balls: bool, size: tuple, sampler: str) -> mi.Scene:
+    """three_balls with another map, another floor, or without its balls."""
+    scene = SCENES / "three_balls.xml"
+    mi.file_resolver().prepend(str(scene.parent))
+    text = scene.read_text().replace("assets/clear_sky.exr", str(Path(file).resolve()))
+    text = text.replace('type="independent"', f'type="{sampler}"')
+    if floor:
+        text = FLOOR.sub(floor, text)
+    if not with_balls:
+        text = BALLS.sub("", text)
+    width, height = map(str, size)
+    return mi.load_string(text, width=width, height=height, rfilter="box", optimize=False)
+
+
+def shows_floor(scene: mi.Scene, rays: int = 16) -> np.ndarray:
+    """The pixels all of whose rays meet the floor: [height, width]."""
+    width, height = scene.sensors()[0].film().crop_size()
+    si = scene.ray_intersect(camera_rays(scene, rays))
+    hits = (si.is_valid() & (si.p.z < 1e-4)).numpy()
+    return hits.reshape(height, width, rays).all(axis=-1)
+
+
+def floor_methods(count: int) -> dict[str, tuple[str, dict, int]]:
+    """Methods that make so many connections, or BSDF samples, for each pixel: sampler, integrator,
+    and samples per pixel."""
+    many = {"type": "composed_path", "connections": count}
+    per_ray = max(1, count // 4)
+    return {
+        "BSDF alone": (SAMPLER, {"type": "composed_path", "mis": "bsdf"}, count),
+        "light alone": ("independent", {**many, "mis": "light"}, 1),
+        "light alone, as many rays": (SAMPLER, {"type": "composed_path", "mis": "light"}, count),
+        "MIS": (SAMPLER, {"type": "path"}, count),
+        "two-stage": (
+            "independent", {"type": "two_stage", "light_samples": count, "splits": count}, 1,
+        ),
+        "two-stage, 4 rays": (
+            SAMPLER, {"type": "two_stage", "light_samples": per_ray, "splits": count}, 4,
+        ),
+    }  # fmt: skip
+
+
+@main.command()
+@click.option("--without-balls", is_flag=True, help="Nothing is in between.")
+@click.option("--floor", "floors", multiple=True, type=click.Choice(list(FLOORS)))
+@click.option("--count", "counts", multiple=True, type=int, default=(16, 64))
+@click.option("--seeds", default=6)
+@click.option("--size", type=(int, int), default=(96, 54))
+@click.argument("file")
+def floor(
+    file: str, size: tuple, seeds: int, counts: tuple[int, ...], floors: tuple[str, ...],
+    without_balls: bool,
+) -> None:  # fmt: skip
+    """σ/μ on the floor of three_balls under the map FILE, direct light only."""
+    print_header(["map, floor", "N", *floor_methods(1), "two-stage / MIS"])
+    for name in floors or FLOORS:
+        scenes = {
+            sampler: floor_scene(file, FLOORS[name], not without_balls, size, sampler)
+            for sampler in ("independent", SAMPLER)
+        }
+        pixels = shows_floor(scenes[SAMPLER])
+        for count in counts:
+            values = {}
+            for method, (sampler, integrator, spp) in floor_methods(count).items():
+                made = {method: integrator}
+                renders = render_in_turns(scenes[sampler], made, 2, spp, seeds)[method]
+                variance = renders.variance[pixels].mean()
+                values[method] = float(np.sqrt(variance) / renders.mean[pixels].mean())
+            least = min(value for method, value in values.items() if "two" in method)
+            cells = [*(f"{value:.3f}" for value in values.values())]
+            cells.append(f"{least / values['MIS']:.2f}")
+            print_row([f"{Path(file).stem}, {name}", str(count), *cells])
 
 
 if __name__ == "__main__":
