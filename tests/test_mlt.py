@@ -139,7 +139,7 @@ def test_techniques_are_chosen_as_often_as_they_say() -> None:
 # ---- Mutations ----
 
 
-@pytest.mark.parametrize("name", some("lens_perturbation", "caustic_perturbation", of=SWITCHES))
+@pytest.mark.parametrize("name", some("caustic_perturbation", of=SWITCHES))
 def test_a_mutation_alone_leaves_the_image_as_it_is(name: str) -> None:
     """Chains begin where they belong: what moves them must not bring them elsewhere."""
     scene = mi.load_dict({**_balls(SPECULAR["glass"]()), "light": EMITTERS["constant"]()},
@@ -235,6 +235,7 @@ def test_directions_are_turned_by_angles_of_which_the_logarithm_is_uniform() -> 
 # ---- What it takes ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "camera",
     [pytest.param({"plugin": "orthographic"}, marks=pytest.mark.slow),
