@@ -238,7 +238,7 @@ def test_directions_are_turned_by_angles_of_which_the_logarithm_is_uniform() -> 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "camera",
-    [pytest.param({"plugin": "orthographic"}, marks=pytest.mark.slow),
+    [{"plugin": "orthographic"},
      {"plugin": "thinlens", "aperture_radius": 0.1, "focus_distance": 4.0}],
     ids=["orthographic", "thinlens"],
 )  # fmt: skip
