@@ -25,7 +25,7 @@ from mitsuba_ext.long_renders.batch_renderer import BatchRenderer, RenderRequest
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.long_render import Goal, LongRender
 from mitsuba_ext.long_renders.state import Batch, RenderState
-from mitsuba_ext.rendering import seed_passes
+from mitsuba_ext.rendering import batches, seed_passes
 from mitsuba_ext.rendering.batches import Batches
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -251,11 +251,31 @@ def test_what_is_learned_is_learned_once(run, make_scene, scenes, tmp_path, monk
     assert run(*command, "--spp", 48)[0] == 0
     assert run(*command, "--add", 16)[0] == 0
     assert seen == [(True, False)] + [(False, True)] * 3
+    assert not list(kept.glob("*.part.npz"))
     # Killed before the first batch was kept: what it has learned depends on its numbers
     for name in ("state.npz", "state.before.npz"):
         (kept / name).unlink(missing_ok=True)
     assert run(*command, "--spp", 16)[0] == 0
     assert seen[4:] == [(True, False)]
+
+
+def test_a_batch_that_was_interrupted_has_taught_nothing(request_of, scenes, tmp_path, monkeypatch):
+    """A second try has the same numbers, on which what was learned depends."""
+    learner = "composed_path:max_depth=3,next_event=contribution"
+    learned = tmp_path / "learned.npz"
+    scene = str(scenes / "cornell_box.xml")
+    renderer = BatchRenderer(RenderRequest(scene, (8, 6), (), learner, learned=str(learned)))
+
+    def dies(*_arguments):
+        assert list(tmp_path.glob("*.npz")), "nothing was learned"
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(batches, "_complete", dies)
+    with pytest.raises(KeyboardInterrupt):
+        renderer.render(Batch(0, 0, 64))
+    assert renderer.must_learn
+    monkeypatch.undo()
+    assert renderer.render(Batch(0, 0, 64)).has_taught and not renderer.must_learn
 
 
 # ---- The command ----

@@ -143,7 +143,8 @@ def render(
 
     With --checkpoint, --until, --workers or --dask, all integrators render in batches: independent
     renders with seeds of their own. An EXR then holds the variance of the image too. What an
-    integrator learns in the first batch, the others use. SIGUSR1 keeps the render at once.
+    integrator learns in the first batch, the others use. SIGUSR1 keeps the render after the
+    running batch.
     """
     if specification and not plugins:
         check_integrator(specification)

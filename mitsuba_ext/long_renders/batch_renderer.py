@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import os
 import platform
 import threading
 from dataclasses import dataclass
@@ -156,10 +157,14 @@ class BatchRenderer:
             KeyboardInterrupt: The batch was interrupted: it is lost.
         """
         integrator, film = self.named.integrator, self.sensor.film()
-        file, teaches = self._request.learned, self.must_learn
+        teaches = self.must_learn
+        learned = Path(self._request.learned)
+        # It counts from the end of this batch on: what is learned depends on the batch's numbers,
+        # and must not serve a second try
+        unfinished = learned.with_suffix(".part.npz")
         if self._learns:
-            integrator.load_learned = "" if teaches else file
-            integrator.save_learned = file if teaches else ""
+            integrator.load_learned = "" if teaches else str(learned)
+            integrator.save_learned = str(unfinished) if teaches else ""
         seed = batch_seeds(batch.seed, 1, batch.index)[0]
         try:
             batches = each_batch(integrator, self.loaded.scene, self.sensor, batch.spp, [seed])
@@ -168,12 +173,14 @@ class BatchRenderer:
             raise InputError(
                 f'{self.loaded.source}: "{self.named.name}": {one_line(error)}'
             ) from error
+        if has_taught := teaches and unfinished.exists():
+            os.replace(unfinished, learned)
         sums = FilmSums()
         sums.add(film, images.spp)
         return BatchResult(
             batch._replace(spp=images.spp), sums.contents.astype(np.float32), sums.has_weights,
             images.mean.astype(np.float32), images.channels, images.image_channel_count,
-            tuple(integrator.aov_names()), teaches and Path(file).exists(),
+            tuple(integrator.aov_names()), has_taught,
         )  # fmt: skip
 
 
