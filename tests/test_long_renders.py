@@ -242,7 +242,7 @@ def test_what_is_learned_is_learned_once(run, make_scene, scenes, tmp_path, monk
     render = BatchRenderer.render
 
     def watched(self, batch):
-        integrator = self.named.integrator
+        integrator = self.chosen.named.integrator
         result = render(self, batch)
         seen.append((bool(integrator.save_learned), bool(integrator.load_learned)))
         return result
@@ -251,7 +251,7 @@ def test_what_is_learned_is_learned_once(run, make_scene, scenes, tmp_path, monk
     assert run(*command, "--spp", 48)[0] == 0
     assert run(*command, "--add", 16)[0] == 0
     assert seen == [(True, False)] + [(False, True)] * 3
-    assert not list(kept.glob("*.part.npz"))
+    assert not list(kept.glob("*.part"))
     # Killed before the first batch was kept: what it has learned depends on its numbers
     for name in ("state.npz", "state.before.npz"):
         (kept / name).unlink(missing_ok=True)
@@ -267,7 +267,7 @@ def test_a_batch_that_was_interrupted_has_taught_nothing(request_of, scenes, tmp
     renderer = BatchRenderer(RenderRequest(scene, (8, 6), (), learner, learned=str(learned)))
 
     def dies(*_arguments):
-        assert list(tmp_path.glob("*.npz")), "nothing was learned"
+        assert list(tmp_path.glob("*.part")), "nothing was learned"
         raise KeyboardInterrupt
 
     monkeypatch.setattr(batches, "_complete", dies)

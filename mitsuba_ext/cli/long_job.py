@@ -23,7 +23,6 @@ from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
 from ..long_renders.workers import Workers
 from ..rendering.interrupts import deferred_interrupt
-from ..scene_remarks import scene_remarks
 from .common import Interval
 from .reports import Report, Speed, time_left
 
@@ -78,31 +77,27 @@ class LongJob:
             request, learned=str(learned.absolute()), threads=request.threads or threads
         )
         self._renderer = BatchRenderer(self._request)
+        named = self._renderer.chosen.named
+        self.integrator, self.name, self.parameters = (
+            named.integrator, named.name, named.parameters
+        )  # fmt: skip
         if options.dask:
             if self._renderer.must_learn and not self._folder:
                 raise InputError(
-                    f'"{self._renderer.named.name}" learns: with --dask, it needs --checkpoint, a '
-                    f"folder that the workers see too"
+                    f'"{self.name}" learns: with --dask, it needs --checkpoint, a folder that the '
+                    f"workers see too"
                 )
             # Workers have another current folder, and perhaps other files
             description = json.dumps(self._renderer.description(), default=str)
             self._request = replace(_absolute(self._request), description=description)
-        named = self._renderer.named
-        self.integrator, self.name, self.parameters = (
-            named.integrator, named.name, named.parameters
-        )  # fmt: skip
-        self.scene, self.sensor = self._renderer.loaded.scene, self._renderer.sensor
+        self.scene, self.sensor = self._renderer.chosen.scene, self._renderer.sensor
         self.film = self.sensor.film()
         self.is_interrupted, self.seconds = False, 0.0
         self._state, self._render = RenderState(), None
 
     def remarks(self, is_sensor_chosen: bool) -> list[str]:
         """Warnings about what the image will not show."""
-        scene = self._renderer.loaded.scene
-        remarks = scene_remarks(scene, self._renderer.sensor, self.integrator, self.name)
-        if (count := len(scene.sensors())) > 1 and not is_sensor_chosen:
-            remarks.append(f"the scene has {count} sensors: the first is rendered (see --sensor)")
-        return remarks
+        return self._renderer.chosen.remarks(is_sensor_chosen)
 
     def run(
         self, spp: int | None, seconds: float | None, write: Callable[[], None], report: Report

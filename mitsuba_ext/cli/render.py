@@ -217,6 +217,7 @@ def _render_image(
 ) -> int:
     """Renders an image and returns the exit code."""
     from .. import denoising
+    from ..chosen import Chosen
     from ..compare import images, machine
     from ..long_renders.batch_renderer import RenderRequest
     from .long_job import LongJob
@@ -264,10 +265,11 @@ def _render_image(
                     order.long,
                 )  # fmt: skip
             else:
-                job = RenderJob.load(
+                chosen = Chosen.load(
                     order.scene, order.size, dict(definitions), order.specification,
-                    sensor_index, seed,
-                )
+                    sensor_index or 0,
+                )  # fmt: skip
+                job = RenderJob(chosen, seed)
             is_new = kernels_compiled() > compiled
             images.check_film(output, job.film, job.integrator.aov_names())
             for remark in job.remarks(is_sensor_chosen=sensor_index is not None):

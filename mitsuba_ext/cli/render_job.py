@@ -4,21 +4,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from rich.progress import Progress
 
+from ..chosen import Chosen
 from ..compare import timing
 from ..errors import InputError
 from ..rendering.batches import sample_count
 from ..rendering.seed_passes import SeedPasses, can_render, is_independent
-from ..scene_remarks import scene_remarks
-from ..scenes import LoadedScene, load_scene, one_line
-from ..specifications import make_named
+from ..scenes import one_line
 from .reports import Report, Speed, time_left
 
 
@@ -33,53 +30,21 @@ class RenderJob:
         seconds: Wall clock of the render.
     """
 
-    def __init__(
-        self, loaded: LoadedScene, integrator: mi.Integrator, name: str,
-        parameters: Mapping[str, Any], sensor_index: int, seed: int,
-    ) -> None:  # fmt: skip
-        self.integrator, self.name, self.parameters = integrator, name, parameters
+    def __init__(self, chosen: Chosen, seed: int) -> None:
+        named = chosen.named
+        self.integrator, self.name, self.parameters = (
+            named.integrator, named.name, named.parameters
+        )  # fmt: skip
+        self.scene, self.sensor, self.film = chosen.scene, chosen.sensor, chosen.sensor.film()
         self.is_interrupted, self.seconds = False, 0.0
-        self._loaded, self._sensor_index, self._seed = loaded, sensor_index, seed
-        self._sensor = loaded.scene.sensors()[sensor_index]
-        self.scene, self.sensor = loaded.scene, self._sensor
-        self.film = self._sensor.film()
+        self._chosen, self._seed = chosen, seed
         self._wanted: int | None = None  # samples per pixel, where it is known
         self._is_measuring = False
         self._passes: SeedPasses | None = None
 
-    @classmethod
-    def load(
-        cls, path: Path, size: tuple[int, int] | None, definitions: Mapping[str, str],
-        specification: str | None, sensor_index: int | None, seed: int,
-    ) -> RenderJob:  # fmt: skip
-        """
-        Args:
-            specification: The integrator; ``None`` for the scene's.
-            sensor_index: ``None`` for the first.
-
-        Raises:
-            InputError: The scene, the integrator or the sensor cannot be used.
-        """
-        loaded = load_scene(path, size, definitions, keep_integrator=specification is None)
-        if specification is not None:
-            named = make_named(specification, loaded.settings)
-            parts = (named.integrator, named.name, named.parameters)
-        else:
-            parts = (loaded.scene.integrator(), loaded.integrator_name, dict(loaded.settings))
-        if parts[0] is None:
-            raise InputError(f"{path}: the scene has no integrator: name one with --integrator")
-        count = len(loaded.scene.sensors())
-        if sensor_index is not None and sensor_index >= count:
-            raise InputError(f"{path}: there is no sensor {sensor_index}: the scene has {count}")
-        return cls(loaded, *parts, sensor_index or 0, seed)
-
     def remarks(self, is_sensor_chosen: bool) -> list[str]:
         """Warnings about what the image will not show."""
-        remarks = scene_remarks(self._loaded.scene, self._sensor, self.integrator, self.name)
-        count = len(self._loaded.scene.sensors())
-        if count > 1 and not is_sensor_chosen:
-            remarks.append(f"the scene has {count} sensors: the first is rendered (see --sensor)")
-        return remarks
+        return self._chosen.remarks(is_sensor_chosen)
 
     def run(
         self, spp: int | None, seconds: float | None, _write: Callable[[], None], report: Report
@@ -98,14 +63,14 @@ class RenderJob:
             with report.bars() as bars:
                 if can_render(self.integrator):
                     self._passes = SeedPasses(
-                        self.integrator, self._loaded.scene, self._sensor, self._seed
+                        self.integrator, self.scene, self.sensor, self._seed
                     )
-                if seconds is not None and not (self._passes and is_independent(self._sensor)):
+                if seconds is not None and not (self._passes and is_independent(self.sensor)):
                     spp, seconds = self._measured(seconds, bars), None
                     begin = time.perf_counter()
                 self._render(spp, seconds, bars, report)
         except (ValueError, TypeError, RuntimeError) as error:
-            message = f'{self._loaded.source}: "{self.name}": {one_line(error)}'
+            message = f'{self._chosen.loaded.source}: "{self.name}": {one_line(error)}'
             raise InputError(message) from error
         finally:
             self.seconds = time.perf_counter() - begin
@@ -114,7 +79,7 @@ class RenderJob:
         self._is_measuring = True
         bar = bars.add_task("measuring the speed", total=None, left="")
         spp = timing.samples_for(
-            seconds, self.integrator, self._loaded.scene, self._seed, self._sensor_index
+            seconds, self.integrator, self.scene, self._seed, self._chosen.sensor_index
         )
         bars.remove_task(bar)
         self._is_measuring = False
@@ -138,14 +103,14 @@ class RenderJob:
         self._wanted = spp
         if self._passes is not None:
             if seconds is None:
-                self._wanted = sample_count(self._sensor, spp or 0)
+                self._wanted = sample_count(self.sensor, spp or 0)
             self._passes.run(self._wanted or 0, seconds, progress)
             self.is_interrupted = self._passes.interrupted
             return
         if hasattr(self.integrator, "progress"):
             self.integrator.progress = progress
         timing.timed_render(
-            self.integrator, self._loaded.scene, self._seed, spp or 0, self._sensor_index
+            self.integrator, self.scene, self._seed, spp or 0, self._chosen.sensor_index
         )
 
     def variance(self) -> dict[str, np.ndarray]:
@@ -165,7 +130,7 @@ class RenderJob:
         report = self._passes or timing.own_statistics(self.integrator)
         if report is not None:
             return report.spp
-        return None if self.is_interrupted else sample_count(self._sensor, self._wanted or 0)
+        return None if self.is_interrupted else sample_count(self.sensor, self._wanted or 0)
 
     def how_far(self) -> str:
         """The progress, for a message about an interruption."""

@@ -16,15 +16,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..chosen import Chosen
 from ..compare.machine import versions
-from ..content_hash import hash_code
 from ..errors import InputError
 from ..rendering.batches import batch_seeds, each_batch, sample_count
 from ..rendering.camera import film_extent
 from ..rendering.film_sums import FilmSums
 from ..rendering.seed_passes import can_render, is_independent, pass_length
-from ..scenes import LoadedScene, load_scene, one_line
-from ..specifications import NamedIntegrator, make_named
+from ..scenes import one_line
 from ..variants import select_variant
 from .folder import difference
 from .state import Batch, BatchResult
@@ -77,7 +76,7 @@ class BatchRenderer:
         request: What to render; its variant is the active one.
 
     Attributes:
-        loaded, named: The scene and the integrator.
+        chosen: The scene, the integrator and the sensor.
         sensor: The sensor.
 
     Raises:
@@ -89,28 +88,13 @@ class BatchRenderer:
             raise InputError(
                 f'batches need a variant such as "llvm_ad_rgb", and not "{mi.variant()}"'
             )
-        self._request, chosen = request, request.specification
-        path = Path(request.scene)
-        self.loaded: LoadedScene = load_scene(
-            path, request.size, dict(request.definitions), keep_integrator=chosen is None
-        )
-        if chosen is None:
-            integrator = self.loaded.scene.integrator()
-            if integrator is None:
-                raise InputError(f"{path}: the scene has no integrator: name one with --integrator")
-            self.named = NamedIntegrator(
-                self.loaded.integrator_name, self.loaded.integrator_name,
-                dict(self.loaded.settings), integrator, hash_code([type(integrator)]) or "",
-            )  # fmt: skip
-        else:
-            self.named = make_named(chosen, self.loaded.settings)
-        sensors = self.loaded.scene.sensors()
-        if request.sensor >= len(sensors):
-            raise InputError(
-                f"{path}: there is no sensor {request.sensor}: the scene has {len(sensors)}"
-            )
-        self.sensor = sensors[request.sensor]
-        integrator = self.named.integrator
+        self._request = request
+        self.chosen = Chosen.load(
+            Path(request.scene), request.size, dict(request.definitions), request.specification,
+            request.sensor,
+        )  # fmt: skip
+        self.sensor = self.chosen.sensor
+        integrator = self.chosen.named.integrator
         # Its own file, if it has one, holds for all batches already
         self._learns = bool(
             request.learned
@@ -127,13 +111,14 @@ class BatchRenderer:
     def description(self) -> dict[str, Any]:
         """What the image depends on, but for the number of samples."""
         request, film = self._request, self.sensor.film()
+        loaded, named = self.chosen.loaded, self.chosen.named
         return {
-            "scene": self.loaded.source,
-            "scene files hash": self.loaded.content_hash,
+            "scene": loaded.source,
+            "scene files hash": loaded.content_hash,
             "size": "x".join(map(str, film.crop_size())),
-            "integrator": self.named.name,
-            "parameters": self.named.parameters,
-            "integrator hash": self.named.identity,
+            "integrator": named.name,
+            "parameters": named.parameters,
+            "integrator hash": named.identity,
             "sensor": request.sensor,
             "seed": request.seed,
             "versions": {k: v for k, v in versions().items() if k not in ("numpy", "python")},
@@ -142,7 +127,7 @@ class BatchRenderer:
     def length(self, spp: int) -> int:
         """The samples per pixel of the next batch, of ``spp`` that are left. It does not depend on
         the speed, so that the same command gives the same image."""
-        if can_render(self.named.integrator):
+        if can_render(self.chosen.named.integrator):
             return min(pass_length(self.sensor), spp)
         limit = _SAMPLES[dr.backend_v(mi.Float)] // math.prod(film_extent(self.sensor.film()))
         limit = max(limit, _SPP if is_independent(self.sensor) else _STRUCTURED_SPP)
@@ -156,24 +141,23 @@ class BatchRenderer:
             InputError: The integrator cannot render this scene.
             KeyboardInterrupt: The batch was interrupted: it is lost.
         """
-        integrator, film = self.named.integrator, self.sensor.film()
-        teaches = self.must_learn
-        learned = Path(self._request.learned)
+        loaded, named, film = self.chosen.loaded, self.chosen.named, self.sensor.film()
+        integrator = named.integrator
+        teaches, learned = self.must_learn, self._request.learned
         # It counts from the end of this batch on: what is learned depends on the batch's numbers,
         # and must not serve a second try
-        unfinished = learned.with_suffix(".part.npz")
+        unfinished = f"{learned}.part"
         if self._learns:
-            integrator.load_learned = "" if teaches else str(learned)
-            integrator.save_learned = str(unfinished) if teaches else ""
+            integrator.load_learned = "" if teaches else learned
+            integrator.save_learned = unfinished if teaches else ""
         seed = batch_seeds(batch.seed, 1, batch.index)[0]
         try:
-            batches = each_batch(integrator, self.loaded.scene, self.sensor, batch.spp, [seed])
+            batches = each_batch(integrator, loaded.scene, self.sensor, batch.spp, [seed])
             images = next(batches)
         except (ValueError, TypeError, RuntimeError) as error:
-            raise InputError(
-                f'{self.loaded.source}: "{self.named.name}": {one_line(error)}'
-            ) from error
-        if has_taught := teaches and unfinished.exists():
+            message = f'{loaded.source}: "{named.name}": {one_line(error)}'
+            raise InputError(message) from error
+        if has_taught := teaches and Path(unfinished).exists():
             os.replace(unfinished, learned)
         sums = FilmSums()
         sums.add(film, images.spp)
