@@ -1,0 +1,232 @@
+"""``mitsuba-ext render --checkpoint`` and ``merge``: signals, full disks, processes that die."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import PATH, in_subprocess
+
+from mitsuba_ext.cli.common import Interval
+from mitsuba_ext.compare import load_reference, read_exr
+from mitsuba_ext.long_renders.batch_renderer import BatchRenderer
+from mitsuba_ext.long_renders.folder import CheckpointFolder
+
+pytestmark = pytest.mark.usefixtures("batches_of_sixteen_samples")
+
+
+def test_more_samples_later_and_merged(run, make_scene, tmp_path):
+    scene = make_scene()
+    for seed in (1, 2):
+        command = ("render", scene, "-o", tmp_path / f"{seed}.exr", "--seed", seed,
+                   "--checkpoint", tmp_path / str(seed))  # fmt: skip
+        assert "32 spp" in run(*command, "--spp", 32)[1]
+        assert "48 spp" in run(*command, "--add", 16)[1]
+        assert "48 spp in 0.0 s" in run(*command, "--spp", 48)[1]
+    code, out, _ = run("merge", tmp_path / "1", tmp_path / "2", "-o", tmp_path / "both")
+    assert code == 0 and "96 spp in 6 batches" in out
+    command = ("render", scene, "-o", tmp_path / "both.exr", "--seed", 1,
+               "--checkpoint", tmp_path / "both")  # fmt: skip
+    assert run(*command, "--spp", 96)[0] == 0
+    images = {name: read_exr(tmp_path / f"{name}.exr")[0] for name in ("1", "2", "both")}
+    mean = (images["1"]["R"] + images["2"]["R"]) / 2
+    np.testing.assert_allclose(images["both"]["R"], mean, rtol=1e-5)
+    state = CheckpointFolder(tmp_path / "both").load()
+    np.testing.assert_allclose(images["both"]["variance.R"], state.images.variance[..., 0])
+    reference = load_reference(tmp_path / "both.exr")
+    assert reference.spp == 96 and 0 < reference.noise < 1
+    # New samples have seeds of their own
+    assert run(*command, "--add", 16)[0] == 0
+    kept = CheckpointFolder(tmp_path / "both").load().done
+    assert len(set(b[:2] for b in kept)) == len(kept) == 7
+
+    assert "both have samples of seed 1" in run(
+        "merge", tmp_path / "1", tmp_path / "both", "-o", tmp_path / "c")[2]  # fmt: skip
+    assert "exists already" in run("merge", tmp_path / "1", tmp_path / "2", "-o", tmp_path)[2]
+    assert "no render is kept here" in run(
+        "merge", tmp_path / "1", tmp_path, "-o", tmp_path / "c")[2]  # fmt: skip
+    make_scene(integrator=PATH.replace("3", "2"))
+    other = ("--seed", 3, "--spp", 16, "--checkpoint", tmp_path / "3")
+    assert run("render", scene, "-o", tmp_path / "3.exr", *other)[0] == 0
+    assert '"scene files" differs' in run(
+        "merge", tmp_path / "1", tmp_path / "3", "-o", tmp_path / "c")[2]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (("--add", 3), "--add needs --checkpoint"),
+    (("--checkpoint", "a", "--add", 3, "--spp", 4), "--add and --spp exclude each other"),
+    (("--checkpoint", "a", "--every", "5"), "expected something like 60s"),
+    (("--until", 0), "0"),
+])  # fmt: skip
+def test_wrong_options_are_named(run, make_scene, tmp_path, arguments, words):
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", *arguments)
+    assert code == 2 and words in err
+
+
+def test_intervals():
+    assert Interval.parse("1.5m") == Interval(seconds=90) and Interval.parse("2h").seconds == 7200
+    assert Interval.parse("100spp") == Interval(spp=100)
+    for text in ("", "0s", "5", "1.5spp", "-3s", "s"):
+        with pytest.raises(ValueError, match="expected something like"):
+            Interval.parse(text)
+
+
+def test_a_full_disk_costs_an_interval_at_most(run, make_scene, tmp_path, monkeypatch):
+    """The render goes on, and what was kept before is still there."""
+    savez, calls = np.savez, []
+
+    def full(*arguments, **arrays):
+        calls.append(1)
+        if len(calls) in (2, 3, 5):
+            raise OSError(28, "No space left on device")
+        savez(*arguments, **arrays)
+
+    monkeypatch.setattr(np, "savez", full)
+    kept, spps = tmp_path / "kept", []
+    save = CheckpointFolder.save
+
+    def watched(self, state):
+        try:
+            save(self, state)
+        finally:
+            spps.append(self.load().spp)
+
+    monkeypatch.setattr(CheckpointFolder, "save", watched)
+    code, out, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
+                         "--checkpoint", kept, "--every", "16spp")  # fmt: skip
+    assert code == 0 and err.count("No space left") == 3 and "64 spp" in out
+    assert spps == [16, 16, 16, 64, 64] and not list(kept.glob(".state*"))
+    assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64
+
+
+def test_variants_without_batches_are_named(run, make_scene, tmp_path):
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--until", 0.1,
+                       "--variant", "scalar_rgb")  # fmt: skip
+    assert code == 2 and 'a variant such as "llvm_ad_rgb"' in err
+
+
+def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkeypatch):
+    render, seen = BatchRenderer.render, []
+
+    def signalled(self, batch):
+        if batch.index == 1:
+            os.kill(os.getpid(), signal.SIGUSR1)
+        if batch.index == 2:
+            seen.append((CheckpointFolder(tmp_path / "kept").load().spp,
+                         read_exr(tmp_path / "a.exr")[1]["spp"]))  # fmt: skip
+        return render(self, batch)
+
+    monkeypatch.setattr(BatchRenderer, "render", signalled)
+    code, out, _ = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
+                       "--checkpoint", tmp_path / "kept")  # fmt: skip
+    assert code == 0 and "64 spp" in out and seen == [(32, 32)]
+
+
+@pytest.mark.parametrize("integrator", ["path", "composed_path"])
+def test_ctrl_c_keeps_the_render_and_ends(run, make_scene, tmp_path, monkeypatch, integrator):
+    render = BatchRenderer.render
+
+    def signalled(self, batch):
+        if batch.index == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return render(self, batch)
+
+    monkeypatch.setattr(BatchRenderer, "render", signalled)
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", integrator,
+               "--checkpoint", tmp_path / "kept")  # fmt: skip
+    code, _, err = run(*command, "--spp", 64)
+    spp = CheckpointFolder(tmp_path / "kept").load().spp
+    assert code == 143 and f"interrupted after {spp} of 64 spp" in err and 32 <= spp <= 48
+    assert read_exr(tmp_path / "a.exr")[1]["spp"] == spp
+    monkeypatch.setattr(BatchRenderer, "render", render)
+    assert run(*command, "--spp", 64)[0] == 0
+
+
+def test_another_render_is_refused(run, make_scene, tmp_path):
+    scene, kept = make_scene(), tmp_path / "kept"
+    command = ("render", scene, "-o", tmp_path / "a.exr", "--spp", 16, "--checkpoint", kept)
+    assert run(*command)[0] == 0
+    for change, words in (
+        (("--seed", 1), '"seed" differs (0 there, 1 here)'),
+        (("--integrator", "path:max_depth=2"), '"parameters" differs'),
+        (("--integrator", "neepp"), '"integrator" differs (path there, neepp here)'),
+        (("--size", "4x4"), '"size" differs (8x6 there, 4x4 here)'),
+    ):
+        code, _, err = run(*command, *change)
+        assert code == 2 and words in err, err
+    make_scene(integrator=PATH.replace("3", "4"))
+    assert '"scene files" differs (its files or code have changed)' in run(*command)[2]
+    # The same file by another name
+    make_scene()
+    assert run("render", os.path.relpath(scene), *command[2:])[0] == 0
+
+
+# ---- Processes ----
+
+
+@pytest.mark.slow
+def test_processes_divide_a_render_and_one_of_them_is_killed(make_scene, tmp_path):
+    scene = make_scene()
+    command = ["render", scene, "--spp", 4096, "--size", "32x32"]
+    assert in_subprocess(*command, "-o", tmp_path / "one.exr", "--until", "1e-9").returncode == 0
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mitsuba_ext", *map(str, command), "-o", tmp_path / "two.exr",
+         "--workers", "2"], stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    killed = False
+    while process.poll() is None:
+        workers = _children(process.pid)
+        if not killed and len(workers) >= 2:
+            time.sleep(1)
+            os.kill(workers[-1], signal.SIGKILL)
+            killed = True
+        time.sleep(0.1)
+    assert killed and process.returncode == 0, process.stderr.read()
+    one, two = (read_exr(tmp_path / f"{name}.exr") for name in ("one", "two"))
+    assert one[1]["spp"] == two[1]["spp"] == 4096
+    np.testing.assert_allclose(one[0]["R"], two[0]["R"], rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_render_that_is_killed_again_and_again_loses_no_interval(make_scene, tmp_path):
+    scene, kept = make_scene(), CheckpointFolder(tmp_path / "kept")
+    command = [sys.executable, "-m", "mitsuba_ext", *map(str, (
+        "render", scene, "-o", tmp_path / "a.exr", "--spp", 1 << 20, "--size", "64x64",
+        "--checkpoint", kept.path, "--every", "16spp",
+    ))]  # fmt: skip
+    before, rng = 0, random.Random(1)
+    for _ in range(8):
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        deadline = time.monotonic() + 60
+        while kept.load().spp <= before and time.monotonic() < deadline:
+            time.sleep(rng.random() * 0.3)
+        process.kill()
+        process.wait()
+        assert kept.load().spp > before
+        before = kept.load().spp
+    state = kept.load()
+    assert sum(b.spp for b in state.done) == state.spp
+    assert [b.index for b in state.done] == list(range(len(state.done)))
+    other = tmp_path / "b.exr"
+    assert in_subprocess("render", scene, "-o", other, "--spp", state.spp, "--size", "64x64",
+                         "--seed", 5).returncode == 0  # fmt: skip
+    assert abs(read_exr(other)[0]["R"].mean() / state.images.mean[..., 0].mean() - 1) < 0.01
+
+
+def _children(process: int) -> list[int]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == process and b"spawn_main" in (path.parent / "cmdline").read_bytes():
+            found.append(int(path.parent.name))
+    return found
