@@ -155,11 +155,16 @@ def save(folder: Path, name: str, images: list[np.ndarray]) -> None:
         int(left * width), int(right * width)
     )
     parts = [image[rows, columns] for image in images]
+    folder.mkdir(parents=True, exist_ok=True)
+    for label, part in zip(("path", *FILTERS), parts):
+        write(folder / f"{name}_{label}.jpg", part)
     parts += [np.ones_like(parts[0])] * (-len(parts) % 3)
     lines = [np.concatenate(parts[i : i + 3], axis=1) for i in range(0, len(parts), 3)]
-    sheet = np.repeat(np.repeat(np.concatenate(lines), 2, 0), 2, 1)
-    folder.mkdir(parents=True, exist_ok=True)
-    mi.util.write_bitmap(str(folder / f"{name}.png"), mi.TensorXf(sheet.astype(np.float32)))
+    write(folder / f"{name}.png", np.repeat(np.repeat(np.concatenate(lines), 2, 0), 2, 1))
+
+
+def write(file: Path, image: np.ndarray) -> None:
+    mi.util.write_bitmap(str(file), mi.TensorXf(image.astype(np.float32)))
     mi.Thread.wait_for_tasks()
 
 

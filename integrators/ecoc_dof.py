@@ -12,6 +12,7 @@ from mitsuba_ext.composition.wrapping_integrator import WrappingIntegrator
 from mitsuba_ext.decisions.query.moving_scene import scene_query
 from mitsuba_ext.defocus.filters import FILTERS
 from mitsuba_ext.defocus.thin_lens import ThinLens
+from mitsuba_ext.denoising import denoiser
 from mitsuba_ext.parameters import MOST_SPP
 from mitsuba_ext.rendering.layered_job import LayeredJob
 from mitsuba_ext.rendering.pinhole import LensCentre
@@ -52,6 +53,10 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
        - |int|
        - Samples per pixel of what is hidden, and of what lies around the film, where the lens sees
          it; 0 for half of the samples per pixel. (Default: 0)
+     * - denoise
+       - |bool|
+       - Denoises the layers before they are filtered (Open Image Denoise, from the package
+         :monosp:`mitsuba-oidn`). They are collected with a box filter then. (Default: false)
      * - (Common parameters)
        - |float|
        - Those of :class:`StagedIntegrator`: timeout.
@@ -125,6 +130,9 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
         self.focus_distance = self.parameter(props, "focus_distance", 0.0, minimum=0.0)
         self.filter = self.parameter(props, "filter", "lens", choices=FILTERS)
         self.hidden_spp = self.parameter(props, "hidden_spp", 0, minimum=0, maximum=MOST_SPP)
+        self.denoise = self.parameter(props, "denoise", False)
+        if self.denoise:
+            denoiser()
         self._is_rendering = False
         if reason := self.nested.needs_equal_samples if self._is_staged else "":
             raise ValueError(
@@ -146,6 +154,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
             "focus_distance": self.focus_distance or "of the sensor",
             "filter": self.filter,
             "hidden_spp": self.hidden_spp or "half",
+            "denoise": self.denoise,
             "nested": str(self.nested).replace("\n", "\n  "),
         }
 

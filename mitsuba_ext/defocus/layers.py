@@ -4,7 +4,7 @@ part of the lens only."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -122,12 +122,15 @@ class LayerSums:
         hits: Their number.
         known: The number of samples that tell whether the layer is there: those that met something
             in it or behind it.
+        guides: What guides a denoiser: sums of RGB of the albedo, and of the shading normal. Empty
+            if there is no denoiser.
     """
 
     color: mi.Color3f
     blur: mi.Float
     hits: mi.Float
     known: mi.Float
+    guides: list[mi.Float] = field(default_factory=list)
 
     @property
     def is_there(self) -> bool:

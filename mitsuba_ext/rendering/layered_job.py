@@ -8,12 +8,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..defocus.denoised import denoised
 from ..defocus.filters import Capture, make_filter
 from ..defocus.images import Size
-from ..defocus.layers import LayerSums, Limits
+from ..defocus.layers import LayerSums
 from ..transport.estimator import CameraRays, Sample
 from . import camera
-from .pinhole import PinholeView
+from .layer_blocks import LayerBlocks
+from .pinhole import PinholeView, Surface
 from .render import Job
 
 #: Edge of the squares of pixels for which it is decided together whether anything hidden is needed.
@@ -28,70 +30,6 @@ _WIDEST_MARGIN = 1 / 8
 
 #: Samples of a pass over a list of pixels, at most.
 _MOST_LANES = 1 << 21
-
-
-class LayerBlocks:
-    """Image blocks that collect the layers' samples.
-
-    Parameters:
-        size, offset: Of the blocks; the offset is that of their corner on the film.
-
-    Attributes:
-        limits: Which layers there are.
-    """
-
-    def __init__(self, film: mi.Film, size: Size, offset: list[int], limits: Limits) -> None:
-        self.limits = limits
-        count = limits.layer_count
-
-        def block(channels: int) -> mi.ImageBlock:
-            area = [size.width, size.height]
-            return mi.ImageBlock(area, offset, channels, film.rfilter(), coalesce=False)
-
-        # RGB, alpha, blur, hits
-        self._hits = [block(6) for _ in range(count)]
-        self._known = block(count)
-
-    def put(
-        self,
-        position: mi.Point2f,
-        color: mi.Color3f,
-        alpha: mi.Float,
-        blur: mi.Float,
-        weight: mi.Float,
-        active: mi.Bool,
-        behind: mi.Float | None = None,
-    ) -> None:
-        """Adds samples.
-
-        Parameters:
-            behind: Only to layers behind the one of a surface of this blur.
-        """
-        known = []
-        for k, block in enumerate(self._hits):
-            is_open = active if behind is None else active & ~self.limits.is_before(k, behind)
-            is_hit = is_open & self.limits.contains(k, blur)
-            values = [color.x, color.y, color.z, alpha, blur, mi.Float(1)]
-            block.put(position, [weight * value for value in values], is_hit)
-            known.append(dr.select(is_open & self.limits.is_before(k, blur), weight, 0))
-        self._known.put(position, known, active)
-
-    def tensors(self) -> list[mi.TensorXf]:
-        return [block.tensor() for block in (*self._hits, self._known)]
-
-    def sums(self) -> tuple[list[LayerSums], list[mi.Float]]:
-        """The sums of each layer, and those of alpha."""
-        known = self._known.tensor()
-        count = self.limits.layer_count
-        lane = dr.arange(mi.UInt32, len(known.array) // count)
-        sums, alphas = [], []
-        for k, block in enumerate(self._hits):
-            v = [dr.gather(mi.Float, block.tensor().array, 6 * lane + i) for i in range(6)]
-            sums.append(LayerSums(
-                mi.Color3f(*v[:3]), v[4], v[5], dr.gather(mi.Float, known.array, count * lane + k)
-            ))  # fmt: skip
-            alphas.append(v[3])
-        return sums, alphas
 
 
 class LayeredJob(Job):
@@ -110,7 +48,9 @@ class LayeredJob(Job):
                 f'use an "hdrfilm".'
             )
         self.lens = integrator.thin_lens(sensor)
-        self.view = PinholeView(scene, sensor, integrator.scene_query(scene), self.lens)
+        self.view = PinholeView(
+            scene, sensor, integrator.scene_query(scene), self.lens, integrator.denoise
+        )
         self.filter = make_filter(integrator.filter)
         self._crop = [int(n) for n in self.film.crop_size()]
         # The film and a margin around it
@@ -122,7 +62,7 @@ class LayeredJob(Job):
         # A closed room has nothing behind its walls
         self._sees_sky = bool((self.blurs == np.float32(self.lens.blur_of_sky)).any())
         limits = self.filter.limits(self.blurs.ravel())
-        self.layers = LayerBlocks(self.film, self.size, offset, limits)
+        self.layers = LayerBlocks(self.film, self.size, offset, limits, integrator.denoise)
         self._last_stage = None
 
     def _with_margin(self) -> Size:
@@ -154,8 +94,8 @@ class LayeredJob(Job):
 
     def _sample(self, stage, sampler, rays: CameraRays, count=1.0) -> Sample:
         sample = super()._sample(stage, sampler, rays, count)
-        blur = self.view.first(rays.ray).blur
-        self._put(rays, sample, blur, mi.Float(rays.weight * count), mi.Bool(True))
+        first = self.view.first(rays.ray)
+        self._put(rays, sample, first, mi.Float(rays.weight * count), mi.Bool(True))
         self._last_stage = stage
         return sample
 
@@ -163,10 +103,12 @@ class LayeredJob(Job):
         super()._run_part(stage, spp, part)
         dr.eval(self.layers.tensors())
 
-    def _put(self, rays, sample, blur, weight, active, behind=None) -> None:
+    def _put(
+        self, rays, sample, surface: Surface, weight, active, behind: mi.Float | None = None
+    ) -> None:
         L = camera.to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
         alpha = dr.select(sample.valid, mi.Float(1), 0)
-        self.layers.put(rays.position, mi.Color3f(L), alpha, blur, weight, active, behind)
+        self.layers.put(rays.position, mi.Color3f(L), alpha, surface, weight, active, behind)
 
     def run(self, interrupt) -> None:
         super().run(interrupt)
@@ -213,7 +155,7 @@ class LayeredJob(Job):
         weight = mi.Float(rays.weight) * dr.opaque(mi.Float, self.statistics.spp / spp)
         if least is None:
             sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
-            self._put(rays, sample, first.blur, weight, mi.Bool(True))
+            self._put(rays, sample, first, weight, mi.Bool(True))
             return
         rest, hidden, active = self.view.beyond(rays.ray, first)
         active &= first.blur > dr.gather(mi.Float, least, pixel) + 1
@@ -221,7 +163,7 @@ class LayeredJob(Job):
             active &= hidden.is_hit
         rays.ray.o = rest.o
         sample = stage.estimator(self.scene, sampler, rays, active)
-        self._put(rays, sample, hidden.blur, weight, active, first.blur)
+        self._put(rays, sample, hidden, weight, active, first.blur)
 
     def _lanes_with_margin(self, pixel: mi.UInt32, index: mi.UInt32) -> camera.Lanes:
         """Lanes for pixels of the film and its margin. Tables of the nested integrator that have an
@@ -245,6 +187,8 @@ class LayeredJob(Job):
     def _put_picture(self) -> None:
         """Replaces colours and alpha of the block by those of the blurred layers."""
         sums, alphas = self.layers.sums()
+        if self.integrator.denoise:
+            sums = [denoised(layer, self.size) for layer in sums]
         values = np.array(self.block.tensor())
         has_alpha = mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha)
         # The film divides by these

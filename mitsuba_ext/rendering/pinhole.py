@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -41,12 +41,15 @@ class Surface:
         is_hit: Does the ray meet a surface?
         shape: Which one.
         side: On which side of the surface the ray arrives: 1 or -1.
+        guides: What guides a denoiser: RGB of the albedo, and the shading normal. Empty if nobody
+            asked for them.
     """
 
     blur: mi.Float
     is_hit: mi.Bool
     shape: mi.ShapePtr
     side: mi.Float
+    guides: list[mi.Float] = field(default_factory=list)
 
 
 class PinholeView:
@@ -55,12 +58,14 @@ class PinholeView:
     Parameters:
         scene, sensor, query: The query says how a ray meets the scene.
         lens: The lens, of which the sensor's camera rays begin in the middle.
+        has_guides: Does a denoiser want to know the surfaces' albedo and normal?
     """
 
     def __init__(
-        self, scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery, lens: ThinLens
-    ) -> None:
-        self.lens, self._scene, self._query = lens, scene, query
+        self, scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery, lens: ThinLens,
+        has_guides: bool = False,
+    ) -> None:  # fmt: skip
+        self.lens, self._scene, self._query, self._has_guides = lens, scene, query, has_guides
         to_world = mi.Transform4f(sensor.world_transform())
         self._axis = dr.normalize(to_world @ mi.Vector3f(0, 0, 1))
         self._origin = to_world @ mi.Point3f(0)
@@ -97,15 +102,23 @@ class PinholeView:
         return rest, self._meet(rest, first, active, True), active
 
     def _meet(self, ray: mi.Ray3f, hider: Surface, active: mi.Bool, can_pass: bool) -> Surface:
-        if can_pass:
-            p, hit, shape, side = _walk(self, mi.Ray3f(ray), hider.shape, hider.side, active)
+        guides = []
+        if can_pass or self._has_guides:
+            if can_pass:
+                si, side = _walk(self, mi.Ray3f(ray), hider.shape, hider.side, active)
+            else:
+                si, side = self._closest(ray, active), mi.Float(1)
+            p, hit, shape = si.p, si.is_valid(), si.shape
+            if self._has_guides:
+                guides = _guides(si, hit)
         else:
             pi = self._query.closest(self._scene, ray, coherent=True, active=active)
             hit, shape, side = pi.is_valid(), pi.shape, mi.Float(1)
             p = ray(dr.select(hit, pi.t, 0))
         depth = dr.select(hit, self._depth(p), dr.inf)
         # Rounding at the lens itself
-        return Surface(self.lens.blur(dr.maximum(depth, 1e-6)), hit, shape, side)
+        blur = self.lens.blur(dr.maximum(depth, 1e-6))
+        return Surface(blur, hit, shape, side, guides)
 
     def _depth(self, p: mi.Point3f) -> mi.Float:
         return dr.dot(p - self._origin, self._axis)
@@ -129,14 +142,20 @@ class PinholeView:
 
 @dr.syntax
 def _walk(view, ray, hider, hider_side, active):
-    p, hit = mi.Point3f(0), mi.Bool(False)
-    shape, side = dr.zeros(mi.ShapePtr), mi.Float(0)
+    si, side = dr.zeros(mi.SurfaceInteraction3f), mi.Float(0)
     steps, going = mi.UInt32(0), mi.Bool(active)
     while going:
         si = view._closest(ray, going)
-        p, hit, shape = si.p, si.is_valid(), si.shape
         side = dr.sign(dr.dot(si.n, ray.d))
-        going &= hit & view._passes(si, side, hider, hider_side, going) & (steps < _MOST_PASSED)
+        passes = view._passes(si, side, hider, hider_side, going)
+        going &= si.is_valid() & passes & (steps < _MOST_PASSED)
         steps += 1
         ray = dr.select(going, si.spawn_ray(ray.d), ray)
-    return p, hit, shape, side
+    return si, side
+
+
+def _guides(si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Float]:
+    albedo = mi.unpolarized_spectrum(si.bsdf().eval_diffuse_reflectance(si, active))
+    if mi.is_spectral or mi.is_monochromatic:
+        albedo = mi.Color3f(dr.mean(albedo))
+    return [*dr.select(active, dr.clip(albedo, 0, 1), 0), *dr.select(active, si.sh_frame.n, 0)]

@@ -1,0 +1,48 @@
+"""Layers without their noise, before a filter blurs them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..denoising import denoiser
+from .images import Size, filled
+from .layers import LayerSums
+
+
+def denoised(sums: LayerSums, size: Size) -> LayerSums:
+    """A layer whose colours Open Image Denoise has denoised, guided by albedo and normal.
+
+    A denoiser knows little of a picture that a lens has blurred: its guides are blurred and noisy
+    too. Before the filter, they are sharp. Holes of the layer are filled in first, so that they
+    are no edges.
+
+    Parameters:
+        sums: With guides.
+        size: Of the layer.
+
+    Raises:
+        InstallationError: The package ``mitsuba-oidn`` is missing.
+    """
+    if not sums.is_there:
+        return sums
+    is_known = sums.hits > 1e-6
+    scale = dr.select(is_known, dr.rcp(dr.select(is_known, sums.hits, 1)), 0)
+    weight = dr.select(is_known, mi.Float(1), 0)
+
+    def picture(values: list[mi.Float]) -> np.ndarray:
+        packed = mi.Vector4f(*(value * scale for value in values), 0)
+        dr.eval(packed, weight)
+        whole = filled(packed, weight, size)
+        flat = np.array(mi.Vector4f(whole)).T[:, :3]
+        return np.ascontiguousarray(flat.reshape(size.height, size.width, 3), dtype=np.float32)
+
+    color = picture(list(sums.color))
+    result = np.array(denoiser().denoise(
+        color, albedo=picture(sums.guides[:3]), normal=picture(sums.guides[3:]), hdr=True
+    ))  # fmt: skip
+    found = mi.Color3f(np.ascontiguousarray(result.reshape(-1, 3).T))
+    return replace(sums, color=found * dr.select(is_known, sums.hits, 0))
