@@ -127,18 +127,22 @@ def draw_numbers(
         if samples.aperture is None:
             numbers.aperture = sampler.next_2d()
         else:
-            numbers.aperture, numbers.weight = samples.aperture.draw(lanes.pixel, lanes.index)
+            numbers.aperture, numbers.weight = samples.aperture.draw(
+                sampler, lanes.pixel, lanes.index
+            )
     if sensor.shutter_open_time() > 0:
         if samples.time is None:
             numbers.time = sampler.next_1d()
         else:
-            numbers.time, weight = samples.time.draw(lanes.pixel, lanes.index)
+            numbers.time, weight = samples.time.draw(sampler, lanes.pixel, lanes.index)
             numbers.weight *= weight
     if mi.is_spectral:
         if samples.wavelength is None:
             numbers.wavelength = sampler.next_1d()
         else:
-            numbers.wavelength, hero, all_four = samples.wavelength.draw(lanes.pixel, lanes.index)
+            numbers.wavelength, hero, all_four = samples.wavelength.draw(
+                sampler, lanes.pixel, lanes.index
+            )
             numbers.weight *= all_four
             numbers.hero_weight = hero / all_four
     return numbers

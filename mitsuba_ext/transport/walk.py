@@ -115,6 +115,7 @@ class Walk:
         shadow_state = self.shadow_test.begin(sampler, ray)
         roulette_state = self.roulette.begin(sampler, ray, pixel)
         self.observer.begin(dr.width(ray), pixel)
+        self.observer.camera(rays)
 
         pi = self.query.closest(scene, ray, coherent=True, active=active)
         if dr.hint(self.hide_emitters, mode="scalar"):
