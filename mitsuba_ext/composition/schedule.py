@@ -20,6 +20,9 @@ from .decision_parameters import DecisionParameters, Setting
 from .learned_file import States
 from .swarm import Swarm, doubling_pilots, stage_weights
 
+#: Where pilots double, from so many samples on they may have half of all: they cost little then.
+_MANY_SAMPLES = 8
+
 #: Paths of each of the first two pilots, about: they show what learning is worth.
 _TRIAL_PATHS = 1 << 17
 
@@ -53,7 +56,7 @@ def pilot_samples(
         # Two of a pixel show their variance
         samples = min(samples, max(2, -(-enough // pixel_count)))
     if all(parameters.doubles for parameters in learning):
-        return doubling_pilots(samples)
+        return doubling_pilots(min(pilot_spp, spp // 2 if spp >= _MANY_SAMPLES else spp // 4))
     if samples < 3 or all(not parameters.tries for parameters in learning):
         return [samples]
     quarter = samples // 4 or 1

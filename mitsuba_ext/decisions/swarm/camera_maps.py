@@ -75,7 +75,7 @@ class CameraMapLearner(MapLearner):
 
     def choices(self, radiance: mi.Float) -> Choices:
         cell, density = self.decision.drawn
-        return Choices(mi.UInt32(0), cell, density, dr.square(radiance), mi.Bool(True))
+        return Choices(mi.UInt32(0), cell, density, radiance, mi.Bool(True))
 
     def finish(self) -> None:
         super().finish()

@@ -20,7 +20,23 @@ Extraneous Variance*, 1973).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+
+
+class Form(NamedTuple):
+    """How the density of a cell follows from what its samples bring.
+
+    Attributes:
+        exponent: Of the mean of a cell. The variance is least with 1 where all samples of a cell
+            bring the same, and with 1/2 where some of them bring nothing.
+        floor: The share of uniform numbers.
+    """
+
+    exponent: float
+    floor: float
+
 
 #: Probabilities closer to 0 or 1 are not believed when tiles are compared.
 _LEAST_PROBABILITY = 0.02
@@ -30,7 +46,7 @@ def estimate(counts: np.ndarray, squares: np.ndarray, widths: np.ndarray) -> np.
     """The share of each cell in what each tile brings.
 
     Parameters:
-        counts: Sums of sample values, [row, column, map of the tile, cell].
+        counts: Sums of what samples brought, [row, column, map of the tile, cell].
         squares: Sums of their squares, [row, column, map of the tile]: they tell how many samples
             of equal size the sums are worth.
         widths: The share of each cell where nothing is known.
@@ -48,25 +64,26 @@ def estimate(counts: np.ndarray, squares: np.ndarray, widths: np.ndarray) -> np.
     return shares
 
 
-def predicted(shares: np.ndarray, widths: np.ndarray) -> np.ndarray:
-    """The second moment under the best density over cells, relative to uniform numbers, for each
-    map. ``shares`` are those of second moments."""
-    return np.square(np.sqrt(shares * widths).sum(-1))
-
-
-def density(shares: np.ndarray, widths: np.ndarray, floor: float) -> np.ndarray:
-    """The probability of each cell: in proportion to the root of its second moment, which makes the
-    variance least, mixed with uniform numbers.
+def density(shares: np.ndarray, widths: np.ndarray, form: Form) -> np.ndarray:
+    """The probability of each cell.
 
     Parameters:
-        shares: Of cells in the second moments.
+        shares: Of cells in what the samples bring.
         widths: Of the cells.
-        floor: The share of uniform numbers.
+        form: How the one follows from the other.
     """
-    root = np.sqrt(shares * widths)
-    total = root.sum(-1, keepdims=True)
-    root = np.where(total > 0, root / np.where(total > 0, total, 1), widths)
-    return (1 - floor) * root + floor * widths
+    safe = np.where(widths > 0, widths, 1)
+    power = widths * (shares / safe) ** np.float32(form.exponent)
+    total = power.sum(-1, keepdims=True)
+    power = np.where(total > 0, power / np.where(total > 0, total, 1), widths)
+    return (1 - form.floor) * power + form.floor * widths
+
+
+def expected_ratio(mass: np.ndarray, widths: np.ndarray) -> np.ndarray:
+    """The second moment, relative to that of uniform numbers, of what is in proportion to a density
+    and drawn from it."""
+    safe = np.where(widths > 0, widths, 1)
+    return 1 / (np.square(mass) / safe).sum(-1)
 
 
 def _updated(shares: np.ndarray, sums: np.ndarray, squares: np.ndarray) -> np.ndarray:

@@ -12,12 +12,14 @@ from ...rendering.camera import to_rgb
 from ...transport.estimator import CameraRays
 from ..learner import Learner
 from .cells import CellDensities, Cells
-from .estimate import density, estimate, predicted
+from .estimate import Form, density, estimate, expected_ratio
 from .film_tiles import FilmTiles
 from .tile_counts import Choices, TileCounts
 
-#: The share of uniform numbers in a map.
-FLOOR = 0.15
+#: How densities may follow from what was found; and how they do as long as nothing is known of
+#: what that brings.
+_FORMS = (Form(0.5, 0.2), Form(0.75, 0.1), Form(1.0, 0.05))
+_FIRST_FORM = Form(0.75, 0.15)
 
 #: By how much a map is to lower the variance of the image, relatively, to be used.
 _LEAST_GAIN = 0.03
@@ -27,9 +29,10 @@ class MapLearner(Learner):
     """Learns the maps of one decision from the samples of the pilots, and draws from them in all
     stages but the first.
 
-    A map gives each cell the root of the second moment of what followed from numbers in it. It is
-    used where that promises to lower the variance of the image, and given up for good after a stage
-    in which it did not.
+    A map gives each cell a power of the mean of what followed from numbers in it. The samples of each
+    stage tell which power would have been best, and what maps are worth: they are used where that
+    promises to lower the variance of the image, and given up for good after a stage in which they
+    did not.
 
     Parameters:
         name: What summaries call the maps.
@@ -100,27 +103,35 @@ class MapLearner(Learner):
         counts = self._counts
         if counts is None:
             return None
-        was_used = self.decision.maps is not None
-        self.gain = counts.gain
-        counts.begin_stage()
-        self.decision.maps = None
-        if was_used and self.gain < _LEAST_GAIN and not self._always:
-            self._counts = None
-            return None
+        gains, form = counts.gains(), _FIRST_FORM
+        if len(gains) > 0:
+            best = int(np.argmax(gains))
+            self.gain, form = float(gains[best]), _FORMS[best]
+            if self.gain < _LEAST_GAIN and self.decision.maps is not None and not self._always:
+                self._counts, self.decision.maps = None, None
+                return None
         array, squares = counts.arrays()
         widths = self.cells.widths
         shares = estimate(array, squares, widths)
-        expected = counts.expected_gain(predicted(shares, widths))
-        if not was_used:
+        mass = density(shares, widths, form)
+        expected = counts.expected_gain(expected_ratio(mass, widths))
+        if len(gains) == 0:
             self.gain = expected
+        self.decision.maps = None
+        if self._always or min(self.gain, expected) >= _LEAST_GAIN:
+            self.decision.maps = CellDensities(self.cells, mass.reshape(-1, self.cells.count))
+        if not is_last:
+            counts.begin_stage([self._relative(density(shares, widths, f)) for f in _FORMS])
         self._memory = counts.bytes
-        if expected < _LEAST_GAIN and not self._always:
-            # More samples may show more
-            return None
-        mass = density(shares, widths, FLOOR).reshape(-1, self.cells.count)
-        self.decision.maps = CellDensities(self.cells, mass)
-        self._memory += self.decision.maps.bytes
+        if self.decision.maps is not None:
+            self._memory += self.decision.maps.bytes
         return None
+
+    def _relative(self, mass: np.ndarray) -> mi.Float:
+        """Densities relative to uniform numbers."""
+        widths = self.cells.widths
+        relative = np.where(widths > 0, mass / np.where(widths > 0, widths, 1), 1)
+        return mi.Float(relative.astype(np.float32).ravel())
 
     def state(self) -> dict[str, np.ndarray]:
         maps = self.decision.maps
