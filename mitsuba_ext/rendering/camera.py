@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.colour import to_rgb
 from ..transport.estimator import CameraRays, Sample, Splats
 from ..transport.numbers import Numbers
 from .camera_samples import CameraSamples
@@ -250,13 +251,6 @@ def _channels(
     rgb = to_rgb(L, wavelengths)
     has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
     return [rgb.x, rgb.y, rgb.z, *([alpha] if has_alpha else [])]
-
-
-def to_rgb(L: mi.Spectrum, wavelengths: mi.Spectrum | None) -> mi.Color3f:
-    """Radiance as the colour that films store."""
-    if mi.is_spectral:
-        return mi.spectrum_to_srgb(L, wavelengths)
-    return mi.Color3f(L.x) if mi.is_monochromatic else L
 
 
 def develop(film: mi.Film, develop: bool, evaluate: bool) -> mi.TensorXf:

@@ -13,6 +13,7 @@ from ..defocus.filters import Capture, make_filter
 from ..defocus.images import Size
 from ..defocus.layers import LayerSums
 from ..transport.estimator import CameraRays, Sample
+from ..transport.colour import to_rgb
 from . import camera
 from .layer_blocks import LayerBlocks
 from .pinhole import PinholeView, Surface
@@ -106,7 +107,7 @@ class LayeredJob(Job):
     def _put(
         self, rays, sample, surface: Surface, weight, active, behind: mi.Float | None = None
     ) -> None:
-        L = camera.to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
+        L = to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
         alpha = dr.select(sample.valid, mi.Float(1), 0)
         self.layers.put(rays.position, mi.Color3f(L), alpha, surface, weight, active, behind)
 

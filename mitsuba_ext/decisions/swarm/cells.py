@@ -161,9 +161,8 @@ def splits_of(mass: np.ndarray) -> np.ndarray:
     """``CellDensities.splits`` of probabilities, [table, cell]."""
     splits = np.ones(mass.shape, np.float32)
     while mass.shape[1] > 1:
-        halves = mass.reshape(len(mass), -1, 2)
-        mass = halves.sum(-1)
+        left = mass[:, 0::2]
+        mass = left + mass[:, 1::2]
         # What is never reached may be anything
-        left = halves[..., 0] / np.where(mass > 0, mass, 1)
-        splits[:, mass.shape[1] : 2 * mass.shape[1]] = np.where(mass > 0, left, 1)
+        splits[:, mass.shape[1] : 2 * mass.shape[1]] = left / np.maximum(mass, 1e-30)
     return splits

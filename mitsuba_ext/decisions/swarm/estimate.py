@@ -29,12 +29,13 @@ class Form(NamedTuple):
     """How the density of a cell follows from what its samples bring.
 
     Attributes:
-        exponent: Of the mean of a cell. The variance is least with 1 where all samples of a cell
-            bring the same, and with 1/2 where some of them bring nothing.
+        is_root: Is it in proportion to the root of the mean of a cell, and not to the mean? The
+            variance is least with the mean where all samples of a cell bring the same, and with the
+            root where some of them bring nothing.
         floor: The share of uniform numbers.
     """
 
-    exponent: float
+    is_root: bool
     floor: float
 
 
@@ -72,38 +73,39 @@ def density(shares: np.ndarray, widths: np.ndarray, form: Form) -> np.ndarray:
         widths: Of the cells.
         form: How the one follows from the other.
     """
-    safe = np.where(widths > 0, widths, 1)
-    power = widths * (shares / safe) ** np.float32(form.exponent)
-    total = power.sum(-1, keepdims=True)
-    power = np.where(total > 0, power / np.where(total > 0, total, 1), widths)
-    return (1 - form.floor) * power + form.floor * widths
+    widths = widths.astype(np.float32)
+    mass = shares
+    if form.is_root:
+        mass = np.sqrt(shares * widths)
+        mass /= np.maximum(mass.sum(-1, keepdims=True), 1e-20)
+    return (1 - np.float32(form.floor)) * mass + np.float32(form.floor) * widths
 
 
 def expected_ratio(mass: np.ndarray, widths: np.ndarray) -> np.ndarray:
     """The second moment, relative to that of uniform numbers, of what is in proportion to a density
     and drawn from it."""
-    safe = np.where(widths > 0, widths, 1)
-    return 1 / (np.square(mass) / safe).sum(-1)
+    inverse = np.where(widths > 0, 1 / np.where(widths > 0, widths, 1), 0)
+    return 1 / np.einsum("...i,...i,i->...", mass, mass, inverse.astype(np.float32))
 
 
 def _updated(shares: np.ndarray, sums: np.ndarray, squares: np.ndarray) -> np.ndarray:
     """What a tile knows, where the tile around it expects ``shares``."""
     total = sums.sum(-1, dtype=np.float64)
     samples = np.divide(np.square(total), squares, where=squares > 0, out=np.zeros_like(total))
-    scale = np.divide(samples, total, where=total > 0, out=np.zeros_like(total))[..., None]
+    scale = np.divide(samples, total, where=total > 0, out=np.zeros_like(total))
+    scale = scale[..., None].astype(np.float32)
     nodes, excess, weight, chance = [], 0.0, 0.0, 0.0
     own, expected = sums, shares
     while own.shape[-1] > 1:
-        own_halves, expected_halves = _pairs(own), _pairs(expected)
-        own, expected = own_halves.sum(-1), expected_halves.sum(-1)
-        h, p = _left_share(own_halves, own), _left_share(expected_halves, expected)
-        n = (own * scale).astype(np.float32)
+        left, expected_left = own[..., 0::2], expected[..., 0::2]
+        own, expected = left + own[..., 1::2], expected_left + expected[..., 1::2]
+        h, p = _share(left, own), _share(expected_left, expected)
+        n = own * scale
         nodes.append((h, p, n))
         is_known = (n > 1) & (p > 0) & (p < 1)
         q = np.clip(p, _LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY)
-        distance = np.where(is_known, n * np.square(h - p) / (q * (1 - q)) - 1, 0)
-        excess = excess + distance.sum(-1)
-        weight = weight + np.where(is_known, n - 1, 0).sum(-1)
+        excess = excess + ((n * np.square(h - p) / (q * (1 - q)) - 1) * is_known).sum(-1)
+        weight = weight + ((n - 1) * is_known).sum(-1)
         chance = chance + 2.0 * is_known.sum(-1)
     excess, weight, chance = map(_pooled, (excess, weight, chance))
     # One standard deviation of what chance brings is not believed
@@ -113,17 +115,17 @@ def _updated(shares: np.ndarray, sums: np.ndarray, squares: np.ndarray) -> np.nd
     for h, p, n in reversed(nodes):
         # n / (n + κ), without dividing by ρ = 0
         believed = n * rho / np.maximum(n * rho + (1 - rho), 1e-6)
-        left = p + believed * (h - p)
-        result = np.stack([result * left, result * (1 - left)], -1).reshape(*shares.shape[:-1], -1)
+        whole, left = result, p + believed * (h - p)
+        result = np.empty((*shares.shape[:-1], 2 * whole.shape[-1]), np.float32)
+        result[..., 0::2] = whole * left
+        result[..., 1::2] = whole - result[..., 0::2]
     return result
 
 
-def _pairs(x: np.ndarray) -> np.ndarray:
-    return x.reshape(*x.shape[:-1], -1, 2)
-
-
-def _left_share(halves: np.ndarray, both: np.ndarray) -> np.ndarray:
-    return np.divide(halves[..., 0], both, where=both > 0, out=np.full_like(both, 0.5))
+def _share(left: np.ndarray, both: np.ndarray) -> np.ndarray:
+    """The share of the left half; 1/2 where there is nothing."""
+    nothing = both <= 0
+    return (left + np.float32(0.5) * nothing) / (both + nothing)
 
 
 def _pooled(x: np.ndarray) -> np.ndarray:

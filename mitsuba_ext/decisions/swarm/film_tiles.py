@@ -5,9 +5,6 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-#: Edge of a tile in pixels, where memory suffices.
-_EDGE = 8
-
 #: Cells of all tiles of one map, at most: 32 MiB of counters, and as much for the table.
 _MOST_CELLS = 1 << 23
 
@@ -17,6 +14,7 @@ class FilmTiles:
 
     Parameters:
         width, height: Of the film in pixels, with its border where that is sampled.
+        edge: Of a tile in pixels, where memory suffices.
         cells: Cells that each tile has; where the film is large and these are many, tiles are
             larger.
 
@@ -25,8 +23,8 @@ class FilmTiles:
         rows, columns, count: How many tiles there are.
     """
 
-    def __init__(self, width: int, height: int, cells: int) -> None:
-        self.edge = _EDGE
+    def __init__(self, width: int, height: int, edge: int, cells: int) -> None:
+        self.edge = edge
         while -(-width // self.edge) * -(-height // self.edge) * cells > _MOST_CELLS:
             self.edge *= 2
         self.rows, self.columns = -(-height // self.edge), -(-width // self.edge)

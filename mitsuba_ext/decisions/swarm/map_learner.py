@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...rendering.camera import to_rgb
+from ...transport.colour import to_rgb
 from ...transport.estimator import CameraRays
 from ..learner import Learner
 from .cells import CellDensities, Cells
@@ -18,8 +18,8 @@ from .tile_counts import Choices, TileCounts
 
 #: How densities may follow from what was found; and how they do as long as nothing is known of
 #: what that brings.
-_FORMS = (Form(0.5, 0.2), Form(0.75, 0.1), Form(1.0, 0.05))
-_FIRST_FORM = Form(0.75, 0.15)
+_FORMS = (Form(True, 0.2), Form(False, 0.05))
+_FIRST_FORM = Form(False, 0.2)
 
 #: By how much a map is to lower the variance of the image, relatively, to be used.
 _LEAST_GAIN = 0.03
@@ -29,10 +29,10 @@ class MapLearner(Learner):
     """Learns the maps of one decision from the samples of the pilots, and draws from them in all
     stages but the first.
 
-    A map gives each cell a power of the mean of what followed from numbers in it. The samples of each
-    stage tell which power would have been best, and what maps are worth: they are used where that
-    promises to lower the variance of the image, and given up for good after a stage in which they
-    did not.
+    The density of a cell follows from the mean of what numbers in it have brought. The samples of
+    each stage tell which of two forms would have been best for them, and what maps are worth: these
+    are used where that promises to lower the variance of the image, and given up for good after a
+    stage in which they did not.
 
     Parameters:
         name: What summaries call the maps.
@@ -40,6 +40,7 @@ class MapLearner(Learner):
             numbers are to be uniform.
         width, height: Of the film, with its border where that is sampled.
         cells: Of a map.
+        edge: Of a tile in pixels, where memory suffices.
         maps: Maps of a tile.
         always: Use them also where they do not pay?
 
@@ -57,11 +58,12 @@ class MapLearner(Learner):
         width: int,
         height: int,
         cells: Cells,
+        edge: int,
         maps: int = 1,
         always: bool = False,
     ) -> None:
         self.name, self.decision, self.cells, self.maps = name, decision, cells, maps
-        self.tiles = FilmTiles(width, height, maps * cells.count)
+        self.tiles = FilmTiles(width, height, edge, maps * cells.count)
         self.gain, self._always, self._memory = 0.0, always, 0
         self._counts: TileCounts | None = TileCounts(self.tiles, maps, cells.count)
         self._pixel: mi.UInt32 | None = None
@@ -130,8 +132,9 @@ class MapLearner(Learner):
     def _relative(self, mass: np.ndarray) -> mi.Float:
         """Densities relative to uniform numbers."""
         widths = self.cells.widths
-        relative = np.where(widths > 0, mass / np.where(widths > 0, widths, 1), 1)
-        return mi.Float(relative.astype(np.float32).ravel())
+        # Nothing is drawn from a cell without width
+        inverse = (1 / np.where(widths > 0, widths, 1)).astype(np.float32)
+        return mi.Float((mass * inverse).ravel())
 
     def state(self) -> dict[str, np.ndarray]:
         maps = self.decision.maps
