@@ -70,17 +70,17 @@ class SwarmPath(WalkIntegrator):
     larger tiles around it have found, as far as the differences are no more than chance. From the
     samples of each pilot follows which density would have been best (in proportion to the mean of
     what a cell brings, with 5 % of uniform numbers, or to its root, with 20 %), and by how much the
-    variance is lower: below 3 %, a map is given up. After a render, :monosp:`integrator.statistics.learned`
-    tells what was found.
+    variance is lower: below 3 %, a map is given up. After a render,
+    :monosp:`integrator.statistics.learned` tells what was found.
 
     Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
     pilot.
 
     Source: D. Cline, PhD dissertation, BYU 2007, chapter 9 (Tables 9.1 and 9.2). The source keeps
-    the maps of two rows of pixels, and averages those of seven neighbours in the order of rendering;
-    passes and tiles, which hear from all sides, the estimate, and the measurement of the gain are
-    ours, as are maps of wavelengths, which it proposes.
+    the maps of two rows of pixels, and averages those of seven neighbours in the order of
+    rendering; passes and tiles, which hear from all sides, the estimate, and the measurement of the
+    gain are ours, as are maps of wavelengths, which it proposes.
 
     .. tabs::
         .. code-tab:: xml

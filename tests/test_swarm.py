@@ -157,8 +157,8 @@ def _furnace() -> mi.Scene:
     }  # fmt: skip
     wall = {"bsdf": diffuse(0.5), "emitter": area(0.5)}
     walls = {
-        name: rectangle(T().rotate(axis, angle) @ T().translate([0, 0, -2]).scale([2, 2, 1]), **wall)
-        for name, (axis, angle) in turns.items()
+        name: rectangle(T().rotate(*turn) @ T().translate([0, 0, -2]).scale([2, 2, 1]), **wall)
+        for name, turn in turns.items()
     }
     cube = {"type": "cube", "to_world": T().scale(0.35), "bsdf": diffuse(1.0)}
     moving = {"type": "moving", "axis": [1, 2, 0.5], "angle": 200.0, "cube": cube}
@@ -205,7 +205,7 @@ def test_maps_lower_the_noise_where_they_promise_to() -> None:
     noise = batches(scene, plain, 32, [1, 2]).var(axis=0).mean()
     integrator = swarm(max_depth=2)
     ours = batches(scene, integrator, 32, [1, 2]).var(axis=0).mean()
-    assert ours < 0.4 * noise
+    assert ours < 0.6 * noise
     assert "less variance" in integrator.statistics.learned
 
 

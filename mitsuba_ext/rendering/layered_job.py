@@ -12,8 +12,8 @@ from ..defocus.denoised import denoised
 from ..defocus.filters import Capture, make_filter
 from ..defocus.images import Size
 from ..defocus.layers import LayerSums
-from ..transport.estimator import CameraRays, Sample
 from ..transport.colour import to_rgb
+from ..transport.estimator import CameraRays, Sample
 from . import camera
 from .layer_blocks import LayerBlocks
 from .pinhole import PinholeView, Surface

@@ -18,8 +18,8 @@ class Stage:
         learned: What had been learned before.
         is_scout: Does it take one sample per pixel that is not added to the film?
         camera: What chooses points of the aperture, times and wavelengths.
-        weight: How many samples of the last stage each of its samples counts for. It must not depend
-            on any sample.
+        weight: How many samples of the last stage each of its samples counts for. It must not
+            depend on any sample.
     """
 
     estimator: Estimator
