@@ -61,8 +61,8 @@ class MovingCamera(mi.Sensor):
     next to :monosp:`moving` shapes. Light paths are connected to the lens at the time of the path,
     wherever the nested sensor can be connected to: :monosp:`light_tracer`, :monosp:`bdpt` and
     :monosp:`mlt` render with a :monosp:`perspective` or :monosp:`thinlens` that moves.
-    :monosp:`ecoc_dof`, which needs one depth for each pixel, refuses moving cameras, and so does
-    Mitsuba's :monosp:`ptracer`, for which the camera has no place on the film.
+    Mitsuba's :monosp:`ptracer` does so as well. :monosp:`ecoc_dof`, which needs one depth for each
+    pixel, refuses moving cameras.
 
     A ray costs three table look-ups and a rotation more; nothing of it is in the kernels of other
     sensors. Parameters of the nested sensor are known to :monosp:`mi.traverse` by their usual
