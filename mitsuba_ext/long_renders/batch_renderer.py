@@ -8,6 +8,7 @@ import math
 import os
 import platform
 import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from ..rendering.batches import batch_seeds, each_batch, sample_count
 from ..rendering.camera import film_extent
 from ..rendering.film_sums import FilmSums
 from ..rendering.seed_passes import can_render, is_independent, pass_length
+from ..rendering.totals import RenderTotals, forget_memory_peak
 from ..scenes import one_line
 from ..variants import select_variant
 from .folder import difference
@@ -151,6 +153,8 @@ class BatchRenderer:
             integrator.load_learned = "" if teaches else learned
             integrator.save_learned = unfinished if teaches else ""
         seed = batch_seeds(batch.seed, 1, batch.index)[0]
+        forget_memory_peak()
+        begin = time.perf_counter()
         try:
             batches = each_batch(integrator, loaded.scene, self.sensor, batch.spp, [seed])
             images = next(batches)
@@ -159,12 +163,13 @@ class BatchRenderer:
             raise InputError(message) from error
         if has_taught := teaches and Path(unfinished).exists():
             os.replace(unfinished, learned)
+        totals = RenderTotals.of(integrator, film, images.spp, time.perf_counter() - begin)
         sums = FilmSums()
         sums.add(film, images.spp)
         return BatchResult(
             batch._replace(spp=images.spp), sums.contents.astype(np.float32), sums.has_weights,
             images.mean.astype(np.float32), images.channels, images.image_channel_count,
-            tuple(integrator.aov_names()), has_taught,
+            tuple(integrator.aov_names()), has_taught, totals,
         )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 from ..errors import InputError
 from ..rendering.batches import Batches
 from ..rendering.film_sums import FilmSums
+from ..rendering.totals import RenderTotals
 
 
 class Batch(NamedTuple):
@@ -37,6 +39,7 @@ class BatchResult(NamedTuple):
         channels, image_channel_count: See :class:`~mitsuba_ext.rendering.batches.Batches`.
         aov_names: Channels besides those of the image.
         has_taught: Has it made the file of what the integrator has learned?
+        totals: What it cost.
     """
 
     batch: Batch
@@ -47,6 +50,7 @@ class BatchResult(NamedTuple):
     image_channel_count: int
     aov_names: tuple[str, ...]
     has_taught: bool
+    totals: RenderTotals
 
 
 class RenderState:
@@ -58,11 +62,12 @@ class RenderState:
         images: Mean and variance of their images; ``None`` before the first.
         aov_names: Channels besides those of the image.
         has_taught: Is there a batch among them that the others use what it has learned from?
+        totals: What they cost.
     """
 
     def __init__(self) -> None:
         self.done: list[Batch] = []
-        self.has_taught = False
+        self.has_taught, self.totals = False, RenderTotals()
         self.film, self.images = FilmSums(), None
         self.aov_names: tuple[str, ...] = ()
 
@@ -81,6 +86,7 @@ class RenderState:
         self.images, self.aov_names = images, result.aov_names
         self.done.append(result.batch)
         self.has_taught |= result.has_taught
+        self.totals = self.totals.plus(result.totals)
 
     def plus(self, other: RenderState) -> RenderState:
         """The batches of both.
@@ -100,6 +106,7 @@ class RenderState:
         total.done = [*self.done, *other.done]
         total.film, total.images = self.film.plus(other.film), self.images.plus(other.images)
         total.aov_names = self.aov_names
+        total.totals = self.totals.plus(other.totals)
         return total
 
     def fill(self, film: mi.Film) -> None:
@@ -118,6 +125,7 @@ class RenderState:
             "has_weights": np.array(self.film.has_weights),
             "spp": np.array(self.film.spp),
             "has_taught": np.array(self.has_taught),
+            "totals": np.array(json.dumps(self.totals.known())),
             "aov_names": np.array(self.aov_names, dtype=str),
         }
 
@@ -133,6 +141,7 @@ class RenderState:
         state.film.has_weights, state.film.spp = bool(arrays["has_weights"]), int(arrays["spp"])
         state.aov_names = tuple(arrays["aov_names"].tolist())
         state.has_taught = bool(arrays["has_taught"])
+        state.totals = RenderTotals(**json.loads(str(arrays.get("totals", "{}"))))
         if state.done:
             prefix = "images."
             parts = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
