@@ -61,8 +61,8 @@ class Moving(mi.Mesh):
     :monosp:`shutter_close`, which must be set: they are both 0 by default, and such a sensor sees
     the shapes where they are at time 0. Before the motion and after it, the shapes rest at its two
     ends.
-    **Not when** light sources move or shapes deform: that is not supported. For a camera that moves,
-    use :monosp:`moving_camera`.
+    **Not when** light sources move or shapes deform: that is not supported. For a camera that
+    moves, use :monosp:`moving_camera`.
 
     Only integrators of this package see these shapes. **Mitsuba's own**, such as :monosp:`path` or
     :monosp:`aov`, **render the scene without them, and there is no way to stop them**; use
@@ -163,7 +163,9 @@ class Moving(mi.Mesh):
                 "itself, at rest"
             )
         if child.is_sensor():
-            raise self._error("sensors of shapes cannot move: put this shape into the scene itself, at rest")
+            raise self._error(
+                "sensors of shapes cannot move: put this shape into the scene itself, at rest"
+            )
         if child.is_mesh():
             reserved = ("vertex_positions", "vertex_normals", "vertex_texcoords")
             attributes = [key for key in mi.traverse(child).keys() if key.startswith("vertex_")]

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hard_cases import diffuse, film, lookat, rectangle
+from hard_cases import diffuse, film, rectangle
 from motions import LENS, Pose, at, camera, keyed, pair, room, sky, uniform
 from scipy.spatial.transform import Rotation
 from statistical import (
