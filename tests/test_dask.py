@@ -14,19 +14,10 @@ import numpy as np
 import pytest
 from conftest import in_subprocess
 
-from mitsuba_ext.cli import long_job
 from mitsuba_ext.compare import InputError, read_exr
-from mitsuba_ext.long_renders import batch_renderer, dask_cluster
-from mitsuba_ext.long_renders.batch_renderer import RenderRequest, render_batch
-from mitsuba_ext.long_renders.state import Batch
+from mitsuba_ext.long_renders import dask_cluster
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-@pytest.fixture(autouse=True)
-def no_scene_is_kept():
-    yield
-    batch_renderer._renderer.cache_clear()
 
 
 def test_without_dask_one_sentence_says_what_to_install(run, make_scene, tmp_path, monkeypatch):
@@ -40,33 +31,6 @@ def test_who_renders_is_said_once(run, make_scene, tmp_path):
     code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr",
                        "--dask", "tcp://127.0.0.1:1", "--workers", 2)  # fmt: skip
     assert code == 2 and "--workers and --dask exclude each other" in err
-
-
-def test_an_integrator_that_learns_needs_a_folder_that_workers_see(run, scenes, tmp_path):
-    code, _, err = run("render", scenes / "cornell_box.xml", "-o", tmp_path / "a.exr",
-                       "--integrator", "composed_path:next_event=contribution",
-                       "--size", "8x6", "--dask", "tcp://127.0.0.1:1")  # fmt: skip
-    assert code == 2 and "it needs --checkpoint" in err
-
-
-def test_a_worker_with_other_files_refuses(make_scene):
-    """A description as the command sends it, and a file that has changed since."""
-    options = long_job.LongOptions(dask="tcp://127.0.0.1:1")
-    scene = str(make_scene())
-    job = long_job.LongJob(RenderRequest(scene), options)
-    render_batch(job._request, Batch(0, 0, 1))
-    batch_renderer._renderer.cache_clear()
-    make_scene(body="")
-    with pytest.raises(InputError, match='would render another image: "scene files" differs'):
-        render_batch(job._request, Batch(0, 0, 1))
-
-
-def test_files_are_named_so_that_workers_find_them(make_scene, tmp_path, monkeypatch):
-    make_scene()
-    monkeypatch.chdir(tmp_path)
-    found = long_job._absolute(RenderRequest("scene.xml", specification="path", plugins=("mine",)))
-    assert found == RenderRequest(
-        str(tmp_path / "scene.xml"), specification="path", plugins=("mine",))
 
 
 # ---- A cluster ----
