@@ -15,6 +15,7 @@ from noisy import Clock
 
 import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before drjit and mitsuba)
 from mitsuba_ext import cli
+from mitsuba_ext.cli import image_render
 from mitsuba_ext.compare import timing
 
 import drjit as dr  # isort: skip
@@ -150,7 +151,7 @@ def in_subprocess(*arguments, **options) -> subprocess.CompletedProcess:
 @pytest.fixture(autouse=True)
 def kernels_are_cached(monkeypatch):
     """Makes ``render`` print nothing about compiled kernels, which depend on earlier tests."""
-    monkeypatch.setattr(sys.modules["mitsuba_ext.cli.render"], "kernels_compiled", lambda: 0)
+    monkeypatch.setattr(image_render, "kernels_compiled", lambda: 0)
 
 
 @pytest.fixture

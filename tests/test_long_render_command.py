@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
@@ -38,6 +39,9 @@ def test_more_samples_later_and_merged(run, make_scene, tmp_path):
     images = {name: read_exr(tmp_path / f"{name}.exr")[0] for name in ("1", "2", "both")}
     mean = (images["1"]["R"] + images["2"]["R"]) / 2
     np.testing.assert_allclose(images["both"]["R"], mean, rtol=1e-5)
+    metadata = read_exr(tmp_path / "both.exr")[1]
+    assert json.loads(metadata["seeds"]) == [1, 2]
+    assert json.loads(metadata["statistics"])["rays"] == {"camera": 48 * 96}
     state = CheckpointFolder(tmp_path / "both").load()
     np.testing.assert_allclose(images["both"]["variance.R"], state.images.variance[..., 0])
     reference = load_reference(tmp_path / "both.exr")

@@ -21,6 +21,7 @@ from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
 from ..long_renders.workers import Workers
 from ..rendering.interrupts import deferred_interrupt
+from ..rendering.totals import RenderTotals
 from .common import Interval
 from .reports import Report, Speed, time_left
 
@@ -227,7 +228,17 @@ class LongJob:
 
     def about(self) -> Mapping[str, Any]:
         """What the metadata of the image say besides."""
-        return {"batches": len(self._state.done)}
+        return {"batches": len(self._state.done), "seeds": self.seeds}
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds of the samples in the image."""
+        return sorted({batch.seed for batch in self._state.done})
+
+    @property
+    def totals(self) -> RenderTotals:
+        """The cost of these samples, whoever rendered them."""
+        return self._state.totals
 
 
 class _Last:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from ..rendering.batches import batch_seeds, each_batch, sample_count
 from ..rendering.camera import film_extent
 from ..rendering.film_sums import FilmSums
 from ..rendering.seed_passes import can_render, is_independent, pass_length
+from ..rendering.totals import RenderTotals, forget_memory_peak
 from ..scenes import one_line
 from .bundle import Bundle
 from .state import Batch, BatchResult
@@ -165,16 +167,19 @@ class BatchRenderer:
         loaded, named, film = self.chosen.loaded, self.chosen.named, self.sensor.film()
         integrator = named.integrator
         seed = batch_seeds(batch.seed, 1, batch.index)[0]
+        forget_memory_peak()
+        begin = time.perf_counter()
         try:
             batches = each_batch(integrator, loaded.scene, self.sensor, batch.spp, [seed])
             images = next(batches)
         except (ValueError, TypeError, RuntimeError) as error:
             message = f'{loaded.source}: "{named.name}": {one_line(error)}'
             raise InputError(message) from error
+        totals = RenderTotals.of(integrator, film, images.spp, time.perf_counter() - begin)
         sums = FilmSums()
         sums.add(film, images.spp)
         return BatchResult(
             batch._replace(spp=images.spp), sums.contents.astype(np.float32), sums.has_weights,
             images.mean.astype(np.float32), images.channels, images.image_channel_count,
-            tuple(integrator.aov_names()),
+            tuple(integrator.aov_names()), totals,
         )  # fmt: skip

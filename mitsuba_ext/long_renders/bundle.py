@@ -58,8 +58,9 @@ class Bundle:
             raise InputError(f"{loaded.source}: cannot be sent to the workers: {error}") from None
         if not is_same:
             raise InputError(f"{loaded.source}: its files have changed since the render began")
-        # What the resolver does not find is opened in the current folder
-        folders = tuple(os.path.abspath(str(f)) for f in [*mi.file_resolver(), os.curdir])
+        # The scene may be a link; what the resolver does not find is opened in the current folder
+        searched = [loaded.path.resolve().parent, *mi.file_resolver(), os.curdir]
+        folders = tuple(os.path.abspath(str(folder)) for folder in searched)
         return cls(files, folders, _digest(files, folders))
 
     @contextlib.contextmanager

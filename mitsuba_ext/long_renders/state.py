@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 from ..errors import InputError
 from ..rendering.batches import Batches
 from ..rendering.film_sums import FilmSums
+from ..rendering.totals import RenderTotals
 
 
 class Batch(NamedTuple):
@@ -38,6 +40,7 @@ class BatchResult(NamedTuple):
         aov_names: Channels besides those of the image.
         learned: What the integrator has learned, for the other batches; empty if there was nothing
             to learn, ``None`` if it did not try.
+        totals: What it cost.
     """
 
     batch: Batch
@@ -47,6 +50,7 @@ class BatchResult(NamedTuple):
     channels: tuple[str, ...]
     image_channel_count: int
     aov_names: tuple[str, ...]
+    totals: RenderTotals
     learned: bytes | None = None
 
 
@@ -59,11 +63,13 @@ class RenderState:
         images: Mean and variance of their images; ``None`` before the first.
         aov_names: Channels besides those of the image.
         learned: What one of them has learned for the others: see :class:`BatchResult`.
+        totals: What they cost.
     """
 
     def __init__(self) -> None:
         self.done: list[Batch] = []
         self.learned: bytes | None = None
+        self.totals = RenderTotals()
         self.film, self.images = FilmSums(), None
         self.aov_names: tuple[str, ...] = ()
 
@@ -83,6 +89,7 @@ class RenderState:
         self.done.append(result.batch)
         if result.learned is not None:
             self.learned = result.learned
+        self.totals = self.totals.plus(result.totals)
 
     def plus(self, other: RenderState) -> RenderState:
         """The batches of both.
@@ -102,6 +109,7 @@ class RenderState:
         total.done = [*self.done, *other.done]
         total.film, total.images = self.film.plus(other.film), self.images.plus(other.images)
         total.aov_names = self.aov_names
+        total.totals = self.totals.plus(other.totals)
         return total
 
     def fill(self, film: mi.Film) -> None:
@@ -123,6 +131,7 @@ class RenderState:
             "contents": np.asarray(self.film.contents),
             "has_weights": np.array(self.film.has_weights),
             "spp": np.array(self.film.spp),
+            "totals": np.array(json.dumps(self.totals.known())),
             "aov_names": np.array(self.aov_names, dtype=str),
         }
 
@@ -139,6 +148,7 @@ class RenderState:
         state.aov_names = tuple(arrays["aov_names"].tolist())
         if "learned" in arrays:
             state.learned = arrays["learned"].tobytes()
+        state.totals = RenderTotals(**json.loads(str(arrays.get("totals", "{}"))))
         if state.done:
             prefix = "images."
             parts = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
