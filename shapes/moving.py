@@ -7,6 +7,7 @@ import numpy as np
 
 from mitsuba_ext import registry
 from mitsuba_ext.bounds import shape_bounds
+from mitsuba_ext.luminaires.moving_emitter import MovingEmitter
 from mitsuba_ext.motion import Motion
 from mitsuba_ext.motion_parameters import read_motion
 
@@ -104,14 +105,20 @@ class Moving(mi.Mesh):
             'what': {'type': 'cube'}
     """
 
+    #: The name of the module is the class of the variant that was selected last
+    _emitter = MovingEmitter
+
     def __init__(self, props: mi.Properties) -> None:
         self.name = props.plugin_name()
         self.children = self._nested(props)
         self.motion = read_motion(self.name, props)
+        self.light = self._light()
         self._at_rest = None
         # The base class gets no parameters: those that it accepts have no meaning here
         own = mi.Properties(self.name)
         own.set_id(props.id())
+        if self.light is not None:
+            own["emitter"] = self._emitter(self.name, self.light, self.motion)
         super().__init__(self.name, vertex_count=3, face_count=2, props=own)
         self._span(*self.motion.bounds(self._corners()))
 
@@ -156,12 +163,16 @@ class Moving(mi.Mesh):
             raise self._error("nothing is nested in it that could move; put a shape into it")
         return children
 
-    def _refuse_what_cannot_move(self, child: mi.Shape) -> None:
-        if child.is_emitter():
+    def _light(self) -> mi.Emitter | None:
+        lights = [child.emitter() for child in self.children if child.is_emitter()]
+        if len(lights) > 1:
             raise self._error(
-                "emitters cannot move: leave the emitter out, or put this shape into the scene "
-                "itself, at rest"
+                f"{len(lights)} of the nested shapes are lights: nest each into a moving shape of "
+                f"its own, with the same motion"
             )
+        return lights[0] if lights else None
+
+    def _refuse_what_cannot_move(self, child: mi.Shape) -> None:
         if child.is_sensor():
             raise self._error(
                 "sensors of shapes cannot move: put this shape into the scene itself, at rest"

@@ -247,7 +247,11 @@ def _row(
     not_flat = [0.0, 0.0, 0.0, np.inf]
     least_radius = _ROUNDING * extent
     if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
-        return [*p, 1.0], not_flat, [least_radius, 1 / (4 * np.pi)]
+        # A light that moves may be anywhere in its box
+        box = emitter.bbox()
+        radius = 0.5 * float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
+        center = p if radius == 0 else np.array(box.center(), dtype=np.float64)
+        return [*center, 1.0], not_flat, [radius + least_radius, 1 / (4 * np.pi)]
     is_delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)
     if shape is None or is_delta:
         if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
