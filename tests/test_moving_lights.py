@@ -45,7 +45,7 @@ def keys() -> tuple[Scene, Pose]:
 def _area(shape: str, pose: np.ndarray) -> Scene:
     """A light on a shape, at the pose."""
     T = mi.ScalarTransform4f
-    place = T().translate([-0.3, 0.1, 1.5]).rotate([1, 0.3, 0], 150).scale(0.25)
+    place = T().translate([-0.3, 0.1, 1.5]).rotate([0.8, 0.6, 0], 150).scale(0.25)
     light: Scene = {"type": shape, "to_world": at(pose, place), "bsdf": diffuse(0.2),
                     "emitter": area(4.0)}  # fmt: skip
     if shape == "disk":
@@ -100,10 +100,14 @@ def _room(shutter: tuple[float, float], light: Scene, **things: Any) -> mi.Scene
 # ---- At one time ----
 
 
+#: For these, equal numbers do not choose equal points in turned frames.
+BY_SOLID_ANGLE = ("sphere", "solid_angle")
+
+
 @pytest.mark.parametrize("light", [
-    "sphere", "spot",
+    "rectangle", "spot",
     *(pytest.param(name, marks=pytest.mark.slow) for name in (*AREAS, *POINTS)
-      if name not in ("sphere", "spot")),
+      if name not in ("rectangle", "spot", *BY_SOLID_ANGLE)),
 ])  # fmt: skip
 def test_closed_shutter_shows_the_light_of_its_time(light: str) -> None:
     """With the numbers of ``path``."""
@@ -123,9 +127,13 @@ def test_closed_shutter_in_variant(variant: str) -> None:
     test_closed_shutter_shows_the_light_of_its_time("cube")
 
 
-@pytest.mark.parametrize("light", AREAS)
+@pytest.mark.parametrize("light", [
+    "sphere", "disk",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in AREAS
+      if name not in ("sphere", "disk")),
+])  # fmt: skip
 def test_densities_are_those_of_the_light_at_the_pose(light: str) -> None:
-    """Of connections, of rays that run into the light, and of both at the same point."""
+    """Of connections, and of rays that run into the light there."""
     parameters, pose = keys()
     moving = mi.load_dict({"type": "scene", "lamp": _moving(light, parameters)})
     emitter = moving.emitters()[0]
@@ -137,30 +145,28 @@ def test_densities_are_those_of_the_light_at_the_pose(light: str) -> None:
     for time in (0.1, 0.55):
         it.time = mi.Float(time)
         resting = mi.load_dict({"type": "scene", "lamp": _resting(light, pose(time))})
+        still = resting.emitters()[0]
         ds, weight = emitter.sample_direction(it, sample)
-        wanted, theirs = resting.emitters()[0].sample_direction(it, sample)
-        seen = np.array(wanted.pdf > 0) & (np.array(theirs).sum(axis=0) > 0)
+        seen = np.array(ds.pdf > 0) & (np.array(weight).sum(axis=0) > 0)
         assert seen.mean() > 0.1
-        for field in ("p", "d", "n", "uv", "pdf", "dist"):
-            a, b = (np.array(getattr(x, field))[..., seen] for x in (ds, wanted))
-            np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4, err_msg=field)
-        np.testing.assert_allclose(
-            np.array(weight)[:, seen], np.array(theirs)[:, seen], rtol=5e-3
-        )
-        # A ray in this direction finds the light, as another emitter that is the same light
-        ray = mi.Ray3f(it.p, ds.d, mi.Float(time), [])
+        of_still = dr.copy(ds)
+        of_still.emitter = mi.EmitterPtr(still)
+        # The light at rest, asked about the same direction, and a ray that finds it
+        pdf = np.array(ds.pdf)[seen]
+        wanted = np.array(still.pdf_direction(it, of_still))[seen]
+        np.testing.assert_allclose(pdf, wanted, rtol=1e-2)
+        radiance = np.array(still.eval_direction(it, of_still))[:, seen]
+        np.testing.assert_allclose(np.array(weight)[:, seen] * pdf, radiance, rtol=2e-2)
+        ray = mi.Ray3f(it.p, ds.d)
+        ray.time = it.time
         si = query.interaction(query.closest(moving, ray, False, mi.Bool(True)), ray)
         hit = mi.DirectionSample3f(moving, si, it)
         hit.emitter = query.emitter(si, hit.emitter)
-        pdf = np.array(moving.pdf_emitter_direction(it, hit))
-        close = np.abs(np.array(si.t) - np.array(ds.dist)) < 1e-3
-        found = seen & close & np.array(hit.emitter == mi.EmitterPtr(emitter))
-        assert found.sum() > 0.99 * (seen & close).sum() > 0.05 * len(seen)
-        same = np.isclose(pdf[found], np.array(ds.pdf)[found], rtol=2e-2)
-        assert same.mean() > 0.97
-        radiance = np.array(hit.emitter.eval(si))[:, found]
-        expected = (np.array(weight) * np.array(ds.pdf))[:, found]
-        assert np.isclose(radiance, expected, rtol=5e-2).mean() > 0.95
+        seen &= np.abs(np.array(si.t) - np.array(ds.dist)) < 1e-3
+        assert seen.mean() > 0.1
+        assert np.array(hit.emitter == mi.EmitterPtr(emitter))[seen].all()
+        by_hit = np.array(moving.pdf_emitter_direction(it, hit))[seen]
+        assert np.isclose(by_hit, np.array(ds.pdf)[seen], rtol=2e-2).mean() > 0.99
 
 
 # ---- On average ----
@@ -180,18 +186,18 @@ def reference(light: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("light", "name"),
     [
-        ("rectangle", "composed_path"),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
             for case in (
+                ("rectangle", "composed_path"),
                 *(("rectangle", name) for name in (
-                    "neepp", "power", "spatial", "linear", "learned", "resampled", "pss_guided",
-                    "many_connections", "two_stage",
-                ) if name in TECHNIQUES),
+                    "neepp", "power", "spatial", "linear", "resampled", "pss_guided",
+                    "many_connections", "auto_path", "mis_bsdf",
+                )),
                 ("sphere", "composed_path"),
                 *(("point", name) for name in (
-                    "composed_path", "power", "spatial", "linear", "learned", "resampled",
-                ) if name in TECHNIQUES),
+                    "composed_path", "neepp", "power", "spatial", "linear", "resampled",
+                )),
                 ("point", "path"),
             )
         ),
@@ -204,7 +210,7 @@ def test_image_is_the_average_of_images_at_rest(light: str, name: str) -> None:
     assert_same_pixels_on_average(images, reference(light), precision=0.004, tile=4)
 
 
-@pytest.mark.parametrize("depth", [1, 2, 4])
+@pytest.mark.parametrize("depth", [1, 3])
 def test_furnace_that_moves_around_the_camera(depth: int) -> None:
     """All walls of a closed cube emit 1 and reflect a half, wherever they are."""
     walls = {"type": "cube", "flip_normals": True, "bsdf": diffuse(0.5), "emitter": area(1.0)}
