@@ -242,6 +242,13 @@ XML = """<scene version="3.0.0">
 </scene>"""
 
 
+@pytest.mark.parametrize("light", POINTS)
+def test_bounds_are_those_of_the_motion(light: str) -> None:
+    box = mi.load_dict(_moving(light, {"translate": [1, 0, -1]})).bbox()
+    expected = [-0.6, -0.8, 0.7, 0.4, -0.8, 1.7]
+    np.testing.assert_allclose([*box.min, *box.max], expected, atol=1e-5)
+
+
 def test_lights_of_a_file(tmp_path) -> None:
     file = tmp_path / "scene.xml"
     file.write_text(XML)

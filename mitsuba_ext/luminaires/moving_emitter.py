@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsuba_ext.motion import Motion, Pose, PoseTable
 
@@ -76,7 +77,11 @@ class MovingEmitter(mi.Emitter):
         return self.nested.sample_wavelengths(si, sample, active)
 
     def bbox(self):
-        return self.motion.box(self.nested.bbox())
+        box = self.nested.bbox()
+        if not box.valid():  # Mitsuba's projector knows none
+            origin = np.array(self.nested.world_transform().matrix).reshape(4, 4)[:3, 3]
+            box = mi.ScalarBoundingBox3f(mi.ScalarPoint3f(origin), mi.ScalarPoint3f(origin))
+        return self.motion.box(box)
 
     def traverse(self, callback):
         self.nested.traverse(callback)
