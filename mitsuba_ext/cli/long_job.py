@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ..chosen import LastScene
 from ..errors import InputError
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
 from ..long_renders.dask_cluster import dask_cluster
@@ -60,8 +61,14 @@ class LongJob:
         seconds: Wall clock of the render.
     """
 
-    def __init__(self, request: RenderRequest, options: LongOptions) -> None:
+    def __init__(
+        self, request: RenderRequest, options: LongOptions, scenes: LastScene | None = None
+    ) -> None:
         """
+        Args:
+            request, options: What to render, and how long.
+            scenes: Keeps the scene for the next image.
+
         Raises:
             InputError: The scene, the integrator or the sensor cannot be used, or what is learned
                 cannot be sent to the workers.
@@ -77,7 +84,7 @@ class LongJob:
         self._request = replace(
             request, learned=str(learned.absolute()), threads=request.threads or threads
         )
-        self._renderer = BatchRenderer(self._request)
+        self._renderer = BatchRenderer(self._request, scenes)
         named = self._renderer.chosen.named
         self.integrator, self.name, self.parameters = (
             named.integrator, named.name, named.parameters

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..chosen import Chosen
+from ..chosen import LastScene
 from ..compare.machine import versions
 from ..errors import InputError
 from ..rendering.batches import batch_seeds, each_batch, sample_count
@@ -54,6 +54,8 @@ class RenderRequest:
         learned: A file of what the integrator has learned; empty for none. It need not be there
             yet: the first batch makes it.
         threads: Of a process; 0 for as many as there are cores.
+        values: Of the loaded scene, as :func:`~mitsuba_ext.scene_values.as_text` makes them;
+            ``None`` if no frame has any.
         description: What the image depends on, as JSON: a process that finds other files or
             another version of this package refuses. Empty for what each process finds.
     """
@@ -68,6 +70,7 @@ class RenderRequest:
     plugins: tuple[str, ...] = ()
     learned: str = ""
     threads: int = 0
+    values: str | None = None
     description: str = ""
 
 
@@ -76,6 +79,7 @@ class BatchRenderer:
 
     Parameters:
         request: What to render; its variant is the active one.
+        scenes: Keeps the scene.
 
     Attributes:
         chosen: The scene, the integrator and the sensor.
@@ -85,15 +89,15 @@ class BatchRenderer:
         InputError: The scene, the integrator or the sensor cannot be used.
     """
 
-    def __init__(self, request: RenderRequest) -> None:
+    def __init__(self, request: RenderRequest, scenes: LastScene | None = None) -> None:
         if not dr.is_jit_v(mi.Float):
             raise InputError(
                 f'batches need a variant such as "llvm_ad_rgb", and not "{mi.variant()}"'
             )
         self._request = request
-        self.chosen = Chosen.load(
+        self.chosen = (scenes or LastScene()).choose(
             Path(request.scene), request.size, dict(request.definitions), request.specification,
-            request.sensor,
+            request.sensor, request.values,
         )  # fmt: skip
         self.sensor = self.chosen.sensor
         integrator = self.chosen.named.integrator
@@ -117,6 +121,7 @@ class BatchRenderer:
         return {
             "scene": loaded.source,
             "scene files hash": loaded.content_hash,
+            **({"values of the scene": request.values} if request.values else {}),
             "size": "x".join(map(str, film.crop_size())),
             "integrator": named.name,
             "parameters": named.parameters,
