@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,10 +67,6 @@ class Chosen:
         return remarks
 
 
-#: Attributes of an integrator that long renders change.
-_FILES = ("load_learned", "save_learned")
-
-
 class LastScene:
     """Keeps the scene that was loaded last, for images that need the same one."""
 
@@ -78,11 +74,11 @@ class LastScene:
         self._key: tuple | None = None
         self._loaded: LoadedScene | None = None
         self._values: SceneValues | None = None
-        self._files: dict[str, str] = {}
 
     def choose(
         self, path: Path, size: tuple[int, int] | None, definitions: Mapping[str, str],
         specification: str | None, sensor_index: int, values: str | None = None,
+        moved: Callable[[str], str] | None = None,
     ) -> Chosen:  # fmt: skip
         """The scene of a file, with what renders it.
 
@@ -93,6 +89,7 @@ class LastScene:
             specification: The integrator; ``None`` for the scene's.
             values: Of the loaded scene, as :func:`~mitsuba_ext.scene_values.as_text` makes them;
                 ``None`` if no image will have any.
+            moved: See :func:`~mitsuba_ext.scenes.load_scene`.
 
         Raises:
             InputError: The scene, the integrator or the sensor cannot be used.
@@ -102,15 +99,9 @@ class LastScene:
         if key != self._key:
             # First: Dr.Jit compiles the methods of all living objects
             self._key = self._loaded = self._values = None
-            self._loaded = load_scene(
-                path, size, definitions, keep_integrator=is_own, keep_names=has_values
-            )
+            self._loaded = load_scene(path, size, definitions, is_own, has_values, moved)
             self._values = SceneValues(self._loaded.scene) if has_values else None
-            own = self._loaded.scene.integrator()
-            self._files = {name: getattr(own, name) for name in _FILES if hasattr(own, name)}
             self._key = key
-        for name, file in self._files.items():
-            setattr(self._loaded.scene.integrator(), name, file)
         if self._values:
             self._values.set(values or "")
         return Chosen.of(self._loaded, specification, sensor_index)

@@ -119,13 +119,13 @@ def test_variants_without_batches_are_named(run, make_scene, tmp_path):
 def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkeypatch):
     render, seen = BatchRenderer.render, []
 
-    def signalled(self, batch):
+    def signalled(self, batch, learned):
         if batch.index == 1:
             os.kill(os.getpid(), signal.SIGUSR1)
         if batch.index == 2:
             seen.append((CheckpointFolder(tmp_path / "kept").load().spp,
                          read_exr(tmp_path / "a.exr")[1]["spp"]))  # fmt: skip
-        return render(self, batch)
+        return render(self, batch, learned)
 
     monkeypatch.setattr(BatchRenderer, "render", signalled)
     code, out, _ = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
@@ -137,10 +137,10 @@ def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkey
 def test_ctrl_c_keeps_the_render_and_ends(run, make_scene, tmp_path, monkeypatch, integrator):
     render = BatchRenderer.render
 
-    def signalled(self, batch):
+    def signalled(self, batch, learned):
         if batch.index == 2:
             os.kill(os.getpid(), signal.SIGTERM)
-        return render(self, batch)
+        return render(self, batch, learned)
 
     monkeypatch.setattr(BatchRenderer, "render", signalled)
     command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", integrator,
