@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,6 +100,7 @@ class LastScene:
         if key != self._key:
             # First: Dr.Jit compiles the methods of all living objects
             self._key = self._loaded = self._values = None
+            gc.collect()  # what mi.traverse returns refers to itself
             self._loaded = load_scene(path, size, definitions, is_own, has_values, moved)
             self._values = SceneValues(self._loaded.scene) if has_values else None
             self._key = key

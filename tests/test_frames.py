@@ -96,11 +96,11 @@ def test_frames_are_kept_each_in_a_folder(
                "-D", "x={frame}", "--sensor", "0", "--checkpoint", tmp_path / "kept")  # fmt: skip
     render, seen = BatchRenderer.render, []
 
-    def signalled(self, batch):
+    def signalled(self, batch, *rest):
         seen.append((self.chosen.loaded.parameters["x"], batch.index))
         if seen[-1] == ("4", 1):
             os.kill(os.getpid(), signal.SIGTERM)
-        return render(self, batch)
+        return render(self, batch, *rest)
 
     monkeypatch.setattr(BatchRenderer, "render", signalled)
     assert run(*command, "--spp", 64)[0] == 143
@@ -132,6 +132,10 @@ def move(frame):
         found["ball.bsdf.reflectance.value"] = [0.1, 0.2, 0.3]
     return found
 
+def kernels(frame):
+    return {"x": frame // 6, "ball.to_world": mi.ScalarTransform4f().translate([frame, 0, 5]),
+            "ball.bsdf.reflectance.value": 0.1 * frame}
+
 def wrong(frame):
     return WRONG
 """
@@ -142,16 +146,12 @@ def test_a_function_moves_things_without_another_load(run, make_scene, tmp_path,
     body = BODY.replace("<shape", '<shape id="ball"').replace(
         "/></shape>", '><rgb name="reflectance" value="0.5, 0.5, 0.5"/></bsdf></shape>')
     scene = make_scene(body=body)
-    for name, step in (("other", "0.3"), ("animate", "0.5")):
-        (tmp_path / f"{name}.py").write_text(FUNCTION.replace("0.5", step))
-        before = kernels_compiled()
-        with mock.patch("mitsuba_ext.chosen.load_scene", wraps=chosen.load_scene) as load:
-            code, _, err = run("render", scene, "-o", tmp_path / f"{name[0]}.#.exr", "--spp", 64,
-                               "--parameters", f"{tmp_path / name}.py:move", *options,
-                               "--frames", "0:3")  # fmt: skip
-        assert code == 0 and not err and load.call_count == 1
-    # Other values need no other kernels
-    assert kernels_compiled() == before
+    (tmp_path / "animate.py").write_text(FUNCTION)
+    with mock.patch("mitsuba_ext.chosen.load_scene", wraps=chosen.load_scene) as load:
+        code, _, err = run("render", scene, "-o", tmp_path / "a.#.exr", "--spp", 64, *options,
+                           "--parameters", f"{tmp_path / 'animate.py'}:move",
+                           "--frames", "0:3")  # fmt: skip
+    assert code == 0 and not err and load.call_count == 1
     for frame in range(4):
         image, metadata = read_exr(tmp_path / f"a.{frame}.exr")
         assert "ball.to_world" in metadata["scene_values"]
@@ -162,6 +162,22 @@ def test_a_function_moves_things_without_another_load(run, make_scene, tmp_path,
         assert run(*single)[0] == 0
         np.testing.assert_allclose(
             read_exr(tmp_path / "b.exr")[0]["G"], image["G"], rtol=1e-4, atol=1e-5)
+
+
+def test_other_values_need_no_other_kernels(run, make_scene, tmp_path, monkeypatch):
+    (tmp_path / "animate.py").write_text(FUNCTION)
+    counts, choose = [], chosen.LastScene.choose
+
+    def counted(self, *arguments):
+        counts.append(kernels_compiled())
+        return choose(self, *arguments)
+
+    monkeypatch.setattr(chosen.LastScene, "choose", counted)
+    # The scene is loaded again for the last one, where another $x is given
+    scene = make_scene(body=BODY.replace("<shape", '<shape id="ball"'))
+    assert run("render", scene, "-o", tmp_path / "a.#.exr", "--frames", "0:6", "--spp", 64,
+               "--parameters", f"{tmp_path / 'animate.py'}:kernels")[0] == 0  # fmt: skip
+    assert len(counts) == 7 and counts[1:] == [counts[1]] * 6, counts
 
 
 @pytest.mark.parametrize(("value", "words"), [
