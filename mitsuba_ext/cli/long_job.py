@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ..chosen import LastScene
 from ..errors import InputError
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
 from ..long_renders.dask_cluster import dask_cluster
@@ -58,8 +59,14 @@ class LongJob:
         seconds: Wall clock of the render.
     """
 
-    def __init__(self, request: RenderRequest, options: LongOptions) -> None:
+    def __init__(
+        self, request: RenderRequest, options: LongOptions, scenes: LastScene | None = None
+    ) -> None:
         """
+        Args:
+            request, options: What to render, and how long.
+            scenes: Keeps the scene for the next image.
+
         Raises:
             InputError: The scene, the integrator or the sensor cannot be used.
         """
@@ -68,7 +75,7 @@ class LongJob:
         # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR file
         threads = max(2, (os.cpu_count() or 1) // options.workers) if options.workers else 0
         self._request = replace(request, threads=request.threads or threads)
-        self._renderer = BatchRenderer(self._request)
+        self._renderer = BatchRenderer(self._request, scenes=scenes)
         named = self._renderer.chosen.named
         self.integrator, self.name, self.parameters = (
             named.integrator, named.name, named.parameters

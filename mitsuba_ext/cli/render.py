@@ -56,8 +56,15 @@ from .frames import FrameRange, Sensors, pictures
     "n.",
 )
 @click.option(
+    "--parameters", metavar="FILE.py:FUNCTION",
+    help="With --frames: a Python function of the frame's number that returns a dict of the "
+    "frame's parameters. Keys with a dot are those of mi.traverse, which are set without loading "
+    "the scene again; others are $KEY parameters of the scene file.",
+)
+@click.option(
     "--checkpoint", type=FilledPath(), metavar="DIR",
-    help="A folder that keeps the render. The same command goes on from there.",
+    help="A folder that keeps the render. The same command goes on from there. Of several frames "
+    "or sensors, each has a folder in it.",
 )
 @click.option(
     "--every", type=Every(), default="60s", metavar="TIME", show_default=True,
@@ -106,6 +113,7 @@ def render(
     seed: int,
     sensors: tuple[int, ...] | None,
     frames: range | None,
+    parameters: str | None,
     checkpoint: Path | None,
     every: Interval,
     add: int | None,
@@ -140,7 +148,8 @@ def render(
     from ..scenes import check_scene_file
 
     check_scene_file(scene)
-    from .image_render import Order, render_image
+    from ..chosen import LastScene
+    from .image_render import Order, is_finished, render_image
     from .long_job import LongOptions
     from .reports import Report
 
@@ -155,33 +164,45 @@ def render(
         raise click.UsageError("--workers and --dask exclude each other")
     is_long = checkpoint or until or workers or dask
     order = Order(
-        scene, specification, spp, seconds, size, variant, denoise, threads,
+        scene, specification, spp, seconds, size, variant, tuple(plugins), denoise, threads,
         LongOptions(checkpoint, every, add, until, workers or 0, dask or "") if is_long else None,
         is_one_of_many=frames is not None or (sensors is not None and len(sensors) != 1),
     )  # fmt: skip
-    if order.is_one_of_many and checkpoint:
-        raise click.UsageError("--checkpoint keeps one image: it excludes --frames and sensors")
+    if order.is_one_of_many and add is not None:
+        raise click.UsageError("--add is for one image: give --spp, the number that all shall have")
+    if parameters is not None and frames is None:
+        raise click.UsageError("--parameters needs --frames")
+    function = None
+    if parameters is not None:
+        from .frame_parameters import load_function
+
+        select_variant(variant, plugins)  # the function may use types of Mitsuba
+        plugins = ()  # they are registered
+        function = load_function(parameters)
     if sensors == ():
-        sensors = _all_sensors(scene, definitions, variant, plugins, frames)
-    result = 0
-    chosen = list(pictures(output, definitions, sensors or [None], seed, frames))
-    for picture in chosen:
-        if order.is_one_of_many and picture.output.exists():
+        sensors = _all_sensors(scene, definitions, variant, plugins, frames, function)
+        plugins = ()
+    result, scenes = 0, LastScene()
+    for picture in list(pictures(output, definitions, sensors or [None], seed, frames)):
+        if order.is_one_of_many and is_finished(order, picture):
             report.note(f"{picture.output}: exists already")
             continue
-        code = render_image(order, picture, plugins, report)
-        plugins = ()  # they are registered
+        code = render_image(order, picture, plugins, report, scenes, function)
+        plugins = ()
         if code > 1:
             return code
         result = max(result, code)
     return result
 
 
-def _all_sensors(scene, definitions, variant, plugins, frames) -> list[int]:
+def _all_sensors(scene, definitions, variant, plugins, frames, function) -> list[int]:
     """The numbers of a scene's sensors, in the first of the frames."""
     from ..scenes import load_scene
 
     select_variant(variant, plugins)
     (picture,) = pictures(Path("#"), definitions, [None], 0, frames and frames[:1])
-    loaded = load_scene(scene, parameters=dict(picture.definitions), keep_integrator=False)
+    values = dict(picture.definitions)
+    if function:
+        values |= function(picture.frame).definitions
+    loaded = load_scene(scene, parameters=values, keep_integrator=False)
     return list(range(len(loaded.scene.sensors())))
