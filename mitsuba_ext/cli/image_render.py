@@ -39,6 +39,7 @@ class Order(NamedTuple):
     threads: int | None
     long: LongOptions | None
     is_one_of_many: bool
+    preview: Path | None
 
 
 def is_finished(order: Order, picture: Picture) -> bool:
@@ -79,7 +80,8 @@ def render_image(
         values = changed.values
     if long and long.folder and picture.name:
         long = replace(long, folder=long.folder / picture.name)
-    images.check_target(output)
+    for file in filter(None, (output, order.preview)):
+        images.check_target(file)
     if order.denoise:
         denoising.denoiser()
     guides = {}
@@ -102,6 +104,13 @@ def render_image(
 
     def write(target: Path, others: Mapping[str, np.ndarray] | None = None) -> None:
         images.write_film(target, job.film, metadata(), {**job.variance(), **(others or {})})
+
+    def show(is_asked: bool) -> None:
+        if is_asked or (long and long.folder):
+            # A frame that is there counts as finished
+            write(picture.unfinished if order.is_one_of_many else output)
+        if order.preview:
+            images.write_film(order.preview, job.film, metadata())
 
     with stopping() as stop:
         job = None
@@ -128,7 +137,8 @@ def render_image(
                 )  # fmt: skip
                 job = RenderJob(chosen, seed)
             is_new = kernels_compiled() > compiled
-            images.check_film(output, job.film, job.integrator.aov_names())
+            for file in filter(None, (output, order.preview)):
+                images.check_film(file, job.film, job.integrator.aov_names())
             for remark in job.remarks(is_sensor_chosen=sensor_index is not None):
                 report.warn(remark)
             if order.denoise and (remark := denoising.remark(job.film)):
@@ -138,9 +148,7 @@ def render_image(
                 report.note("compiling kernels (later renders like this one find them in a cache)")
             if order.denoise:
                 guides = denoising.render_guides(job.scene, job.sensor, seed)
-            # A frame that is there counts as finished
-            growing = picture.unfinished if order.is_one_of_many else output
-            job.run(order.spp, order.seconds, lambda: write(growing), report)
+            job.run(order.spp, order.seconds, show, report)
         except (KeyboardInterrupt, OSError) as error:
             # After SIGHUP, showing progress on the closed terminal raises an OSError
             if isinstance(error, OSError) and not stop.is_asked:
@@ -159,9 +167,11 @@ def render_image(
         if order.denoise:
             noisy = target.with_name(f"{target.stem}.noisy.exr")
             write(noisy, guides)
-            denoising.denoise_file(noisy, target, metadata())
+            denoising.denoise_file(noisy, filter(None, (target, order.preview)), metadata())
         else:
             write(target)
+            if order.preview:
+                images.write_film(order.preview, job.film, metadata())
         if order.is_one_of_many and target == output:
             picture.unfinished.unlink(missing_ok=True)
         bad, pixel_count = images.count_non_finite(job.film)

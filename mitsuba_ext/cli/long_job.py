@@ -38,6 +38,7 @@ class LongOptions:
         until: The relative error at which it ends; ``None`` for none.
         workers: Processes that render; 0 for this one.
         dask: The address of a Dask scheduler whose workers render; empty for none.
+        has_preview: Is the image to be shown while it grows, also if no folder keeps it?
     """
 
     folder: Path | None = None
@@ -46,6 +47,7 @@ class LongOptions:
     until: float | None = None
     workers: int = 0
     dask: str = ""
+    has_preview: bool = False
 
 
 class LongJob:
@@ -90,7 +92,7 @@ class LongJob:
         return self._renderer.chosen.remarks(is_sensor_chosen)
 
     def run(
-        self, spp: int | None, seconds: float | None, write: Callable[[], None], report: Report
+        self, spp: int | None, seconds: float | None, write: Callable[[bool], None], report: Report
     ) -> None:
         """Goes on with what is in the folder.
 
@@ -98,7 +100,7 @@ class LongJob:
             spp: Samples per pixel of the whole image. Default: the number of the sampler, if
                 nothing else ends the render.
             seconds: Of this call.
-            write: Writes the image of the film.
+            write: Shows the image of the film. Its argument says whether a signal asked for it.
             report: Is told how far it is.
 
         Raises:
@@ -121,14 +123,17 @@ class LongJob:
         elif spp is None and options.until is None and seconds is None:
             spp = self._renderer.sensor.sampler().sample_count()
         last = _Last(state.spp)
+        is_due_at_once = options.has_preview
 
-        def keep() -> None:
+        def keep(is_asked: bool) -> None:
+            nonlocal is_due_at_once
+            is_due_at_once = False
             last.mark(state.spp)
             if self._folder:
                 self._folder.save(state)
             state.fill(self.film)
             self.seconds = time.perf_counter() - last.begin
-            write()
+            write(is_asked)
 
         speed, pixel_count = Speed(), math.prod(self.film.crop_size())
 
@@ -153,9 +158,12 @@ class LongJob:
                     samples_per_second=per_second and per_second * pixel_count,
                     seconds=time.perf_counter() - last.begin, seconds_left=left,
                 )  # fmt: skip
-                if asked() or (self._folder and last.is_due(options.every, state.spp)):
+                is_asked, is_due = asked(), is_due_at_once
+                if self._folder or options.has_preview:
+                    is_due |= last.is_due(options.every, state.spp)
+                if is_asked or is_due:
                     try:
-                        keep()
+                        keep(is_asked)
                     except OSError as problem:
                         report.warn(f"the render could not be kept: {problem}; it goes on")
 

@@ -23,7 +23,8 @@ from .frames import FrameRange, Sensors, pictures
 @click.command(short_help="Render a scene to an image.")
 @click.option(
     "-o", "--output", type=FilledPath(), required=True, metavar="FILE",
-    help="Image to write: .exr (float, with metadata), .png, .jpg, .hdr or .pfm.",
+    help="Image to write: .exr (all channels as floats, with metadata), .hdr or .pfm (RGB as "
+    "floats), .png or .jpg (8 bits: the sRGB curve, clipped at 1, no exposure or tone mapping).",
 )
 @click.option(
     "--integrator", "specification", metavar="INTEGRATOR",
@@ -68,7 +69,14 @@ from .frames import FrameRange, Sensors, pictures
 )
 @click.option(
     "--every", type=Every(), default="60s", metavar="TIME", show_default=True,
-    help="With --checkpoint: how often to keep it, and to write FILE: 60s, 10m, 2h or 100spp.",
+    help="How often --checkpoint keeps the render and writes FILE, and --preview is written: 60s, "
+    "10m, 2h or 100spp.",
+)
+@click.option(
+    "--preview", type=FilledPath(), metavar="FILE",
+    help="A second image, such as a .png, that shows the render while it grows: after the first "
+    "batch, and then each --every. Of several frames or sensors, it shows the one that is being "
+    "rendered.",
 )
 @click.option(
     "--add", type=click.IntRange(1, MOST_SPP), metavar="N",
@@ -116,6 +124,7 @@ def render(
     parameters: str | None,
     checkpoint: Path | None,
     every: Interval,
+    preview: Path | None,
     add: int | None,
     until: float | None,
     workers: int | None,
@@ -138,9 +147,9 @@ def render(
     Mitsuba's own integrators render in passes. A structured sampler stratifies the samples of a
     pass (64 per pixel or more, 16 for large images), not those of the whole render.
 
-    With --checkpoint, --until, --workers or --dask, all integrators render in batches: independent
-    renders with seeds of their own. An EXR then holds the variance of the image too. What an
-    integrator learns in the first batch, the others use. SIGUSR1 keeps the render after the
+    With --checkpoint, --until, --workers, --dask or --preview, all integrators render in batches:
+    independent renders with seeds of their own. An EXR then holds the variance of the image too.
+    What an integrator learns in the first batch, the others use. SIGUSR1 keeps the render after the
     running batch.
     """
     if specification and not plugins:
@@ -162,11 +171,16 @@ def render(
         raise click.UsageError("--add and --spp exclude each other")
     if workers is not None and dask is not None:
         raise click.UsageError("--workers and --dask exclude each other")
-    is_long = checkpoint or until or workers or dask
+    if preview is not None and preview.absolute() == output.absolute():
+        raise click.UsageError("--preview must be another file than --output")
+    is_long = checkpoint or until or workers or dask or preview
     order = Order(
         scene, specification, spp, seconds, size, variant, tuple(plugins), denoise, threads,
-        LongOptions(checkpoint, every, add, until, workers or 0, dask or "") if is_long else None,
+        LongOptions(
+            checkpoint, every, add, until, workers or 0, dask or "", preview is not None
+        ) if is_long else None,
         is_one_of_many=frames is not None or (sensors is not None and len(sensors) != 1),
+        preview=preview,
     )  # fmt: skip
     if order.is_one_of_many and add is not None:
         raise click.UsageError("--add is for one image: give --spp, the number that all shall have")
