@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..chosen import Chosen
+from ..chosen import LastScene
 from ..compare.machine import versions
 from ..errors import InputError
 from ..nesting import with_nested
@@ -29,6 +29,8 @@ class RenderRequest:
         seed: Of the random numbers.
         variant, plugins: Mitsuba's variant, and modules that register other plugins.
         threads: Of a process; 0 for as many as there are cores.
+        values: Of the loaded scene, as :func:`~mitsuba_ext.scene_values.as_text` makes them;
+            ``None`` if no frame has any.
         description: What the image depends on, as JSON: a process that would render another image
             refuses. Empty for what each process finds.
     """
@@ -42,6 +44,7 @@ class RenderRequest:
     variant: str = "llvm_ad_rgb"
     plugins: tuple[str, ...] = ()
     threads: int = 0
+    values: str | None = None
     description: str = ""
 
 
@@ -51,6 +54,7 @@ class BatchRenderer(IntegratorBatches):
     Parameters:
         request: What to render; its variant is the active one.
         bundle: The scene's files; ``None`` for those at their paths.
+        scenes: Keeps the scene.
 
     Attributes:
         request: What to render.
@@ -60,15 +64,17 @@ class BatchRenderer(IntegratorBatches):
         InputError: The scene, the integrator or the sensor cannot be used.
     """
 
-    def __init__(self, request: RenderRequest, bundle: Bundle | None = None) -> None:
+    def __init__(
+        self, request: RenderRequest, bundle: Bundle | None = None, scenes: LastScene | None = None
+    ) -> None:
         self.request = request
         with bundle.unpacked() if bundle else contextlib.nullcontext() as moved:
             scene, specification = request.scene, request.specification
             if moved:
                 scene, specification = moved(scene), specification and moved(specification)
-            self.chosen = Chosen.load(
+            self.chosen = (scenes or LastScene()).choose(
                 Path(scene), request.size, dict(request.definitions), specification,
-                request.sensor, moved,
+                request.sensor, request.values, moved,
             )  # fmt: skip
         self.chosen.loaded.path = Path(request.scene)
         integrator = self.chosen.named.integrator
@@ -87,6 +93,7 @@ class BatchRenderer(IntegratorBatches):
         return {
             "scene": loaded.source,
             "scene files hash": loaded.content_hash,
+            **({"values of the scene": request.values} if request.values else {}),
             "size": "x".join(map(str, film.crop_size())),
             "integrator": named.name,
             "parameters": named.parameters,
