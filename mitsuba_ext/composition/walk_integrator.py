@@ -210,7 +210,7 @@ class WalkIntegrator(StagedIntegrator):
         decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}
         decisions = {slot: decision for slot, decision in decisions.items() if decision}
         walk = self.walk(query=self.query(scene), **decisions)
-        sample = walk(scene, sampler, CameraRays(ray), mi.Bool(active))
+        sample = walk(scene, sampler, CameraRays(ray, medium=medium), mi.Bool(active))
         return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
 
     def aov_names(self) -> list[str]:
