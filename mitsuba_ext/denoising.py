@@ -1,7 +1,7 @@
 """Open Image Denoise [1] on rendered images, through the package ``mitsuba-oidn``.
 
-It is guided by the albedo and the shading normal of each pixel, where these are known. A denoised
-image is biased: compare techniques by their own images.
+It is guided by the albedo and the shading normal of each pixel, where these are known. Guides are
+denoised first, each on its own. A denoised image is biased: compare techniques by their own images.
 
 [1] Áfra. Intel Open Image Denoise. https://www.openimagedenoise.org
 """
@@ -21,11 +21,8 @@ from .errors import InputError, InstallationError
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Samples per pixel of the guides.
-_GUIDE_SPP = 32
-
-#: The guides as layers of an EXR: their channels, and the type of ``aov`` that renders them.
-_GUIDES = {"albedo": ("RGB", "albedo"), "normal": ("XYZ", "sh_normal")}
+#: The guides as layers of an EXR, and their channels.
+_GUIDES = {"albedo": "RGB", "normal": "XYZ"}
 
 
 def denoiser() -> ModuleType:
@@ -62,24 +59,16 @@ def remark(film: mi.Film) -> str | None:
 
 
 def render_guides(scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> dict[str, np.ndarray]:
-    """Albedo and shading normal where the camera's rays hit first, also on mirrors and glass.
-    Replaces the contents of the film.
+    """Albedo and shading normal of what the camera sees, in mirrors and through glass too. Replaces
+    the contents of the film.
 
     Returns:
         Arrays (height, width) by the names of channels: ``albedo.R``, …, ``normal.Z``.
     """
-    import mitsuba as mi
+    from .decisions.query.moving_scene import scene_query
+    from .rendering import guides
 
-    aovs = ",".join(f"{name}:{kind}" for name, (_, kind) in _GUIDES.items())
-    integrator = mi.load_dict({"type": "aov", "aovs": aovs})
-    asked = sensor.sampler().sample_count()
-    try:
-        image = np.array(integrator.render(scene, sensor, seed, _GUIDE_SPP))
-    finally:
-        sensor.sampler().set_sample_count(asked)
-    names = [f"{name}.{channel}" for name, (letters, _) in _GUIDES.items() for channel in letters]
-    first = image.shape[2] - len(names)
-    return {name: image[..., first + n] for n, name in enumerate(names)}
+    return guides.render_guides(scene, sensor, scene_query(scene), seed)
 
 
 def denoise_file(source: Path, target: Path, metadata: Mapping[str, object]) -> list[str]:
@@ -110,8 +99,10 @@ def denoise_file(source: Path, target: Path, metadata: Mapping[str, object]) -> 
         guides = {}
     is_linear = source.suffix.lower() in (".exr", ".hdr", ".pfm", ".npy", ".npz")
     result = oidn.denoise(
-        np.ascontiguousarray(pixels, dtype=np.float32), **guides, hdr=is_linear
-    )
+        np.ascontiguousarray(pixels, dtype=np.float32),
+        **{name: _without_noise(oidn, guide, name) for name, guide in guides.items()},
+        hdr=is_linear, clean_aux=bool(guides),
+    )  # fmt: skip
     result = np.array(result, dtype=np.float32)
     if not np.isfinite(result).all():
         raise InputError(f"{source}: cannot be denoised: the result has NaN or infinite pixels")
@@ -123,9 +114,17 @@ def denoise_file(source: Path, target: Path, metadata: Mapping[str, object]) -> 
     return list(guides)
 
 
+def _without_noise(oidn: ModuleType, guide: np.ndarray, name: str) -> np.ndarray:
+    """A guide that has been denoised itself, as an image of values in [0, 1]: a denoiser that can
+    trust its guides keeps more detail."""
+    scale, offset = (2, -1) if name == "normal" else (1, 0)
+    result = np.array(oidn.denoise(np.ascontiguousarray((guide - offset) / scale), hdr=False))
+    return np.ascontiguousarray(scale * result + offset, dtype=np.float32)
+
+
 def _layer(channels: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
     """The only layer whose name ends so; ``None`` if there are none or several."""
-    letters, _ = _GUIDES[name]
+    letters = _GUIDES[name]
     ends = {c.rpartition(".")[0] for c in channels if c.rpartition(".")[0].lower().endswith(name)}
     whole = [end for end in ends if all(f"{end}.{letter}" in channels for letter in letters)]
     if len(whole) != 1:
