@@ -99,6 +99,8 @@ class LightTracerIntegrator(WalkIntegrator):
             'max_depth': 8
     """
 
+    sees_media = False
+
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.lens_sampling = self.parameter(

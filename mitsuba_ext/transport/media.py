@@ -81,6 +81,10 @@ class NoMedia:
         goes_on = (vertex.depth + 1 < max_depth) & vertex.si.is_valid()
         return goes_on, goes_on & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
 
+    def turns(self, vertex: Vertex, active) -> mi.Bool:
+        """Where, of ``active``, may the direction change?"""
+        return active
+
     def scatter(self, vertex: Vertex, sample_1, sample_2, bs, weight):
         """The direction sample of ``vertex``, and its weight, where the BSDF has given these."""
         return bs, weight
@@ -177,6 +181,10 @@ class Media(NoMedia):
         connects = in_medium.scatters & in_medium.mei.medium.use_emitter_sampling()
         connects |= mi.has_flag(flags, mi.BSDFFlags.Smooth)
         return goes_on, goes_on & counts & connects
+
+    def turns(self, vertex, active):
+        is_matched = vertex.bsdf.flags() & mi.UInt32(+mi.BSDFFlags.All) == +mi.BSDFFlags.Null
+        return active & ~is_matched
 
     def eval(self, vertex: Vertex, d, value, pdf, active) -> tuple[mi.Spectrum, mi.Float]:
         """The value and the density of the direction ``d`` (in world space), where the BSDF has

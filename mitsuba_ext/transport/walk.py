@@ -177,8 +177,9 @@ class Walk:
                 shadow_count += shadow_rays
 
             # ----- Evaluate the BSDF towards the light and choose where to scatter -----
+            turns = media.turns(vertex, active_next)
             sample_1, sample_2, directions_weight, directions_state = self.directions.draw(
-                directions_state, sampler, vertex, active_next
+                directions_state, sampler, vertex, turns
             )
             bsdf_value, light_pdf, bs, bsdf_weight, scattering_state = self.scattering.sample(
                 scattering_state, ctx, vertex, wo, sample_1, sample_2
@@ -198,7 +199,7 @@ class Walk:
                 connection_count += dr.select(considered, 1, 0)
                 shadow_count += dr.select(tested, 1, 0)
             bs, bsdf_weight = media.scatter(vertex, sample_1, sample_2, bs, bsdf_weight)
-            self.observer.direction(vertex, sample_2, directions_weight, L, active_next)
+            self.observer.direction(vertex, sample_2, directions_weight, L, turns)
 
             # ----- Move on to the next vertex -----
             bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)
