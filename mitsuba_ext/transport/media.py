@@ -89,6 +89,10 @@ class NoMedia:
         """The direction sample of ``vertex``, and its weight, where the BSDF has given these."""
         return bs, weight
 
+    def scattered(self, bs, active) -> mi.Bool:
+        """Where, of ``active``, does the sample ``bs`` count as a vertex?"""
+        return active
+
     def leave(self, vertex: Vertex, bs, path: PathState) -> PathState:
         """What a path carries on when it leaves ``vertex`` with the sample ``bs``."""
         return path
@@ -223,8 +227,11 @@ class Media(NoMedia):
         phase_weight = dr.select(pdf > 0, phase_weight, 0)
         return bs, dr.select(scatters, phase_weight, weight)
 
+    def scattered(self, bs, active):
+        return active & ~_passes(bs)
+
     def leave(self, vertex, bs, path):
-        passes = self._passes(bs)
+        passes = _passes(bs)
         before = vertex.path
         arrival = Arrival(
             dr.select(passes, before.arrival.ref, path.arrival.ref),
@@ -237,7 +244,7 @@ class Media(NoMedia):
         )
 
     def kept(self, bs, before, after):
-        return dr.select(self._passes(bs), before, after)
+        return dr.select(_passes(bs), before, after)
 
     def cross(self, inside, si, d):
         medium = dr.select(si.is_medium_transition(), si.target_medium(d), inside.medium)
@@ -251,9 +258,6 @@ class Media(NoMedia):
             return emitted
         return dr.select(path.depth == 0, 0, emitted)
 
-    def _passes(self, bs) -> mi.Bool:
-        return mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-
 
 def media_of(scene: mi.Scene, hide_emitters: bool, numbers: FlightNumbers) -> NoMedia:
     """What the walk has to ask in ``scene``."""
@@ -263,6 +267,11 @@ def media_of(scene: mi.Scene, hide_emitters: bool, numbers: FlightNumbers) -> No
 def attenuation(σ: mi.Spectrum, t: mi.Float) -> mi.Spectrum:
     """exp(−σ t), also where t is infinite and σ zero."""
     return dr.select(σ == 0, 1, dr.exp(-t * σ))
+
+
+def _passes(bs: mi.BSDFSample3f) -> mi.Bool:
+    """Where does the sample go through an index-matched surface?"""
+    return mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
 
 def _context() -> mi.PhaseFunctionContext:

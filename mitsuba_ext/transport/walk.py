@@ -227,7 +227,9 @@ class Walk:
                 roulette_state, vertex, path, active_next & rr_active & ~is_black
             )
             rr_continue = sampler.next_1d() < survival
-            self.observer.survival(path, dr.select(rr_active, survival, 1), active_next)
+            self.observer.survival(
+                path, dr.select(rr_active, survival, 1), media.scattered(bs, active_next)
+            )
             active = active_next & (~rr_active | rr_continue) & ~is_black
             path.β[rr_active] *= dr.rcp(survival)
 
