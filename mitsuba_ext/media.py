@@ -23,6 +23,12 @@ def may_have_media(scene: mi.Scene) -> bool:
     return any(s.class_name() == "Instance" for s in _all(scene.shapes())) and _any_is_alive()
 
 
+def may_have_grids(scene: mi.Scene) -> bool:
+    """May there be a medium in ``scene`` that is not homogeneous?"""
+    is_known = all(s.class_name() != "Instance" for s in _all(scene.shapes()))
+    return not is_known or any(not medium.is_homogeneous() for medium in _media(scene))
+
+
 def refuse_media(scene: mi.Scene, what: str, instead: str) -> None:
     """Raises an error if there are media in ``scene``.
 

@@ -74,7 +74,7 @@ def test_shadow_rays_are_attenuated_by_absorbing_media(name: str) -> None:
     T = mi.ScalarTransform4f
     if name == "grid":
         density = np.full((2, 2, 2, 1), 0.7, dtype=np.float32)
-        density[:, :, 1] = 0.3  # along x, which is not that of the light
+        density[:, :, 1] = 0.3  # on the side of positive x
         volume = {"type": "gridvolume", "grid": mi.VolumeGrid(density), "filter_type": "nearest",
                   "to_world": T().translate([-1, -1, -1]).scale(2)}  # fmt: skip
         medium = {"type": "heterogeneous", "albedo": 0.0, "sigma_t": volume}
@@ -88,7 +88,7 @@ def test_shadow_rays_are_attenuated_by_absorbing_media(name: str) -> None:
                           "fog": cube(medium), "light": light})  # fmt: skip
     images = batches(scene, _make(2), 4096, SEEDS[:8])
     left, right = images[:, :, :4].mean(axis=(1, 2, 3)), images[:, :, 4:].mean(axis=(1, 2, 3))
-    expected = np.exp([-1.4, -1.4] if name == "homogeneous" else [-0.6, -1.4])
+    expected = np.exp([-1.4, -1.4] if name == "homogeneous" else [-1.4, -0.6])
     for values, exact in zip((left, right), expected):
         z, error = z_exact(values, exact)
         assert abs(z) < 4 and error < 0.005
@@ -101,8 +101,9 @@ WHITE = {
 }
 
 
-@pytest.mark.parametrize("name", WHITE)
-@pytest.mark.parametrize("light", ["sky", "walls"])
+@pytest.mark.parametrize(("name", "light"), some(
+    ("chromatic", "walls"), ("grid", "sky"), of=[(m, x) for m in WHITE for x in ("sky", "walls")]
+))  # fmt: skip
 def test_white_medium_in_a_white_world_is_invisible(name: str, light: str) -> None:
     """What scatters without loss, in an environment of radiance 1, has the radiance 1: also under
     roulette, and where the light is a surface."""
@@ -130,19 +131,22 @@ class _OrderOfVolpath(DirectionSamples):
         return sampler.next_1d(), sample_2, 1.0, state
 
 
-@pytest.mark.parametrize("make", [
-    fog,
-    lambda: fog(medium=homogeneous([0.2, 0.5, 0.9])),
-    lambda: fog(medium=grid()),
-    lambda: fog("environment"),
-    lambda: fog("point_inside"),
-    lambda: fog_around_the_camera(medium=homogeneous(0.1)),
-    lambda: fog(inner=cube(homogeneous(3.0), 0.4, exterior=homogeneous())),
-], ids=["homogeneous", "chromatic", "grid", "sky", "lamp_inside", "around", "nested"])  # fmt: skip
-def test_walk_draws_the_numbers_of_volpath(make) -> None:
+SAME_PATHS = {
+    "homogeneous": fog,
+    "chromatic": lambda: fog(medium=homogeneous([0.2, 0.5, 0.9])),
+    "grid": lambda: fog(medium=grid()),
+    "sky": lambda: fog("environment"),
+    "lamp_inside": lambda: fog("point_inside"),
+    "around_the_camera": lambda: fog_around_the_camera(medium=homogeneous(0.1)),
+    "nested": lambda: fog(inner=cube(homogeneous(3.0), 0.4, exterior=homogeneous())),
+}
+
+
+@pytest.mark.parametrize("name", some("grid", "chromatic", of=SAME_PATHS))
+def test_walk_draws_the_numbers_of_volpath(name: str) -> None:
     """Every path is the same, where no connection is left out because its BSDF is black, and where
     roulette, which has another rule, has not begun."""
-    scene = mi.load_dict(make())
+    scene = mi.load_dict(SAME_PATHS[name]())
     sensor = scene.sensors()[0]
     values = []
     walk = Walk(8, 100, directions=_OrderOfVolpath())
@@ -175,8 +179,10 @@ def _compare(scene: mi.Scene, integrator, reference, spp: int = 256, precision=0
     assert_same_pixels_on_average(images, expected, precision)
 
 
-@pytest.mark.parametrize("light", some("area", of=LIGHTS))
-@pytest.mark.parametrize("medium", some("homogeneous", "grid", of=MEDIA))
+@pytest.mark.parametrize(("medium", "light"), some(
+    ("grid", "area"),
+    of=[(m, x) for m in MEDIA for x in LIGHTS if m != "thick" or "inside" not in x],
+))  # fmt: skip
 def test_fog_has_the_mean_of_volpath(medium: str, light: str) -> None:
     spp = 2048 if "inside" in light else 512
     _compare(mi.load_dict(fog(light, MEDIA[medium]())), _make(), _volpath(), spp, 0.05)
@@ -223,7 +229,7 @@ SPECIAL = {
 }
 
 
-@pytest.mark.parametrize("name", some("glass_of_milk", "leaves_and_windows", of=SPECIAL))
+@pytest.mark.parametrize("name", some("glass_of_milk", of=SPECIAL))
 def test_special_media_have_the_mean_of_volpath(name: str) -> None:
     _compare(mi.load_dict(SPECIAL[name]()), _make(), _volpath(), 1024, 0.03)
 
@@ -283,7 +289,7 @@ SEEING = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", some("guided", "rejecting", of=SEEING))
+@pytest.mark.parametrize("name", some("guided", of=SEEING))
 def test_technique_has_the_mean_of_volpath_in_fog(name: str) -> None:
     lamps = {"lamp": LIGHTS["area_inside"], "spot": LIGHTS["point"]}
     scene = mi.load_dict(fog("environment", **lamps))
@@ -293,12 +299,12 @@ def test_technique_has_the_mean_of_volpath_in_fog(name: str) -> None:
 
 @pytest.mark.parametrize("parameters", [
     {"type": "bdpt"}, {"type": "light_tracer"}, {"type": "pssmlt"}, {"type": "mlt"},
-    {"type": "erpt"}, {"type": "two_stage"}, {"type": "composed_path", "next_event": "linear"},
+    {"type": "erpt"}, {"type": "erpt", "mutations": "path"}, {"type": "two_stage"}, {"type": "composed_path", "next_event": "linear"},
     {"type": "composed_path", "next_event": "resampled"},
     {"type": "composed_path", "next_event": "triple_product"},
     {"type": "adaptive", "nested": {"type": "two_stage"}},
     {"type": "moment", "nested": {"type": "two_stage"}},
-], ids=lambda x: x.get("next_event") or x["type"])  # fmt: skip
+], ids=lambda x: "-".join(v for v in x.values() if isinstance(v, str)))  # fmt: skip
 def test_techniques_that_need_surfaces_refuse_media(parameters: dict) -> None:
     scene = mi.load_dict(fog("environment"))
     name = parameters.get("nested", parameters)["type"]

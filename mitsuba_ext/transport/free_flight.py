@@ -42,6 +42,11 @@ def extinction(medium: mi.MediumPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Spect
     return dr.select(active, mi.Spectrum(σ), 0)
 
 
+def attenuation(σ: mi.Spectrum, t: mi.Float) -> mi.Spectrum:
+    """exp(−σ t), also where t is infinite and σ zero."""
+    return mi.Spectrum(dr.select(σ == 0, 1, dr.exp(-t * σ)))
+
+
 @dr.syntax
 def track(
     numbers: FlightNumbers,
@@ -79,15 +84,15 @@ def track(
         σ = mei.combined_extinction
         chosen = component(σ, channel)
         flown = dr.minimum(dr.select(is_inside, mei.t, dr.inf), end) - mei.mint
-        difference = σ - chosen
-        ratio = dr.select(difference == 0, 1, dr.exp(-flown * difference))
-        β[active] *= ratio * dr.select(is_inside, dr.rcp(chosen), 1)
+        weight = attenuation(σ - chosen, flown) * dr.select(is_inside, dr.rcp(chosen), 1)
         # Is the collision a real one?
         passing = dr.mean(dr.select(σ > 0, mei.sigma_n / σ, 0))
         is_null = is_inside & (sampler.next_1d(is_inside) < passing)
         is_real = is_inside & ~is_null
-        β[is_null] *= mei.sigma_n / passing
-        β[is_real] *= mei.sigma_s / dr.mean(dr.select(σ > 0, mei.sigma_t / σ, 0))
+        weight *= dr.select(is_null, mei.sigma_n / passing, 1)
+        real = dr.mean(dr.select(σ > 0, mei.sigma_t / σ, 0))
+        weight *= dr.select(is_real, mei.sigma_s / real, 1)
+        β = dr.select(active, β * mi.Spectrum(weight), β)
         t = dr.select(is_real, dr.norm(mei.p - start), t)
         collides |= is_real
         sampler.next_1d(is_null)  # `volpath` plays roulette at each collision

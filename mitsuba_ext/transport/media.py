@@ -27,8 +27,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..media import may_have_media
-from .free_flight import FlightNumbers, component, extinction, interaction_at, track
+from ..media import may_have_grids, may_have_media
+from .free_flight import (
+    FlightNumbers,
+    attenuation,
+    component,
+    extinction,
+    interaction_at,
+    track,
+)
 from .hidden_emitters import behind_emitters
 from .path_decisions import SceneQuery
 from .transmittance import transmittance
@@ -121,12 +128,15 @@ class Media(NoMedia):
     Parameters:
         hide_emitters: Are lights invisible to rays that nothing has scattered yet?
         numbers: Which random numbers choose distances.
+        has_grids: May there be media that are not homogeneous?
     """
 
     exist = True
 
-    def __init__(self, hide_emitters: bool, numbers: FlightNumbers) -> None:
-        self._hides, self._numbers = hide_emitters, numbers
+    def __init__(
+        self, hide_emitters: bool, numbers: FlightNumbers, has_grids: bool = True
+    ) -> None:
+        self._hides, self._numbers, self._has_grids = hide_emitters, numbers, has_grids
 
     def begin(self, sampler, medium):
         channel = mi.UInt32(0)
@@ -167,13 +177,14 @@ class Media(NoMedia):
         σ_s, _, _ = inside.medium.get_scattering_coefficients(mei, scatters)
         sampler.next_1d(scatters)  # `volpath` asks whether the collision is a real one
         weight = ratio * dr.select(scatters, σ_s / chosen, 1)
-        β = dr.select(is_homogeneous, β * weight, β)
+        β = dr.select(is_homogeneous, β * mi.Spectrum(weight), β)
         # ----- Media of varying density -----
-        tracks = in_medium & ~is_homogeneous
-        t, β, collides = track(
-            self._numbers, sampler, ray, si.t, inside.medium, inside.channel, t, β, tracks
-        )
-        scatters |= collides
+        if self._has_grids:
+            tracks = in_medium & ~is_homogeneous
+            t, β, collides = track(
+                self._numbers, sampler, ray, si.t, inside.medium, inside.channel, t, β, tracks
+            )
+            scatters |= collides
         mei = interaction_at(ray, ray(t), inside.medium)
         return _at(si, mei, t, scatters), β, MediumVertex(scatters, mei)
 
@@ -205,8 +216,9 @@ class Media(NoMedia):
         """What is left of the light that ``ds`` is about at ``vertex``; see
         :func:`transmittance`."""
         return transmittance(
-            query, scene, vertex.si, ds, inside.medium, inside.channel, sampler, active
-        )
+            query, scene, vertex.si, ds, inside.medium, inside.channel, self._has_grids, sampler,
+            active,
+        )  # fmt: skip
 
     def scatter(self, vertex, sample_1, sample_2, bs, weight):
         in_medium, si = vertex.medium, vertex.si
@@ -261,12 +273,9 @@ class Media(NoMedia):
 
 def media_of(scene: mi.Scene, hide_emitters: bool, numbers: FlightNumbers) -> NoMedia:
     """What the walk has to ask in ``scene``."""
-    return Media(hide_emitters, numbers) if may_have_media(scene) else NoMedia()
-
-
-def attenuation(σ: mi.Spectrum, t: mi.Float) -> mi.Spectrum:
-    """exp(−σ t), also where t is infinite and σ zero."""
-    return dr.select(σ == 0, 1, dr.exp(-t * σ))
+    if not may_have_media(scene):
+        return NoMedia()
+    return Media(hide_emitters, numbers, may_have_grids(scene))
 
 
 def _passes(bs: mi.BSDFSample3f) -> mi.Bool:

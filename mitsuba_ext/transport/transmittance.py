@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .free_flight import component, extinction
+from .free_flight import attenuation, component, extinction
 from .path_decisions import SceneQuery
 
 
@@ -17,6 +17,7 @@ def transmittance(
     ds: mi.DirectionSample3f,
     medium: mi.MediumPtr,
     channel: mi.UInt32,
+    has_grids: bool,
     sampler: mi.Sampler,
     active: mi.Bool,
 ) -> mi.Spectrum:
@@ -28,6 +29,7 @@ def transmittance(
         query: How rays meet the scene.
         si, ds: The vertex, and the direction of the light.
         medium, channel: The medium in front of the vertex, and the colour that chooses distances.
+        has_grids: May there be media that are not homogeneous?
     """
     medium = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
     ray = query.shadow_ray(scene, si, ds)
@@ -48,14 +50,15 @@ def transmittance(
         is_met = active & pi.is_valid()
         end = dr.minimum(dr.select(is_met, pi.t, dr.inf), left)
         # ----- Attenuation up to the next surface, or to the light -----
-        T[collides & ~is_met] = mi.Spectrum(0)
-        difference = σ - chosen
-        T[is_homogeneous] *= dr.select(difference == 0, 1, dr.exp(-end * difference))
-        T = ratio_tracking(ray, end, medium, channel, sampler, T, in_medium & ~is_homogeneous)
+        T = dr.select(collides & ~is_met, 0, T)
+        T = dr.select(is_homogeneous, T * attenuation(σ - chosen, end), T)
+        if dr.hint(has_grids, mode="scalar"):
+            T = ratio_tracking(ray, end, medium, channel, sampler, T, in_medium & ~is_homogeneous)
         # ----- Does the surface let it pass? -----
         met = query.interaction(pi, segment)
         is_met &= dr.max(T) > 0
-        T[is_met] *= met.bsdf(segment).eval_null_transmission(met, is_met)
+        passing = met.bsdf(segment).eval_null_transmission(met, is_met)
+        T = dr.select(is_met, T * mi.Spectrum(passing), T)
         is_met &= dr.max(T) > 0
         crosses = is_met & met.is_medium_transition()
         medium = dr.select(crosses, met.target_medium(ray.d), medium)
@@ -89,9 +92,8 @@ def ratio_tracking(
         σ = mei.combined_extinction
         chosen = component(σ, channel)
         flown = dr.minimum(mei.t, ray.maxt) - mei.mint
-        difference = σ - chosen
-        T[active] *= dr.select(difference == 0, 1, dr.exp(-flown * difference))
-        T[is_inside] *= mei.sigma_n / chosen
+        share = attenuation(σ - chosen, flown) * dr.select(is_inside, mei.sigma_n / chosen, 1)
+        T = dr.select(active, T * mi.Spectrum(share), T)
         ray.o = dr.select(is_inside, mei.p, ray.o)
         ray.maxt = dr.select(is_inside, ray.maxt - mei.t, ray.maxt)
         active &= is_inside & (dr.max(T) > 0)
