@@ -13,6 +13,7 @@ from mitsuba_ext.decisions.query.moving_scene import scene_query
 from mitsuba_ext.defocus.filters import FILTERS
 from mitsuba_ext.defocus.thin_lens import ThinLens
 from mitsuba_ext.denoising import denoiser
+from mitsuba_ext.movers import is_moving_camera
 from mitsuba_ext.parameters import MOST_SPP
 from mitsuba_ext.rendering.layered_job import LayeredJob
 from mitsuba_ext.rendering.pinhole import LensCentre
@@ -181,8 +182,12 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
 
         Raises:
             ValueError: It has none, and none is given.
-            NotImplementedError: Its rays do not begin in a point.
+            NotImplementedError: Its rays do not begin in a point, or it moves.
         """
+        if is_moving_camera(sensor):
+            raise NotImplementedError(
+                f'"{self.name}": the sensor moves, and nothing has one depth: use "composed_path"'
+            )
         if sensor.class_name() not in _SENSORS:
             raise NotImplementedError(
                 f'"{self.name}": the sensor "{sensor.class_name()}" has no lens: use a "thinlens", '

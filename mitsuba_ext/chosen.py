@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +33,7 @@ class Chosen:
     def load(
         cls, path: Path, size: tuple[int, int] | None, definitions: Mapping[str, str],
         specification: str | None, sensor_index: int,
+        moved: Callable[[str], str] | None = None,
     ) -> Chosen:  # fmt: skip
         """
         Args:
@@ -40,11 +41,12 @@ class Chosen:
             size: Of the image; ``None`` for the film's.
             definitions: Values of the file's ``$name`` parameters.
             specification: The integrator; ``None`` for the scene's.
+            moved: See :func:`~mitsuba_ext.scenes.load_scene`.
 
         Raises:
             InputError: The scene, the integrator or the sensor cannot be used.
         """
-        loaded = load_scene(path, size, definitions, keep_integrator=specification is None)
+        loaded = load_scene(path, size, definitions, specification is None, moved)
         named = _of_scene(loaded) if specification is None else make_named(
             specification, loaded.settings
         )

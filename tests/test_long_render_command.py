@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
@@ -38,6 +39,9 @@ def test_more_samples_later_and_merged(run, make_scene, tmp_path):
     images = {name: read_exr(tmp_path / f"{name}.exr")[0] for name in ("1", "2", "both")}
     mean = (images["1"]["R"] + images["2"]["R"]) / 2
     np.testing.assert_allclose(images["both"]["R"], mean, rtol=1e-5)
+    metadata = read_exr(tmp_path / "both.exr")[1]
+    assert json.loads(metadata["seeds"]) == [1, 2]
+    assert json.loads(metadata["statistics"])["rays"] == {"camera": 48 * 96}
     state = CheckpointFolder(tmp_path / "both").load()
     np.testing.assert_allclose(images["both"]["variance.R"], state.images.variance[..., 0])
     reference = load_reference(tmp_path / "both.exr")
@@ -115,13 +119,13 @@ def test_variants_without_batches_are_named(run, make_scene, tmp_path):
 def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkeypatch):
     render, seen = BatchRenderer.render, []
 
-    def signalled(self, batch):
+    def signalled(self, batch, learned):
         if batch.index == 1:
             os.kill(os.getpid(), signal.SIGUSR1)
         if batch.index == 2:
             seen.append((CheckpointFolder(tmp_path / "kept").load().spp,
                          read_exr(tmp_path / "a.exr")[1]["spp"]))  # fmt: skip
-        return render(self, batch)
+        return render(self, batch, learned)
 
     monkeypatch.setattr(BatchRenderer, "render", signalled)
     code, out, _ = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
@@ -133,10 +137,10 @@ def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkey
 def test_ctrl_c_keeps_the_render_and_ends(run, make_scene, tmp_path, monkeypatch, integrator):
     render = BatchRenderer.render
 
-    def signalled(self, batch):
+    def signalled(self, batch, learned):
         if batch.index == 2:
             os.kill(os.getpid(), signal.SIGTERM)
-        return render(self, batch)
+        return render(self, batch, learned)
 
     monkeypatch.setattr(BatchRenderer, "render", signalled)
     command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", integrator,

@@ -93,7 +93,7 @@ def _errors() -> dict[str, tuple[Scene, str]]:
         "material": ({**line, "cube": cube, "paint": {"type": "diffuse"}}, "must be a shape"),
         "emitter": ({**line, "lamp": {**cube, "light": area(1.0)}}, "emitters cannot move"),
         "sensor": ({**line, "meter": {"type": "rectangle", "sensor": {"type": "irradiancemeter"}}},
-                   "sensors cannot move"),
+                   "sensors of shapes cannot move"),
         "nested": ({**line, "inner": {"type": "moving", **line, "cube": cube}}, "another one"),
         "attribute": ({**line, "mesh": _coloured_mesh()}, '"vertex_color"'),
     }  # fmt: skip

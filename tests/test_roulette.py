@@ -194,7 +194,9 @@ def _lamp_to_the_ceiling() -> mi.Scene:
 
 
 @pytest.mark.parametrize("max_depth", some(8, of=[8, -1]))
-@pytest.mark.parametrize("make", [_lamp_in_glass, _lamp_to_the_ceiling])
+@pytest.mark.parametrize(
+    "make", some(_lamp_to_the_ceiling, of=[_lamp_in_glass, _lamp_to_the_ceiling])
+)
 def test_learned_roulette_is_unbiased(make, max_depth: int) -> None:
     scene = make()
     integrator = TECHNIQUES["pss_guided"].make(max_depth, rr_depth=1)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import signal
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
@@ -23,6 +21,7 @@ from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
 from ..long_renders.workers import Workers
 from ..rendering.interrupts import deferred_interrupt
+from ..rendering.totals import RenderTotals
 from .common import Interval
 from .reports import Report, Speed, time_left
 
@@ -62,34 +61,18 @@ class LongJob:
     def __init__(self, request: RenderRequest, options: LongOptions) -> None:
         """
         Raises:
-            InputError: The scene, the integrator or the sensor cannot be used, or what is learned
-                cannot be sent to the workers.
+            InputError: The scene, the integrator or the sensor cannot be used.
         """
         self._options = options
         self._folder = CheckpointFolder(options.folder) if options.folder else None
-        # Without a folder, what is learned is forgotten with this object
-        self._temporary = tempfile.TemporaryDirectory()
-        folder = CheckpointFolder(Path(self._temporary.name))
-        learned = (self._folder or folder).learned
         # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR file
         threads = max(2, (os.cpu_count() or 1) // options.workers) if options.workers else 0
-        self._request = replace(
-            request, learned=str(learned.absolute()), threads=request.threads or threads
-        )
+        self._request = replace(request, threads=request.threads or threads)
         self._renderer = BatchRenderer(self._request)
         named = self._renderer.chosen.named
         self.integrator, self.name, self.parameters = (
             named.integrator, named.name, named.parameters
         )  # fmt: skip
-        if options.dask:
-            if self._renderer.must_learn and not self._folder:
-                raise InputError(
-                    f'"{self.name}" learns: with --dask, it needs --checkpoint, a folder that the '
-                    f"workers see too"
-                )
-            # Workers have another current folder, and perhaps other files
-            description = json.dumps(self._renderer.description(), default=str)
-            self._request = replace(_absolute(self._request), description=description)
         self.scene, self.sensor = self._renderer.chosen.scene, self._renderer.sensor
         self.film = self.sensor.film()
         self.is_interrupted, self.seconds = False, 0.0
@@ -120,9 +103,6 @@ class LongJob:
                 if self._folder:
                     self._folder.describe(self._renderer.description())
                     self._state = self._folder.load()
-                    if not self._state.has_taught:
-                        # It would depend on the numbers of a batch that is still to come
-                        self._folder.learned.unlink(missing_ok=True)
                 self._run(spp, seconds, write, report)
             finally:
                 self.seconds = time.perf_counter() - begin
@@ -203,19 +183,22 @@ class LongJob:
                 report.warn(f"the render could not be kept: {problem}")
 
     @contextlib.contextmanager
-    def _executor(self) -> Iterator[tuple[Executor | None, int, Callable[[], None]]]:
-        """Who renders, how many batches at a time, and a function that fails if these are gone."""
+    def _executor(
+        self,
+    ) -> Iterator[tuple[Executor | None, Callable[[], int], Callable[[], None]]]:
+        """Who renders, how many batches at a time (which may change), and a function that fails if
+        these are gone."""
         if self._options.dask:
-            with dask_cluster(self._options.dask) as cluster:
-                yield cluster
+            with dask_cluster(self._options.dask) as (executor, check):
+                yield executor, executor.count, check
         elif self._options.workers:
             executor = Workers(self._options.workers)
             try:
-                yield executor, self._options.workers, lambda: None
+                yield executor, lambda: self._options.workers, lambda: None
             finally:
                 executor.shutdown(cancel_futures=True)
         else:
-            yield None, 1, lambda: None
+            yield None, lambda: 1, lambda: None
 
     # ---- How far it got ----
 
@@ -245,20 +228,17 @@ class LongJob:
 
     def about(self) -> Mapping[str, Any]:
         """What the metadata of the image say besides."""
-        return {"batches": len(self._state.done)}
+        return {"batches": len(self._state.done), "seeds": self.seeds}
 
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds of the samples in the image."""
+        return sorted({batch.seed for batch in self._state.done})
 
-def _absolute(request: RenderRequest) -> RenderRequest:
-    """A request whose files are found from any folder."""
-
-    def absolute(name: str) -> str:
-        path = Path(name)
-        return str(path.absolute()) if path.suffix and path.is_file() else name
-
-    return replace(
-        request, scene=absolute(request.scene), plugins=tuple(map(absolute, request.plugins)),
-        specification=request.specification and absolute(request.specification),
-    )  # fmt: skip
+    @property
+    def totals(self) -> RenderTotals:
+        """The cost of these samples, whoever rendered them."""
+        return self._state.totals
 
 
 class _Last:

@@ -15,6 +15,7 @@ from ..compare import timing
 from ..errors import InputError
 from ..rendering.batches import sample_count
 from ..rendering.seed_passes import SeedPasses, can_render, is_independent
+from ..rendering.totals import RenderTotals, forget_memory_peak
 from ..scenes import one_line
 from .reports import Report, Speed, time_left
 
@@ -59,6 +60,7 @@ class RenderJob:
                 :meth:`is_complete` whether it holds all of them.
         """
         begin = time.perf_counter()
+        forget_memory_peak()
         try:
             with report.bars() as bars:
                 if can_render(self.integrator):
@@ -120,6 +122,16 @@ class RenderJob:
     def about(self) -> dict[str, Any]:
         """What the metadata of the image say besides."""
         return {}
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seed of the render."""
+        return [self._seed]
+
+    @property
+    def totals(self) -> RenderTotals:
+        """What the render cost."""
+        return RenderTotals.of(self.integrator, self.film, self.spp or 0, self.seconds)
 
     # ---- How far it got ----
 
