@@ -61,6 +61,27 @@ def refuse_moving_grids(scene: mi.Scene, what: str) -> None:
         )
 
 
+def refuse_missing_colours(scene: mi.Scene, what: str) -> None:
+    """Raises an error where one colour, which may be that which chooses distances, knows nothing of
+    a medium.
+
+    Parameters:
+        what: Begins the message.
+
+    Raises:
+        NotImplementedError: A homogeneous medium has an extinction of zero in some colours only.
+    """
+    if not mi.is_rgb:
+        return
+    for medium in _media(scene):
+        σ = medium.get_majorant(dr.zeros(mi.MediumInteraction3f), True).numpy()
+        if medium.is_homogeneous() and σ.min() <= 0 < σ.max():
+            raise NotImplementedError(
+                f"{what}: a medium has no extinction in some colours: give these a small one, such "
+                f'as 1e-2 of the largest, or use "volpathmis".'
+            )
+
+
 def _media(scene: mi.Scene) -> Iterator[mi.Medium]:
     """The media of ``scene``, one or several times each."""
     for sensor in scene.sensors():

@@ -12,7 +12,6 @@ from statistical import (
     REFERENCE_SEEDS,
     SEEDS,
     assert_images_are_sound,
-    assert_same_image,
     assert_same_pixels_on_average,
     batches,
     some,
@@ -49,7 +48,7 @@ def _volpath(max_depth: int = 6, **parameters) -> mi.Integrator:
 
 
 def _looking_along_z(**other) -> dict:
-    """Parallel rays through the cube around the origin, of which each is in it for a length of 2."""
+    """Parallel rays through the cube around the origin: each is in it for a length of 2."""
     view = lookat([0, 0, 5], [0, 0, 0], [0, 1, 0]) @ mi.ScalarTransform4f().scale([0.5, 0.5, 1])
     return {"type": "orthographic", "to_world": view, "film": film(8, 8),
             "sampler": {"type": "independent"}, **other}  # fmt: skip
@@ -299,7 +298,8 @@ def test_technique_has_the_mean_of_volpath_in_fog(name: str) -> None:
 
 @pytest.mark.parametrize("parameters", [
     {"type": "bdpt"}, {"type": "light_tracer"}, {"type": "pssmlt"}, {"type": "mlt"},
-    {"type": "erpt"}, {"type": "erpt", "mutations": "path"}, {"type": "two_stage"}, {"type": "composed_path", "next_event": "linear"},
+    {"type": "erpt"}, {"type": "erpt", "mutations": "path"}, {"type": "two_stage"},
+    {"type": "composed_path", "next_event": "linear"},
     {"type": "composed_path", "next_event": "resampled"},
     {"type": "composed_path", "next_event": "triple_product"},
     {"type": "adaptive", "nested": {"type": "two_stage"}},
@@ -310,6 +310,13 @@ def test_techniques_that_need_surfaces_refuse_media(parameters: dict) -> None:
     name = parameters.get("nested", parameters)["type"]
     with pytest.raises((NotImplementedError, RuntimeError), match=f'"{name}".*participating media'):
         dr.eval(mi.load_dict(parameters).render(scene, spp=4))
+
+
+def test_medium_without_extinction_in_one_colour_is_refused() -> None:
+    """Paths whose distances the third colour chooses would never scatter."""
+    scene = mi.load_dict(fog(medium=homogeneous([1.0, 0.5, 0.0])))
+    with pytest.raises(NotImplementedError, match="no extinction in some colours"):
+        _make().render(scene, spp=1)
 
 
 def test_moving_grid_is_refused() -> None:

@@ -16,7 +16,7 @@ from ..decisions.learner import Learner
 from ..decisions.query.moving_scene import scene_query
 from ..errors import InputError
 from ..files import check_target
-from ..media import refuse_media, refuse_moving_grids
+from ..media import refuse_media, refuse_missing_colours, refuse_moving_grids
 from ..movers import refuse_movers
 from ..rendering.aovs import check_aovs
 from ..rendering.camera import film_extent
@@ -258,6 +258,7 @@ class WalkIntegrator(StagedIntegrator):
                 what = f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which'
                 refuse_media(scene, what, 'choose another one, such as "contribution"')
         refuse_moving_grids(scene, f'"{self.name}"')
+        refuse_missing_colours(scene, f'"{self.name}"')
 
     def _aov_integrator(self, aovs: str) -> mi.Integrator | None:
         check_aovs(self.name, aovs)

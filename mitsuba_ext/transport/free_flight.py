@@ -25,9 +25,7 @@ def component(σ: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
     return chosen
 
 
-def interaction_at(
-    ray: mi.Ray3f, p: mi.Point3f, medium: mi.MediumPtr
-) -> mi.MediumInteraction3f:
+def interaction_at(ray: mi.Ray3f, p: mi.Point3f, medium: mi.MediumPtr) -> mi.MediumInteraction3f:
     """The interaction of a ray with a medium at ``p``, without its coefficients."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p, mei.wi, mei.time, mei.wavelengths = p, -ray.d, ray.time, ray.wavelengths

@@ -133,9 +133,7 @@ class Media(NoMedia):
 
     exist = True
 
-    def __init__(
-        self, hide_emitters: bool, numbers: FlightNumbers, has_grids: bool = True
-    ) -> None:
+    def __init__(self, hide_emitters: bool, numbers: FlightNumbers, has_grids: bool = True) -> None:
         self._hides, self._numbers, self._has_grids = hide_emitters, numbers, has_grids
 
     def begin(self, sampler, medium):
