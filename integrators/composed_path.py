@@ -114,9 +114,9 @@ class ComposedPath(WalkIntegrator):
     each.
 
     Source: the algorithms are those of Mitsuba's :monosp:`path` and :monosp:`volpath`; J. T.
-    Kajiya, *The Rendering Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple importance sampling); P.
-    Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH 2003 course 44, section 3.4
-    (:monosp:`linear`). The pages of the decisions name theirs.
+    Kajiya, *The Rendering Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple
+    importance sampling); P. Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH
+    2003 course 44, section 3.4 (:monosp:`linear`). The pages of the decisions name theirs.
 
     .. tabs::
         .. code-tab:: xml
