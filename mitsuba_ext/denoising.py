@@ -8,7 +8,7 @@ denoised first, each on its own. A denoised image is biased: compare techniques 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -71,13 +71,15 @@ def render_guides(scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> dict[str
     return guides.render_guides(scene, sensor, scene_query(scene), seed)
 
 
-def denoise_file(source: Path, target: Path, metadata: Mapping[str, object]) -> list[str]:
+def denoise_file(
+    source: Path, targets: Iterable[Path], metadata: Mapping[str, object]
+) -> list[str]:
     """Denoises an image.
 
     Args:
         source: Any image that ``diff`` reads. An EXR may hold guides: layers whose names end with
             ``albedo`` (R, G, B) and ``normal`` (X, Y, Z).
-        target: Where to write it; its extension says how.
+        targets: Where to write it; the extensions say how.
         metadata: Of an EXR.
 
     Returns:
@@ -106,11 +108,12 @@ def denoise_file(source: Path, target: Path, metadata: Mapping[str, object]) -> 
     result = np.array(result, dtype=np.float32)
     if not np.isfinite(result).all():
         raise InputError(f"{source}: cannot be denoised: the result has NaN or infinite pixels")
-    images.write_rgb(
-        target, result,
-        {**metadata, "denoised": f"Open Image Denoise {oidn.oidn_version()}",
-         "denoised_from": str(source), "guides": list(guides)},
-    )  # fmt: skip
+    about = {
+        **metadata, "denoised": f"Open Image Denoise {oidn.oidn_version()}",
+        "denoised_from": str(source), "guides": list(guides),
+    }  # fmt: skip
+    for target in targets:
+        images.write_rgb(target, result, about)
     return list(guides)
 
 

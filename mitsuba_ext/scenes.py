@@ -134,6 +134,7 @@ def load_scene(
     size: tuple[int, int] | None = None,
     parameters: Mapping[str, object] | None = None,
     keep_integrator: bool = True,
+    keep_names: bool = False,
     moved: Callable[[str], str] | None = None,
 ) -> LoadedScene:
     """Loads a scene in the active variant.
@@ -144,6 +145,8 @@ def load_scene(
         parameters: Values for the ``$name`` placeholders of the file.
         keep_integrator: ``False`` leaves the scene's integrator out, so that a scene whose
             integrator is unknown here can be rendered with another.
+        keep_names: Objects stay what they are in the file, for ``mi.traverse``: by default, Mitsuba
+            merges meshes of the same material, and equal materials.
         moved: Says where a file is now that was at an absolute path; other texts it returns.
 
     Raises:
@@ -160,6 +163,8 @@ def load_scene(
     if is_dict and strings:
         raise InputError(f"a scene from a dict has no $parameters: found {', '.join(strings)}")
     config = mi.parser.ParserConfig(mi.variant())
+    if keep_names:
+        config.merge_meshes = config.merge_equivalent = False
     with _search_path(path):
         try:
             if is_dict:

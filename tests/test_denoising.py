@@ -53,7 +53,9 @@ def test_a_render_is_denoised_and_its_image_is_kept(run, make_scene, tmp_path, c
 
 def test_a_long_render_is_denoised_too(run, make_scene, tmp_path, calls):
     code, _, _ = run("render", make_scene(), "-o", tmp_path / "a.png", "--denoise", "--spp", 4,
-                     "--checkpoint", tmp_path / "kept")  # fmt: skip
+                     "--checkpoint", tmp_path / "kept",
+                     "--preview", tmp_path / "b.png")  # fmt: skip
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert code == 0 and images.open_bitmap(tmp_path / "a.png").width() == 8
     assert len(calls) == 1 and (tmp_path / "a.noisy.exr").exists()
 

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import PATH, in_subprocess
@@ -131,6 +132,34 @@ def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkey
     code, out, _ = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
                        "--checkpoint", tmp_path / "kept")  # fmt: skip
     assert code == 0 and "64 spp" in out and seen == [(32, 32)]
+
+
+@pytest.mark.parametrize("is_kept", [True, False])
+def test_a_preview_shows_the_render_while_it_grows(
+    run, make_scene, tmp_path, monkeypatch, is_kept
+):
+    render, seen = BatchRenderer.render, []
+    output, preview = tmp_path / "a.exr", tmp_path / "look.png"
+
+    def watched(self, batch, *rest):
+        shown = preview.read_bytes() if preview.exists() else None
+        seen.append((read_exr(output)[1]["spp"] if output.exists() else 0, shown))
+        return render(self, batch, *rest)
+
+    monkeypatch.setattr(BatchRenderer, "render", watched)
+    kept = ("--checkpoint", tmp_path / "kept") if is_kept else ()
+    command = ("render", make_scene(), "-o", output, "--spp", 64, "--every", "32spp", *kept)
+    assert run(*command, "--preview", preview)[0] == 0
+    # After the first batch, then after 32 more; at the end
+    assert [spp for spp, _ in seen] == ([0, 16, 16, 48] if is_kept else [0] * 4)
+    looks = [shown for _, shown in seen]
+    assert looks[0] is None and looks[1] == looks[2] != looks[3]
+    # It has the sRGB curve, without exposure, dithered
+    image, linear = np.array(mi.Bitmap(str(preview))), read_exr(output)[0]["G"].astype(float)
+    curve = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    assert np.abs(image[..., 1] - 255 * np.clip(curve, 0, 1)).max() <= 1.01
+    code, _, err = run(*command, "--preview", output)
+    assert code == 2 and "--preview must be another file" in err
 
 
 @pytest.mark.parametrize("integrator", ["path", "composed_path"])

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ..chosen import LastScene
 from ..errors import InputError
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
 from ..long_renders.dask_cluster import dask_cluster
@@ -37,6 +38,7 @@ class LongOptions:
         until: The relative error at which it ends; ``None`` for none.
         workers: Processes that render; 0 for this one.
         dask: The address of a Dask scheduler whose workers render; empty for none.
+        has_preview: Is the image to be shown while it grows, also if no folder keeps it?
     """
 
     folder: Path | None = None
@@ -45,6 +47,7 @@ class LongOptions:
     until: float | None = None
     workers: int = 0
     dask: str = ""
+    has_preview: bool = False
 
 
 class LongJob:
@@ -58,8 +61,14 @@ class LongJob:
         seconds: Wall clock of the render.
     """
 
-    def __init__(self, request: RenderRequest, options: LongOptions) -> None:
+    def __init__(
+        self, request: RenderRequest, options: LongOptions, scenes: LastScene | None = None
+    ) -> None:
         """
+        Args:
+            request, options: What to render, and how long.
+            scenes: Keeps the scene for the next image.
+
         Raises:
             InputError: The scene, the integrator or the sensor cannot be used.
         """
@@ -68,7 +77,7 @@ class LongJob:
         # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR file
         threads = max(2, (os.cpu_count() or 1) // options.workers) if options.workers else 0
         self._request = replace(request, threads=request.threads or threads)
-        self._renderer = BatchRenderer(self._request)
+        self._renderer = BatchRenderer(self._request, scenes=scenes)
         named = self._renderer.chosen.named
         self.integrator, self.name, self.parameters = (
             named.integrator, named.name, named.parameters
@@ -83,7 +92,7 @@ class LongJob:
         return self._renderer.chosen.remarks(is_sensor_chosen)
 
     def run(
-        self, spp: int | None, seconds: float | None, write: Callable[[], None], report: Report
+        self, spp: int | None, seconds: float | None, write: Callable[[bool], None], report: Report
     ) -> None:
         """Goes on with what is in the folder.
 
@@ -91,7 +100,7 @@ class LongJob:
             spp: Samples per pixel of the whole image. Default: the number of the sampler, if
                 nothing else ends the render.
             seconds: Of this call.
-            write: Writes the image of the film.
+            write: Shows the image of the film. Its argument says whether a signal asked for it.
             report: Is told how far it is.
 
         Raises:
@@ -114,14 +123,17 @@ class LongJob:
         elif spp is None and options.until is None and seconds is None:
             spp = self._renderer.sensor.sampler().sample_count()
         last = _Last(state.spp)
+        is_due_at_once = options.has_preview
 
-        def keep() -> None:
+        def keep(is_asked: bool) -> None:
+            nonlocal is_due_at_once
+            is_due_at_once = False
             last.mark(state.spp)
             if self._folder:
                 self._folder.save(state)
             state.fill(self.film)
             self.seconds = time.perf_counter() - last.begin
-            write()
+            write(is_asked)
 
         speed, pixel_count = Speed(), math.prod(self.film.crop_size())
 
@@ -146,9 +158,12 @@ class LongJob:
                     samples_per_second=per_second and per_second * pixel_count,
                     seconds=time.perf_counter() - last.begin, seconds_left=left,
                 )  # fmt: skip
-                if asked() or (self._folder and last.is_due(options.every, state.spp)):
+                is_asked, is_due = asked(), is_due_at_once
+                if self._folder or options.has_preview:
+                    is_due |= last.is_due(options.every, state.spp)
+                if is_asked or is_due:
                     try:
-                        keep()
+                        keep(is_asked)
                     except OSError as problem:
                         report.warn(f"the render could not be kept: {problem}; it goes on")
 

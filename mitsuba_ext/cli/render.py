@@ -23,7 +23,8 @@ from .frames import FrameRange, Sensors, pictures
 @click.command(short_help="Render a scene to an image.")
 @click.option(
     "-o", "--output", type=FilledPath(), required=True, metavar="FILE",
-    help="Image to write: .exr (float, with metadata), .png, .jpg, .hdr or .pfm.",
+    help="Image to write: .exr (all channels as floats, with metadata), .hdr or .pfm (RGB as "
+    "floats), .png or .jpg (8 bits: the sRGB curve, clipped at 1, no exposure or tone mapping).",
 )
 @click.option(
     "--integrator", "specification", metavar="INTEGRATOR",
@@ -56,12 +57,26 @@ from .frames import FrameRange, Sensors, pictures
     "n.",
 )
 @click.option(
+    "--parameters", metavar="FILE.py:FUNCTION",
+    help="With --frames: a Python function of the frame's number that returns a dict of the "
+    "frame's parameters. Keys with a dot are those of mi.traverse, which are set without loading "
+    "the scene again; others are $KEY parameters of the scene file.",
+)
+@click.option(
     "--checkpoint", type=FilledPath(), metavar="DIR",
-    help="A folder that keeps the render. The same command goes on from there.",
+    help="A folder that keeps the render. The same command goes on from there. Of several frames "
+    "or sensors, each has a folder in it.",
 )
 @click.option(
     "--every", type=Every(), default="60s", metavar="TIME", show_default=True,
-    help="With --checkpoint: how often to keep it, and to write FILE: 60s, 10m, 2h or 100spp.",
+    help="How often --checkpoint keeps the render and writes FILE, and --preview is written: 60s, "
+    "10m, 2h or 100spp.",
+)
+@click.option(
+    "--preview", type=FilledPath(), metavar="FILE",
+    help="A second image, such as a .png, that shows the render while it grows: after the first "
+    "batch, and then each --every. Of several frames or sensors, it shows the one that is being "
+    "rendered.",
 )
 @click.option(
     "--add", type=click.IntRange(1, MOST_SPP), metavar="N",
@@ -106,8 +121,10 @@ def render(
     seed: int,
     sensors: tuple[int, ...] | None,
     frames: range | None,
+    parameters: str | None,
     checkpoint: Path | None,
     every: Interval,
+    preview: Path | None,
     add: int | None,
     until: float | None,
     workers: int | None,
@@ -130,9 +147,9 @@ def render(
     Mitsuba's own integrators render in passes. A structured sampler stratifies the samples of a
     pass (64 per pixel or more, 16 for large images), not those of the whole render.
 
-    With --checkpoint, --until, --workers or --dask, all integrators render in batches: independent
-    renders with seeds of their own. An EXR then holds the variance of the image too. What an
-    integrator learns in the first batch, the others use. SIGUSR1 keeps the render after the
+    With --checkpoint, --until, --workers, --dask or --preview, all integrators render in batches:
+    independent renders with seeds of their own. An EXR then holds the variance of the image too.
+    What an integrator learns in the first batch, the others use. SIGUSR1 keeps the render after the
     running batch.
     """
     if specification and not plugins:
@@ -140,7 +157,8 @@ def render(
     from ..scenes import check_scene_file
 
     check_scene_file(scene)
-    from .image_render import Order, render_image
+    from ..chosen import LastScene
+    from .image_render import Order, is_finished, render_image
     from .long_job import LongOptions
     from .reports import Report
 
@@ -153,35 +171,52 @@ def render(
         raise click.UsageError("--add and --spp exclude each other")
     if workers is not None and dask is not None:
         raise click.UsageError("--workers and --dask exclude each other")
-    is_long = checkpoint or until or workers or dask
+    if preview is not None and preview.absolute() == output.absolute():
+        raise click.UsageError("--preview must be another file than --output")
+    is_long = checkpoint or until or workers or dask or preview
     order = Order(
-        scene, specification, spp, seconds, size, variant, denoise, threads,
-        LongOptions(checkpoint, every, add, until, workers or 0, dask or "") if is_long else None,
+        scene, specification, spp, seconds, size, variant, tuple(plugins), denoise, threads,
+        LongOptions(
+            checkpoint, every, add, until, workers or 0, dask or "", preview is not None
+        ) if is_long else None,
         is_one_of_many=frames is not None or (sensors is not None and len(sensors) != 1),
+        preview=preview,
     )  # fmt: skip
-    if order.is_one_of_many and checkpoint:
-        raise click.UsageError("--checkpoint keeps one image: it excludes --frames and sensors")
+    if order.is_one_of_many and add is not None:
+        raise click.UsageError("--add is for one image: give --spp, the number that all shall have")
+    if parameters is not None and frames is None:
+        raise click.UsageError("--parameters needs --frames")
+    function = None
+    if parameters is not None:
+        from .frame_parameters import load_function
+
+        select_variant(variant, plugins)  # the function may use types of Mitsuba
+        plugins = ()  # they are registered
+        function = load_function(parameters)
     if sensors == ():
-        sensors = _all_sensors(scene, definitions, variant, plugins, frames)
-    result = 0
-    chosen = list(pictures(output, definitions, sensors or [None], seed, frames))
-    for picture in chosen:
-        if order.is_one_of_many and picture.output.exists():
+        sensors = _all_sensors(scene, definitions, variant, plugins, frames, function)
+        plugins = ()
+    result, scenes = 0, LastScene()
+    for picture in list(pictures(output, definitions, sensors or [None], seed, frames)):
+        if order.is_one_of_many and is_finished(order, picture):
             report.note(f"{picture.output}: exists already")
             continue
-        code = render_image(order, picture, plugins, report)
-        plugins = ()  # they are registered
+        code = render_image(order, picture, plugins, report, scenes, function)
+        plugins = ()
         if code > 1:
             return code
         result = max(result, code)
     return result
 
 
-def _all_sensors(scene, definitions, variant, plugins, frames) -> list[int]:
+def _all_sensors(scene, definitions, variant, plugins, frames, function) -> list[int]:
     """The numbers of a scene's sensors, in the first of the frames."""
     from ..scenes import load_scene
 
     select_variant(variant, plugins)
     (picture,) = pictures(Path("#"), definitions, [None], 0, frames and frames[:1])
-    loaded = load_scene(scene, parameters=dict(picture.definitions), keep_integrator=False)
+    values = dict(picture.definitions)
+    if function:
+        values |= function(picture.frame).definitions
+    loaded = load_scene(scene, parameters=values, keep_integrator=False)
     return list(range(len(loaded.scene.sensors())))

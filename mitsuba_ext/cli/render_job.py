@@ -48,7 +48,7 @@ class RenderJob:
         return self._chosen.remarks(is_sensor_chosen)
 
     def run(
-        self, spp: int | None, seconds: float | None, _write: Callable[[], None], report: Report
+        self, spp: int | None, seconds: float | None, _write: Callable[[bool], None], report: Report
     ) -> None:
         """Renders ``spp`` samples per pixel (by default, the number of the sampler), or as many as
         fit into ``seconds``, and tells ``report`` how far it is. After Ctrl-C, passes end with

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..chosen import Chosen
+from ..chosen import LastScene
 from ..compare.machine import versions
 from ..errors import InputError
 from ..rendering.batches import batch_seeds, each_batch, sample_count
@@ -48,6 +48,8 @@ class RenderRequest:
         seed: Of the random numbers.
         variant, plugins: Mitsuba's variant, and modules that register other plugins.
         threads: Of a process; 0 for as many as there are cores.
+        values: Of the loaded scene, as :func:`~mitsuba_ext.scene_values.as_text` makes them;
+            ``None`` if no frame has any.
         description: What the image depends on, as JSON: a process that would render another image
             refuses. Empty for what each process finds.
     """
@@ -61,6 +63,7 @@ class RenderRequest:
     variant: str = "llvm_ad_rgb"
     plugins: tuple[str, ...] = ()
     threads: int = 0
+    values: str | None = None
     description: str = ""
 
 
@@ -70,6 +73,7 @@ class BatchRenderer:
     Parameters:
         request: What to render; its variant is the active one.
         bundle: The scene's files; ``None`` for those at their paths.
+        scenes: Keeps the scene.
 
     Attributes:
         chosen: The scene, the integrator and the sensor.
@@ -80,7 +84,9 @@ class BatchRenderer:
         InputError: The scene, the integrator or the sensor cannot be used.
     """
 
-    def __init__(self, request: RenderRequest, bundle: Bundle | None = None) -> None:
+    def __init__(
+        self, request: RenderRequest, bundle: Bundle | None = None, scenes: LastScene | None = None
+    ) -> None:
         if not dr.is_jit_v(mi.Float):
             raise InputError(
                 f'batches need a variant such as "llvm_ad_rgb", and not "{mi.variant()}"'
@@ -90,9 +96,9 @@ class BatchRenderer:
             scene, specification = request.scene, request.specification
             if moved:
                 scene, specification = moved(scene), specification and moved(specification)
-            self.chosen = Chosen.load(
+            self.chosen = (scenes or LastScene()).choose(
                 Path(scene), request.size, dict(request.definitions), specification,
-                request.sensor, moved,
+                request.sensor, request.values, moved,
             )  # fmt: skip
         self.chosen.loaded.path = Path(request.scene)
         self.sensor = self.chosen.sensor
@@ -111,6 +117,7 @@ class BatchRenderer:
         return {
             "scene": loaded.source,
             "scene files hash": loaded.content_hash,
+            **({"values of the scene": request.values} if request.values else {}),
             "size": "x".join(map(str, film.crop_size())),
             "integrator": named.name,
             "parameters": named.parameters,
