@@ -14,6 +14,7 @@ from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
 from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.movers import sensor_at_rest
 from mitsuba_ext.rendering.camera import check_takes_splats
 from mitsuba_ext.rendering.stages import OneStage
 from mitsuba_ext.transport.walk import Walk
@@ -128,7 +129,8 @@ class LightTracerIntegrator(WalkIntegrator):
     def schedule(self, scene, sensor, samples, seed) -> OneStage:
         if not ConnectableSensor.can_connect(sensor):
             raise NotImplementedError(
-                f'"{self.name}": nothing can be connected to the sensor "{sensor.class_name()}": '
+                f'"{self.name}": nothing can be connected to the sensor '
+                f'"{sensor_at_rest(sensor).class_name()}": '
                 f'use a "perspective" or "thinlens", or the integrator "path"'
             )
         try:

@@ -104,6 +104,11 @@ class Motion:
             high = np.maximum(high, moved.max(axis=(0, 1)) + sagitta)
         return low, high
 
+    def box(self, at_rest: mi.ScalarBoundingBox3f) -> mi.ScalarBoundingBox3f:
+        """:meth:`bounds` of a box."""
+        corners = np.array([list(at_rest.corner(i)) for i in range(8)], dtype=np.float64)
+        return mi.ScalarBoundingBox3f(*self.bounds(corners))
+
     def _move_in_segment(self, points: np.ndarray, k: int, x: float) -> np.ndarray:
         rotation = Rotation.from_rotvec(self.turns[k] * x) * Rotation.from_quat(self.starts[k])
         position = (1 - x) * self.positions[k] + x * self.positions[k + 1]

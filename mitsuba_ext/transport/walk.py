@@ -138,7 +138,8 @@ class Walk:
             if dr.hint(can_hit_emitters, mode="scalar"):
                 count = self.connections.weight(path.depth - 1)
                 emitted, mis, hit, light_pdf = emission(
-                    scene, si, path, self.next_event, next_event_state, self.mis, count
+                    scene, self.query, si, path, self.next_event, next_event_state, self.mis,
+                    count,
                 )
                 emitted = media.visible_emission(emitted, path)
                 L = dr.fma(path.β, emitted, L)
