@@ -233,6 +233,13 @@ def test_special_media_have_the_mean_of_volpath(name: str) -> None:
     _compare(mi.load_dict(SPECIAL[name]()), _make(), _volpath(), 1024, 0.03)
 
 
+@pytest.mark.parametrize("max_depth", [1, 2])
+def test_paths_through_leaves_end_at_their_longest_length(max_depth: int) -> None:
+    """What passes the last vertex adds none; what it scatters would."""
+    scene = mi.load_dict({**_leaves_and_windows(), "light": LIGHTS["environment"]})
+    _compare(scene, _make(max_depth), _volpath(max_depth), 512)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("light", ["area", "environment", "area_inside"])
 def test_hidden_emitters_in_fog_have_the_mean_of_volpath(light: str) -> None:

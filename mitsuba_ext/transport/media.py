@@ -104,6 +104,10 @@ class NoMedia:
         """What a path carries on when it leaves ``vertex`` with the sample ``bs``."""
         return path
 
+    def is_within(self, path: PathState, max_depth: int, active) -> mi.Bool:
+        """Which of the ``active`` paths may have one more vertex?"""
+        return active
+
     def kept(self, bs, before: Any, after: Any) -> Any:
         """The state of the next event decision: the new one, but for index-matched surfaces."""
         return after
@@ -252,6 +256,10 @@ class Media(NoMedia):
         return PathState(
             path.β, path.η, path.sampling_weight, depth, arrival, path.hero_is_alone, path.sums
         )
+
+    def is_within(self, path, max_depth, active):
+        # Surfaces that may let a path pass were allowed one vertex too many
+        return active & (path.depth < max_depth)
 
     def kept(self, bs, before, after):
         return dr.select(_passes(bs), before, after)
