@@ -49,7 +49,7 @@ class AutoPath(WalkIntegrator):
     of the two lowers the variance of the image. What costs more time than it saves ends there.
     :monosp:`integrator.statistics.learned` says what was kept, and why.
 
-    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
     pilot.
 

@@ -114,7 +114,8 @@ class BidirectionalIntegrator(WalkIntegrator):
     :monosp:`directionalarea`, which :monosp:`path` does not find, are seen here; spectral variants
     refuse them.
 
-    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    Participating media are refused (use :monosp:`volpath` or :monosp:`composed_path`). Gradients
+    are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants, nor nesting in :monosp:`moment` and
     :monosp:`aov`.
 

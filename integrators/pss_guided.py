@@ -75,7 +75,8 @@ class PSSGuided(WalkIntegrator):
     After a render, :monosp:`integrator.statistics.learned` tells what was found, and
     :monosp:`integrator.guide` holds it (see examples/learned_samples.py).
 
-    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    Participating media are rendered as by :monosp:`volpath`; in them, directions are guided by
+    tiles only. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
     pilot.
 

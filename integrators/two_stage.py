@@ -68,7 +68,8 @@ class TwoStage(WalkIntegrator):
     small opening, :monosp:`visibility` helps, but :monosp:`composed_path` with
     :monosp:`next_event=contribution` and :monosp:`connections=16` was seven times as efficient.
 
-    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    Participating media are refused (use :monosp:`volpath` or :monosp:`composed_path`). Gradients
+    are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants.
 
     Source: D. Cline, P. K. Egbert, J. F. Talbot, D. L. Cardon, *Two Stage Importance Sampling for

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..marks import has_crashed, mark_of, marked
+from ..marks import has_crashed, mark_of, marked, renew
 from ..nesting import with_nested
 from ..progress import Step
 from ..scenes import InputError, LoadedScene, one_line
@@ -302,6 +302,7 @@ class Experiment:
             contender._zero_radiance = zero_radiance_share(integrator, self.scene.scene, seed=0)
 
     def _timed(self, contender: Contender, spp: int, seed: int) -> timing.Timed:
+        renew(self._mark(contender))
         timed = timing.timed_render(contender.named.integrator, self.scene.scene, seed, spp)
         contender.compile_seconds += timed.compile_seconds
         return timed

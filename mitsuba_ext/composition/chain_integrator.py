@@ -78,6 +78,8 @@ class ChainIntegrator(WalkIntegrator):
 
     missing_in_samples = "its chains find the rest"
 
+    sees_media = False
+
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.direct_samples = self.parameter(
