@@ -86,7 +86,8 @@ class ComposedPath(WalkIntegrator):
          saved. (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** you want :monosp:`path` with passes of bounded memory, a time budget, statistics
     or progress, or to combine techniques. **Not when** you need gradients (use :monosp:`prb`), or a

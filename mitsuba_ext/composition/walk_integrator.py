@@ -51,7 +51,7 @@ class WalkIntegrator(StagedIntegrator):
        - Hide directly visible emitters. (Default: false)
      * - (Common parameters)
        - |float|
-       - Those of :class:`StagedIntegrator`: timeout.
+       - Those of :class:`StagedIntegrator`: timeout, checkpoint.
      * - aovs
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
@@ -209,6 +209,7 @@ class WalkIntegrator(StagedIntegrator):
         """One sample, for integrators that nest this one and draw its samples (``moment``; ``aov``
         calls :meth:`render`). Nothing is learned there: each decision that needs a pilot falls
         back to its default."""
+        self.check_sampled()
         setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1)
         decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}
         decisions = {slot: decision for slot, decision in decisions.items() if decision}
