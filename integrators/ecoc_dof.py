@@ -13,6 +13,7 @@ from mitsuba_ext.decisions.query.moving_scene import scene_query
 from mitsuba_ext.defocus.filters import FILTERS
 from mitsuba_ext.defocus.thin_lens import ThinLens
 from mitsuba_ext.denoising import denoiser
+from mitsuba_ext.movers import is_moving_camera
 from mitsuba_ext.parameters import MOST_SPP
 from mitsuba_ext.rendering.layered_job import LayeredJob
 from mitsuba_ext.rendering.pinhole import LensCentre
@@ -59,7 +60,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
          :monosp:`mitsuba-oidn`). They are collected with a box filter then. (Default: false)
      * - (Common parameters)
        - |float|
-       - Those of :class:`StagedIntegrator`: timeout.
+       - Those of :class:`StagedIntegrator`: timeout, checkpoint.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
@@ -158,8 +159,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
             "nested": str(self.nested).replace("\n", "\n  "),
         }
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        self.is_cancelled = False
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         self._is_rendering = True
         try:
             return render(self, scene, sensor, seed, spp, develop, evaluate, LayeredJob)
@@ -181,8 +181,12 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
 
         Raises:
             ValueError: It has none, and none is given.
-            NotImplementedError: Its rays do not begin in a point.
+            NotImplementedError: Its rays do not begin in a point, or it moves.
         """
+        if is_moving_camera(sensor):
+            raise NotImplementedError(
+                f'"{self.name}": the sensor moves, and nothing has one depth: use "composed_path"'
+            )
         if sensor.class_name() not in _SENSORS:
             raise NotImplementedError(
                 f'"{self.name}": the sensor "{sensor.class_name()}" has no lens: use a "thinlens", '

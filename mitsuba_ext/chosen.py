@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import gc
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import mitsuba as mi
 from .content_hash import hash_code
 from .errors import InputError
 from .scene_remarks import scene_remarks
+from .scene_values import SceneValues
 from .scenes import LoadedScene, load_scene
 from .specifications import NamedIntegrator, make_named
 
@@ -30,27 +32,23 @@ class Chosen:
     sensor_index: int
 
     @classmethod
-    def load(
-        cls, path: Path, size: tuple[int, int] | None, definitions: Mapping[str, str],
-        specification: str | None, sensor_index: int,
-    ) -> Chosen:  # fmt: skip
+    def of(cls, loaded: LoadedScene, specification: str | None, sensor_index: int) -> Chosen:
         """
         Args:
-            path: The scene's file.
-            size: Of the image; ``None`` for the film's.
-            definitions: Values of the file's ``$name`` parameters.
+            loaded: The scene, with its integrator if ``specification`` is ``None``.
             specification: The integrator; ``None`` for the scene's.
 
         Raises:
-            InputError: The scene, the integrator or the sensor cannot be used.
+            InputError: The integrator or the sensor cannot be used.
         """
-        loaded = load_scene(path, size, definitions, keep_integrator=specification is None)
         named = _of_scene(loaded) if specification is None else make_named(
             specification, loaded.settings
         )
         count = len(loaded.scene.sensors())
         if sensor_index >= count:
-            raise InputError(f"{path}: there is no sensor {sensor_index}: the scene has {count}")
+            raise InputError(
+                f"{loaded.source}: there is no sensor {sensor_index}: the scene has {count}"
+            )
         return cls(loaded, named, sensor_index)
 
     @property
@@ -68,6 +66,47 @@ class Chosen:
         if count > 1 and not is_sensor_chosen:
             remarks.append(f"the scene has {count} sensors: the first is rendered (see --sensor)")
         return remarks
+
+
+class LastScene:
+    """Keeps the scene that was loaded last, for images that need the same one."""
+
+    def __init__(self) -> None:
+        self._key: tuple | None = None
+        self._loaded: LoadedScene | None = None
+        self._values: SceneValues | None = None
+
+    def choose(
+        self, path: Path, size: tuple[int, int] | None, definitions: Mapping[str, str],
+        specification: str | None, sensor_index: int, values: str | None = None,
+        moved: Callable[[str], str] | None = None,
+    ) -> Chosen:  # fmt: skip
+        """The scene of a file, with what renders it.
+
+        Args:
+            path: The file.
+            size: Of the image; ``None`` for the film's.
+            definitions: Values of the file's ``$name`` parameters.
+            specification: The integrator; ``None`` for the scene's.
+            values: Of the loaded scene, as :func:`~mitsuba_ext.scene_values.as_text` makes them;
+                ``None`` if no image will have any.
+            moved: See :func:`~mitsuba_ext.scenes.load_scene`.
+
+        Raises:
+            InputError: The scene, the integrator or the sensor cannot be used.
+        """
+        is_own, has_values = specification is None, values is not None
+        key = (mi.variant(), path, size, tuple(definitions.items()), is_own, has_values)
+        if key != self._key:
+            # First: Dr.Jit compiles the methods of all living objects
+            self._key = self._loaded = self._values = None
+            gc.collect()  # what mi.traverse returns refers to itself
+            self._loaded = load_scene(path, size, definitions, is_own, has_values, moved)
+            self._values = SceneValues(self._loaded.scene) if has_values else None
+            self._key = key
+        if self._values:
+            self._values.set(values or "")
+        return Chosen.of(self._loaded, specification, sensor_index)
 
 
 def _of_scene(loaded: LoadedScene) -> NamedIntegrator:

@@ -13,7 +13,7 @@ import numpy as np
 from . import registry
 
 if TYPE_CHECKING:
-    import mitsuba as mi
+    pass
 
 _PACKAGE = Path(__file__).parent
 
@@ -21,28 +21,16 @@ _PACKAGE = Path(__file__).parent
 _COMPILED = ("builtins", "mitsuba", "drjit.detail")
 
 
-def hash_parsed_scene(
-    state: mi.parser.ParserState, parameters: Mapping[str, str], source: object = None
-) -> str:
-    """SHA-256 over a scene's XML files, its parameters, and all files that it names.
+def hash_files(files: Iterable[Path], parameters: Mapping[str, str], source: object = None) -> str:
+    """SHA-256 over a scene's files, and its parameters.
 
     Args:
-        state: The parsed scene, before any transformation.
+        files: From :func:`~mitsuba_ext.scene_files.files_of`.
         parameters: Values of the ``$name`` placeholders.
         source: The dict that the scene was made from, if it was not a file.
     """
-    import mitsuba as mi
-
-    files = {Path(str(file)).resolve() for file in state.files}
-    for node in state.nodes:
-        properties = mi.Properties(node.props)  # a copy: what is read counts as known to a plugin
-        for key in properties.keys():
-            if properties.type(key) == mi.Properties.Type.String and properties[key]:
-                file = Path(str(mi.file_resolver().resolve(properties[key])))
-                if file.is_file():
-                    files.add(file.resolve())
     digest = hashlib.sha256(repr(sorted(parameters.items())).encode())
-    for file in sorted(files):
+    for file in sorted({file.resolve() for file in files}):
         digest.update(hashlib.sha256(file.read_bytes()).digest())
     if source is not None:
         _feed(digest, source)

@@ -1,14 +1,14 @@
 """Open Image Denoise [1] on rendered images, through the package ``mitsuba-oidn``.
 
-It is guided by the albedo and the shading normal of each pixel, where these are known. A denoised
-image is biased: compare techniques by their own images.
+It is guided by the albedo and the shading normal of each pixel, where these are known. Guides are
+denoised first, each on its own. A denoised image is biased: compare techniques by their own images.
 
 [1] Áfra. Intel Open Image Denoise. https://www.openimagedenoise.org
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -21,11 +21,8 @@ from .errors import InputError, InstallationError
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Samples per pixel of the guides.
-_GUIDE_SPP = 32
-
-#: The guides as layers of an EXR: their channels, and the type of ``aov`` that renders them.
-_GUIDES = {"albedo": ("RGB", "albedo"), "normal": ("XYZ", "sh_normal")}
+#: The guides as layers of an EXR, and their channels.
+_GUIDES = {"albedo": "RGB", "normal": "XYZ"}
 
 
 def denoiser() -> ModuleType:
@@ -62,33 +59,27 @@ def remark(film: mi.Film) -> str | None:
 
 
 def render_guides(scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> dict[str, np.ndarray]:
-    """Albedo and shading normal where the camera's rays hit first, also on mirrors and glass.
-    Replaces the contents of the film.
+    """Albedo and shading normal of what the camera sees, in mirrors and through glass too. Replaces
+    the contents of the film.
 
     Returns:
         Arrays (height, width) by the names of channels: ``albedo.R``, …, ``normal.Z``.
     """
-    import mitsuba as mi
+    from .decisions.query.moving_scene import scene_query
+    from .rendering import guides
 
-    aovs = ",".join(f"{name}:{kind}" for name, (_, kind) in _GUIDES.items())
-    integrator = mi.load_dict({"type": "aov", "aovs": aovs})
-    asked = sensor.sampler().sample_count()
-    try:
-        image = np.array(integrator.render(scene, sensor, seed, _GUIDE_SPP))
-    finally:
-        sensor.sampler().set_sample_count(asked)
-    names = [f"{name}.{channel}" for name, (letters, _) in _GUIDES.items() for channel in letters]
-    first = image.shape[2] - len(names)
-    return {name: image[..., first + n] for n, name in enumerate(names)}
+    return guides.render_guides(scene, sensor, scene_query(scene), seed)
 
 
-def denoise_file(source: Path, target: Path, metadata: Mapping[str, object]) -> list[str]:
+def denoise_file(
+    source: Path, targets: Iterable[Path], metadata: Mapping[str, object]
+) -> list[str]:
     """Denoises an image.
 
     Args:
         source: Any image that ``diff`` reads. An EXR may hold guides: layers whose names end with
             ``albedo`` (R, G, B) and ``normal`` (X, Y, Z).
-        target: Where to write it; its extension says how.
+        targets: Where to write it; the extensions say how.
         metadata: Of an EXR.
 
     Returns:
@@ -110,22 +101,33 @@ def denoise_file(source: Path, target: Path, metadata: Mapping[str, object]) -> 
         guides = {}
     is_linear = source.suffix.lower() in (".exr", ".hdr", ".pfm", ".npy", ".npz")
     result = oidn.denoise(
-        np.ascontiguousarray(pixels, dtype=np.float32), **guides, hdr=is_linear
-    )
+        np.ascontiguousarray(pixels, dtype=np.float32),
+        **{name: _without_noise(oidn, guide, name) for name, guide in guides.items()},
+        hdr=is_linear, clean_aux=bool(guides),
+    )  # fmt: skip
     result = np.array(result, dtype=np.float32)
     if not np.isfinite(result).all():
         raise InputError(f"{source}: cannot be denoised: the result has NaN or infinite pixels")
-    images.write_rgb(
-        target, result,
-        {**metadata, "denoised": f"Open Image Denoise {oidn.oidn_version()}",
-         "denoised_from": str(source), "guides": list(guides)},
-    )  # fmt: skip
+    about = {
+        **metadata, "denoised": f"Open Image Denoise {oidn.oidn_version()}",
+        "denoised_from": str(source), "guides": list(guides),
+    }  # fmt: skip
+    for target in targets:
+        images.write_rgb(target, result, about)
     return list(guides)
+
+
+def _without_noise(oidn: ModuleType, guide: np.ndarray, name: str) -> np.ndarray:
+    """A guide that has been denoised itself, as an image of values in [0, 1]: a denoiser that can
+    trust its guides keeps more detail."""
+    scale, offset = (2, -1) if name == "normal" else (1, 0)
+    result = np.array(oidn.denoise(np.ascontiguousarray((guide - offset) / scale), hdr=False))
+    return np.ascontiguousarray(scale * result + offset, dtype=np.float32)
 
 
 def _layer(channels: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
     """The only layer whose name ends so; ``None`` if there are none or several."""
-    letters, _ = _GUIDES[name]
+    letters = _GUIDES[name]
     ends = {c.rpartition(".")[0] for c in channels if c.rpartition(".")[0].lower().endswith(name)}
     whole = [end for end in ends if all(f"{end}.{letter}" in channels for letter in letters)]
     if len(whole) != 1:

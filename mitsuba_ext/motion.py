@@ -104,6 +104,11 @@ class Motion:
             high = np.maximum(high, moved.max(axis=(0, 1)) + sagitta)
         return low, high
 
+    def box(self, at_rest: mi.ScalarBoundingBox3f) -> mi.ScalarBoundingBox3f:
+        """:meth:`bounds` of a box."""
+        corners = np.array([list(at_rest.corner(i)) for i in range(8)], dtype=np.float64)
+        return mi.ScalarBoundingBox3f(*self.bounds(corners))
+
     def _move_in_segment(self, points: np.ndarray, k: int, x: float) -> np.ndarray:
         rotation = Rotation.from_rotvec(self.turns[k] * x) * Rotation.from_quat(self.starts[k])
         position = (1 - x) * self.positions[k] + x * self.positions[k + 1]
@@ -120,17 +125,36 @@ class Pose:
 
     def to_rest(self, ray: mi.Ray3f) -> mi.Ray3f:
         """The ray in the rest frame; distances along it stay the same."""
-        inverse = self.rotation.T
         moved = mi.Ray3f(ray)
-        moved.o = inverse @ (ray.o - self.position) + self.center
-        moved.d = inverse @ ray.d
+        moved.o = self.point_to_rest(ray.o)
+        moved.d = self.rotation.T @ ray.d
         return moved
+
+    def ray_to_world(self, ray: mi.Ray3f) -> mi.Ray3f:
+        """The ray of the rest frame, and its differentials if it has them, in the world."""
+        moved = type(ray)(ray)
+        parts = [("o", "d")]
+        if isinstance(ray, mi.RayDifferential3f):
+            moved.has_differentials = ray.has_differentials
+            parts += [("o_x", "d_x"), ("o_y", "d_y")]
+        for o, d in parts:
+            setattr(moved, o, self.point_to_world(getattr(ray, o)))
+            setattr(moved, d, self.rotation @ getattr(ray, d))
+        return moved
+
+    def point_to_rest(self, p: mi.Point3f) -> mi.Point3f:
+        """The point in the rest frame."""
+        return self.rotation.T @ (p - self.position) + self.center
+
+    def point_to_world(self, p: mi.Point3f) -> mi.Point3f:
+        """The point of the rest frame in the world."""
+        return self.rotation @ (p - self.center) + self.position
 
     def to_world(self, si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
         """Transforms an interaction from the rest frame to the world. ``wi``, which is relative to
         the shading frame, and ``uv`` stay the same."""
         R = self.rotation
-        si.p = R @ (si.p - self.center) + self.position
+        si.p = self.point_to_world(si.p)
         si.n = R @ si.n
         frame = si.sh_frame
         si.sh_frame = mi.Frame3f(R @ frame.s, R @ frame.t, R @ frame.n)

@@ -1,6 +1,7 @@
 """Registers every plugin of the package in each variant that is selected.
 
-A plugin is a file in ``integrators/``, ``emitters/``, ``bsdfs/``, ``samplers/`` or ``shapes/``.
+A plugin is a file in ``integrators/``, ``emitters/``, ``bsdfs/``, ``samplers/``, ``sensors/``
+or ``shapes/``.
 The file's name is the plugin's name in a scene, and the one class that the file defines and
 decorates with :func:`plugin` is what Mitsuba instantiates. Deleting the file removes the plugin.
 
@@ -28,6 +29,7 @@ _KINDS: dict[str, str] = {
     "emitters": "register_emitter",
     "bsdfs": "register_bsdf",
     "samplers": "register_sampler",
+    "sensors": "register_sensor",
     "shapes": "register_shape",
 }
 
@@ -42,6 +44,7 @@ _BASES = (
     "mitsuba_ext.composition.reweighted_camera",
     "mitsuba_ext.sequences.sequence_sampler",
     "mitsuba_ext.luminaires.area_luminaire",
+    "mitsuba_ext.luminaires.moving_emitter",
 )
 
 _registered: set[str] = set()

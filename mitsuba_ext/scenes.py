@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .content_hash import hash_parsed_scene
+from .content_hash import hash_files
 from .errors import InputError
 from .rendering.aovs import check_nodes
+from .scene_files import files_of, named_in
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -90,7 +91,8 @@ class LoadedScene:
         scene: The ``mi.Scene``.
         path: The XML file; ``None`` for a scene made from a dict.
         parameters: The ``$name`` parameters that were passed to it.
-        content_hash: SHA-256 over the XML or dict, its parameters, and all files that it names.
+        files: The XML file, and all files that it names, by their absolute paths.
+        content_hash: SHA-256 over the XML or dict, its parameters, and all these files.
         settings: ``max_depth`` and ``rr_depth`` of the scene's own integrator, as far as it has
             them, and ``hide_emitters`` where it is set.
         integrator_name: Plugin name of the scene's own integrator; empty if there is none.
@@ -100,6 +102,7 @@ class LoadedScene:
     scene: mi.Scene
     path: Path | None
     parameters: dict[str, str]
+    files: list[Path]
     content_hash: str
     settings: dict[str, int | bool]
     integrator_name: str
@@ -131,6 +134,8 @@ def load_scene(
     size: tuple[int, int] | None = None,
     parameters: Mapping[str, object] | None = None,
     keep_integrator: bool = True,
+    keep_names: bool = False,
+    moved: Callable[[str], str] | None = None,
 ) -> LoadedScene:
     """Loads a scene in the active variant.
 
@@ -140,6 +145,9 @@ def load_scene(
         parameters: Values for the ``$name`` placeholders of the file.
         keep_integrator: ``False`` leaves the scene's integrator out, so that a scene whose
             integrator is unknown here can be rendered with another.
+        keep_names: Objects stay what they are in the file, for ``mi.traverse``: by default, Mitsuba
+            merges meshes of the same material, and equal materials.
+        moved: Says where a file is now that was at an absolute path; other texts it returns.
 
     Raises:
         InputError: The file is missing or broken, something in it cannot be made or is of another
@@ -155,6 +163,8 @@ def load_scene(
     if is_dict and strings:
         raise InputError(f"a scene from a dict has no $parameters: found {', '.join(strings)}")
     config = mi.parser.ParserConfig(mi.variant())
+    if keep_names:
+        config.merge_meshes = config.merge_equivalent = False
     with _search_path(path):
         try:
             if is_dict:
@@ -162,7 +172,11 @@ def load_scene(
             else:
                 state = mi.parser.parse_file(config, str(path), **strings)
             check_nodes(state)
-            content_hash = hash_parsed_scene(state, strings, source if is_dict else None)
+            if moved:
+                for (node, key), name in list(named_in(state)):
+                    node.props[key] = moved(name)
+            files = files_of(state, strings)
+            content_hash = hash_files(files, strings, source if is_dict else None)
             integrator = _integrator_node(state)
             # Before transform_all(): afterwards, a node may be freed memory
             integrator_name = integrator.props.plugin_name() if integrator else ""
@@ -190,6 +204,7 @@ def load_scene(
         scene=scene,
         path=path,
         parameters=strings,
+        files=files,
         content_hash=content_hash,
         settings=settings,
         integrator_name=integrator_name,

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import math
-import re
-from typing import Any
-
 import mitsuba as mi
 import numpy as np
 
 from mitsuba_ext import registry
 from mitsuba_ext.bounds import shape_bounds
+from mitsuba_ext.luminaires.moving_emitter import MovingEmitter
 from mitsuba_ext.motion import Motion
-from mitsuba_ext.parameters import read_parameter
-
-#: The most that a pose may differ from a rigid one: matrices in text files are rounded.
-_RIGID_TOLERANCE = 1e-4
+from mitsuba_ext.motion_parameters import read_motion
 
 
 @registry.plugin
@@ -68,11 +62,20 @@ class Moving(mi.Mesh):
     :monosp:`shutter_close`, which must be set: they are both 0 by default, and such a sensor sees
     the shapes where they are at time 0. Before the motion and after it, the shapes rest at its two
     ends.
-    **Not when** light sources or the camera move, or shapes deform: that is not supported.
+    **Not when** shapes deform: that is not supported. For a camera that moves, use
+    :monosp:`moving_camera`; for lights without a surface, :monosp:`moving_light`.
+
+    **Lights.** One of the nested shapes may be an area light, of any type of emitter and shape.
+    Connections sample it at the pose of the path's time, and MIS weights have the densities of that
+    time. A second light gets a :monosp:`moving` of its own, with the same motion. Choices among
+    lights take it as a whole, and the bounds of its motion for its place. Integrators that start
+    paths from lights refuse lights that move: :monosp:`bdpt`, :monosp:`light_tracer`,
+    :monosp:`mlt`, and :monosp:`erpt` and :monosp:`pssmlt` where they are bidirectional.
 
     Only integrators of this package see these shapes. **Mitsuba's own**, such as :monosp:`path` or
-    :monosp:`aov`, **render the scene without them, and there is no way to stop them**; use
-    :monosp:`composed_path`, which is :monosp:`path` otherwise. The parameter :monosp:`aovs` is
+    :monosp:`aov`, **render the scene without them, and there is no way to stop them** (a light
+    among them still lights connections, with a wrong weight); use :monosp:`composed_path`, which is
+    :monosp:`path` otherwise. The parameter :monosp:`aovs` is
     refused.
 
     Every motion costs time: its shapes have an acceleration structure of their own, which all rays
@@ -80,8 +83,8 @@ class Moving(mi.Mesh):
     motion took 1.15 to 1.3 times as long and four took 1.3 to 1.6 times (less where boxes are small
     in the view, more where they fill it). Put shapes that move together into one :monosp:`moving`.
 
-    A nested shape may be nowhere else in the scene. Emitters, sensors, and meshes with vertex
-    attributes cannot be nested; participating media are ignored, as by :monosp:`path`. The scene's
+    A nested shape may be nowhere else in the scene. Sensors, and meshes with vertex attributes,
+    cannot be nested, and a medium in moving shapes must be homogeneous. The scene's
     bounds include all of the motion. :monosp:`mi.traverse` does not show nested shapes: it shows a
     placeholder mesh in their place. Textures that depend on the position in the world do not move
     along. An instance of a group that holds a :monosp:`merge` of rectangles
@@ -110,14 +113,20 @@ class Moving(mi.Mesh):
             'what': {'type': 'cube'}
     """
 
+    #: The name of the module is the class of the variant that was selected last
+    _emitter = MovingEmitter
+
     def __init__(self, props: mi.Properties) -> None:
         self.name = props.plugin_name()
         self.children = self._nested(props)
-        self.motion = self._motion(props)
+        self.motion = read_motion(self.name, props)
+        self.light = self._light()
         self._at_rest = None
         # The base class gets no parameters: those that it accepts have no meaning here
         own = mi.Properties(self.name)
         own.set_id(props.id())
+        if self.light is not None:
+            own["emitter"] = self._emitter(self.name, self.light, self.motion)
         super().__init__(self.name, vertex_count=3, face_count=2, props=own)
         self._span(*self.motion.bounds(self._corners()))
 
@@ -162,14 +171,20 @@ class Moving(mi.Mesh):
             raise self._error("nothing is nested in it that could move; put a shape into it")
         return children
 
-    def _refuse_what_cannot_move(self, child: mi.Shape) -> None:
-        if child.is_emitter():
+    def _light(self) -> mi.Emitter | None:
+        lights = [child.emitter() for child in self.children if child.is_emitter()]
+        if len(lights) > 1:
             raise self._error(
-                "emitters cannot move: leave the emitter out, or put this shape into the scene "
-                "itself, at rest"
+                f"{len(lights)} of the nested shapes are lights: nest each into a moving shape of "
+                f"its own, with the same motion"
             )
+        return lights[0] if lights else None
+
+    def _refuse_what_cannot_move(self, child: mi.Shape) -> None:
         if child.is_sensor():
-            raise self._error("sensors cannot move: put this shape into the scene itself, at rest")
+            raise self._error(
+                "sensors of shapes cannot move: put this shape into the scene itself, at rest"
+            )
         if child.is_mesh():
             reserved = ("vertex_positions", "vertex_normals", "vertex_texcoords")
             attributes = [key for key in mi.traverse(child).keys() if key.startswith("vertex_")]
@@ -195,92 +210,10 @@ class Moving(mi.Mesh):
         parameters["faces"] = mi.UInt32([0, 0, 1, 1, 1, 2])
         parameters.update()
 
-    # ---- How it moves ----
-
-    def _motion(self, props: mi.Properties) -> Motion:
-        keys = sorted(key for key in props.keys() if re.fullmatch(r"(pose|time)_\d+", key))
-        simple = [k for k in ("translate", "axis", "angle", "begin", "end") if k in props]
-        if keys and simple:
-            raise self._error(
-                f'the parameters "{simple[0]}" and "{keys[0]}" exclude each other: give a '
-                f"displacement and a turn, or poses at times"
-            )
-        return self._keyed(props, keys) if keys else self._uniform(props)
-
-    def _uniform(self, props: mi.Properties) -> Motion:
-        if "translate" not in props and "axis" not in props:
-            raise self._error(
-                'no motion is given: set "translate", "axis" and "angle", or "pose_0", "time_0", …'
-            )
-        begin = self._parameter(props, "begin", 0.0)
-        end = self._parameter(props, "end", 1.0)
-        if not begin < end:
-            raise self._error(f'"begin" is {begin:g} and must be before "end", which is {end:g}')
-        translate = self._vector(props, "translate", (0, 0, 0))
-        if "axis" not in props:
-            return Motion.uniform(begin, end, translate)
-        axis = self._vector(props, "axis")
-        length = np.linalg.norm(axis)
-        if length == 0:
-            raise self._error('the parameter "axis" must not be zero')
-        if "angle" not in props:
-            raise self._error('the parameter "axis" asks for the parameter "angle", in degrees')
-        angle = math.radians(self._parameter(props, "angle", 0.0))
-        center = self._vector(props, "center", (0, 0, 0))
-        return Motion.uniform(begin, end, translate, axis / length * angle, center)
-
-    def _keyed(self, props: mi.Properties, keys: list[str]) -> Motion:
-        count = len(keys) // 2
-        wanted = sorted(f"{kind}_{i}" for kind in ("pose", "time") for i in range(count))
-        if keys != wanted or count < 2:
-            raise self._error(
-                f'poses are "pose_0", "pose_1" and so on, two at least, each with its "time_0", '
-                f'"time_1"; found {", ".join(keys)}'
-            )
-        times = [self._parameter(props, f"time_{i}", 0.0) for i in range(count)]
-        for i in range(1, count):
-            if not times[i - 1] < times[i]:
-                raise self._error(
-                    f'"time_{i}" is {times[i]:g} and must be after "time_{i - 1}", which is '
-                    f"{times[i - 1]:g}"
-                )
-        return Motion.keyed(times, [self._pose(props, f"pose_{i}") for i in range(count)])
-
-    def _pose(self, props: mi.Properties, key: str) -> np.ndarray:
-        value = props[key]
-        if not hasattr(value, "matrix"):
-            raise TypeError(self._message(f'the parameter "{key}" must be a transform'))
-        matrix = np.array(value.matrix, dtype=np.float64)
-        rotation = matrix[:3, :3]
-        is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID_TOLERANCE)
-        is_rotation &= np.linalg.det(rotation) > 0
-        if not (is_rotation and np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all()):
-            raise self._error(
-                f'the parameter "{key}" must be rigid, a rotation and a translation: scale and '
-                f'mirror the nested shapes, by their "to_world"'
-            )
-        return matrix
-
     # ---- Helpers ----
 
-    def _parameter(self, props: mi.Properties, key: str, default: Any) -> Any:
-        return read_parameter(self.name, props, key, default)
-
-    def _vector(self, props: mi.Properties, key: str, default: Any = None) -> np.ndarray:
-        value = props.get(key, default)
-        try:
-            vector = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            vector = np.zeros(0)
-        if vector.shape != (3,) or not np.isfinite(vector).all():
-            raise self._error(f'the parameter "{key}" must be three finite numbers')
-        return vector
-
-    def _message(self, text: str) -> str:
-        return f'"{self.name}": {text}'
-
     def _error(self, text: str) -> ValueError:
-        return ValueError(self._message(text))
+        return ValueError(f'"{self.name}": {text}')
 
 
 def _has_extent(shape: mi.Shape) -> bool:

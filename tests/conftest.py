@@ -15,6 +15,7 @@ from noisy import Clock
 
 import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before drjit and mitsuba)
 from mitsuba_ext import cli
+from mitsuba_ext.cli import image_render
 from mitsuba_ext.compare import timing
 
 import drjit as dr  # isort: skip
@@ -72,12 +73,13 @@ def _clean_up() -> None:
 
 @pytest.fixture
 def batches_of_sixteen_samples(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Per pixel of the scenes of :func:`make_scene`, in long renders."""
-    from mitsuba_ext.long_renders import batch_renderer
+    """Per pixel of the scenes of :func:`make_scene`, in long renders, also where they learn."""
+    from mitsuba_ext.long_renders import integrator_batches
     from mitsuba_ext.rendering import seed_passes
 
-    for table in (seed_passes._PASS_SAMPLES, batch_renderer._SAMPLES):
+    for table in (seed_passes._PASS_SAMPLES, integrator_batches._SAMPLES):
         monkeypatch.setitem(table, dr.JitBackend.LLVM, 48 * 16)
+    monkeypatch.setattr(integrator_batches, "_LEARNING_SPP", 16)
 
 
 # ---- Comparisons ----
@@ -149,7 +151,7 @@ def in_subprocess(*arguments, **options) -> subprocess.CompletedProcess:
 @pytest.fixture(autouse=True)
 def kernels_are_cached(monkeypatch):
     """Makes ``render`` print nothing about compiled kernels, which depend on earlier tests."""
-    monkeypatch.setattr(sys.modules["mitsuba_ext.cli.render"], "kernels_compiled", lambda: 0)
+    monkeypatch.setattr(image_render, "kernels_compiled", lambda: 0)
 
 
 @pytest.fixture

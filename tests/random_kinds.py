@@ -45,7 +45,7 @@ def _plain(seed: int, folder: Path, time: float | None) -> Scene:
     return Maker(seed, folder).scene()
 
 
-# ---- Moving shapes ----
+# ---- Moving shapes and cameras ----
 
 
 def _moving(seed: int, folder: Path, time: float | None) -> Scene:
@@ -66,6 +66,27 @@ def _moving(seed: int, folder: Path, time: float | None) -> Scene:
             to_world = parts[name].get("to_world", mi.ScalarTransform4f())
             moved = mi.ScalarTransform4f(pose(opens + time * lasts)) @ to_world
             scene |= parts | {name: {**parts[name], "to_world": moved}}
+    return scene
+
+
+def _moving_camera(seed: int, folder: Path, time: float | None) -> Scene:
+    """The camera moves as well."""
+    scene, maker = _moving(seed, folder, time), Maker(seed, folder, stream=23)
+    still = scene["sensor"]
+    opens, lasts = still["shutter_open"], still["shutter_close"] - still["shutter_open"]
+    if maker.chance(0.5):
+        translate, axis = maker.rng.normal(size=(2, 3))
+        parameters, pose = uniform((0.3 * translate).tolist(), axis.tolist(),
+                                   maker.number(-20, 20), maker.point())  # fmt: skip
+    else:
+        turns, positions = maker.rng.normal(size=(2, 3, 3))
+        turns = Rotation.from_rotvec(0.1 * turns)
+        parameters, pose = keyed(opens + lasts * np.array([0.1, 0.4, 0.9]), turns, 0.2 * positions)
+    if time is None:
+        scene["sensor"] = {"type": "moving_camera", **parameters, "still": still}
+    else:
+        place = mi.ScalarTransform4f(pose(opens + time * lasts))
+        scene["sensor"] = {**still, "to_world": place @ still["to_world"]}
     return scene
 
 
@@ -144,6 +165,7 @@ def _closed(maker: Maker) -> Any:
 KINDS = {
     "plain": Kind(_plain),
     "moving": Kind(_moving, strata=16),
+    "moving_camera": Kind(_moving_camera, strata=16),
     "constant_index": Kind(_constant_index),
     # Long paths without roulette: a small max_depth would lose energy, and in RGB roulette would be
     # the only source of noise

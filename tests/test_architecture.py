@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "mitsuba_ext"
 
 #: The folders of plugins, which are installed as parts of the package.
-PLUGINS = ("integrators", "emitters", "bsdfs", "shapes", "samplers")
+PLUGINS = ("integrators", "emitters", "bsdfs", "shapes", "samplers", "sensors")
 
 #: By room, what it imports nothing of.
 FORBIDDEN = {

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from conftest import PATH
 
+from mitsuba_ext.cli import image_render
 from mitsuba_ext.cli.stopping import Stop, stopping
 from mitsuba_ext.compare import images, load_scene, read_exr, write_exr
 from mitsuba_ext.rendering import interrupts, plan, seed_passes
@@ -57,7 +58,7 @@ def test_render_keeps_aovs_in_an_exr_and_leaves_them_out_of_a_png(run, make_scen
 
 
 def test_first_render_says_that_it_compiles(run, make_scene, tmp_path, monkeypatch):
-    command = sys.modules["mitsuba_ext.cli.render"]
+    command = image_render
     # Before the scene is loaded, after that, after the render
     for counts, before, after in (((5, 7, 8), True, False), ((5, 5, 8), False, True),
                                   ((5, 5, 5), False, False)):  # fmt: skip
@@ -137,7 +138,7 @@ def test_interrupted_render_writes_what_the_film_holds(
     arguments = ("render", make_scene(), "-o", output, "--integrator", interrupted_integrator)
     code, _, err = run(*arguments)
     assert code == 130
-    assert err == f"interrupted during the render: {output}\n"
+    assert err.splitlines()[0] == f"interrupted during the render: {output}"
     assert read_exr(output)[0]["R"].shape == (6, 8)
 
 

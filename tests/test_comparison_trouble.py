@@ -214,6 +214,7 @@ def test_runs_of_a_live_object_are_not_taken_up(clock, tmp_path):
         assert (run_seed(0, 0), 8) in calls
 
 
+@pytest.mark.slow
 def test_times_are_compared_within_one_session(clock, tmp_path, monkeypatch):
     calls = []
     made = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -14,19 +15,13 @@ import numpy as np
 import pytest
 from conftest import in_subprocess
 
-from mitsuba_ext.cli import long_job
 from mitsuba_ext.compare import InputError, read_exr
-from mitsuba_ext.long_renders import batch_renderer, dask_cluster
-from mitsuba_ext.long_renders.batch_renderer import RenderRequest, render_batch
-from mitsuba_ext.long_renders.state import Batch
+from mitsuba_ext.long_renders import dask_cluster, dispatch
+from mitsuba_ext.long_renders.batch_renderer import BatchRenderer, RenderRequest
+from mitsuba_ext.long_renders.long_render import Goal, LongRender
+from mitsuba_ext.long_renders.state import RenderState
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-@pytest.fixture(autouse=True)
-def no_scene_is_kept():
-    yield
-    batch_renderer._renderer.cache_clear()
 
 
 def test_without_dask_one_sentence_says_what_to_install(run, make_scene, tmp_path, monkeypatch):
@@ -40,33 +35,6 @@ def test_who_renders_is_said_once(run, make_scene, tmp_path):
     code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr",
                        "--dask", "tcp://127.0.0.1:1", "--workers", 2)  # fmt: skip
     assert code == 2 and "--workers and --dask exclude each other" in err
-
-
-def test_an_integrator_that_learns_needs_a_folder_that_workers_see(run, scenes, tmp_path):
-    code, _, err = run("render", scenes / "cornell_box.xml", "-o", tmp_path / "a.exr",
-                       "--integrator", "composed_path:next_event=contribution",
-                       "--size", "8x6", "--dask", "tcp://127.0.0.1:1")  # fmt: skip
-    assert code == 2 and "it needs --checkpoint" in err
-
-
-def test_a_worker_with_other_files_refuses(make_scene):
-    """A description as the command sends it, and a file that has changed since."""
-    options = long_job.LongOptions(dask="tcp://127.0.0.1:1")
-    scene = str(make_scene())
-    job = long_job.LongJob(RenderRequest(scene), options)
-    render_batch(job._request, Batch(0, 0, 1))
-    batch_renderer._renderer.cache_clear()
-    make_scene(body="")
-    with pytest.raises(InputError, match='would render another image: "scene files" differs'):
-        render_batch(job._request, Batch(0, 0, 1))
-
-
-def test_files_are_named_so_that_workers_find_them(make_scene, tmp_path, monkeypatch):
-    make_scene()
-    monkeypatch.chdir(tmp_path)
-    found = long_job._absolute(RenderRequest("scene.xml", specification="path", plugins=("mine",)))
-    assert found == RenderRequest(
-        str(tmp_path / "scene.xml"), specification="path", plugins=("mine",))
 
 
 # ---- A cluster ----
@@ -130,6 +98,69 @@ def test_a_cluster_divides_a_render_and_one_of_its_workers_is_killed(make_scene,
     one, two = (read_exr(tmp_path / f"{name}.exr") for name in ("one", "two"))
     assert one[1]["spp"] == two[1]["spp"] == 4096
     np.testing.assert_allclose(one[0]["R"], two[0]["R"], rtol=1e-4)
+
+
+def _rendered(request: RenderRequest, spp: int, address: str = "", progress=lambda render: None):
+    render = LongRender(BatchRenderer(request), RenderState(), progress)
+    if not address:
+        assert render.run(Goal(spp))
+        return render.state
+    with dask_cluster.dask_cluster(address) as (executor, check):
+
+        def is_stopped() -> bool:
+            check()
+            return False
+
+        assert render.run(Goal(spp), is_stopped, executor, executor.count)
+    return render.state
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("specification", ["neepp", "pss_guided"])
+def test_workers_without_the_files_render_what_is_learned_once(
+    specification, scenes, tmp_path, monkeypatch
+):
+    """The scene is named by a path that is another one in each process."""
+    home, foreign = tmp_path / "home", tmp_path / "foreign"
+    for folder in (home, foreign):
+        folder.mkdir()
+    (home / "box.xml").write_text((scenes / "cornell_box.xml").read_text())
+    (home / "scene.xml").write_text('<scene version="3.0.0"><include filename="box.xml"/></scene>')
+    monkeypatch.chdir(home)
+    request = RenderRequest("/proc/self/cwd/scene.xml", (64, 48), (), specification)
+    with _cluster(foreign, 2) as (address, _):
+        learned = []
+        state = _rendered(
+            request, 4096, address, lambda render: learned.append(render.state.learned))
+    assert learned[0] and set(learned) == {learned[0]}
+    here = _rendered(request, 4096)
+    assert sorted(state.done) == here.done and len(here.done) >= 3
+    ours, its = (each.images.mean[..., :3].mean() for each in (state, here))
+    # Which path is sampled may depend on the last bit of what was learned
+    error = (state.images.variance[..., :3].sum() ** 0.5) / state.images.mean[..., :3].size
+    assert abs(ours - its) < 4 * error
+    assert not list(foreign.rglob("*.xml"))
+
+
+@pytest.mark.slow
+def test_a_worker_that_hangs_costs_its_batches_only(make_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(dispatch, "_FIRST_LATE", 5.0)
+    request = RenderRequest(str(make_scene()), (64, 64))
+    hanging = []
+    with _cluster(tmp_path, 2) as (address, workers):
+
+        def hang(render) -> None:
+            if len(render.state.done) == 3:
+                hanging.append(workers[0].pid)
+                os.kill(workers[0].pid, signal.SIGSTOP)
+
+        try:
+            state = _rendered(request, 4096, address, hang)
+        finally:
+            os.kill(workers[0].pid, signal.SIGCONT)
+    here = _rendered(request, 4096)
+    assert hanging and sorted(state.done) == here.done
+    np.testing.assert_allclose(state.images.mean, here.images.mean, rtol=1e-4)
 
 
 @pytest.mark.slow

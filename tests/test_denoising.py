@@ -21,7 +21,11 @@ def calls(monkeypatch):
     """A denoiser that halves images, and what it was called with."""
     calls = []
 
-    def denoise(color, albedo=None, normal=None, *, hdr):
+    def denoise(color, albedo=None, normal=None, *, hdr, clean_aux=None):
+        if clean_aux is None:  # a guide
+            assert not hdr and color.min() >= 0 and color.max() <= 1
+            return color
+        assert clean_aux == (albedo is not None)
         calls.append(SimpleNamespace(color=color, albedo=albedo, normal=normal, hdr=hdr))
         return color / 2
 
@@ -49,7 +53,9 @@ def test_a_render_is_denoised_and_its_image_is_kept(run, make_scene, tmp_path, c
 
 def test_a_long_render_is_denoised_too(run, make_scene, tmp_path, calls):
     code, _, _ = run("render", make_scene(), "-o", tmp_path / "a.png", "--denoise", "--spp", 4,
-                     "--checkpoint", tmp_path / "kept")  # fmt: skip
+                     "--checkpoint", tmp_path / "kept",
+                     "--preview", tmp_path / "b.png")  # fmt: skip
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert code == 0 and images.open_bitmap(tmp_path / "a.png").width() == 8
     assert len(calls) == 1 and (tmp_path / "a.noisy.exr").exists()
 
@@ -61,7 +67,7 @@ def test_an_image_is_guided_by_its_layers(run, tmp_path, calls):
     images.write_exr(tmp_path / "a.exr", pixels, names, {})
     assert "guided by albedo and normal" in run("denoise", tmp_path / "a.exr")[1]
     np.testing.assert_array_equal(calls[0].albedo, pixels[..., 3:6])
-    np.testing.assert_array_equal(calls[0].normal, pixels[..., 6:])
+    np.testing.assert_allclose(calls[0].normal, pixels[..., 6:], atol=1e-6)
     found = read_exr(tmp_path / "a.denoised.exr")[0]
     np.testing.assert_array_equal(found["G"], pixels[..., 1] / 2)
     images.write_exr(tmp_path / "b.exr", pixels[..., :3], "RGB", {})
@@ -86,6 +92,61 @@ def test_a_filter_that_correlates_pixels_is_named(run, make_scene, tmp_path, cal
     scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))
     code, _, err = run("render", scene, "-o", tmp_path / "a.exr", "--denoise")
     assert code == 0 and "use a film with a box filter" in err
+
+
+def _guides(*shapes, **film):
+    """Guides of shapes in front of a camera at the origin that looks along z: [y, x, channel]."""
+    film = {"type": "hdrfilm", "width": 9, "height": 9, "rfilter": {"type": "box"}, **film}
+    scene = mi.load_dict({
+        "type": "scene", "sensor": {"type": "perspective", "fov": 20, "film": film},
+        **{f"shape{n}": shape for n, shape in enumerate(shapes)},
+    })  # fmt: skip
+    found = denoising.render_guides(scene, scene.sensors()[0], seed=1)
+    assert list(found) == [*(f"albedo.{c}" for c in "RGB"), *(f"normal.{c}" for c in "XYZ")]
+    return np.stack(list(found.values()), axis=2)
+
+
+def _wall(z, bsdf, angle=180, axis=(0, 1, 0)):
+    T = mi.ScalarTransform4f
+    to_world = T().translate([0, 0, z]).rotate(list(axis), angle).scale(9)
+    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+
+
+def _diffuse(*rgb):
+    return {"type": "twosided", "b": {
+        "type": "diffuse", "reflectance": {"type": "rgb", "value": list(rgb)}}}  # fmt: skip
+
+
+@pytest.mark.parametrize("film", [{}, {"width": 1, "height": 1}, {"rfilter": {"type": "gaussian"}}])
+def test_guides_are_those_of_what_a_mirror_shows(film):
+    mirror = {"type": "conductor", "material": "none",
+              "specular_reflectance": {"type": "rgb", "value": [0.5, 1, 1]}}  # fmt: skip
+    # The mirror shows a wall behind the camera
+    found = _guides(_wall(4, mirror), _wall(-3, _diffuse(0.2, 0.4, 0.6), 0), **film)
+    assert np.abs(found[..., :3] - [0.1, 0.4, 0.6]).max() < 1e-5
+    np.testing.assert_allclose(found[..., 3:].mean((0, 1)), [0, 0, 1], atol=1e-5)
+
+
+def test_guides_are_those_of_what_is_behind_glass_and_holes():
+    pane = {"type": "thindielectric", "int_ior": 1.0001}
+    hole = {"type": "mask", "opacity": 0.25, "b": _diffuse(0, 0, 0)}
+    wall = _wall(6, _diffuse(0.8, 0.8, 0.8))
+    found = _guides(_wall(4, pane), wall)
+    np.testing.assert_allclose(found[..., :3], 0.8, atol=1e-3)
+    # A hole that lets three quarters of the light through
+    found = _guides(_wall(4, hole), wall)
+    assert abs(found[..., :3].mean() - 0.6) < 0.02
+    # Plastic is itself, though it mirrors too; what nothing is behind has no guides
+    plastic = {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": 0.3}}
+    found = _guides(_wall(4, plastic), _wall(-3, _diffuse(1, 1, 1), 0))
+    np.testing.assert_allclose(found[..., 5], -1, atol=1e-5)
+    assert (_guides({"type": "sphere", "center": [9, 9, 9]}) == 0).all()
+
+
+def test_two_mirrors_end():
+    mirror = {"type": "conductor", "material": "none"}
+    found = _guides(_wall(4, mirror), _wall(-3, mirror, 0))
+    assert np.isfinite(found).all()
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)

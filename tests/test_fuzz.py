@@ -17,6 +17,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 SCENES = [
     ("llvm_ad_rgb", "plain", (2, 3, 5)),
     ("llvm_ad_rgb", "moving", (1, 34, 46)),
+    ("llvm_ad_rgb", "moving_camera", (4,)),
     ("llvm_ad_rgb", "constant_index", (7, 8)),
     ("llvm_ad_spectral", "constant_index", (51,)),
     ("llvm_ad_spectral", "furnace", (10, 11, 12, 13)),

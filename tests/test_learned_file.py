@@ -31,7 +31,7 @@ def _larger_film() -> mi.Sensor:
     return mi.load_dict({"type": "perspective", "film": film})
 
 
-@pytest.mark.parametrize("name", some("guide and lights", of=LEARNING))
+@pytest.mark.parametrize("name", some("lights and roulette", of=LEARNING))
 def test_a_restored_render_draws_what_the_last_stage_would_have_drawn(name, tmp_path: Path) -> None:
     """Without pilots: the last stage of the same seed is the whole render."""
     scene, file = load("rooms"), tmp_path / "learned.npz"
@@ -50,6 +50,7 @@ def test_a_restored_render_draws_what_the_last_stage_would_have_drawn(name, tmp_
     assert type(again.learners) is type(walk.learners)
 
 
+@pytest.mark.slow
 def test_restored_decisions_are_those_that_were_saved(tmp_path: Path) -> None:
     """The tables themselves, bit for bit."""
     scene, file = load("rooms"), tmp_path / "learned.npz"

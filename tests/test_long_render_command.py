@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
@@ -10,14 +11,15 @@ import sys
 import time
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import PATH, in_subprocess
 
-from mitsuba_ext.cli.common import Interval
 from mitsuba_ext.compare import load_reference, read_exr
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer
 from mitsuba_ext.long_renders.folder import CheckpointFolder
+from mitsuba_ext.long_renders.intervals import Interval
 
 pytestmark = pytest.mark.usefixtures("batches_of_sixteen_samples")
 
@@ -38,6 +40,9 @@ def test_more_samples_later_and_merged(run, make_scene, tmp_path):
     images = {name: read_exr(tmp_path / f"{name}.exr")[0] for name in ("1", "2", "both")}
     mean = (images["1"]["R"] + images["2"]["R"]) / 2
     np.testing.assert_allclose(images["both"]["R"], mean, rtol=1e-5)
+    metadata = read_exr(tmp_path / "both.exr")[1]
+    assert json.loads(metadata["seeds"]) == [1, 2]
+    assert json.loads(metadata["statistics"])["rays"] == {"camera": 48 * 96}
     state = CheckpointFolder(tmp_path / "both").load()
     np.testing.assert_allclose(images["both"]["variance.R"], state.images.variance[..., 0])
     reference = load_reference(tmp_path / "both.exr")
@@ -115,13 +120,13 @@ def test_variants_without_batches_are_named(run, make_scene, tmp_path):
 def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkeypatch):
     render, seen = BatchRenderer.render, []
 
-    def signalled(self, batch):
+    def signalled(self, batch, learned):
         if batch.index == 1:
             os.kill(os.getpid(), signal.SIGUSR1)
         if batch.index == 2:
             seen.append((CheckpointFolder(tmp_path / "kept").load().spp,
                          read_exr(tmp_path / "a.exr")[1]["spp"]))  # fmt: skip
-        return render(self, batch)
+        return render(self, batch, learned)
 
     monkeypatch.setattr(BatchRenderer, "render", signalled)
     code, out, _ = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
@@ -129,14 +134,42 @@ def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkey
     assert code == 0 and "64 spp" in out and seen == [(32, 32)]
 
 
+@pytest.mark.parametrize("is_kept", [True, False])
+def test_a_preview_shows_the_render_while_it_grows(
+    run, make_scene, tmp_path, monkeypatch, is_kept
+):
+    render, seen = BatchRenderer.render, []
+    output, preview = tmp_path / "a.exr", tmp_path / "look.png"
+
+    def watched(self, batch, *rest):
+        shown = preview.read_bytes() if preview.exists() else None
+        seen.append((read_exr(output)[1]["spp"] if output.exists() else 0, shown))
+        return render(self, batch, *rest)
+
+    monkeypatch.setattr(BatchRenderer, "render", watched)
+    kept = ("--checkpoint", tmp_path / "kept") if is_kept else ()
+    command = ("render", make_scene(), "-o", output, "--spp", 64, "--every", "32spp", *kept)
+    assert run(*command, "--preview", preview)[0] == 0
+    # After the first batch, then after 32 more; at the end
+    assert [spp for spp, _ in seen] == ([0, 16, 16, 48] if is_kept else [0] * 4)
+    looks = [shown for _, shown in seen]
+    assert looks[0] is None and looks[1] == looks[2] != looks[3]
+    # It has the sRGB curve, without exposure, dithered
+    image, linear = np.array(mi.Bitmap(str(preview))), read_exr(output)[0]["G"].astype(float)
+    curve = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    assert np.abs(image[..., 1] - 255 * np.clip(curve, 0, 1)).max() <= 1.01
+    code, _, err = run(*command, "--preview", output)
+    assert code == 2 and "--preview must be another file" in err
+
+
 @pytest.mark.parametrize("integrator", ["path", "composed_path"])
 def test_ctrl_c_keeps_the_render_and_ends(run, make_scene, tmp_path, monkeypatch, integrator):
     render = BatchRenderer.render
 
-    def signalled(self, batch):
+    def signalled(self, batch, learned):
         if batch.index == 2:
             os.kill(os.getpid(), signal.SIGTERM)
-        return render(self, batch)
+        return render(self, batch, learned)
 
     monkeypatch.setattr(BatchRenderer, "render", signalled)
     command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", integrator,

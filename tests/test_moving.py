@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hard_cases import area, bitmap, diffuse, lookat, rectangle, sensor
-from motions import Pose, keyed, uniform
+from hard_cases import diffuse, lookat, rectangle
+from motions import LENS, Pose, at, camera, keyed, pair, plate, room, sky, uniform
 from scipy.spatial.transform import Rotation
 from statistical import (
     SEEDS,
@@ -34,7 +34,7 @@ def quiet(variant: str) -> None:
     mi.set_log_level(mi.LogLevel.Error)
 
 
-# ---- Motions ----
+# ---- Motions and scenes ----
 
 SPIN = uniform([0.5, -0.3, 0.2], [0, 0.4, 1], 420.0, [0.1, 0, 0.5])
 SLIDE = uniform([0, -0.8, 0], [0, 0, 1], 0.0, [0, 0, 0], begin=0.1, end=0.6)
@@ -45,61 +45,6 @@ def keys() -> tuple[Scene, Pose]:
     positions = [[-0.3, 0, 0], [0.4, 0, 0.2], [0.3, -0.6, 0.5], [0, 0.1, 0.3]]
     return keyed([0.1, 0.4, 0.7, 0.9], rotations, positions)
 
-
-def at(pose: np.ndarray, *rest: mi.ScalarTransform4f) -> mi.ScalarTransform4f:
-    return functools.reduce(lambda a, b: a @ b, rest, mi.ScalarTransform4f(pose))
-
-
-# ---- Scenes ----
-
-
-def pair(pose: np.ndarray) -> Scene:
-    """A block and a ball."""
-    T = mi.ScalarTransform4f
-    return {
-        "block": {"type": "cube", "bsdf": diffuse(0.2, 0.7, 0.3),
-                  "to_world": at(pose, T().translate([0.4, 0, 0.4]).scale([0.25, 0.15, 0.3]))},
-        "ball": {"type": "sphere", "bsdf": {"type": "roughconductor", "alpha": 0.2},
-                 "to_world": at(pose, T().translate([-0.35, 0.1, 0.5]).scale(0.25))},
-    }  # fmt: skip
-
-
-def plate(pose: np.ndarray) -> Scene:
-    T = mi.ScalarTransform4f
-    bsdf = {"type": "twosided", "bsdf": diffuse(0.8, 0.4, 0.1)}
-    to_world = at(pose, T().translate([-0.6, 0.4, 0.9]).rotate([1, 0, 0], 60).scale(0.3))
-    return {"plate": {"type": "rectangle", "bsdf": bsdf, "to_world": to_world}}
-
-
-def room(camera: Scene, **things: Any) -> Scene:
-    """A floor, a mirror behind, and a lamp (large, as the mirror's caustic is sampled badly)."""
-    T = mi.ScalarTransform4f
-    upright = T().translate([0, 1.5, 1]).rotate([1, 0, 0], 90)
-    return {
-        "type": "scene",
-        "sensor": camera,
-        "floor": rectangle(T().scale([2, 2, 1]), bsdf=diffuse()),
-        "mirror": rectangle(upright, T().scale([2, 1, 1]), bsdf={"type": "conductor"}),
-        "lamp": rectangle(
-            T().translate([-0.3, 0, 1.9]).rotate([1, 0, 0], 180).scale(0.9),
-            bsdf=diffuse(0.0),
-            emitter=area(1.5),
-        ),
-        **things,
-    }
-
-
-def camera(begin: float = 0.0, end: float = 1.0, plugin: str = "perspective", **changes) -> Scene:
-    return sensor(plugin, shutter_open=begin, shutter_close=end, **changes)
-
-
-def sky() -> Scene:
-    """Not uniform: where nothing is noisy, rounding errors of long sums stand out."""
-    pixels = np.random.default_rng(4).uniform(0.2, 0.6, size=(8, 16, 3))
-    return {"type": "envmap", "bitmap": bitmap(pixels)}
-
-
-LENS = {"plugin": "thinlens", "aperture_radius": 0.15, "focus_distance": 4.0}
 
 #: Shutter, other parameters of the camera, what else is in the scene (made in the variant), and
 #: what moves how.

@@ -91,9 +91,10 @@ def _errors() -> dict[str, tuple[Scene, str]]:
         "mirror": ({**poses, "pose_1": T().scale([-1, 1, 1])}, "must be rigid"),
         "nothing": (line, "nothing is nested"),
         "material": ({**line, "cube": cube, "paint": {"type": "diffuse"}}, "must be a shape"),
-        "emitter": ({**line, "lamp": {**cube, "light": area(1.0)}}, "emitters cannot move"),
+        "lights": ({**line, "a": {**cube, "light": area(1.0)}, "b": {**cube, "light": area(1.0)}},
+                   "2 of the nested shapes are lights"),
         "sensor": ({**line, "meter": {"type": "rectangle", "sensor": {"type": "irradiancemeter"}}},
-                   "sensors cannot move"),
+                   "sensors of shapes cannot move"),
         "nested": ({**line, "inner": {"type": "moving", **line, "cube": cube}}, "another one"),
         "attribute": ({**line, "mesh": _coloured_mesh()}, '"vertex_color"'),
     }  # fmt: skip
@@ -108,7 +109,7 @@ def _coloured_mesh() -> mi.Mesh:
 @pytest.mark.parametrize("case", [
     "typo", "to_world", "no_motion", "no_angle", "no_axis", "zero_axis", "backwards",
     "not_a_number", "mixed", "gap", "one_pose", "order", "scale", "mirror", "nothing", "material",
-    "emitter", "sensor", "nested", "attribute",
+    "lights", "sensor", "nested", "attribute",
 ])  # fmt: skip
 def test_what_cannot_move_is_refused(case: str) -> None:
     parameters, message = _errors()[case]

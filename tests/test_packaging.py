@@ -21,7 +21,7 @@ from mitsuba_ext import runtime
 
 ROOT = Path(__file__).parents[1]
 PYPROJECT = (ROOT / "pyproject.toml").read_text()
-KINDS = ("integrators", "emitters", "bsdfs", "samplers", "shapes")
+KINDS = ("integrators", "emitters", "bsdfs", "samplers", "sensors", "shapes")
 SOURCES = [ROOT / name for name in ("mitsuba_ext", *KINDS)]
 
 

@@ -94,9 +94,10 @@ def test_mean_is_that_of_path_whatever_is_guided(
     assert_same_pixels_on_average(images, reference, precision)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parameters", "most"),
-    [({}, 0.8), pytest.param({**TILES, "tile": 10}, 0.93, marks=pytest.mark.slow)],
+    [({}, 0.8), ({**TILES, "tile": 10}, 0.93)],
     ids=["surfaces", "tiles"],
 )
 def test_guiding_lowers_the_variance_behind_a_door(parameters: dict, most: float) -> None:

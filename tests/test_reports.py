@@ -7,7 +7,9 @@ import json
 import drjit as dr
 import pytest
 
-from mitsuba_ext.cli import long_job, reports
+from mitsuba_ext.cli import long_job, reports, statistics
+from mitsuba_ext.compare import read_exr
+from mitsuba_ext.rendering.totals import RenderTotals
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -34,13 +36,52 @@ def test_a_script_reads_events(run, make_scene, tmp_path, every_event, options):
     assert code == 0 and not err
     *steps, end = events
     assert end == {"event": "end", "interrupted": False, "file": str(target), "spp": 1 << 16,
-                   "seconds": end["seconds"], "bad_pixels": 0}  # fmt: skip
+                   "seconds": end["seconds"], "bad_pixels": 0,
+                   "statistics": end["statistics"]}  # fmt: skip
+    assert end["statistics"]["rays"] == {"camera": 48 << 16}
     assert {step["event"] for step in steps} == {"progress"} and len(steps) >= 3
     found = [step["spp"] for step in steps]
     assert found == sorted(set(found)) and found[-1] == 1 << 16
     assert steps[-2]["seconds_left"] > 0 == steps[-1]["seconds_left"]
     if options:
         assert steps[-1]["samples_per_second"] > 0 and steps[-1]["goal_spp"] == 1 << 16
+
+
+@pytest.mark.parametrize(("integrator", "options"), [
+    ("path", ()), ("neepp:grid=4", ()), ("neepp:grid=4", ("--until", "1e-9")),
+])  # fmt: skip
+def test_the_end_says_what_the_render_cost(run, make_scene, tmp_path, integrator, options):
+    target = tmp_path / "a.exr"
+    command = ("render", make_scene(), "-o", target, "--integrator", integrator, "--spp", 256,
+               "--seed", 5, *options)  # fmt: skip
+    code, out, _ = run(*command)
+    assert code == 0 and "256 spp in" in out.splitlines()[0]
+    metadata = read_exr(target)[1]
+    name, is_ours = integrator.partition(":")[0], integrator != "path"
+    assert metadata["integrator"] == name and metadata["seed"] == 5
+    found = json.loads(metadata["statistics"])
+    assert found["rays"]["camera"] == 48 * 256 and found["memory_bytes"] > 0
+    assert found["render_seconds"] > 0
+    assert f"{name}, seed 5, llvm_ad_rgb, mitsuba_ext" in out and "12.3 thousand from the" in out
+    if is_ours:
+        assert found["rays"]["shadow"] > 0 < found["learning_seconds"] and found["learned"]
+        assert f"learned: {found['learned']}" in out and " to lights" in out
+    code, out, _ = run(*command, "--json", "--spp", 256)
+    end = json.loads(out.splitlines()[-1])["statistics"]
+    assert end["integrator"] == name and end["seeds"] == [5] and end["rays"] == found["rays"]
+    assert end["versions"]["variant"] == "llvm_ad_rgb"
+
+
+def test_costs_add_up():
+    one = RenderTotals({"camera": 2}, 3, 1.0, 0.5, 0.25, 7, "a")
+    two = RenderTotals({"camera": 1, "shadow": 4}, 1, 1.0, 0.0, 0.0, 5, "")
+    both = one.plus(two)
+    assert both == RenderTotals({"camera": 3, "shadow": 4}, 4, 2.0, 0.5, 0.25, 7, "a")
+    assert RenderTotals(**json.loads(json.dumps(both.known()))) == both
+    assert RenderTotals().known() == {}
+    many = statistics.lines(RenderTotals(), "path", range(9), {
+        "variant": "v", "mitsuba_ext": "1", "mitsuba": "3"})  # fmt: skip
+    assert many == ["  path, seeds 0, 1, 2, 3, …, v, mitsuba_ext 1, Mitsuba 3"]
 
 
 def test_threads_are_those_of_all_processes(run, make_scene, tmp_path):

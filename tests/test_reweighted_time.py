@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from hard_cases import film, lookat, sensor, stage
-from statistical import assert_images_are_sound, assert_same_pixels_on_average, batches
+from statistical import assert_images_are_sound, assert_same_pixels_on_average, batches, some
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -78,7 +78,7 @@ def test_sets_lower_the_noise_of_motion(pattern, weights, factor):
 
 
 @pytest.mark.parametrize(
-    "nested", ["neepp", pytest.param("pss_guided", marks=pytest.mark.slow), "reweighted_direct"]
+    "nested", some("reweighted_direct", of=["neepp", "pss_guided", "reweighted_direct"])
 )
 def test_mean_with_other_integrators(nested):
     ball = {"type": "moving", "translate": [0.8, 0, 0.4], "ball": {"type": "sphere", "radius": 0.5}}
@@ -88,6 +88,7 @@ def test_mean_with_other_integrators(nested):
     assert_same_pixels_on_average(batches(scene, timed(nested), 256, [1, 2]), reference, 0.05)
 
 
+@pytest.mark.slow
 def test_lens_and_time_work_together() -> None:
     """Nested in each other: the mean stays, and both kinds of noise fall."""
     scene = streaks(kind="thinlens", film=film(24, 24), aperture_radius=0.3, focus_distance=2.0)

@@ -106,7 +106,8 @@ def test_where_one_wavelength_is_left_it_has_the_weight_of_the_whole_circle(vari
     assert 5 * batches(scene, weighted, 64, range(1, 6)).var(axis=0).mean() < plain
 
 
-@pytest.mark.parametrize("nested", ["neepp", pytest.param("pss_guided", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("nested", ["neepp", "pss_guided"])
 def test_mean_with_other_integrators(variant, nested):
     scene = mi.load_dict(stage(camera=sensor(film=film(12, 12))))
     nested = {"type": nested, "max_depth": 4}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..movers import point_at_rest, sensor_at_rest, viewing_axis
 from ..transport.numbers import hashed
 from ..transport.path_decisions import SceneQuery
 
@@ -17,14 +18,14 @@ class DepthMaps:
     areas: they are squares of the numbers that choose points of the aperture.
 
     A pixel has one ray, from a random point of the piece through a random point of the pixel, at a
-    random time. A map takes 4 bytes for each pixel.
+    random time. A map takes 4 bytes for each pixel. All is in the frame in which the sensor rests.
 
     Where the middle of the aperture sees a point, and its inverse depth, are called the *place* of
     the point: x and y in units of the film's size, and z.
 
     Parameters:
         scene: The scene.
-        sensor: A ``thinlens``.
+        sensor: A ``thinlens``, which may move.
         query: How a ray meets the scene.
         pieces: There are ``pieces``² of them.
         most_pixels: Of a map along its longer edge. It has no more than the film.
@@ -42,14 +43,13 @@ class DepthMaps:
     def __init__(
         self, scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery, pieces: int, most_pixels: int
     ) -> None:
-        self._sensor, self.pieces = sensor, pieces
+        self._sensor, self.pieces = sensor_at_rest(sensor), pieces
         size = [int(n) for n in sensor.film().crop_size()]
         shrink = min(1.0, most_pixels / max(size))
         self.shape = (max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink)))
-        axis = mi.Transform4f(sensor.world_transform()) @ mi.Vector3f(0, 0, 1)
-        self._axis = dr.normalize(axis)
+        self._axis = viewing_axis(self._sensor, mi.Float(0))
         dr.make_opaque(self._axis)
-        self._maps = self._trace(scene, query)
+        self._maps = self._trace(scene, sensor, query)
         self.nearest = self.farthest = self.parallax = 0.0
         self.margins = (0.0, 0.0)
         if dr.width(self.places) > 0:
@@ -102,20 +102,20 @@ class DepthMaps:
         ds, _ = self._sensor.sample_direction(it, numbers)
         return ds.uv / mi.ScalarVector2f(self._sensor.film().crop_size())
 
-    def _trace(self, scene: mi.Scene, query: SceneQuery) -> mi.Float:
+    def _trace(self, scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery) -> mi.Float:
         """The maps, one after the other, row by row; 0 where nothing is seen."""
         width, height = self.shape
         lane = dr.arange(mi.UInt32, width * height * self.pieces**2)
         numbers = hashed(lane, 5)
         x, y, piece = lane % width, (lane // width) % height, lane // (width * height)
         position = mi.Point2f(x + numbers[0], y + numbers[1]) / mi.Vector2f(width, height)
-        sensor = self._sensor
         time = sensor.shutter_open() + numbers[4] * sensor.shutter_open_time()
         lens = self.lens_numbers(piece, mi.Point2f(numbers[2], numbers[3]))
         ray, _ = sensor.sample_ray(time, _MIDDLE, position, lens)
         pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
         is_hit = pi.is_valid()
-        place = self.place(ray(dr.select(is_hit, pi.t, 0)))
+        hit = ray(dr.select(is_hit, pi.t, 0))
+        place = self.place(point_at_rest(sensor, hit, ray.time))
         place.z = dr.select(is_hit, place.z, 0)
         dr.eval(place)
         self.places = dr.gather(mi.Point3f, place, dr.compress(place.z > 0))

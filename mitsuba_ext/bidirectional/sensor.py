@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..movers import is_moving_camera, point_at_rest, sensor_at_rest, viewing_axis
 from ..transport.path_decisions import SceneQuery
 
 #: The sensors of Mitsuba to which a point can be connected.
@@ -44,8 +45,9 @@ class UniformLens:
     def sample(
         self, sample: mi.Point2f, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[mi.Point2f, mi.Float | float]:
-        """The numbers that choose a point of the aperture for a connection to ``si``, and the
-        weight of the connection (1 / density of the numbers)."""
+        """The numbers that choose a point of the aperture for a connection to ``si`` (in the frame
+        in which the sensor rests), and the weight of the connection (1 / density of the
+        numbers)."""
         return sample, 1.0
 
 
@@ -81,7 +83,7 @@ class ConnectableSensor:
     @staticmethod
     def can_connect(sensor: mi.Sensor) -> bool:
         """Can points of the scene be connected to this sensor?"""
-        return sensor.class_name() in _CONNECTABLE
+        return sensor_at_rest(sensor).class_name() in _CONNECTABLE
 
     @property
     def needs_aperture_sample(self) -> bool:
@@ -95,7 +97,7 @@ class ConnectableSensor:
         Returns:
             The connection, and its weight (1 unless the lens prefers some points).
         """
-        sample, weight = self._lens.sample(sample, si, active)
+        sample, weight = self._lens.sample(sample, self._at_rest(si), active)
         ds, _importance = self._sensor.sample_direction(si, sample, active)
         cosine = -dr.dot(ds.d, ds.n)
         depth = cosine * ds.dist
@@ -113,9 +115,17 @@ class ConnectableSensor:
         """The point of the aperture from which a camera ray comes (it begins at the near clip
         plane), and the density of its direction per solid angle, as :attr:`SensorConnection.pdf`.
         """
-        axis = mi.Transform4f(self._sensor.world_transform()) @ mi.Vector3f(0, 0, 1)
-        inverse = dr.rcp(dr.maximum(dr.dot(ray.d, dr.normalize(axis)), 1e-6))
+        axis = viewing_axis(self._sensor, ray.time)
+        inverse = dr.rcp(dr.maximum(dr.dot(ray.d, axis), 1e-6))
         return ray.o - ray.d * (self._near * inverse), self._inverse_area * inverse**3
+
+    def _at_rest(self, si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+        """The interaction with its point in the frame in which a moving camera rests."""
+        if not is_moving_camera(self._sensor):
+            return si
+        moved = mi.SurfaceInteraction3f(si)
+        moved.p = point_at_rest(self._sensor, si.p, si.time)
+        return moved
 
 
 def is_occluded(

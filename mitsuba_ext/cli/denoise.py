@@ -32,6 +32,6 @@ def denoise(image: Path, output: Path | None) -> int:
     images.check_target(target)
     denoiser()
     select_variant("scalar_rgb")
-    guides = denoise_file(image, target, {})
+    guides = denoise_file(image, [target], {})
     say(f"{target}: guided by {' and '.join(guides) or 'nothing but the image'}", err=False)
     return 0

@@ -53,12 +53,21 @@ class Picture(NamedTuple):
         definitions: Values of the scene's ``$name`` parameters.
         sensor: The number of the sensor; ``None`` for the first.
         seed: Of the random numbers.
+        frame: The number of the frame; ``None`` if there are none.
+        name: Among the images of the call; empty if it is the only one.
     """
 
     output: Path
     definitions: tuple[tuple[str, str], ...]
     sensor: int | None
     seed: int
+    frame: int | None = None
+    name: str = ""
+
+    @property
+    def unfinished(self) -> Path:
+        """The file of an image that is not finished."""
+        return self.output.with_name(f"{self.output.stem}.partial{self.output.suffix}")
 
 
 def pictures(
@@ -80,16 +89,18 @@ def pictures(
     if frames is not None and len(re.findall("#+", output.name)) != 1:
         raise InputError(f"{output}: needs a place for the number of the frame: image.####.exr")
     for frame in [None] if frames is None else frames:
-        file, values = output, tuple(definitions)
+        file, values, names = output, tuple(definitions), []
         if frame is not None:
-            name = re.sub("#+", lambda m, f=frame: str(f).zfill(len(m[0])), output.name)
-            file = output.with_name(name)
+            digits = re.sub("#+", lambda m, f=frame: str(f).zfill(len(m[0])), output.name)
+            file = output.with_name(digits)
+            names.append(str(frame).zfill(output.name.count("#")))
             values = tuple((key, _evaluated(text, frame)) for key, text in definitions)
         for sensor in sensors:
-            own = f"{file.stem}.sensor{sensor}{file.suffix}"
+            own = [f"sensor{sensor}"] if len(sensors) > 1 else []
+            name = ".".join([file.stem, *own]) + file.suffix
             yield Picture(
-                file.with_name(own) if len(sensors) > 1 else file, values, sensor,
-                (seed + (frame or 0)) % (MAX_SEED + 1),
+                file.with_name(name), values, sensor, (seed + (frame or 0)) % (MAX_SEED + 1),
+                frame, ".".join([*names, *own]),
             )  # fmt: skip
 
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import signal
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
@@ -15,15 +13,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ..chosen import LastScene
 from ..errors import InputError
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
 from ..long_renders.dask_cluster import dask_cluster
 from ..long_renders.folder import CheckpointFolder
+from ..long_renders.intervals import Interval, LastKept
 from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
 from ..long_renders.workers import Workers
 from ..rendering.interrupts import deferred_interrupt
-from .common import Interval
+from ..rendering.totals import RenderTotals
 from .reports import Report, Speed, time_left
 
 
@@ -38,6 +38,7 @@ class LongOptions:
         until: The relative error at which it ends; ``None`` for none.
         workers: Processes that render; 0 for this one.
         dask: The address of a Dask scheduler whose workers render; empty for none.
+        has_preview: Is the image to be shown while it grows, also if no folder keeps it?
     """
 
     folder: Path | None = None
@@ -46,6 +47,7 @@ class LongOptions:
     until: float | None = None
     workers: int = 0
     dask: str = ""
+    has_preview: bool = False
 
 
 class LongJob:
@@ -59,37 +61,27 @@ class LongJob:
         seconds: Wall clock of the render.
     """
 
-    def __init__(self, request: RenderRequest, options: LongOptions) -> None:
+    def __init__(
+        self, request: RenderRequest, options: LongOptions, scenes: LastScene | None = None
+    ) -> None:
         """
+        Args:
+            request, options: What to render, and how long.
+            scenes: Keeps the scene for the next image.
+
         Raises:
-            InputError: The scene, the integrator or the sensor cannot be used, or what is learned
-                cannot be sent to the workers.
+            InputError: The scene, the integrator or the sensor cannot be used.
         """
         self._options = options
         self._folder = CheckpointFolder(options.folder) if options.folder else None
-        # Without a folder, what is learned is forgotten with this object
-        self._temporary = tempfile.TemporaryDirectory()
-        folder = CheckpointFolder(Path(self._temporary.name))
-        learned = (self._folder or folder).learned
         # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR file
         threads = max(2, (os.cpu_count() or 1) // options.workers) if options.workers else 0
-        self._request = replace(
-            request, learned=str(learned.absolute()), threads=request.threads or threads
-        )
-        self._renderer = BatchRenderer(self._request)
+        self._request = replace(request, threads=request.threads or threads)
+        self._renderer = BatchRenderer(self._request, scenes=scenes)
         named = self._renderer.chosen.named
         self.integrator, self.name, self.parameters = (
             named.integrator, named.name, named.parameters
         )  # fmt: skip
-        if options.dask:
-            if self._renderer.must_learn and not self._folder:
-                raise InputError(
-                    f'"{self.name}" learns: with --dask, it needs --checkpoint, a folder that the '
-                    f"workers see too"
-                )
-            # Workers have another current folder, and perhaps other files
-            description = json.dumps(self._renderer.description(), default=str)
-            self._request = replace(_absolute(self._request), description=description)
         self.scene, self.sensor = self._renderer.chosen.scene, self._renderer.sensor
         self.film = self.sensor.film()
         self.is_interrupted, self.seconds = False, 0.0
@@ -100,7 +92,7 @@ class LongJob:
         return self._renderer.chosen.remarks(is_sensor_chosen)
 
     def run(
-        self, spp: int | None, seconds: float | None, write: Callable[[], None], report: Report
+        self, spp: int | None, seconds: float | None, write: Callable[[bool], None], report: Report
     ) -> None:
         """Goes on with what is in the folder.
 
@@ -108,7 +100,7 @@ class LongJob:
             spp: Samples per pixel of the whole image. Default: the number of the sampler, if
                 nothing else ends the render.
             seconds: Of this call.
-            write: Writes the image of the film.
+            write: Shows the image of the film. Its argument says whether a signal asked for it.
             report: Is told how far it is.
 
         Raises:
@@ -120,9 +112,6 @@ class LongJob:
                 if self._folder:
                     self._folder.describe(self._renderer.description())
                     self._state = self._folder.load()
-                    if not self._state.has_taught:
-                        # It would depend on the numbers of a batch that is still to come
-                        self._folder.learned.unlink(missing_ok=True)
                 self._run(spp, seconds, write, report)
             finally:
                 self.seconds = time.perf_counter() - begin
@@ -133,15 +122,18 @@ class LongJob:
             spp = state.spp + options.add
         elif spp is None and options.until is None and seconds is None:
             spp = self._renderer.sensor.sampler().sample_count()
-        last = _Last(state.spp)
+        last = LastKept(state.spp)
+        is_due_at_once = options.has_preview
 
-        def keep() -> None:
+        def keep(is_asked: bool) -> None:
+            nonlocal is_due_at_once
+            is_due_at_once = False
             last.mark(state.spp)
             if self._folder:
                 self._folder.save(state)
             state.fill(self.film)
             self.seconds = time.perf_counter() - last.begin
-            write()
+            write(is_asked)
 
         speed, pixel_count = Speed(), math.prod(self.film.crop_size())
 
@@ -166,13 +158,16 @@ class LongJob:
                     samples_per_second=per_second and per_second * pixel_count,
                     seconds=time.perf_counter() - last.begin, seconds_left=left,
                 )  # fmt: skip
-                if asked() or (self._folder and last.is_due(options.every, state.spp)):
+                is_asked, is_due = asked(), is_due_at_once
+                if self._folder or options.has_preview:
+                    is_due |= last.is_due(options.every, state.spp)
+                if is_asked or is_due:
                     try:
-                        keep()
+                        keep(is_asked)
                     except OSError as problem:
                         report.warn(f"the render could not be kept: {problem}; it goes on")
 
-            self._render = LongRender(self._renderer, self._request, state, progress)
+            self._render = LongRender(self._renderer, state, progress)
             goal = Goal(spp, options.until, seconds)
             is_reached = False
             try:
@@ -203,19 +198,22 @@ class LongJob:
                 report.warn(f"the render could not be kept: {problem}")
 
     @contextlib.contextmanager
-    def _executor(self) -> Iterator[tuple[Executor | None, int, Callable[[], None]]]:
-        """Who renders, how many batches at a time, and a function that fails if these are gone."""
+    def _executor(
+        self,
+    ) -> Iterator[tuple[Executor | None, Callable[[], int], Callable[[], None]]]:
+        """Who renders, how many batches at a time (which may change), and a function that fails if
+        these are gone."""
         if self._options.dask:
-            with dask_cluster(self._options.dask) as cluster:
-                yield cluster
+            with dask_cluster(self._options.dask) as (executor, check):
+                yield executor, executor.count, check
         elif self._options.workers:
             executor = Workers(self._options.workers)
             try:
-                yield executor, self._options.workers, lambda: None
+                yield executor, lambda: self._options.workers, lambda: None
             finally:
                 executor.shutdown(cancel_futures=True)
         else:
-            yield None, 1, lambda: None
+            yield None, lambda: 1, lambda: None
 
     # ---- How far it got ----
 
@@ -245,36 +243,17 @@ class LongJob:
 
     def about(self) -> Mapping[str, Any]:
         """What the metadata of the image say besides."""
-        return {"batches": len(self._state.done)}
+        return {"batches": len(self._state.done), "seeds": self.seeds}
 
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds of the samples in the image."""
+        return sorted({batch.seed for batch in self._state.done})
 
-def _absolute(request: RenderRequest) -> RenderRequest:
-    """A request whose files are found from any folder."""
-
-    def absolute(name: str) -> str:
-        path = Path(name)
-        return str(path.absolute()) if path.suffix and path.is_file() else name
-
-    return replace(
-        request, scene=absolute(request.scene), plugins=tuple(map(absolute, request.plugins)),
-        specification=request.specification and absolute(request.specification),
-    )  # fmt: skip
-
-
-class _Last:
-    """When a render was kept last."""
-
-    def __init__(self, spp: int) -> None:
-        self.begin = time.perf_counter()
-        self.mark(spp)
-
-    def mark(self, spp: int) -> None:
-        self._time, self._spp = time.perf_counter(), spp
-
-    def is_due(self, every: Interval, spp: int) -> bool:
-        if every.spp:
-            return spp - self._spp >= every.spp
-        return time.perf_counter() - self._time >= every.seconds
+    @property
+    def totals(self) -> RenderTotals:
+        """The cost of these samples, whoever rendered them."""
+        return self._state.totals
 
 
 @contextlib.contextmanager

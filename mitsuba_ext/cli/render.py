@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
+from ..long_renders.intervals import Interval
 from ..names import check_integrator
 from ..parameters import MOST_SPP
 from ..variants import select_variant
@@ -16,25 +15,16 @@ from .common import (
     MAX_SEED,
     Every,
     FilledPath,
-    Interval,
-    kernels_compiled,
-    say,
     scene_options,
 )
-from .frames import FrameRange, Picture, Sensors, pictures
-from .stopping import stopping
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from .long_job import LongOptions
-    from .reports import Report
+from .frames import FrameRange, Sensors, pictures
 
 
 @click.command(short_help="Render a scene to an image.")
 @click.option(
     "-o", "--output", type=FilledPath(), required=True, metavar="FILE",
-    help="Image to write: .exr (float, with metadata), .png, .jpg, .hdr or .pfm.",
+    help="Image to write: .exr (all channels as floats, with metadata), .hdr or .pfm (RGB as "
+    "floats), .png or .jpg (8 bits: the sRGB curve, clipped at 1, no exposure or tone mapping).",
 )
 @click.option(
     "--integrator", "specification", metavar="INTEGRATOR",
@@ -67,12 +57,26 @@ if TYPE_CHECKING:
     "n.",
 )
 @click.option(
+    "--parameters", metavar="FILE.py:FUNCTION",
+    help="With --frames: a Python function of the frame's number that returns a dict of the "
+    "frame's parameters. Keys with a dot are those of mi.traverse, which are set without loading "
+    "the scene again; others are $KEY parameters of the scene file.",
+)
+@click.option(
     "--checkpoint", type=FilledPath(), metavar="DIR",
-    help="A folder that keeps the render. The same command goes on from there.",
+    help="A folder that keeps the render. The same command goes on from there. Of several frames "
+    "or sensors, each has a folder in it.",
 )
 @click.option(
     "--every", type=Every(), default="60s", metavar="TIME", show_default=True,
-    help="With --checkpoint: how often to keep it, and to write FILE: 60s, 10m, 2h or 100spp.",
+    help="How often --checkpoint keeps the render and writes FILE, and --preview is written: 60s, "
+    "10m, 2h or 100spp.",
+)
+@click.option(
+    "--preview", type=FilledPath(), metavar="FILE",
+    help="A second image, such as a .png, that shows the render while it grows: after the first "
+    "batch, and then each --every. Of several frames or sensors, it shows the one that is being "
+    "rendered.",
 )
 @click.option(
     "--add", type=click.IntRange(1, MOST_SPP), metavar="N",
@@ -117,8 +121,10 @@ def render(
     seed: int,
     sensors: tuple[int, ...] | None,
     frames: range | None,
+    parameters: str | None,
     checkpoint: Path | None,
     every: Interval,
+    preview: Path | None,
     add: int | None,
     until: float | None,
     workers: int | None,
@@ -141,9 +147,9 @@ def render(
     Mitsuba's own integrators render in passes. A structured sampler stratifies the samples of a
     pass (64 per pixel or more, 16 for large images), not those of the whole render.
 
-    With --checkpoint, --until, --workers or --dask, all integrators render in batches: independent
-    renders with seeds of their own. An EXR then holds the variance of the image too. What an
-    integrator learns in the first batch, the others use. SIGUSR1 keeps the render after the
+    With --checkpoint, --until, --workers, --dask or --preview, all integrators render in batches:
+    independent renders with seeds of their own. An EXR then holds the variance of the image too.
+    What an integrator learns in the first batch, the others use. SIGUSR1 keeps the render after the
     running batch.
     """
     if specification and not plugins:
@@ -151,6 +157,8 @@ def render(
     from ..scenes import check_scene_file
 
     check_scene_file(scene)
+    from ..chosen import LastScene
+    from .image_render import Order, is_finished, render_image
     from .long_job import LongOptions
     from .reports import Report
 
@@ -163,158 +171,52 @@ def render(
         raise click.UsageError("--add and --spp exclude each other")
     if workers is not None and dask is not None:
         raise click.UsageError("--workers and --dask exclude each other")
-    is_long = checkpoint or until or workers or dask
-    order = _Order(
-        scene, specification, spp, seconds, size, variant, denoise, threads,
-        LongOptions(checkpoint, every, add, until, workers or 0, dask or "") if is_long else None,
+    if preview is not None and preview.absolute() == output.absolute():
+        raise click.UsageError("--preview must be another file than --output")
+    is_long = checkpoint or until or workers or dask or preview
+    order = Order(
+        scene, specification, spp, seconds, size, variant, tuple(plugins), denoise, threads,
+        LongOptions(
+            checkpoint, every, add, until, workers or 0, dask or "", preview is not None
+        ) if is_long else None,
         is_one_of_many=frames is not None or (sensors is not None and len(sensors) != 1),
+        preview=preview,
     )  # fmt: skip
-    if order.is_one_of_many and checkpoint:
-        raise click.UsageError("--checkpoint keeps one image: it excludes --frames and sensors")
+    if order.is_one_of_many and add is not None:
+        raise click.UsageError("--add is for one image: give --spp, the number that all shall have")
+    if parameters is not None and frames is None:
+        raise click.UsageError("--parameters needs --frames")
+    function = None
+    if parameters is not None:
+        from .frame_parameters import load_function
+
+        select_variant(variant, plugins)  # the function may use types of Mitsuba
+        plugins = ()  # they are registered
+        function = load_function(parameters)
     if sensors == ():
-        sensors = _all_sensors(scene, definitions, variant, plugins, frames)
-    result = 0
-    chosen = list(pictures(output, definitions, sensors or [None], seed, frames))
-    for picture in chosen:
-        if order.is_one_of_many and picture.output.exists():
+        sensors = _all_sensors(scene, definitions, variant, plugins, frames, function)
+        plugins = ()
+    result, scenes = 0, LastScene()
+    for picture in list(pictures(output, definitions, sensors or [None], seed, frames)):
+        if order.is_one_of_many and is_finished(order, picture):
             report.note(f"{picture.output}: exists already")
             continue
-        code = _render_image(order, picture, plugins, report)
-        plugins = ()  # they are registered
+        code = render_image(order, picture, plugins, report, scenes, function)
+        plugins = ()
         if code > 1:
             return code
         result = max(result, code)
     return result
 
 
-class _Order(NamedTuple):
-    """What all images of a call have in common; see the options."""
-
-    scene: Path
-    specification: str | None
-    spp: int | None
-    seconds: float | None
-    size: tuple[int, int] | None
-    variant: str
-    denoise: bool
-    threads: int | None
-    long: LongOptions | None
-    is_one_of_many: bool
-
-
-def _all_sensors(scene, definitions, variant, plugins, frames) -> list[int]:
+def _all_sensors(scene, definitions, variant, plugins, frames, function) -> list[int]:
     """The numbers of a scene's sensors, in the first of the frames."""
     from ..scenes import load_scene
 
     select_variant(variant, plugins)
     (picture,) = pictures(Path("#"), definitions, [None], 0, frames and frames[:1])
-    loaded = load_scene(scene, parameters=dict(picture.definitions), keep_integrator=False)
+    values = dict(picture.definitions)
+    if function:
+        values |= function(picture.frame).definitions
+    loaded = load_scene(scene, parameters=values, keep_integrator=False)
     return list(range(len(loaded.scene.sensors())))
-
-
-def _render_image(
-    order: _Order, picture: Picture, plugins: Sequence[str], report: Report
-) -> int:
-    """Renders an image and returns the exit code."""
-    from .. import denoising
-    from ..chosen import Chosen
-    from ..compare import images, machine
-    from ..long_renders.batch_renderer import RenderRequest
-    from .long_job import LongJob
-    from .render_job import RenderJob
-
-    output, definitions, sensor_index, seed = picture
-    images.check_target(output)
-    if order.denoise:
-        denoising.denoiser()
-    guides = {}
-
-    def metadata() -> dict[str, object]:
-        return {
-            "scene": str(order.scene),
-            "scene_parameters": dict(definitions),
-            "integrator": job.name,
-            "parameters": job.parameters,
-            "seed": seed,
-            "spp": job.spp,
-            "seconds": job.seconds,
-            "interrupted": job.is_interrupted,
-            "versions": machine.versions(),
-            **job.about(),
-        }
-
-    def write(target: Path, others: Mapping[str, np.ndarray] | None = None) -> None:
-        images.write_film(target, job.film, metadata(), {**job.variance(), **(others or {})})
-
-    with stopping() as stop:
-        job = None
-        try:
-            select_variant(order.variant, plugins)
-            if order.threads:
-                import drjit as dr
-
-                dr.set_thread_count(order.threads)
-            compiled = kernels_compiled()
-            if order.long:
-                job = LongJob(
-                    RenderRequest(
-                        str(order.scene), order.size, definitions, order.specification,
-                        sensor_index or 0, seed, order.variant, tuple(plugins),
-                        threads=order.threads or 0,
-                    ),
-                    order.long,
-                )  # fmt: skip
-            else:
-                chosen = Chosen.load(
-                    order.scene, order.size, dict(definitions), order.specification,
-                    sensor_index or 0,
-                )  # fmt: skip
-                job = RenderJob(chosen, seed)
-            is_new = kernels_compiled() > compiled
-            images.check_film(output, job.film, job.integrator.aov_names())
-            for remark in job.remarks(is_sensor_chosen=sensor_index is not None):
-                report.warn(remark)
-            if order.denoise and (remark := denoising.remark(job.film)):
-                report.warn(remark)
-            if is_new:
-                # The render's kernels take longer to compile, and nothing can be printed meanwhile
-                report.note("compiling kernels (later renders like this one find them in a cache)")
-            if order.denoise:
-                guides = denoising.render_guides(job.scene, job.sensor, seed)
-            # A frame that is there counts as finished
-            current = (lambda: None) if order.is_one_of_many else functools.partial(write, output)
-            job.run(order.spp, order.seconds, current, report)
-        except (KeyboardInterrupt, OSError) as error:
-            # After SIGHUP, showing progress on the closed terminal raises an OSError
-            if isinstance(error, OSError) and not stop.is_asked:
-                raise
-            if job is None or not job.has_image():
-                say("interrupted before there was an image: nothing written")
-                return stop.exit_code
-            # After a signal in the last pass, the image may be complete
-            job.is_interrupted = not job.is_complete()
-
-        stop.wait()
-        target = output
-        is_kept = order.long is not None and order.long.folder is not None
-        if job.is_interrupted and (output.exists() or order.is_one_of_many) and not is_kept:
-            target = output.with_name(f"{output.stem}.partial{output.suffix}")
-        if order.denoise:
-            noisy = target.with_name(f"{target.stem}.noisy.exr")
-            write(noisy, guides)
-            denoising.denoise_file(noisy, target, metadata())
-        else:
-            write(target)
-        bad, pixel_count = images.count_non_finite(job.film)
-        if bad:
-            report.warn(f"{bad} of {pixel_count} pixels of {target} are NaN or infinite")
-        figures = {"file": str(target), "spp": job.spp, "seconds": job.seconds, "bad_pixels": bad}
-        if job.is_interrupted:
-            older = "" if target == output else f" ({output} is an older image, and was kept)"
-            older = older if output.exists() else ""
-            report.end(f"interrupted {job.how_far()}: {target}{older}", True, **figures)
-            return stop.exit_code
-    is_slow = kernels_compiled() > compiled and not is_new  # else it was printed above
-    remark = " (compiled kernels: the next such render starts faster)" if is_slow else ""
-    report.end(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}", **figures)
-    return 1 if bad else 0

@@ -15,6 +15,7 @@ from ..compare import timing
 from ..errors import InputError
 from ..rendering.batches import sample_count
 from ..rendering.seed_passes import SeedPasses, can_render, is_independent
+from ..rendering.totals import RenderTotals, forget_memory_peak
 from ..scenes import one_line
 from .reports import Report, Speed, time_left
 
@@ -47,7 +48,7 @@ class RenderJob:
         return self._chosen.remarks(is_sensor_chosen)
 
     def run(
-        self, spp: int | None, seconds: float | None, _write: Callable[[], None], report: Report
+        self, spp: int | None, seconds: float | None, _write: Callable[[bool], None], report: Report
     ) -> None:
         """Renders ``spp`` samples per pixel (by default, the number of the sampler), or as many as
         fit into ``seconds``, and tells ``report`` how far it is. After Ctrl-C, passes end with
@@ -59,11 +60,17 @@ class RenderJob:
                 :meth:`is_complete` whether it holds all of them.
         """
         begin = time.perf_counter()
+        forget_memory_peak()
         try:
             with report.bars() as bars:
                 if can_render(self.integrator):
                     self._passes = SeedPasses(
                         self.integrator, self.scene, self.sensor, self._seed
+                    )
+                if seconds is not None and getattr(self.integrator, "checkpoint", ""):
+                    raise ValueError(
+                        '--time would measure what "checkpoint" keeps: give the integrator a '
+                        '"timeout" instead'
                     )
                 if seconds is not None and not (self._passes and is_independent(self.sensor)):
                     spp, seconds = self._measured(seconds, bars), None
@@ -120,6 +127,16 @@ class RenderJob:
     def about(self) -> dict[str, Any]:
         """What the metadata of the image say besides."""
         return {}
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seed of the render."""
+        return [self._seed]
+
+    @property
+    def totals(self) -> RenderTotals:
+        """What the render cost."""
+        return RenderTotals.of(self.integrator, self.film, self.spp or 0, self.seconds)
 
     # ---- How far it got ----
 

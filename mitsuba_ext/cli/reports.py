@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rich.progress import Progress, TextColumn
@@ -47,12 +47,14 @@ class Report:
             self._last = time.monotonic()
             self._event("progress", **figures)
 
-    def end(self, text: str, is_interrupted: bool = False, **figures: Any) -> None:
-        """The last sentence or event."""
+    def end(
+        self, text: str, details: Sequence[str] = (), is_interrupted: bool = False, **figures: Any
+    ) -> None:
+        """The last sentence or event. The details are left out where nothing is to be said."""
         if self._as_json:
             self._event("end", interrupted=is_interrupted, **figures)
         elif is_interrupted or not self._is_quiet:
-            say(text, err=is_interrupted)
+            say("\n".join([text, *([] if self._is_quiet else details)]), err=is_interrupted)
 
     @contextlib.contextmanager
     def bars(self) -> Iterator[Progress]:

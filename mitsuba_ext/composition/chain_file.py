@@ -53,7 +53,8 @@ class ChainFile:
 
 
 def _digest(sensor: mi.Sensor) -> str:
-    """Of the parameters that it has by name, and of its class."""
+    """Of the parameters that it has by name, of its class, and of its motion."""
     values = mi.traverse(sensor)
+    motion = getattr(sensor, "motion", "")
     text = "".join(f"{key}={values[key]}" for key in sorted(values.keys()))
-    return hashlib.sha256(f"{sensor.class_name()} {text}".encode()).hexdigest()[:16]
+    return hashlib.sha256(f"{sensor.class_name()} {motion} {text}".encode()).hexdigest()[:16]

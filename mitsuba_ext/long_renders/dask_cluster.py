@@ -3,21 +3,90 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
+import time
+import uuid
+import weakref
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
+from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, InstallationError
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 #: Seconds for the scheduler to answer, and for a first worker to come.
 _PATIENCE = 10
 
+#: Seconds between two questions for the workers.
+_PERIOD = 5.0
+
+
+class DaskWorkers(Executor):
+    """The executor of a client of Dask, with the additional methods of
+    :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`.
+
+    Parameters:
+        client: The client.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        # By default, a batch that has failed would not be tried again: Dask takes it for known
+        self._executor = client.get_executor(pure=False)
+        self._keys: weakref.WeakKeyDictionary[Future, str] = weakref.WeakKeyDictionary()
+        self._avoided: set[str] = set()
+        self._known: set[str] = set()
+        self._asked = -_PERIOD
+
+    def submit(self, function: Callable, /, *arguments: Any, **options: Any) -> Future:
+        key = f"batch-{uuid.uuid4().hex}"
+        where = {}
+        if self._avoided and (good := self._addresses() - self._avoided):
+            where["workers"] = sorted(good)
+        future = self._executor.submit(function, *arguments, key=key, **where, **options)
+        self._keys[future] = key
+        return future
+
+    def share(self, value: Any) -> Any:
+        """Puts a value on a worker, from which others get it."""
+        return self._client.scatter([value], hash=False)[0]
+
+    def avoid(self, future: Future) -> None:
+        """Gives nothing to the worker of this task until the task is done."""
+        key = self._keys.get(future)
+        for address, keys in self._client.processing().items():
+            if key in keys:
+                self._avoided.add(address)
+                future.add_done_callback(functools.partial(self._forgive, address))
+                return
+
+    def _forgive(self, address: str, _future: Future) -> None:
+        self._avoided.discard(address)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        self._executor.shutdown(wait=wait)
+
+    def count(self) -> int:
+        """How many workers (processes) there are."""
+        return len(self._addresses())
+
+    def _addresses(self) -> set[str]:
+        now = time.monotonic()
+        if now - self._asked > _PERIOD:
+            self._asked = now
+            with contextlib.suppress(OSError):  # the scheduler is gone
+                self._known = set(self._client.scheduler_info(n_workers=-1)["workers"])
+        return self._known
+
 
 @contextlib.contextmanager
-def dask_cluster(address: str) -> Iterator[tuple[Executor, int, Callable[[], None]]]:
-    """A context with an executor that renders on a cluster, its number of workers (processes), and
-    a function to call now and then: without the scheduler, what is awaited never comes. At the end
-    of the context, batches that have not begun are cancelled.
+def dask_cluster(address: str) -> Iterator[tuple[DaskWorkers, Callable[[], None]]]:
+    """A context with an executor that renders on a cluster, and a function to call now and then:
+    without the scheduler, what is awaited never comes. At the end of the context, batches that have
+    not begun are cancelled.
 
     Args:
         address: Of the scheduler: ``tcp://host:port``.
@@ -48,10 +117,9 @@ def dask_cluster(address: str) -> Iterator[tuple[Executor, int, Callable[[], Non
             client.wait_for_workers(1, timeout=_PATIENCE)
         except TimeoutError:
             raise InputError(f"{address}: the Dask scheduler has no workers") from None
-        # By default, a batch that has failed would not be tried again: Dask takes it for known
-        executor = client.get_executor(pure=False)
+        executor = DaskWorkers(client)
         try:
-            yield executor, len(client.scheduler_info(n_workers=-1)["workers"]), check
+            yield executor, check
         finally:
             if client.status == "running":
                 executor.shutdown(wait=False)

@@ -15,12 +15,11 @@ from ..errors import InputError
 from ..files import make_folder, replacing
 from .state import RenderState
 
-#: What is rendered; the state; the one before it; what the integrator has learned.
+#: What is rendered; the state; the one before it.
 _DESCRIPTION, _STATE, _BEFORE = "render.json", "state.npz", "state.before.npz"
-_LEARNED = "learned.npz"
 
 #: Number of the format of these files.
-_FORMAT = 1
+_FORMAT = 2
 
 
 class CheckpointFolder:
@@ -35,11 +34,6 @@ class CheckpointFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-
-    @property
-    def learned(self) -> Path:
-        """The file of what the integrator has learned."""
-        return self.path / _LEARNED
 
     def in_use(self):
         """A context in which no other process can use the folder."""

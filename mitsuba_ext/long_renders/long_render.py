@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 from ..compare import images, metrics
-from ..errors import InputError
-from .batch_renderer import BatchRenderer, RenderRequest, render_batch
+from .dispatch import QUEUE, Dispatch
+from .integrator_batches import IntegratorBatches
 from .state import Batch, BatchResult, RenderState
 
 #: Batches, at least, that tell the error of an image.
 _FEWEST = 8
-
-#: Batches that wait at each worker.
-_QUEUE = 2
-
-#: Seconds between two looks at what others render.
-_PERIOD = 1.0
-
-#: How often a batch is tried before the render is given up.
-_TRIES = 3
 
 
 @dataclass(frozen=True)
@@ -42,11 +34,11 @@ class Goal:
 
 
 class LongRender:
-    """Adds batches to a state until a goal is reached. Batches are independent renders, and are
-    added in their order: it does not matter who renders them.
+    """Adds batches to a state until a goal is reached. Batches are independent renders, which are
+    added as they come: it does not matter who renders them.
 
     Parameters:
-        renderer, request: What to render.
+        renderer: Renders the batches.
         state: What has been rendered already.
         progress: Called after each batch.
 
@@ -57,12 +49,11 @@ class LongRender:
 
     def __init__(
         self,
-        renderer: BatchRenderer,
-        request: RenderRequest,
+        renderer: IntegratorBatches,
         state: RenderState,
         progress: Callable[[LongRender], None] = lambda render: None,
     ) -> None:
-        self._renderer, self._request, self._progress = renderer, request, progress
+        self._renderer, self._progress = renderer, progress
         self.state, self.goal_spp = state, 0
 
     def run(
@@ -70,21 +61,29 @@ class LongRender:
         goal: Goal,
         is_stopped: Callable[[], bool] = lambda: False,
         executor: Executor | None = None,
-        workers: int = 1,
+        workers: int | Callable[[], int] = 1,
     ) -> bool:
         """Renders; was the goal reached?
 
         Args:
             goal: When to end.
             is_stopped: Asked after each batch, and while batches of others are awaited.
-            executor: Who renders: functions that it is given must find the same files. ``None`` for
-                this process.
-            workers: How many batches the executor renders at a time.
+            executor: Who renders what a ``BatchRenderer`` does: see
+                :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`. ``None`` for this process.
+            workers: How many batches the executor renders at a time, or a function that says so.
+
+        Raises:
+            InputError: A batch cannot be rendered.
         """
         self._goal, self.goal_spp = goal, goal.spp or 0
-        results = self._here()
-        if executor is not None:
-            results = self._elsewhere(executor, workers, is_stopped)
+        count_workers = workers if callable(workers) else lambda: workers
+        if executor is None:
+            results = self._here()
+        else:
+            dispatch = Dispatch(executor, self._renderer, count_workers)
+            results = dispatch.results(self._batches(), lambda: self._learned, is_stopped)
+        # Speed is measured between the first result and this one
+        measured = 1 + QUEUE * count_workers()
         begin, warm, count = time.perf_counter(), 0.0, 0
         while not self._is_reached():
             if is_stopped() or (result := next(results, None)) is None:
@@ -94,7 +93,7 @@ class LongRender:
             if count == 1:
                 # Its kernels may have been compiled
                 warm, before = time.perf_counter(), self.state.spp
-            elif goal.seconds is not None and count == 1 + _QUEUE * workers:
+            elif goal.seconds is not None and count == measured:
                 seconds = (time.perf_counter() - warm) / (self.state.spp - before)
                 self._plan(goal.seconds - (time.perf_counter() - begin), seconds)
             self._progress(self)
@@ -132,63 +131,24 @@ class LongRender:
         fits = self.state.spp + max(0, round(left / seconds))
         self.goal_spp = min(fits, self._goal.spp or fits)
 
+    @property
+    def _learned(self) -> bytes | None:
+        """What the next batch uses; ``None`` if it has to learn it for others."""
+        return self.state.learned if self._renderer.learns else b""
+
     def _batches(self) -> Iterator[Batch]:
-        """The next batches."""
-        seed, spp = self._request.seed, self.state.spp
-        index = 1 + max((b.index for b in self.state.done if b.seed == seed), default=-1)
-        while not self.goal_spp or spp < self.goal_spp:
-            left = self.goal_spp - spp if self.goal_spp else 1 << 30
-            batch = Batch(seed, index, self._renderer.length(left))
-            yield batch
-            index, spp = index + 1, spp + batch.spp
+        """The next batches: first those that were still to come when others had been added."""
+        seed, spp = self._renderer.seed, self.state.spp
+        known = {batch.index for batch in self.state.done if batch.seed == seed}
+        for index in itertools.count():
+            if self.goal_spp and spp >= self.goal_spp:
+                return
+            if index not in known:
+                left = self.goal_spp - spp if self.goal_spp else 1 << 30
+                length = self._renderer.length(left, teaches=self._learned is None)
+                yield Batch(seed, index, length)
+                spp += length
 
     def _here(self) -> Iterator[BatchResult]:
         for batch in self._batches():
-            yield self._renderer.render(batch)
-
-    def _elsewhere(
-        self, executor: Executor, workers: int, is_stopped: Callable[[], bool]
-    ) -> Iterator[BatchResult]:
-        """The same, by others, some of which may fail."""
-        batches, running, done = self._batches(), {}, {}
-        tries: dict[Batch, int] = {}
-        order: list[Batch] = []
-
-        def submit(batch: Batch) -> None:
-            tries[batch] = tries.get(batch, 0) + 1
-            running[executor.submit(render_batch, self._request, batch)] = batch
-
-        # The first batch teaches the others
-        most = 1 if self._renderer.must_learn else _QUEUE * workers
-        while True:
-            while len(order) < most and (batch := next(batches, None)):
-                order.append(batch)
-                submit(batch)
-            while order and order[0] not in done:
-                finished = wait(running, _PERIOD, FIRST_COMPLETED).done
-                if not finished and is_stopped():
-                    return
-                for future in finished:
-                    batch = running.pop(future)
-                    if (failure := _failure(future)) is None:
-                        done[batch] = future.result()
-                    elif is_stopped():  # the workers may have got the same signal
-                        return
-                    elif tries[batch] < _TRIES:
-                        submit(batch)
-                    else:
-                        raise InputError(f"a batch failed {_TRIES} times: {failure}") from failure
-            if not order:
-                return
-            yield done.pop(order.pop(0))
-            most = _QUEUE * workers
-
-
-def _failure(future: Future) -> BaseException | None:
-    """Why a batch failed; raises what is wrong with the input."""
-    if future.cancelled():
-        return CancelledError("its worker is gone")
-    error = future.exception()
-    if isinstance(error, InputError):
-        raise error
-    return error
+            yield self._renderer.render(batch, self._learned)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 from ..errors import InputError
 from ..rendering.batches import Batches
 from ..rendering.film_sums import FilmSums
+from ..rendering.totals import RenderTotals
 
 
 class Batch(NamedTuple):
@@ -36,7 +38,9 @@ class BatchResult(NamedTuple):
         image: The developed film with its AOVs: [height, width, channel].
         channels, image_channel_count: See :class:`~mitsuba_ext.rendering.batches.Batches`.
         aov_names: Channels besides those of the image.
-        has_taught: Has it made the file of what the integrator has learned?
+        learned: What the integrator has learned, for the other batches; empty if there was nothing
+            to learn, ``None`` if it did not try.
+        totals: What it cost.
     """
 
     batch: Batch
@@ -46,7 +50,8 @@ class BatchResult(NamedTuple):
     channels: tuple[str, ...]
     image_channel_count: int
     aov_names: tuple[str, ...]
-    has_taught: bool
+    totals: RenderTotals
+    learned: bytes | None = None
 
 
 class RenderState:
@@ -57,12 +62,14 @@ class RenderState:
         film: The sum of what they have left in the film.
         images: Mean and variance of their images; ``None`` before the first.
         aov_names: Channels besides those of the image.
-        has_taught: Is there a batch among them that the others use what it has learned from?
+        learned: What one of them has learned for the others: see :class:`BatchResult`.
+        totals: What they cost.
     """
 
     def __init__(self) -> None:
         self.done: list[Batch] = []
-        self.has_taught = False
+        self.learned: bytes | None = None
+        self.totals = RenderTotals()
         self.film, self.images = FilmSums(), None
         self.aov_names: tuple[str, ...] = ()
 
@@ -80,7 +87,9 @@ class RenderState:
         self.film = self.film.plus(film)
         self.images, self.aov_names = images, result.aov_names
         self.done.append(result.batch)
-        self.has_taught |= result.has_taught
+        if result.learned is not None:
+            self.learned = result.learned
+        self.totals = self.totals.plus(result.totals)
 
     def plus(self, other: RenderState) -> RenderState:
         """The batches of both.
@@ -100,6 +109,7 @@ class RenderState:
         total.done = [*self.done, *other.done]
         total.film, total.images = self.film.plus(other.film), self.images.plus(other.images)
         total.aov_names = self.aov_names
+        total.totals = self.totals.plus(other.totals)
         return total
 
     def fill(self, film: mi.Film) -> None:
@@ -111,13 +121,17 @@ class RenderState:
     def arrays(self) -> dict[str, np.ndarray]:
         """All that :meth:`from_arrays` needs."""
         images = self.images.arrays() if self.images else {}
+        learned = {}
+        if self.learned is not None:
+            learned["learned"] = np.frombuffer(self.learned, dtype=np.uint8)
         return {
             **{f"images.{name}": array for name, array in images.items()},
+            **learned,
             "done": np.array(self.done, dtype=np.uint32).reshape(-1, 3),
             "contents": np.asarray(self.film.contents),
             "has_weights": np.array(self.film.has_weights),
             "spp": np.array(self.film.spp),
-            "has_taught": np.array(self.has_taught),
+            "totals": np.array(json.dumps(self.totals.known())),
             "aov_names": np.array(self.aov_names, dtype=str),
         }
 
@@ -132,7 +146,9 @@ class RenderState:
         state.film.contents = arrays["contents"]
         state.film.has_weights, state.film.spp = bool(arrays["has_weights"]), int(arrays["spp"])
         state.aov_names = tuple(arrays["aov_names"].tolist())
-        state.has_taught = bool(arrays["has_taught"])
+        if "learned" in arrays:
+            state.learned = arrays["learned"].tobytes()
+        state.totals = RenderTotals(**json.loads(str(arrays.get("totals", "{}"))))
         if state.done:
             prefix = "images."
             parts = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}

@@ -5,8 +5,10 @@ from __future__ import annotations
 import ctypes
 import multiprocessing
 import os
+import queue
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -18,31 +20,71 @@ _PR_SET_PDEATHSIG = 1
 
 
 class Workers(Executor):
-    """A pool of processes that replaces those that die: what these were doing fails.
+    """Processes, each of which does one thing at a time. One that dies is replaced: only what it
+    was doing fails. (In a single ``ProcessPoolExecutor``, everything would.)
 
     Parameters:
         count: How many processes there are.
     """
 
     def __init__(self, count: int) -> None:
-        self._count = count
-        self._pool = self._new_pool()
+        self._waiting: queue.SimpleQueue = queue.SimpleQueue()
+        self._pools: list[ProcessPoolExecutor | None] = [None] * count
+        self._is_given_up = False
+        # A process ends with the thread that started it: this must be one that stays
+        self._threads = [
+            threading.Thread(target=self._serve, args=(number,), daemon=True)
+            for number in range(count)
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def submit(self, function: Callable, /, *arguments: Any, **options: Any) -> Future:
-        try:
-            return self._pool.submit(function, *arguments, **options)
-        except BrokenProcessPool:
-            self._pool.shutdown(wait=False)
-            self._pool = self._new_pool()
-            return self._pool.submit(function, *arguments, **options)
+        future: Future = Future()
+        self._waiting.put((future, function, arguments, options))
+        return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        self._pool.shutdown(wait, cancel_futures=cancel_futures)
+        """Ends the processes. With ``cancel_futures``, they are killed: what they are doing is not
+        needed any more, and one of them may hang."""
+        if cancel_futures:
+            self._is_given_up = True
+            for pool in filter(None, self._pools):
+                for process in list((pool._processes or {}).values()):
+                    process.kill()
+        for _ in self._threads:
+            self._waiting.put(None)
+        if wait:
+            for thread in self._threads:
+                thread.join()
 
-    def _new_pool(self) -> ProcessPoolExecutor:
+    def _serve(self, number: int) -> None:
+        """Has a process do what waits, one after the other."""
+        while (item := self._waiting.get()) is not None:
+            future, function, arguments, options = item
+            if self._is_given_up:
+                future.cancel()
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                result = self._submitted(number, function, arguments, options).result()
+            except BaseException as error:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+        if pool := self._pools[number]:
+            pool.shutdown()
+
+    def _submitted(self, number: int, function, arguments, options) -> Future:
+        if pool := self._pools[number]:
+            try:
+                return pool.submit(function, *arguments, **options)
+            except BrokenProcessPool:
+                pool.shutdown(wait=False)
         # A forked process would share the threads and kernels of this one
         context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self._count, context, _start, (os.getpid(),))
+        self._pools[number] = ProcessPoolExecutor(1, context, _start, (os.getpid(),))
+        return self._pools[number].submit(function, *arguments, **options)
 
 
 def _start(parent: int) -> None:

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..defocus.thin_lens import ThinLens
 from ..transport.path_decisions import SceneQuery
+from .guides import guides_of
 
 #: Surfaces that a ray may pass before it counts as having met one: those that let light through,
 #: and the back of what hides the rest.
@@ -110,7 +111,7 @@ class PinholeView:
                 si, side = self._closest(ray, active), mi.Float(1)
             p, hit, shape = si.p, si.is_valid(), si.shape
             if self._has_guides:
-                guides = _guides(si, hit)
+                guides = guides_of(si, hit)
         else:
             pi = self._query.closest(self._scene, ray, coherent=True, active=active)
             hit, shape, side = pi.is_valid(), pi.shape, mi.Float(1)
@@ -152,10 +153,3 @@ def _walk(view, ray, hider, hider_side, active):
         steps += 1
         ray = dr.select(going, si.spawn_ray(ray.d), ray)
     return si, side
-
-
-def _guides(si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Float]:
-    albedo = mi.unpolarized_spectrum(si.bsdf().eval_diffuse_reflectance(si, active))
-    if mi.is_spectral or mi.is_monochromatic:
-        albedo = mi.Color3f(dr.mean(albedo))
-    return [*dr.select(active, dr.clip(albedo, 0, 1), 0), *dr.select(active, si.sh_frame.n, 0)]

@@ -41,6 +41,7 @@ class MovingSceneQuery(SceneQuery):
         self._poses = PoseTable([mover.motion for mover in moving])
         self._boxes = [_Box(mover.bbox()) for mover in moving]
         self._owners = self._find_owners(scene, moving)
+        self._lights = self._find_lights(moving)
 
     def closest(self, scene, ray, coherent, active):
         pi = super().closest(scene, ray, coherent, active)
@@ -71,6 +72,14 @@ class MovingSceneQuery(SceneQuery):
         ray = dr.if_stmt((owner, ray), moves, self._to_rest, lambda _owner, ray: ray)
         si = super().interaction(pi, ray)
         return dr.if_stmt((owner, si), moves, self._to_world, lambda _owner, si: si)
+
+    def emitter(self, si, emitter):
+        if self._lights is None:
+            return emitter
+        number = _number(si.shape)
+        light = dr.gather(mi.UInt32, self._lights, number, number < dr.width(self._lights))
+        number = dr.reinterpret_array(mi.UInt32, emitter)
+        return dr.reinterpret_array(mi.EmitterPtr, dr.select(light > 0, light, number))
 
     def occluded(self, scene, si, ds, active):
         ray = self.shadow_ray(scene, si, ds)
@@ -111,6 +120,22 @@ class MovingSceneQuery(SceneQuery):
             taken.update(numbers[index + 1])
             owners[numbers[index + 1]] = index
         return mi.UInt32(owners)
+
+
+    def _find_lights(self, moving: Sequence[mi.Shape]) -> mi.UInt32 | None:
+        """The number of the light as the scene knows it, by the number of the shape that it belongs
+        to where it rests; ``None`` if no light moves."""
+        lights = {}
+        for mover in moving:
+            if mover.is_emitter():
+                (shape,) = (child for child in mover.children if child.is_emitter())
+                light = dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(mover.emitter()))
+                lights[_number_of(shape)] = int(light[0])
+        if not lights:
+            return None
+        table = np.zeros(max(lights) + 1, dtype=np.uint32)
+        table[list(lights)] = list(lights.values())
+        return mi.UInt32(table)
 
 
 class _Box:

@@ -1,0 +1,86 @@
+"""The parameters of frames that a function of the user computes."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..errors import InputError
+
+
+class FrameParameters(NamedTuple):
+    """What a frame changes in a scene.
+
+    Attributes:
+        definitions: Values of the scene file's ``$name`` parameters.
+        values: Of the loaded scene, as JSON; see :func:`~mitsuba_ext.scene_values.as_text`.
+    """
+
+    definitions: dict[str, str]
+    values: str
+
+
+def load_function(text: str) -> Callable[[int], FrameParameters]:
+    """A function of the number of a frame.
+
+    Args:
+        text: ``file.py:function`` or ``module:function``. The function returns a dict: keys with a
+            dot are those of ``mi.traverse``, others are ``<default>``s of the scene.
+
+    Raises:
+        InputError: There is no such file or function. The function that is returned raises it if
+            the user's function fails, or returns something else.
+    """
+    source, colon, name = text.rpartition(":")
+    if not colon or not source or not name.isidentifier():
+        raise InputError(f'--parameters: expected something like animate.py:frame, found "{text}"')
+    try:
+        function = getattr(_module(source), name, None)
+    except InputError:
+        raise
+    except Exception as error:  # the module may raise anything
+        raise InputError(f"{source}: {type(error).__name__}: {error}") from error
+    if not callable(function):
+        raise InputError(f'{source}: there is no function "{name}"')
+
+    def parameters(frame: int) -> FrameParameters:
+        from ..scene_values import as_text
+
+        try:
+            found = function(frame)
+        except Exception as error:  # so may the function
+            raise InputError(f"{text}: frame {frame}: {type(error).__name__}: {error}") from error
+        if not isinstance(found, Mapping) or not all(isinstance(key, str) for key in found):
+            raise InputError(f"{text}: frame {frame}: must return a dict by names")
+        definitions = {key: _as_xml(value) for key, value in found.items() if "." not in key}
+        try:
+            values = as_text({key: value for key, value in found.items() if "." in key})
+        except InputError as error:
+            raise InputError(f"{text}: frame {frame}: {error}") from None
+        return FrameParameters(definitions, values)
+
+    return parameters
+
+
+def _as_xml(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _module(source: str) -> Any:
+    if not source.endswith(".py"):
+        sys.path.insert(0, "")  # a command that pip installed does not look in the current folder
+        try:
+            return importlib.import_module(source)
+        finally:
+            sys.path.remove("")
+    path = Path(source)
+    if not path.is_file():
+        raise InputError(f"{source}: no such file")
+    spec = importlib.util.spec_from_file_location(f"parameters_of_frames_{path.stem}", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,197 @@
+"""Renders one image of ``mitsuba-ext render``, and writes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from .. import denoising
+from ..chosen import LastScene
+from ..compare import images, machine
+from ..long_renders.batch_renderer import RenderRequest
+from ..long_renders.folder import CheckpointFolder
+from ..variants import select_variant
+from . import statistics
+from .common import kernels_compiled, say
+from .frame_parameters import FrameParameters
+from .frames import Picture
+from .long_job import LongJob, LongOptions
+from .render_job import RenderJob
+from .reports import Report
+from .stopping import stopping
+
+
+class Order(NamedTuple):
+    """What all images of a call have in common; see the options."""
+
+    scene: Path
+    specification: str | None
+    spp: int | None
+    seconds: float | None
+    size: tuple[int, int] | None
+    variant: str
+    plugins: tuple[str, ...]
+    denoise: bool
+    threads: int | None
+    long: LongOptions | None
+    is_one_of_many: bool
+    preview: Path | None
+
+
+def is_finished(order: Order, picture: Picture) -> bool:
+    """Is there nothing left to do for one of several images?"""
+    if not picture.output.exists():
+        return False
+    long = order.long
+    if long is None or long.folder is None:
+        return True
+    # More may be asked of it than last time. Whether an error is reached, its state must say
+    if long.until is not None:
+        return False
+    return not order.spp or CheckpointFolder(long.folder / picture.name).load().spp >= order.spp
+
+
+def render_image(
+    order: Order, picture: Picture, plugins: Sequence[str], report: Report, scenes: LastScene,
+    function: Callable[[int], FrameParameters] | None = None,
+) -> int:  # fmt: skip
+    """Renders an image and returns the exit code.
+
+    Args:
+        order: What all images of the call have in common.
+        picture: Which one it is.
+        plugins: Modules to import, which register other plugins.
+        report: Is told how far it is, and how it ended.
+        scenes: Keeps the scene for the next image.
+        function: Of the number of the frame: what it changes in the scene.
+
+    Raises:
+        InputError: Something cannot be read, used or written.
+    """
+    output, definitions, sensor_index, seed = picture[:4]
+    values, long = None, order.long
+    if function is not None:
+        changed = function(picture.frame)
+        definitions = tuple((dict(definitions) | changed.definitions).items())
+        values = changed.values
+    if long and long.folder and picture.name:
+        long = replace(long, folder=long.folder / picture.name)
+    for file in filter(None, (output, order.preview)):
+        images.check_target(file)
+    if order.denoise:
+        denoising.denoiser()
+    guides = {}
+
+    def metadata() -> dict[str, object]:
+        return {
+            "scene": str(order.scene),
+            "scene_parameters": dict(definitions),
+            **({"scene_values": values} if values else {}),
+            "integrator": job.name,
+            "parameters": job.parameters,
+            "seed": seed,
+            "spp": job.spp,
+            "seconds": job.seconds,
+            "interrupted": job.is_interrupted,
+            "versions": machine.versions(),
+            "statistics": job.totals.known(),
+            **job.about(),
+        }
+
+    def write(target: Path, others: Mapping[str, np.ndarray] | None = None) -> None:
+        images.write_film(target, job.film, metadata(), {**job.variance(), **(others or {})})
+
+    def show(is_asked: bool) -> None:
+        if is_asked or (long and long.folder):
+            # A frame that is there counts as finished
+            write(picture.unfinished if order.is_one_of_many else output)
+        if order.preview:
+            images.write_film(order.preview, job.film, metadata())
+
+    with stopping() as stop:
+        job = None
+        try:
+            select_variant(order.variant, plugins)
+            if order.threads:
+                import drjit as dr
+
+                dr.set_thread_count(order.threads)
+            compiled = kernels_compiled()
+            if long:
+                job = LongJob(
+                    RenderRequest(
+                        str(order.scene), order.size, definitions, order.specification,
+                        sensor_index or 0, seed, order.variant, order.plugins,
+                        threads=order.threads or 0, values=values,
+                    ),
+                    long, scenes,
+                )  # fmt: skip
+            else:
+                chosen = scenes.choose(
+                    order.scene, order.size, dict(definitions), order.specification,
+                    sensor_index or 0, values,
+                )  # fmt: skip
+                job = RenderJob(chosen, seed)
+            is_new = kernels_compiled() > compiled
+            for file in filter(None, (output, order.preview)):
+                images.check_film(file, job.film, job.integrator.aov_names())
+            for remark in job.remarks(is_sensor_chosen=sensor_index is not None):
+                report.warn(remark)
+            if order.denoise and (remark := denoising.remark(job.film)):
+                report.warn(remark)
+            if is_new:
+                # The render's kernels take longer to compile, and nothing can be printed meanwhile
+                report.note("compiling kernels (later renders like this one find them in a cache)")
+            if order.denoise:
+                guides = denoising.render_guides(job.scene, job.sensor, seed)
+            job.run(order.spp, order.seconds, show, report)
+        except (KeyboardInterrupt, OSError) as error:
+            # After SIGHUP, showing progress on the closed terminal raises an OSError
+            if isinstance(error, OSError) and not stop.is_asked:
+                raise
+            if job is None or not job.has_image():
+                say("interrupted before there was an image: nothing written")
+                return stop.exit_code
+            # After a signal in the last pass, the image may be complete
+            job.is_interrupted = not job.is_complete()
+
+        stop.wait()
+        target = output
+        is_kept = long is not None and long.folder is not None and not order.is_one_of_many
+        if job.is_interrupted and (output.exists() or order.is_one_of_many) and not is_kept:
+            target = picture.unfinished
+        if order.denoise:
+            noisy = target.with_name(f"{target.stem}.noisy.exr")
+            write(noisy, guides)
+            denoising.denoise_file(noisy, filter(None, (target, order.preview)), metadata())
+        else:
+            write(target)
+            if order.preview:
+                images.write_film(order.preview, job.film, metadata())
+        if order.is_one_of_many and target == output:
+            picture.unfinished.unlink(missing_ok=True)
+        bad, pixel_count = images.count_non_finite(job.film)
+        if bad:
+            report.warn(f"{bad} of {pixel_count} pixels of {target} are NaN or infinite")
+        figures = {
+            "file": str(target), "spp": job.spp, "seconds": job.seconds, "bad_pixels": bad,
+            "statistics": {
+                "integrator": job.name, "seeds": job.seeds, "versions": machine.versions(),
+                **job.totals.known(),
+            },
+        }  # fmt: skip
+        costs = statistics.lines(job.totals, job.name, job.seeds, machine.versions())
+        if job.is_interrupted:
+            older = "" if target == output else f" ({output} is an older image, and was kept)"
+            older = older if output.exists() else ""
+            said = f"interrupted {job.how_far()}: {target}{older}"
+            report.end(said, costs, is_interrupted=True, **figures)
+            return stop.exit_code
+    is_slow = kernels_compiled() > compiled and not is_new  # else it was printed above
+    remark = " (compiled kernels: the next such render starts faster)" if is_slow else ""
+    report.end(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}", costs, **figures)
+    return 1 if bad else 0

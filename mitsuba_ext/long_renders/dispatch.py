@@ -1,0 +1,218 @@
+"""Gives batches to workers, of which some may die or hang."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from .batch_renderer import BatchRenderer, RenderRequest
+from .bundle import Bundle
+from .state import Batch, BatchResult
+from .tasks import Missing, digest_of, render_batch
+
+#: Batches that wait at each worker.
+QUEUE = 2
+
+#: Seconds between two looks at what others render.
+_PERIOD = 1.0
+
+#: How often a batch fails before the render is given up.
+_TRIES = 3
+
+#: A batch is late after this multiple of the median time from giving a batch away to its result,
+#: and not before so many seconds: a worker that begins loads the scene and compiles kernels.
+#: Before anything has come back, it is late after the last number of seconds.
+_LATE, _FIRST_LATE, _UNKNOWN_LATE = 5.0, 60.0, 600.0
+
+#: Results whose times count for the median.
+_REMEMBERED = 101
+
+
+@dataclass
+class _Task:
+    """A batch that has been given away.
+
+    Attributes:
+        given: When that was done last.
+        copies: How often it was done because others were late.
+        failures: How often it failed.
+        futures: What is awaited.
+        needs: What workers have asked for.
+    """
+
+    given: float
+    copies: int = 0
+    failures: int = 0
+    futures: tuple[Future, ...] = ()
+    needs: Missing = Missing(False, False)
+
+
+class Dispatch:
+    """Renders batches by an executor. A batch that fails, or whose result is late, is given away
+    again; its first result counts.
+
+    An executor may have two methods more than any. ``share(value)`` returns what can be sent to
+    many workers in place of the value, and ``avoid(future)`` says that the worker which has the
+    task of ``future`` is to get no others until it is done.
+
+    Parameters:
+        executor: Who renders. Its workers need this package, but not the scene's files.
+        renderer: What is rendered.
+        workers: Says how many batches the executor renders at a time.
+    """
+
+    def __init__(
+        self,
+        executor: Executor,
+        renderer: BatchRenderer,
+        workers: Callable[[], int],
+    ) -> None:
+        self._executor, self._renderer, self._workers = executor, renderer, workers
+        # Workers have another current folder, and perhaps other files
+        description = json.dumps(renderer.description(), default=str)
+        self._request = replace(_absolute(renderer.request), description=description)
+        self._tasks: dict[Batch, _Task] = {}
+        self._running: dict[Future, Batch] = {}
+        self._seconds: deque[float] = deque(maxlen=_REMEMBERED)
+        self._shared: dict[str, Any] = {}
+        self._bundle: Bundle | None = None
+
+    def results(
+        self,
+        batches: Iterator[Batch],
+        learned: Callable[[], bytes | None],
+        is_stopped: Callable[[], bool],
+    ) -> Iterator[BatchResult]:
+        """The results of the batches, as they come.
+
+        Args:
+            learned: What has been learned; ``None`` as long as a batch still has to: it is rendered
+                alone.
+            is_stopped: Asked while nothing comes.
+
+        Raises:
+            InputError: A batch cannot be rendered.
+        """
+        try:
+            while True:
+                most = 1 if learned() is None else QUEUE * max(1, self._workers())
+                while len(self._tasks) < most and (batch := next(batches, None)):
+                    self._tasks[batch] = _Task(time.monotonic())
+                    self._give(batch, learned())
+                if not self._tasks:
+                    return
+                finished = wait(self._running, _PERIOD, FIRST_COMPLETED).done
+                if not finished and is_stopped():
+                    return
+                for future in finished:
+                    result = self._taken(future, learned(), is_stopped)
+                    if result is not None:
+                        yield result
+                self._give_late_ones(learned())
+        finally:
+            for future in self._running:
+                future.cancel()
+
+    def _give(self, batch: Batch, learned: bytes | None) -> None:
+        """Gives a batch away, with what its workers have asked for."""
+        task = self._tasks[batch]
+        sent, bundle = None, None
+        if task.needs.learned:
+            sent = self._share("learned", lambda: learned)
+        if task.needs.scene:
+            bundle = self._share("scene", self._make_bundle)
+        future = self._executor.submit(
+            render_batch, self._request, batch, digest_of(learned), sent, bundle
+        )
+        self._running[future] = batch
+        task.futures += (future,)
+
+    def _taken(
+        self, future: Future, learned: bytes | None, is_stopped: Callable[[], bool]
+    ) -> BatchResult | None:
+        """The result of a batch, if it is the first one."""
+        batch = self._running.pop(future)
+        task = self._tasks.get(batch)
+        if task is None:  # a copy was faster
+            return None
+        task.futures = tuple(other for other in task.futures if other is not future)
+        failure = _failure(future)
+        if failure is None:
+            result = future.result()
+            if isinstance(result, Missing):
+                task.needs = Missing(*map(max, task.needs, result))
+                self._give(batch, learned)
+                return None
+            self._seconds.append(time.monotonic() - task.given)
+            del self._tasks[batch]
+            for other in task.futures:
+                other.cancel()
+            return result
+        self._shared.clear()  # it may have died with a worker
+        task.failures += 1
+        if is_stopped():  # the workers may have got the same signal
+            return None
+        if task.failures >= _TRIES:
+            raise InputError(f"a batch failed {_TRIES} times: {failure}") from failure
+        if not task.futures:
+            task.given = time.monotonic()
+            self._give(batch, learned)
+        return None
+
+    def _give_late_ones(self, learned: bytes | None) -> None:
+        limit = _UNKNOWN_LATE
+        if self._seconds:
+            limit = max(_FIRST_LATE, _LATE * statistics.median(self._seconds))
+        now = time.monotonic()
+        for batch, task in self._tasks.items():
+            # Each time it may take longer: perhaps the batch is slow, and not its worker
+            if now - task.given > limit * 2**task.copies:
+                for future in task.futures:
+                    getattr(self._executor, "avoid", lambda future: None)(future)
+                task.given, task.copies = now, task.copies + 1
+                self._give(batch, learned)
+
+    def _share(self, name: str, make: Callable[[], Any]) -> Any:
+        if name not in self._shared:
+            share = getattr(self._executor, "share", lambda value: value)
+            self._shared[name] = share(make())
+        return self._shared[name]
+
+    def _make_bundle(self) -> Bundle:
+        if self._bundle is None:
+            specification = self._request.specification
+            is_file = specification and Path(specification).is_file()
+            others = (specification,) if is_file else ()
+            self._bundle = Bundle.of(self._renderer.chosen.loaded, others)
+        return self._bundle
+
+
+def _absolute(request: RenderRequest) -> RenderRequest:
+    """A request whose files are found from any folder."""
+
+    def absolute(name: str) -> str:
+        path = Path(name)
+        return str(path.absolute()) if path.suffix and path.is_file() else name
+
+    return replace(
+        request, scene=absolute(request.scene), plugins=tuple(map(absolute, request.plugins)),
+        specification=request.specification and absolute(request.specification),
+    )  # fmt: skip
+
+
+def _failure(future: Future) -> BaseException | None:
+    """Why a batch failed; raises what is wrong with the input."""
+    if future.cancelled():
+        return CancelledError("its worker is gone")
+    error = future.exception()
+    if isinstance(error, InputError):
+        raise error
+    return error

@@ -1,0 +1,78 @@
+"""The files that a scene consists of: its XML files, and all that these name."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+
+def files_of(state: mi.parser.ParserState, parameters: Mapping[str, str]) -> list[Path]:
+    """The files of a parsed scene, by their absolute names: XML files, meshes, textures, spectra.
+
+    Args:
+        state: The parsed scene, before any transformation.
+        parameters: Values of the ``$name`` placeholders.
+    """
+    files = {_absolute(str(file)) for file in state.files}
+    names = [name for _, name in named_in(state)]
+    names += [name for _, name in _named_in_xml(sorted(files), parameters)]
+    for name in names:
+        file = _resolved(name)
+        if file.is_file():
+            files.add(file)
+    return sorted(files)
+
+
+def named_by_absolute_path(files: list[Path], parameters: Mapping[str, str]) -> list[str]:
+    """The files that XML files include, and the spectra that they name, by an absolute path."""
+    return [name for _, name in _named_in_xml(files, parameters) if Path(name).is_absolute()]
+
+
+def named_in(state: mi.parser.ParserState) -> Iterator[tuple[tuple[object, str], str]]:
+    """The texts among the parameters of a scene's plugins, each with its node and key."""
+    import mitsuba as mi
+
+    for node in state.nodes:
+        properties = mi.Properties(node.props)  # a copy: what is read counts as known to a plugin
+        for key in properties.keys():
+            if properties.type(key) == mi.Properties.Type.String and properties[key]:
+                yield (node, key), properties[key]
+
+
+def _named_in_xml(files: list[Path], parameters: Mapping[str, str]) -> Iterator[tuple[Path, str]]:
+    """What attributes ``filename`` name: included files, and spectra, which the parser replaces by
+    their contents."""
+    elements = []
+    values = {}
+    for file in files:
+        if file.suffix.lower() != ".xml":
+            continue
+        try:
+            found = list(ElementTree.parse(file).iter())
+        except (OSError, ElementTree.ParseError):
+            continue
+        elements += [(file, element) for element in found]
+        values.update((e.get("name", ""), e.get("value", "")) for e in found if e.tag == "default")
+    values.update(parameters)
+    for file, element in elements:
+        if name := element.get("filename"):
+            # Longer names first: $size_x is not $size followed by "_x"
+            for key in sorted(values, key=len, reverse=True):
+                name = name.replace(f"${key}", values[key])
+            yield file, name
+
+
+def _resolved(name: str) -> Path:
+    import mitsuba as mi
+
+    return _absolute(str(mi.file_resolver().resolve(name)))
+
+
+def _absolute(name: str) -> Path:
+    return Path(os.path.abspath(name))

@@ -1,0 +1,1 @@
+"""The sensors that a scene can name: one file each."""
