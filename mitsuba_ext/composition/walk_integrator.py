@@ -13,10 +13,11 @@ from typing import Any
 import mitsuba as mi
 
 from ..decisions.learner import Learner
+from ..decisions.query.moving_aovs import moving_aovs
 from ..decisions.query.moving_scene import scene_query
 from ..errors import InputError
 from ..files import check_target
-from ..movers import refuse_movers
+from ..movers import movers
 from ..rendering.aovs import check_aovs
 from ..rendering.camera import film_extent
 from ..rendering.staged_integrator import NO_LIMIT, StagedIntegrator
@@ -220,6 +221,9 @@ class WalkIntegrator(StagedIntegrator):
         """The values of the channels that :meth:`aov_names` names."""
         if self._aovs is None:
             return []
+        if movers(scene):  # Mitsuba knows no motion
+            query = self.query(scene)
+            return moving_aovs(self._aovs, self.aovs, query, scene, sampler, ray)
         return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
 
     def common_parameters(self) -> dict[str, Any]:
@@ -237,9 +241,7 @@ class WalkIntegrator(StagedIntegrator):
         return {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
 
     def query(self, scene: mi.Scene) -> SceneQuery:
-        """How rays meet ``scene``. The output variables are Mitsuba's, which knows no motion."""
-        if self._aovs is not None:
-            refuse_movers(scene, f'"{self.name}": the parameter "aovs"', "leave it out")
+        """How rays meet ``scene``."""
         return scene_query(scene)
 
     def _aov_integrator(self, aovs: str) -> mi.Integrator | None:
