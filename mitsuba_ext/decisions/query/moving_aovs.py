@@ -1,5 +1,5 @@
-"""Output variables of shapes that move: what Mitsuba's ``aov`` says of them where they rest, brought
-to the world of the ray's time."""
+"""Output variables of shapes that move: what Mitsuba's ``aov`` says of them where they rest, as it
+is in the world at the time of the ray."""
 
 from __future__ import annotations
 
