@@ -44,7 +44,8 @@ class LightTracerIntegrator(WalkIntegrator):
          hides. (Default: uniform)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** light reaches diffuse surfaces through glass or by mirrors (caustics), above all
     from small lamps, points and spots, or as an independent check of other integrators. **Not
@@ -79,9 +80,9 @@ class LightTracerIntegrator(WalkIntegrator):
     independent random numbers where the sampler is :monosp:`ldsampler`, whose numbers depend on
     each other.
 
-    Alpha and output variables are those of the camera rays. Participating media are ignored, as by
-    :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized
-    variants, nor nesting in :monosp:`moment` and :monosp:`aov`.
+    Alpha and output variables are those of the camera rays. Participating media are refused (use
+    :monosp:`volpath` or :monosp:`composed_path`). Gradients are not supported (use :monosp:`prb`),
+    nor are scalar and polarized variants, nor nesting in :monosp:`moment` and :monosp:`aov`.
 
     Source: J. Arvo, *Backward Ray Tracing*, SIGGRAPH course, 1986; E. Veach, *Robust Monte Carlo
     Methods for Light Transport Simulation*, PhD thesis, 1997, section 10.2 (t = 1); adjoint BSDFs:
@@ -99,6 +100,8 @@ class LightTracerIntegrator(WalkIntegrator):
             'type': 'light_tracer',
             'max_depth': 8
     """
+
+    sees_media = False
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

@@ -27,6 +27,9 @@ _CRASHED = ".crashed"
 
 _LOCK = ".lock"
 
+#: The folder of rendered references, beside those of the scenes.
+REFERENCES = "references"
+
 #: Identifies a session. A supervisor passes its identifier on to its workers.
 SESSION_VARIABLE = "MITSUBA_EXT_SESSION"
 SESSION = os.environ.get(SESSION_VARIABLE) or uuid.uuid4().hex
@@ -75,6 +78,23 @@ def running(folder: Path, process: int) -> set[Path]:
             if mark.read_text(encoding="utf-8") == str(process):
                 marks.add(mark)
     return marks
+
+
+def begun(folder: Path, process: int) -> set[tuple[Path, int]]:
+    """The marks of :func:`running`, each with a number that is another one for each render. (A
+    reference takes as long as it takes: it is left out.)"""
+    found = set()
+    for mark in running(folder, process):
+        if mark.parent.name != REFERENCES:
+            with contextlib.suppress(FileNotFoundError):
+                found.add((mark, mark.stat().st_mtime_ns))
+    return found
+
+
+def renew(mark: Path) -> None:
+    """Says that another render of the integrator begins."""
+    with contextlib.suppress(FileNotFoundError):
+        os.utime(mark)
 
 
 def blame(folder: Path, process: int, message: str) -> set[Path]:

@@ -87,7 +87,7 @@ class Moving(mi.Mesh):
     in the view, more where they fill it). Put shapes that move together into one :monosp:`moving`.
 
     A nested shape may be nowhere else in the scene. Sensors, and meshes with vertex attributes,
-    cannot be nested; participating media are ignored, as by :monosp:`path`. The scene's
+    cannot be nested, and a medium in moving shapes must be homogeneous. The scene's
     bounds include all of the motion. :monosp:`mi.traverse` does not show nested shapes: it shows a
     placeholder mesh in their place. Textures that depend on the position in the world do not move
     along. An instance of a group that holds a :monosp:`merge` of rectangles

@@ -293,10 +293,10 @@ def troubled(make_scene, tmp_path):
     plugin.write_text(TROUBLE)
     started = []
 
-    def start(kind: str) -> tuple[subprocess.Popen, list[str]]:
+    def start(kind: str, *options) -> tuple[subprocess.Popen, list[str]]:
         arguments = [
             "compare", make_scene(), "path", "trouble", "--spp", 2, "--out", tmp_path / "out",
-            "--plugin", plugin,
+            "--plugin", plugin, *options,
         ]
         process = subprocess.Popen(
             [sys.executable, "-m", "mitsuba_ext", *map(str, arguments)],
@@ -327,6 +327,21 @@ def test_integrator_that_takes_the_process_down_is_a_failed_row(
     assert run(*arguments)[0] == 0
     assert stored_runs(tmp_path) == [3, 3]
     assert len(set(tmp_path.rglob("out/*/*.exr")) - files) == 2
+
+
+@pytest.mark.slow
+def test_integrator_that_hangs_is_a_failed_row(troubled, tmp_path):
+    process, _ = troubled("hang", "--limit", 15)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert out.count("a render took more than the 15 s of --limit") == 1
+    assert err.count("going on with the others") == 1
+    assert stored_runs(tmp_path) == [3, 1]
+
+
+def test_limit_needs_processes(run, make_scene):
+    code, _, err = run("compare", make_scene(), "path", "--spp", 2, "--limit", 3)
+    assert code == 2 and "--limit needs worker processes" in err
 
 
 def test_end_of_the_supervisor_is_the_end_of_its_worker_and_lock(

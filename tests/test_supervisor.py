@@ -39,13 +39,15 @@ log(job)
 def supervise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Runs workers of the given lines; returns the exit code and the jobs that they had."""
 
-    def run(lines: str, number: int = signal.SIGTERM) -> tuple[int, list[str]]:
+    def run(
+        lines: str, number: int = signal.SIGTERM, **options: float
+    ) -> tuple[int, list[str]]:
         code = WORKER.replace("SIGNAL", str(int(number))) + lines
         monkeypatch.setattr(
             supervisor, "_command", lambda _arguments, job:
             [sys.executable, "-S", "-c", code, str(tmp_path), job],
         )
-        result = supervisor.supervise([], tmp_path)
+        result = supervisor.supervise([], tmp_path, **options)
         return result, (tmp_path / "log").read_text().split()
 
     return run
@@ -69,6 +71,29 @@ def test_worker_that_dies_in_a_render_is_followed_by_another(supervise, capfd, e
     lines = f"if mark.with_suffix('.crashed').exists(): sys.exit(1)\nbegin(); {end}"
     assert supervise(lines) == (1, ["measure", "measure"])
     assert f"the process {words}; going on with the others" in capfd.readouterr().err
+
+
+def test_render_that_takes_too_long_is_ended_and_followed_by_others(supervise, tmp_path, capfd):
+    lines = "if mark.with_suffix('.crashed').exists(): sys.exit(1)\nbegin(); time.sleep(20)"
+    assert supervise(lines, limit=0.2) == (1, ["measure", "measure"])
+    assert "took more than the 0.2 s of --limit for a render, and was ended; going on" in (
+        capfd.readouterr().err)
+    crashed = tmp_path / "scene" / "a.crashed"
+    assert crashed.read_text() == "a render took more than the 0.2 s of --limit"
+
+
+def test_limit_is_of_each_render_and_not_of_references(supervise):
+    lines = """
+begin()
+for _ in range(8):
+    time.sleep(0.1)
+    os.utime(mark)
+mark.unlink()
+begin(folder / "references" / "b.running")
+time.sleep(0.8)
+os.remove(folder / "references" / "b.running")
+"""
+    assert supervise(lines, limit=0.5)[1] == ["measure"]
 
 
 def test_worker_that_dies_again_and_again_is_given_up(supervise, capfd):

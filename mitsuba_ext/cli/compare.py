@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -61,6 +62,11 @@ from .common import (
     help="Folder for report.html, results.json, the images, and rendered references. Runs that it "
     "holds are used again; they are only timed again where new runs are compared with them.",
 )
+@click.option(
+    "--limit", type=click.FloatRange(min=0, min_open=True), metavar="S",
+    help="Seconds that a render may take, compilation included. An integrator that takes longer is "
+    "ended and reported as failed, and the rest goes on. References have no limit.",
+)
 @click.option("--worker", type=click.Choice(supervisor.JOBS), hidden=True)
 @scene_options
 @click.argument("names", nargs=-1, required=True, metavar="SCENE… INTEGRATOR…")
@@ -77,6 +83,7 @@ def compare(
     reference_spp: int | None,
     reference_integrator: str,
     out: Path,
+    limit: float | None,
     worker: str | None,
     size: tuple[int, int] | None,
     definitions: Sequence[tuple[str, str]],
@@ -111,7 +118,9 @@ def compare(
     if worker is not None:
         supervisor.become_worker()
     elif context.obj == supervisor.SUPERVISED:
-        return supervisor.supervise(sys.argv[1:], out)
+        return supervisor.supervise(sys.argv[1:], out, limit or math.inf)
+    elif limit is not None:
+        raise click.UsageError("--limit needs worker processes, which only the command has")
     from ..compare import Comparison, SceneSetup, budgets, show
 
     make = {

@@ -4,6 +4,8 @@ Python cannot catch a lack of memory, a fault in native code, or an abort of LLV
 records which integrator was rendering when the worker died, and starts another worker. This one
 finds the finished runs in the folder, reports that integrator as failed, and goes on with the rest.
 
+An integrator can hang, too: with a limit, the supervisor kills a worker whose render takes longer.
+
 Mitsuba's own integrators cannot be interrupted: after Ctrl-C, the worker ends when the running
 render does. A second Ctrl-C kills it, and another worker writes the report of the finished runs.
 SIGTERM and SIGHUP, which batch systems send before they kill, act like Ctrl-C, but the running
@@ -48,8 +50,12 @@ _POLL = 0.1
 _PR_SET_PDEATHSIG = 1
 
 
-def supervise(arguments: Sequence[str], folder: Path) -> int:
+def supervise(arguments: Sequence[str], folder: Path, limit: float = math.inf) -> int:
     """Runs ``mitsuba-ext`` with ``arguments`` in worker processes; returns the exit code.
+
+    Args:
+        limit: Seconds that a render may take. A worker that takes longer is killed, and its
+            integrator is reported as failed.
 
     Raises:
         InputError: Another comparison is running in ``folder``.
@@ -57,7 +63,7 @@ def supervise(arguments: Sequence[str], folder: Path) -> int:
     with _collected_signals() as received, marks.in_use(folder):
         blamed: set[Path] = set()
         while True:
-            end = _work(arguments, folder, MEASURE, received)
+            end = _work(arguments, folder, MEASURE, received, limit)
             if end.signal and end.code in _IN_ORDER:
                 return 128 + end.signal if end.code == INTERRUPTED else end.code
             if end.signal:
@@ -66,7 +72,11 @@ def supervise(arguments: Sequence[str], folder: Path) -> int:
                 _work(arguments, folder, STORED, received)
                 return 128 + end.signal
             reason = _reason(end.code)
-            guilty = marks.blame(folder, end.process, f"the process {reason} in this render")
+            message = f"the process {reason} in this render"
+            if end.is_late:
+                reason = f"took more than the {limit:g} s of --limit for a render, and was ended"
+                message = f"a render took more than the {limit:g} s of --limit"
+            guilty = marks.blame(folder, end.process, message)
             if not guilty:
                 if end.code not in _IN_ORDER:
                     say(f"mitsuba-ext: the process {reason}")
@@ -106,19 +116,24 @@ class _End(NamedTuple):
         process: Its process id.
         code: Its exit code; negative if a signal ended it.
         signal: The signal that asked it to end; 0 if none did.
+        is_late: Was it killed because a render took too long?
     """
 
     process: int
     code: int
     signal: int
+    is_late: bool = False
 
 
 def _command(arguments: Sequence[str], job: str) -> list[str]:
     return python_command("mitsuba_ext", *arguments, f"--worker={job}")
 
 
-def _work(arguments: Sequence[str], folder: Path, job: str, received: list[int]) -> _End:
-    """Runs a worker to its end. The first signal interrupts it, a second one kills it."""
+def _work(
+    arguments: Sequence[str], folder: Path, job: str, received: list[int], limit: float = math.inf
+) -> _End:
+    """Runs a worker to its end. The first signal interrupts it, a second one kills it, and so does
+    a render that takes longer than ``limit`` seconds."""
     # In its own session, it does not get signals of the terminal, only those sent below
     worker = subprocess.Popen(
         _command(arguments, job),
@@ -126,11 +141,19 @@ def _work(arguments: Sequence[str], folder: Path, job: str, received: list[int])
         env={**os.environ, marks.SESSION_VARIABLE: marks.SESSION},
     )
     asked, deadline = 0, math.inf
+    seen: dict[tuple[Path, int], float] = {}
+    is_late = False
     while True:
         try:
-            return _End(worker.pid, worker.wait(_POLL), asked)
+            return _End(worker.pid, worker.wait(_POLL), asked, is_late)
         except subprocess.TimeoutExpired:
             pass
+        if limit < math.inf and not is_late:
+            now = time.monotonic()
+            seen = {render: seen.get(render, now) for render in marks.begun(folder, worker.pid)}
+            if any(now - begin > limit for begin in seen.values()):
+                is_late = True
+                worker.kill()
         while received:
             number = received.pop(0)
             if asked:

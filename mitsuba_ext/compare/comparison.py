@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..files import replacing
-from ..marks import in_use
+from ..marks import REFERENCES, in_use
 from ..progress import Step, reporting
 from ..scenes import InputError, LoadedScene, check_source, load_scene, scene_name
 from ..specifications import Specification, make_named
@@ -217,7 +217,7 @@ class Comparison:
     def _render_reference(
         self, scene: LoadedScene, progress: Callable[[Step], None]
     ) -> Reference | None:
-        folder = self.folder / "references"
+        folder = self.folder / REFERENCES
         folder.mkdir(exist_ok=True)
         if self.only_stored:
             return references.stored_reference(scene, folder, self._reference_integrator)
@@ -249,7 +249,7 @@ class Comparison:
 
     def _unique_name(self, source: SceneSource) -> str:
         name = scene_name(source)
-        taken = {record["name"] for record in self._records} | {"references"}
+        taken = {record["name"] for record in self._records} | {REFERENCES}
         candidates = [name] + [f"{name}-{number}" for number in range(2, len(self.scenes) + 3)]
         return next(candidate for candidate in candidates if candidate not in taken)
 

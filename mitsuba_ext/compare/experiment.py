@@ -19,7 +19,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..marks import has_crashed, mark_of, marked
+from ..marks import has_crashed, mark_of, marked, renew
+from ..nesting import with_nested
 from ..progress import Step
 from ..scenes import InputError, LoadedScene, one_line
 from ..specifications import NamedIntegrator, Specification, make_named
@@ -301,6 +302,7 @@ class Experiment:
             contender._zero_radiance = zero_radiance_share(integrator, self.scene.scene, seed=0)
 
     def _timed(self, contender: Contender, spp: int, seed: int) -> timing.Timed:
+        renew(self._mark(contender))
         timed = timing.timed_render(contender.named.integrator, self.scene.scene, seed, spp)
         contender.compile_seconds += timed.compile_seconds
         return timed
@@ -376,6 +378,12 @@ def make_all(
         if labels.count(label) > 1:
             raise InputError(
                 f'the integrator "{label}" is given twice; for more runs of it, increase --seeds'
+            )
+    for named in made:
+        if any(getattr(each, "checkpoint", "") for each in with_nested(named.integrator)):
+            raise InputError(
+                f'the integrator "{named.label}" has the parameter "checkpoint", with which it '
+                f"does not render everything: leave it out"
             )
     return made
 
