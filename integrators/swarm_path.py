@@ -9,7 +9,10 @@ from mitsuba_ext.composition.swarm import MAPS
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 
 #: By parameter, the slot that its maps fill.
-_SLOTS = {"time_map": "time", "lens_map": "aperture", "wavelength_map": "wavelength"}
+_SLOTS = {
+    "time_map": "time", "lens_map": "aperture", "wavelength_map": "wavelength",
+    "light_map": "light_numbers", "lobe_map": "directions", "direction_map": "scattering",
+}  # fmt: skip
 
 
 @registry.plugin
