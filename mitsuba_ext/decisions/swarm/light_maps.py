@@ -39,7 +39,8 @@ def light_cells(scene: mi.Scene, choice_dimension: int) -> Cells:
     if choice_dimension == 1:
         return Cells([0] * bits + [1, 2] * each)
     index = dr.arange(mi.UInt32, len(emitters))
-    cumulative = np.cumsum(scene.pdf_emitter(index).numpy().astype(np.float64))
+    probability = scene.pdf_emitter(index).numpy().astype(np.float64)
+    cumulative = np.cumsum(np.broadcast_to(probability, len(emitters)))
     edges = np.concatenate([[0], cumulative / cumulative[-1]])
     # Groups of equal numbers of lights; those behind the last one are empty
     group = -(-len(emitters) // (1 << bits))
