@@ -36,7 +36,8 @@ class AutoPath(WalkIntegrator):
          saved. (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** you do not know which technique a scene needs, with 16 samples per pixel or
     more. **Not when** an image has fewer samples (there is nothing to learn from), or when light
@@ -48,7 +49,7 @@ class AutoPath(WalkIntegrator):
     of the two lowers the variance of the image. What costs more time than it saves ends there.
     :monosp:`integrator.statistics.learned` says what was kept, and why.
 
-    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
     pilot.
 

@@ -86,12 +86,24 @@ class ComposedPath(WalkIntegrator):
          saved. (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** you want :monosp:`path` with passes of bounded memory, a time budget, statistics
-    or progress, or to combine techniques. **Not when** you need gradients (use :monosp:`prb`),
-    participating media (use :monosp:`volpath`; they are ignored here, as by :monosp:`path`), or a
+    or progress, or to combine techniques. **Not when** you need gradients (use :monosp:`prb`), or a
     scalar or polarized variant.
+
+    Where the scene has participating media, this is :monosp:`volpath`: homogeneous and grid media,
+    all phase functions, index-matched surfaces, cameras and lights in fog. Only the rule of the
+    roulette is that of :monosp:`path`, and :monosp:`hide_emitters` also hides a light that the
+    camera sees through fog. :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`,
+    :monosp:`spatial`, :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility` there; the
+    others need a surface and refuse the scene. :monosp:`directions` guided by regions of surfaces
+    are guided at surfaces, and by tiles everywhere. As with :monosp:`volpath`, distances follow one
+    of the colours: where these differ much, :monosp:`volpathmis` has less noise, and a medium that
+    has no extinction at all in some of them is refused. Light from infinity should not shine into a
+    medium without an end. A medium that only an :monosp:`instance` shows is rendered, but refused
+    by none of those who do not see media.
 
     A scene nests a decision as a :monosp:`sampler`, which is what Mitsuba takes it for, under the
     name of the slot. Every decision goes with every decision of the other slots, and the image
@@ -102,10 +114,10 @@ class ComposedPath(WalkIntegrator):
     and :monosp:`reweighted_direct` are path tracers with some of these decisions, under one name
     each.
 
-    Source: the algorithm is that of Mitsuba's :monosp:`path`; J. T. Kajiya, *The Rendering
-    Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple importance sampling); P.
-    Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH 2003 course 44, section 3.4
-    (:monosp:`linear`). The pages of the decisions name theirs.
+    Source: the algorithms are those of Mitsuba's :monosp:`path` and :monosp:`volpath`; J. T.
+    Kajiya, *The Rendering Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple
+    importance sampling); P. Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH
+    2003 course 44, section 3.4 (:monosp:`linear`). The pages of the decisions name theirs.
 
     .. tabs::
         .. code-tab:: xml

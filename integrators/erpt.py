@@ -93,7 +93,7 @@ class EnergyRedistribution(MetropolisIntegrator):
      * - (Common parameters)
        - |several|
        - Those of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
-         max_depth, rr_depth, hide_emitters, timeout, aovs.
+         max_depth, rr_depth, hide_emitters, timeout, aovs, checkpoint.
 
     ``spp`` is the number of independent samples per pixel.
 
@@ -109,7 +109,7 @@ class EnergyRedistribution(MetropolisIntegrator):
 
     Chains of paths have lens and caustic perturbations. Their paths have up to 32 segments; camera
     samples find longer ones. Then :monosp:`bidirectional`, :monosp:`next_event`, the sizes of
-    mutations and the filters must not be given.
+    mutations and the filters must not be given. Participating media are refused.
 
     Source: D. Cline, PhD thesis, 2007, chapter 8; D. Cline, J. Talbot, P. Egbert, *Energy
     Redistribution Path Tracing*, ACM Transactions on Graphics 24(3), 2005; B. Bitterli, W. Jarosz,

@@ -14,6 +14,7 @@ from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
 from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.movers import sensor_at_rest
 from mitsuba_ext.rendering.camera import check_takes_splats
 from mitsuba_ext.rendering.stages import OneStage
 from mitsuba_ext.transport.walk import Walk
@@ -43,7 +44,8 @@ class LightTracerIntegrator(WalkIntegrator):
          hides. (Default: uniform)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** light reaches diffuse surfaces through glass or by mirrors (caustics), above all
     from small lamps, points and spots, or as an independent check of other integrators. **Not
@@ -78,9 +80,9 @@ class LightTracerIntegrator(WalkIntegrator):
     independent random numbers where the sampler is :monosp:`ldsampler`, whose numbers depend on
     each other.
 
-    Alpha and output variables are those of the camera rays. Participating media are ignored, as by
-    :monosp:`path`. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized
-    variants, nor nesting in :monosp:`moment` and :monosp:`aov`.
+    Alpha and output variables are those of the camera rays. Participating media are refused (use
+    :monosp:`volpath` or :monosp:`composed_path`). Gradients are not supported (use :monosp:`prb`),
+    nor are scalar and polarized variants, nor nesting in :monosp:`moment` and :monosp:`aov`.
 
     Source: J. Arvo, *Backward Ray Tracing*, SIGGRAPH course, 1986; E. Veach, *Robust Monte Carlo
     Methods for Light Transport Simulation*, PhD thesis, 1997, section 10.2 (t = 1); adjoint BSDFs:
@@ -98,6 +100,8 @@ class LightTracerIntegrator(WalkIntegrator):
             'type': 'light_tracer',
             'max_depth': 8
     """
+
+    sees_media = False
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -126,7 +130,8 @@ class LightTracerIntegrator(WalkIntegrator):
     def schedule(self, scene, sensor, samples, seed) -> OneStage:
         if not ConnectableSensor.can_connect(sensor):
             raise NotImplementedError(
-                f'"{self.name}": nothing can be connected to the sensor "{sensor.class_name()}": '
+                f'"{self.name}": nothing can be connected to the sensor '
+                f'"{sensor_at_rest(sensor).class_name()}": '
                 f'use a "perspective" or "thinlens", or the integrator "path"'
             )
         try:

@@ -66,7 +66,7 @@ class PathMetropolis(ChainIntegrator):
      * - (Common parameters)
        - |several|
        - Those of :class:`ChainIntegrator`: direct_samples, chain_file, max_depth, rr_depth,
-         hide_emitters, timeout, aovs.
+         hide_emitters, timeout, aovs, checkpoint.
 
     ``spp`` is the number of mutations per pixel. New paths are independent samples besides, and
     count as such. Chains sample paths of up to 32 segments; camera samples find longer ones, if
@@ -76,7 +76,7 @@ class PathMetropolis(ChainIntegrator):
     glass and in mirrors; light through a gap. **Not when** :monosp:`path` or :class:`bdpt`
     converge well, or for noise that must look even (:class:`pssmlt`).
 
-    The statistics hold the rates of acceptance.
+    The statistics hold the rates of acceptance. Participating media are refused.
 
     Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997; D. Cline, PhD thesis,
     2007, section 7.12. Parameters: Mitsuba 0.6.

@@ -85,7 +85,8 @@ class NEEPlusPlus(WalkIntegrator):
          (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** there are many lights, when most of them are hidden from most places (rooms, a
     sky seen through windows, lamps behind walls), or when large lights are partly covered. **Not
@@ -97,7 +98,8 @@ class NEEPlusPlus(WalkIntegrator):
     that little is to gain, learning ends there, unless :monosp:`grid`, :monosp:`rejection` or a
     file of a map is given.
 
-    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    Participating media are rendered as by :monosp:`volpath`; lights are learned in them as for
+    surfaces (but :monosp:`light_sampling=linear` refuses them). Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
     pilot.
 

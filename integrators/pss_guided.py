@@ -64,7 +64,8 @@ class PSSGuided(WalkIntegrator):
        - Memory for what is recorded and learned, in MiB. (Default: 512)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** light comes by way of other surfaces: through doors, windows and gaps, from lit
     corners, along mirrors and glossy things. **Not when** most light is direct (use :monosp:`neepp`
@@ -74,7 +75,8 @@ class PSSGuided(WalkIntegrator):
     After a render, :monosp:`integrator.statistics.learned` tells what was found, and
     :monosp:`integrator.guide` holds it (see examples/learned_samples.py).
 
-    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    Participating media are rendered as by :monosp:`volpath`; in them, directions are guided by
+    tiles only. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
     pilot.
 

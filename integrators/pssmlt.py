@@ -60,7 +60,7 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
      * - (Common parameters)
        - |several|
        - Those of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
-         max_depth, rr_depth, hide_emitters, timeout, aovs.
+         max_depth, rr_depth, hide_emitters, timeout, aovs, checkpoint.
 
     ``spp`` is the number of mutations per pixel.
 
@@ -70,7 +70,7 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
     each other, and a chain that has found a rare bright path stays there for long, which shows as a
     spot. Errors between renders of different seeds tell the truth (:class:`variance`).
 
-    The statistics hold the rates of acceptance.
+    The statistics hold the rates of acceptance. Participating media are refused.
 
     Source: C. Kelemen, L. Szirmay-Kalos, G. Antal, F. Csonka, *A Simple and Robust Mutation
     Strategy for the Metropolis Light Transport Algorithm*, Eurographics 2002; D. Cline, PhD thesis,

@@ -50,14 +50,15 @@ class ReweightedDirect(WalkIntegrator):
          another integrator. (Default: 0)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** the noise comes from soft shadows and large lights, and edges, defocus or
     materials do not need many camera samples. **Not when** most light is indirect (more camera
     samples reduce its noise more), or with many lights (use :monosp:`neepp`). Compare it with
     :monosp:`path` and a :monosp:`multijitter` sampler, which is hard to beat.
 
-    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants.
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4. Periodic cells, and the fact
@@ -82,9 +83,9 @@ class ReweightedDirect(WalkIntegrator):
         read = self.reader(props, {"count": "light_samples"}, count=256)
         self.fill(props, connections=Connections(read))
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        spp = spp or self.camera_samples
-        return super().render(scene, sensor, seed, spp, develop, evaluate)
+    @property
+    def default_spp(self) -> int:
+        return self.camera_samples
 
     def parameters(self) -> dict[str, Any]:
         return {"camera_samples": self.camera_samples, **super().parameters()}

@@ -57,7 +57,8 @@ class TwoStage(WalkIntegrator):
        - With maps: as in :class:`composed_path`. (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** you compare methods, or the light of an uneven map on rough metal makes the
     noise, and the number of camera samples is limited by something else.
@@ -67,7 +68,8 @@ class TwoStage(WalkIntegrator):
     small opening, :monosp:`visibility` helps, but :monosp:`composed_path` with
     :monosp:`next_event=contribution` and :monosp:`connections=16` was seven times as efficient.
 
-    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    Participating media are refused (use :monosp:`volpath` or :monosp:`composed_path`). Gradients
+    are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants.
 
     Source: D. Cline, P. K. Egbert, J. F. Talbot, D. L. Cardon, *Two Stage Importance Sampling for

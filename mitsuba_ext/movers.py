@@ -14,6 +14,11 @@ def movers(scene: mi.Scene) -> list[mi.Shape]:
     return [s for s in scene.shapes() if isinstance(getattr(s, "motion", None), Motion)]
 
 
+def is_moving_light(emitter: mi.Emitter) -> bool:
+    """Is it a light that moves? It has a ``nested`` emitter, which rests, and a ``motion``."""
+    return isinstance(getattr(emitter, "motion", None), Motion)
+
+
 def is_moving_camera(sensor: mi.Sensor) -> bool:
     """Is it a ``moving_camera``? It has a ``nested`` sensor, a ``motion`` and ``poses``."""
     return isinstance(getattr(sensor, "motion", None), Motion)
@@ -53,6 +58,19 @@ def refuse_movers(scene: mi.Scene, what: str, instead: str) -> None:
     if movers(scene):
         raise NotImplementedError(
             f"{what} does not see the moving shapes of this scene: {instead}."
+        )
+
+
+def refuse_moving_lights(scene: mi.Scene) -> None:
+    """Raises an error if a light moves: for what starts paths from lights.
+
+    Raises:
+        NotImplementedError: A light of ``scene`` moves.
+    """
+    if any(map(is_moving_light, scene.emitters())):
+        raise NotImplementedError(
+            'paths cannot start from lights that move: use an integrator without light paths, such '
+            'as "composed_path"'
         )
 
 

@@ -44,6 +44,7 @@ _BASES = (
     "mitsuba_ext.composition.reweighted_camera",
     "mitsuba_ext.sequences.sequence_sampler",
     "mitsuba_ext.luminaires.area_luminaire",
+    "mitsuba_ext.luminaires.moving_emitter",
 )
 
 _registered: set[str] = set()

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import mitsuba as mi
 
+from .media import has_media
 from .nesting import class_name, with_nested
 
 #: Integrators that need no light and ignore media by design: two show properties of surfaces, one
@@ -38,18 +37,16 @@ def scene_remarks(
         and len(with_nested(each)) == 1
     ]
     remarks = []
-    blind = [each for each in tracers if class_name(each) not in _SEES_MEDIA]
-    if blind and (sensor.get_medium() is not None or _has_media(scene.shapes())):
+    # Those of ours render media, or refuse to
+    blind = [
+        each
+        for each in tracers
+        if class_name(each) not in _SEES_MEDIA and not hasattr(each, "sees_media")
+    ]
+    if blind and has_media(scene):
         remarks.append(
             f'the scene has participating media, and "{name}" treats them as absent: use "volpath"'
         )
     if tracers and not scene.emitters():
         remarks.append("the scene has no light: the image is black")
     return remarks
-
-
-def _has_media(shapes: Iterable[mi.Shape]) -> bool:
-    return any(
-        shape.is_medium_transition() or _has_media(getattr(shape, "children", ()))
-        for shape in shapes
-    )

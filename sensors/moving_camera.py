@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import mitsuba as mi
-import numpy as np
 
 from mitsuba_ext import registry
 from mitsuba_ext.motion import Motion, PoseTable
@@ -139,9 +138,7 @@ class MovingCamera(mi.Sensor):
         return self.nested.sample_wavelengths(si, sample, active)
 
     def bbox(self):
-        box = self.nested.bbox()
-        corners = np.array([list(box.corner(i)) for i in range(8)], dtype=np.float64)
-        return mi.ScalarBoundingBox3f(*self.motion.bounds(corners))
+        return self.motion.box(self.nested.bbox())
 
     def traverse(self, callback):
         self.nested.traverse(callback)

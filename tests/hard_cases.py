@@ -47,6 +47,7 @@ class HardCase:
         is_black: The image must be zero everywhere.
         seeds: Number of renders of the integrator: two are enough if the pixels are independent.
         unit: Edge of the squares of pixels whose errors are independent of each other.
+        reference: The integrator of Mitsuba that has the right mean.
     """
 
     make: Callable[[], Scene]
@@ -57,6 +58,7 @@ class HardCase:
     is_black: bool = False
     seeds: int = 2
     unit: int = 1
+    reference: str = "path"
 
 
 def _many_lights() -> Scene:
@@ -266,7 +268,7 @@ HARD_CASES: dict[str, HardCase] = {
     "degenerate_light": HardCase(_degenerate_light),
     "light_without_area": HardCase(_light_without_area),
     "instances": HardCase(_instances),
-    "medium": HardCase(_medium),
+    "medium": HardCase(_medium, reference="volpath"),
     "film_of_one_pixel": HardCase(_film(1, 1), spp=65536, precision=0.03, seeds=6),
     "film_of_odd_size": HardCase(
         _film(37, 23, rfilter={"type": "gaussian"}), spp=256, unit=4

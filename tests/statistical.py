@@ -59,7 +59,9 @@ def load(name: str, **options: Any) -> mi.Scene:
 def some(*quick: Any, of: Iterable[str]) -> list:
     """Parameters of a test; all but the ``quick`` ones are marked ``slow``: each takes seconds to
     compile."""
-    return [pytest.param(x, marks=() if x in quick else pytest.mark.slow) for x in of]
+    rows = [x if isinstance(x, tuple) else (x,) for x in of]
+    marks = [() if x in quick else pytest.mark.slow for x in of]
+    return [pytest.param(*row, marks=mark) for row, mark in zip(rows, marks)]
 
 
 def batches(

@@ -106,14 +106,14 @@ _UNLIKE_PATH = (
     "directional_area_light", "smooth_normal_lamp", "scaled_by_1e-3", "moved_by_1e3_sizes",
     "thousand_lights",
 )  # fmt: skip
-_OF_CAMERA_PATHS = ("sky_through_portals",)
+_OF_CAMERA_PATHS = ("sky_through_portals", "medium")
 _LIGHT_PATHS = tuple(
     case for case in HARD_CASES if case not in (*_UNLIKE_PATH, *_OF_CAMERA_PATHS)
 )
 
 #: Behind mirrors, glass, masks and null surfaces, and on a film with a sampled border.
 _UNSEEN_FROM_LIGHTS = {
-    "furnace_glass", "furnace_isothermal", "materials", "medium", "cropped_film", "mirror_ring",
+    "furnace_glass", "furnace_isothermal", "materials", "cropped_film", "mirror_ring",
     "floor_under_water",
 }  # fmt: skip
 

@@ -42,7 +42,7 @@ class _ByPlace:
 def _probability(throughput: float, radiance: float, pixel: float, depth: int = 5) -> float:
     table = mi.Float([0.0, radiance])
     roulette = AdjointRoulette(_ByPlace(), table, mi.Float([0.0, 1 / pixel]))
-    vertex = SimpleNamespace(si=SimpleNamespace(p=mi.Point3f(1.5, 0, 0)))
+    vertex = SimpleNamespace(si=SimpleNamespace(p=mi.Point3f(1.5, 0, 0)), medium=None)
     path = SimpleNamespace(β=mi.Color3f(throughput), depth=mi.UInt32(depth))
     state = roulette.begin(None, None, mi.UInt32(1))
     p, _ = roulette.survival(state, vertex, path, mi.Bool(True))

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..discrete_sampling import alias_tables
 from ..lights.division import emitter_shapes, has_interpolated_normals, triangles
+from ..movers import refuse_moving_lights
 from .emitter_choice import emitter_probabilities
 
 # Kinds of pieces
@@ -54,10 +55,12 @@ class LightPieces:
         axis (numpy.ndarray): The direction in which each spot and projector shines; [emitters, 3].
 
     Raises:
-        NotImplementedError: Points on the shape of an area light cannot be sampled.
+        NotImplementedError: Points on the shape of an area light cannot be sampled, or a light
+            moves.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
+        refuse_moving_lights(scene)
         emitters, shapes = scene.emitters(), emitter_shapes(scene)
         count = len(emitters)
         self.area, self.way = np.ones(count), np.full(count, TO_FRONT)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from ..long_renders.intervals import Interval
 from ..names import check_integrator
 from ..parameters import MOST_SPP
 from ..variants import select_variant
@@ -15,7 +16,6 @@ from .common import (
     MAX_SEED,
     Every,
     FilledPath,
-    Interval,
     scene_options,
 )
 from .frames import FrameRange, Sensors, pictures

@@ -117,6 +117,8 @@ class DecisionParameters:
         tries: Does what it learns in a first pilot make the next ones better?
         camera_paths_only: Does it ask what only camera paths know of a vertex (from where it is
             seen, its depth, with what density scattering finds a light)?
+        sees_media: Can it decide at vertices in participating media? False where it needs a normal
+            or a BSDF.
         sample_cost: The time of a sample in units of that of a path, about.
     """
 
@@ -126,6 +128,7 @@ class DecisionParameters:
     pilot_paths = 0
     tries = False
     camera_paths_only = False
+    sees_media = True
     sample_cost = 1
 
     def check_slot(self, plugin: str, slot: str) -> None:

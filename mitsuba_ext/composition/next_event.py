@@ -62,6 +62,7 @@ class LinearLights(DecisionParameters):
 
     name = "linear"
     slots = ("next_event",)
+    sees_media = False
 
     def decision(self, setting: Setting) -> Any | None:
         return LinearChoice(setting.scene) if len(setting.scene.emitters()) > 1 else None
@@ -167,6 +168,7 @@ class ResampledLightsChoice(DecisionParameters):
     name = "resampled_lights"
     slots = ("next_event",)
     camera_paths_only = True
+    sees_media = False
 
     def __init__(self, read: ParameterReader) -> None:
         self.candidates = read("candidates", 8, minimum=1, maximum=1024)
@@ -193,6 +195,7 @@ class TwoStageLights(DecisionParameters):
     name = "two_stage_lights"
     slots = ("next_event",)
     camera_paths_only = True
+    sees_media = False
 
     def __init__(self, read: ParameterReader, visibility: str = "") -> None:
         self.splits = read("splits", 16, minimum=0, maximum=MOST_SPLITS)

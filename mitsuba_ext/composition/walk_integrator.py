@@ -13,10 +13,12 @@ from typing import Any
 import mitsuba as mi
 
 from ..decisions.learner import Learner
+from ..decisions.query.moving_aovs import moving_aovs
 from ..decisions.query.moving_scene import scene_query
 from ..errors import InputError
 from ..files import check_target
-from ..movers import refuse_movers
+from ..media import refuse_media, refuse_missing_colours, refuse_moving_grids
+from ..movers import movers
 from ..rendering.aovs import check_aovs
 from ..rendering.camera import film_extent
 from ..rendering.staged_integrator import NO_LIMIT, StagedIntegrator
@@ -50,7 +52,7 @@ class WalkIntegrator(StagedIntegrator):
        - Hide directly visible emitters. (Default: false)
      * - (Common parameters)
        - |float|
-       - Those of :class:`StagedIntegrator`: timeout.
+       - Those of :class:`StagedIntegrator`: timeout, checkpoint.
      * - aovs
        - |string|
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
@@ -61,11 +63,13 @@ class WalkIntegrator(StagedIntegrator):
 
     Attributes:
         has_light_paths (bool): Are there light paths beside the camera paths?
+        sees_media (bool): Does it render participating media? Else it refuses them.
         slots (dict[str, DecisionParameters]): What fills the slots of the walk.
         learners (dict[str, Learner]): Who learned in the last render, by slot.
     """
 
     has_light_paths = False
+    sees_media = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -206,11 +210,12 @@ class WalkIntegrator(StagedIntegrator):
         """One sample, for integrators that nest this one and draw its samples (``moment``; ``aov``
         calls :meth:`render`). Nothing is learned there: each decision that needs a pilot falls
         back to its default."""
+        self.check_sampled()
         setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1)
         decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}
         decisions = {slot: decision for slot, decision in decisions.items() if decision}
         walk = self.walk(query=self.query(scene), **decisions)
-        sample = walk(scene, sampler, CameraRays(ray), mi.Bool(active))
+        sample = walk(scene, sampler, CameraRays(ray, medium=medium), mi.Bool(active))
         return sample.L, sample.valid, self.sample_aovs(scene, sampler, ray)
 
     def aov_names(self) -> list[str]:
@@ -220,6 +225,8 @@ class WalkIntegrator(StagedIntegrator):
         """The values of the channels that :meth:`aov_names` names."""
         if self._aovs is None:
             return []
+        if movers(scene):  # Mitsuba knows no motion
+            return moving_aovs(self._aovs, self.aovs, scene_query(scene), scene, sampler, ray)
         return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
 
     def common_parameters(self) -> dict[str, Any]:
@@ -237,10 +244,23 @@ class WalkIntegrator(StagedIntegrator):
         return {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
 
     def query(self, scene: mi.Scene) -> SceneQuery:
-        """How rays meet ``scene``. The output variables are Mitsuba's, which knows no motion."""
-        if self._aovs is not None:
-            refuse_movers(scene, f'"{self.name}": the parameter "aovs"', "leave it out")
+        """How rays meet ``scene``.
+
+        Raises:
+            NotImplementedError: There is something in ``scene`` that this integrator does not see.
+        """
+        self._check_media(scene)
         return scene_query(scene)
+
+    def _check_media(self, scene: mi.Scene) -> None:
+        if self.has_light_paths or not self.sees_media:
+            refuse_media(scene, f'"{self.name}"', 'use "composed_path" or "volpath"')
+        for slot, parameters in self.slots.items():
+            if not parameters.sees_media:
+                what = f'"{self.name}": the parameter "{slot}" is "{parameters.name}", which'
+                refuse_media(scene, what, 'choose another one, such as "contribution"')
+        refuse_moving_grids(scene, f'"{self.name}"')
+        refuse_missing_colours(scene, f'"{self.name}"')
 
     def _aov_integrator(self, aovs: str) -> mi.Integrator | None:
         check_aovs(self.name, aovs)

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..bounds import scene_bounds
+from ..movers import is_moving_light
 from .division import emitter_shapes
 from .spectra import brightness
 
@@ -44,10 +45,15 @@ def emitter_powers(scene: mi.Scene) -> np.ndarray:
 def _sent_out(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
     if len(indices) == 0:
         return np.zeros(0)
-    shapes = emitter_shapes(scene)
+    # What moves has its power where it rests
+    at_rest = [e.nested if is_moving_light(e) else e for e in scene.emitters()]
+    shapes = [
+        e.nested.get_shape() if is_moving_light(e) else shape
+        for e, shape in zip(scene.emitters(), emitter_shapes(scene))
+    ]
     # Not by a call through a pointer: Dr.Jit would trace all emitters in memory, also those of
     # other scenes
-    senders = [functools.partial(_radiated, scene.emitters()[i], shapes[i]) for i in indices]
+    senders = [functools.partial(_radiated, at_rest[i], shapes[i]) for i in indices]
     index, sampler = _lanes(len(indices))
     numbers = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
     return _means(dr.switch(index, senders, *numbers), len(indices))

@@ -165,8 +165,9 @@ def camera_rays(
     if film.rfilter().is_box_filter():
         position = mi.Point2f(lanes.corner)
     return CameraRays(
-        ray, lanes.pixel, importance, position, numbers.weight, numbers.hero_weight
-    )
+        ray, lanes.pixel, importance, position, numbers.weight, numbers.hero_weight,
+        sensor.get_medium(),
+    )  # fmt: skip
 
 
 def sample_rays(

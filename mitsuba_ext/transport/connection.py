@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .heroes import Heroes
+from .media import NoMedia
 from .observer import Observer
 from .path_decisions import (
     AlwaysTest,
@@ -59,7 +60,9 @@ class Connector:
         heroes: Heroes,
         weights: Weights,
         observer: Observer,
+        media: NoMedia,
     ) -> None:
+        self._media = media
         self._scene, self._query, self._heroes, self._weights = scene, query, heroes, weights
         self._next_event, self._connections = next_event, connections
         self._shadow_test, self._scattering, self._observer = shadow_test, scattering, observer
@@ -75,7 +78,9 @@ class Connector:
         choice = None
         if dimension > 0:
             choice = sampler.next_1d() if dimension == 1 else sampler.next_2d()
-        connection = self._choose(place, LightNumbers(sampler.next_2d(), choice), vertex, active)
+        # `volpath` draws no numbers where there is no connection
+        point = sampler.next_2d(active) if self._media.exist else sampler.next_2d()
+        connection = self._choose(place, LightNumbers(point, choice), vertex, active)
         if self._connections.first != 1 or self._connections.later != 1:
             count = self._connections.weight(vertex.depth)
             # Without connections: lights that no BSDF sample can hit are not left out
@@ -100,6 +105,8 @@ class Connector:
         pdf: mi.Float,
         count: mi.Float | float,
         active: mi.Bool,
+        inside: Any = (),
+        sampler: mi.Sampler | None = None,
     ) -> tuple[mi.Spectrum, mi.Bool, mi.Bool, mi.Bool, Any]:
         """What a connection brings.
 
@@ -110,6 +117,7 @@ class Connector:
             bsdf_value, pdf: The BSDF's value towards the light (cosine included), and the density
                 with which scattering finds this direction.
             count: Number of the vertex's connections.
+            inside, sampler: Of a path in a scene with media: where it is, and random numbers.
 
         Returns:
             The light that arrives where nothing is in between, with its MIS weight; where it was
@@ -126,7 +134,14 @@ class Connector:
         value, tested, state = self._roulette(
             state, connection, survival_sample, si, value, tested
         )
-        visible = tested & ~self._query.occluded(self._scene, si, ds, tested)
+        if self._media.exist:
+            T = self._media.transmittance(
+                self._query, self._scene, vertex, ds, inside, sampler, tested
+            )
+            value, contribution = value * T, contribution * T
+            visible = tested & (dr.max(T) > 0)
+        else:
+            visible = tested & ~self._query.occluded(self._scene, si, ds, tested)
         self._observer.connection(
             connection.choice, vertex, ds, contribution, value, pdf, visible, tested
         )
@@ -147,6 +162,42 @@ class Connector:
         # p > 0 wherever a lane survives: the random number is not negative
         return value * dr.select(survives, dr.rcp(p), 0), active & survives, state
 
+    def gather_one(
+        self,
+        shadow_state: Any,
+        scattering_state: Any,
+        place: Any,
+        ctx: mi.BSDFContext,
+        sampler: mi.Sampler,
+        vertex: Vertex,
+        active: mi.Bool,
+        inside: Any,
+    ) -> tuple[mi.Spectrum, mi.UInt32, mi.UInt32, Any]:
+        """The same as :meth:`gather` of vertices that have one connection, in a scene with media.
+        """
+        connection = self.one(place, sampler, vertex, active)
+        bsdf_value, pdf = self._value(
+            scattering_state, ctx, vertex, connection.ds, active
+        )
+        value, considered, tested, visible, shadow_state = self.unoccluded(
+            shadow_state, self.survival_sample(sampler), vertex, vertex.path.β, connection,
+            bsdf_value, pdf, 1.0, active, inside, sampler,
+        )  # fmt: skip
+        counts = (dr.select(which, mi.UInt32(1), 0) for which in (considered, tested))
+        return dr.select(visible, value, 0), *counts, shadow_state
+
+    def _value(self, scattering_state, ctx, vertex: Vertex, ds, active):
+        """What a vertex scatters from a light, cosine included, and the density with which
+        scattering finds that."""
+        wo = vertex.si.to_local(ds.d)
+        value, pdf = self._scattering.eval_pdf(scattering_state, ctx, vertex, wo, active)
+        value = self._heroes.connect(
+            vertex.path.hero_is_alone, value, vertex.bsdf, vertex.si, wo
+        )
+        if self._media.exist:
+            value, pdf = self._media.eval(vertex, ds.d, value, pdf, active)
+        return value, pdf
+
     @dr.syntax
     def gather(
         self,
@@ -157,6 +208,7 @@ class Connector:
         sampler: mi.Sampler,
         vertex: Vertex,
         active: mi.Bool,
+        inside: Any,
     ) -> tuple[mi.Spectrum, mi.UInt32, mi.UInt32, Any]:
         """What all connections of vertices that have more than one bring to the path, throughput
         included; the number of connections that were considered, that of shadow rays, and the new
@@ -171,19 +223,17 @@ class Connector:
         active = active & (count > 1)
         # Where there is no connection, nothing is added
         share = vertex.path.β / dr.maximum(count, 1)
+        # Without media, the loop draws no numbers
+        drawn = sampler if self._media.exist else ()
         while active:
             numbers, weight = self._connections.numbers(
                 chosen, index, dimension, active
             )
             connection = self._choose(place, numbers, vertex, active)
-            wo = vertex.si.to_local(connection.ds.d)
-            bsdf_value, pdf = self._scattering.eval_pdf(scattering_state, ctx, vertex, wo, active)
-            bsdf_value = self._heroes.connect(
-                vertex.path.hero_is_alone, bsdf_value, vertex.bsdf, vertex.si, wo
-            )
+            bsdf_value, pdf = self._value(scattering_state, ctx, vertex, connection.ds, active)
             value, considered, tested, visible, shadow_state = self.unoccluded(
                 shadow_state, _turned(survival_sample, index), vertex, share * weight,
-                connection, bsdf_value, pdf, count, active,
+                connection, bsdf_value, pdf, count, active, inside, drawn,
             )  # fmt: skip
             total[visible] += value
             connection_count += dr.select(considered, 1, 0)

@@ -6,12 +6,13 @@ from typing import Any
 
 import mitsuba as mi
 
-from .path_decisions import EmitterSampling, Weights
+from .path_decisions import EmitterSampling, SceneQuery, Weights
 from .vertex import PathState
 
 
 def emission(
     scene: mi.Scene,
+    query: SceneQuery,
     si: mi.SurfaceInteraction3f,
     path: PathState,
     next_event: EmitterSampling,
@@ -24,6 +25,7 @@ def emission(
     from there, and the density with which connections find it (0 where they cannot).
 
     Parameters:
+        query: Found ``si``.
         next_event, state: The decision whose connections could have found the light as well, and
             its state when it left the vertex before.
         weights: Of multiple importance sampling.
@@ -31,6 +33,7 @@ def emission(
     """
     arrival = path.arrival
     ds = mi.DirectionSample3f(scene, si, arrival.ref)
+    ds.emitter = query.emitter(si, ds.emitter)
     is_connectable = ~arrival.is_delta & (ds.emitter != None)  # noqa: E711
     pdf = next_event.density(state, scene, arrival.ref, si, ds, is_connectable)
     weight = weights.emission(scene, si, ds, path, count * pdf)

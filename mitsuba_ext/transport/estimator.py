@@ -22,6 +22,7 @@ class CameraRays:
         weight: Importance weight of a sample; 1.0 where all count the same.
         hero_weight: The factor of ``weight`` for paths of which only the first wavelength is left
             (``heroes.py``). The estimator applies it.
+        medium: The participating medium in which the rays begin; ``None`` in a vacuum.
     """
 
     ray: mi.RayDifferential3f
@@ -30,6 +31,7 @@ class CameraRays:
     position: mi.Point2f | None = None
     weight: mi.Float | float = 1.0
     hero_weight: mi.Float | float = 1.0
+    medium: mi.Medium | None = None
 
 
 @dataclass

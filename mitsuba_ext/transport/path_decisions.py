@@ -354,6 +354,10 @@ class SceneQuery:
         """Everything about an intersection that :meth:`closest` found."""
         return pi.compute_surface_interaction(ray, mi.RayFlags.All)
 
+    def emitter(self, si: mi.SurfaceInteraction3f, emitter: mi.EmitterPtr) -> mi.EmitterPtr:
+        """The light of ``scene.emitters()`` that ``si`` belongs to, by Mitsuba's answer."""
+        return emitter
+
     def occluded(
         self,
         scene: mi.Scene,

@@ -52,20 +52,35 @@ class PathState:
 
 
 @dataclass
-class Vertex:
-    """A point of a surface that a path has reached.
+class MediumVertex:
+    """What is known of a vertex in a medium.
 
     Attributes:
-        si: The interaction there.
-        bsdf: Its BSDF.
+        scatters: Does the path scatter in a medium? Elsewhere, its vertex is on a surface.
+        mei: The interaction there, without coefficients of the medium.
+    """
+
+    scatters: mi.Bool
+    mei: mi.MediumInteraction3f
+
+
+@dataclass
+class Vertex:
+    """A point of a surface or of a medium that a path has reached.
+
+    Attributes:
+        si: The interaction there. In a medium, it has neither shape nor normal.
+        bsdf: Its BSDF; null in a medium.
         path: What the path brings along.
         pixel: Where on the film the path begins, row by row; ``None`` where nobody has said.
+        medium: ``None`` where the scene has no media.
     """
 
     si: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
     path: PathState
     pixel: mi.UInt32 | None = None
+    medium: MediumVertex | None = None
 
     @property
     def depth(self) -> mi.UInt32:

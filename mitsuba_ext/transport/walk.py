@@ -2,7 +2,8 @@
 
 The walk is Mitsuba's ``path``: next event estimation, multiple importance sampling with the power
 heuristic, Russian roulette. With the default decisions it draws the same random numbers in the
-same order, so that a render of one pass returns the same image. A technique replaces one decision
+same order, so that a render of one pass returns the same image. Where the scene has participating
+media, it is ``volpath`` (``media.py``). A technique replaces one decision
 (``path_decisions.py``); Dr.Jit inlines Python while it traces, so a replaced decision costs what it
 does and a default one nothing.
 """
@@ -18,8 +19,9 @@ from ..garbage import garbage_left_alone
 from .connection import Connection, Connector
 from .emission import can_be_hit, emission
 from .estimator import CameraRays, Sample
+from .free_flight import FlightNumbers
 from .heroes import Heroes
-from .hidden_emitters import behind_emitters
+from .media import media_of
 from .observer import Observer
 from .path_decisions import (
     AlwaysTest,
@@ -51,6 +53,7 @@ class Walk:
         shadow_test: Whether the shadow ray of a connection is traced.
         roulette: Which paths go on.
         query: How a ray meets the scene.
+        flights: Which random numbers choose how far a path flies in a medium.
         mis: How what connections find is weighed against what scattering finds.
         subpaths: Other subpaths whose vertices are connected to those of the path.
         observer: Is told what happens.
@@ -66,6 +69,7 @@ class Walk:
     shadow_test: ShadowTest = field(default_factory=AlwaysTest)
     roulette: Roulette = field(default_factory=Roulette)
     query: SceneQuery = field(default_factory=SceneQuery)
+    flights: FlightNumbers = field(default_factory=FlightNumbers)
     mis: Weights = field(default_factory=Weights)
     subpaths: Subpaths | None = None
     observer: Observer = field(default_factory=Observer)
@@ -85,13 +89,16 @@ class Walk:
         can_hit_emitters = has_emitters and can_be_hit(scene)
         sees_environment = scene.environment() is not None and not self.hide_emitters
 
+        media = media_of(scene, self.hide_emitters, self.flights)
         heroes = Heroes(scene, rays.hero_weight)
         ctx = heroes.context()
         connector = Connector(
             scene, self.next_event, self.connections, self.shadow_test, self.scattering,
-            self.query, heroes, self.mis, self.observer,
+            self.query, heroes, self.mis, self.observer, media,
         )  # fmt: skip
         makes_one, makes_many = connects and connector.single, connects and connector.many
+        # Light that comes through media takes random numbers
+        makes_early, makes_one = makes_one and media.exist, makes_one and not media.exist
 
         # --------------------- Configure the loop state ----------------------
         pixel = rays.pixel
@@ -116,41 +123,54 @@ class Walk:
         roulette_state = self.roulette.begin(sampler, ray, pixel)
         self.observer.begin(dr.width(ray), pixel)
 
+        inside = media.begin(sampler, rays.medium)
+        ray, inside = media.launch(inside, sampler, ray, active)
         pi = self.query.closest(scene, ray, coherent=True, active=active)
         if dr.hint(self.hide_emitters, mode="scalar"):
-            ray, pi = behind_emitters(self.query, scene, ray, pi, active)
+            ray, pi = media.behind(self.query, scene, ray, pi, active)
 
         while dr.hint(active, label="walk"):
             si = self.query.interaction(pi, ray)
+            si, path.β, in_medium = media.fly(inside, sampler, ray, si, path.β, active)
             path.sums = self.mis.arrive(path, si)
 
             # ----- How much does this vertex emit towards the previous one? -----
             if dr.hint(can_hit_emitters, mode="scalar"):
                 count = self.connections.weight(path.depth - 1)
                 emitted, mis, hit, light_pdf = emission(
-                    scene, si, path, self.next_event, next_event_state, self.mis, count
+                    scene, self.query, si, path, self.next_event, next_event_state, self.mis,
+                    count,
                 )
+                emitted = media.visible_emission(emitted, path)
                 L = dr.fma(path.β, emitted, L)
                 self.observer.emission(
                     path, hit, path.β * emitted, mis, light_pdf, active
                 )
 
             # ----- Should we continue tracing to reach one more vertex? -----
-            active_next = (path.depth + 1 < self.max_depth) & si.is_valid()
-            vertex = Vertex(si, si.bsdf(ray), path, pixel)
+            vertex = Vertex(si, si.bsdf(ray), path, pixel, in_medium)
+            active_next, active_em = media.goes_on(vertex, self.max_depth, active)
 
             # ----- Which points of which lights do we connect to? -----
-            active_em = active_next & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
             self.observer.vertex(vertex, active_em)
             place = self._visit(connects, next_event_state, scene, si, active_em)
             if dr.hint(makes_many, mode="scalar"):
                 gathered, connections, shadow_rays, shadow_state = connector.gather(
-                    shadow_state, scattering_state, place, ctx, sampler, vertex, active_em
+                    shadow_state, scattering_state, place, ctx, sampler, vertex, active_em, inside
                 )
                 L += gathered
                 connection_count += connections
                 shadow_count += shadow_rays
-            connection = self._connect(connector, makes_one, place, sampler, vertex, active_em)
+            if dr.hint(makes_early, mode="scalar"):
+                gathered, connections, shadow_rays, shadow_state = connector.gather_one(
+                    shadow_state, scattering_state, place, ctx, sampler, vertex, active_em, inside
+                )
+                L += gathered
+                connection_count += connections
+                shadow_count += shadow_rays
+            connection = self._connect(
+                connector, makes_one, makes_early, place, sampler, vertex, active_em
+            )
             wo = si.to_local(connection.ds.d)
             if dr.hint(self.subpaths is not None, mode="scalar"):
                 gathered, shadow_rays = self.subpaths.gather(scene, sampler, vertex, active_em)
@@ -158,8 +178,9 @@ class Walk:
                 shadow_count += shadow_rays
 
             # ----- Evaluate the BSDF towards the light and choose where to scatter -----
+            turns = media.turns(vertex, active_next)
             sample_1, sample_2, directions_weight, directions_state = self.directions.draw(
-                directions_state, sampler, vertex, active_next
+                directions_state, sampler, vertex, turns
             )
             bsdf_value, light_pdf, bs, bsdf_weight, scattering_state = self.scattering.sample(
                 scattering_state, ctx, vertex, wo, sample_1, sample_2
@@ -178,14 +199,15 @@ class Walk:
                 L[visible] += unoccluded
                 connection_count += dr.select(considered, 1, 0)
                 shadow_count += dr.select(tested, 1, 0)
-            self.observer.direction(vertex, sample_2, directions_weight, L, active_next)
+            bs, bsdf_weight = media.scatter(vertex, sample_1, sample_2, bs, bsdf_weight)
+            self.observer.direction(vertex, sample_2, directions_weight, L, turns)
 
             # ----- Move on to the next vertex -----
             bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)
             ray = si.spawn_ray(si.to_world(bs.wo))
             valid |= si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
             is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            path = PathState(
+            onward = PathState(
                 β=path.β * (bsdf_weight * directions_weight),
                 η=path.η * bs.eta,
                 sampling_weight=path.sampling_weight * (directions_weight * hero_count),
@@ -194,7 +216,11 @@ class Walk:
                 hero_is_alone=hero_is_alone,
                 sums=self.mis.leave(vertex, bs),
             )
-            next_event_state = self._leave(connects, place, scene, ray.d, bs.pdf, active_em)
+            path = media.leave(vertex, bs, onward)
+            active_next = media.is_within(path, self.max_depth, active_next)
+            remembered = self._leave(connects, place, scene, ray.d, bs.pdf, active_em)
+            next_event_state = media.kept(bs, next_event_state, remembered)
+            inside = media.cross(inside, si, ray.d)
 
             # ----- Russian roulette -----
             rr_active = path.depth >= self.rr_depth
@@ -203,17 +229,22 @@ class Walk:
                 roulette_state, vertex, path, active_next & rr_active & ~is_black
             )
             rr_continue = sampler.next_1d() < survival
-            self.observer.survival(path, dr.select(rr_active, survival, 1), active_next)
+            self.observer.survival(
+                path, dr.select(rr_active, survival, 1), media.scattered(bs, active_next)
+            )
             active = active_next & (~rr_active | rr_continue) & ~is_black
             path.β[rr_active] *= dr.rcp(survival)
 
+            ray, inside = media.launch(inside, sampler, ray, active)
             pi = self.query.closest(scene, ray, coherent=False, active=active)
+            if dr.hint(media.exist and self.hide_emitters, mode="scalar"):
+                ray, pi = media.behind(self.query, scene, ray, pi, active & (path.depth == 0))
             scatter_count += dr.select(active, 1, 0)
             self.observer.segment(path.arrival.ref.p, ray(pi.t), active & pi.is_valid())
 
         self.observer.end(L)
         return Sample(
-            dr.select(valid, L, 0), valid, scatter_count, shadow_count, connection_count
+            media.result(L, valid), valid, scatter_count, shadow_count, connection_count
         )
 
     def _visit(self, connects: bool, state, scene, si, active):
@@ -224,9 +255,12 @@ class Walk:
         """The state of the next event decision when it leaves a vertex."""
         return self.next_event.remember(place, scene, d, pdf, active) if connects else place
 
-    def _connect(self, connector, connects: bool, place, sampler, vertex, active) -> Connection:
-        """The one connection of a vertex, or none."""
+    def _connect(
+        self, connector, connects: bool, is_made: bool, place, sampler, vertex, active
+    ) -> Connection:
+        """The one connection of a vertex, or none, also where it ``is_made`` already."""
         if connects:
             return connector.one(place, sampler, vertex, active)
-        sampler.next_2d()  # the numbers that follow are those of `path`
+        if not is_made:
+            sampler.next_2d()  # the numbers that follow are those of `path`
         return Connection(dr.zeros(mi.DirectionSample3f), mi.Spectrum(0), ())

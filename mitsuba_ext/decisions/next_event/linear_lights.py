@@ -14,6 +14,7 @@ from ...lights.division import emitter_shapes
 from ...lights.light_cells import LightCells
 from ...lights.spectra import comparison_wavelengths
 from ...lights.weights import power_weights
+from ...movers import is_moving_light
 from ...transport.path_decisions import EmitterSampling
 
 #: Added to the largest cosine under which a vertex sees a light. Glossy reflection does not
@@ -247,7 +248,13 @@ def _row(
     not_flat = [0.0, 0.0, 0.0, np.inf]
     least_radius = _ROUNDING * extent
     if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
-        return [*p, 1.0], not_flat, [least_radius, 1 / (4 * np.pi)]
+        radius = 0.0
+        if is_moving_light(emitter):
+            # It may be anywhere in its box
+            box = emitter.bbox()
+            radius = 0.5 * float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
+            p = np.array(box.center(), dtype=np.float64).ravel()
+        return [*p, 1.0], not_flat, [radius + least_radius, 1 / (4 * np.pi)]
     is_delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)
     if shape is None or is_delta:
         if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):

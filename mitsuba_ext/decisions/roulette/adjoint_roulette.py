@@ -67,4 +67,8 @@ class AdjointRoulette(Roulette):
         expected = dr.mean(path.β) * radiance * state
         p = dr.clip(expected * (1 / _CERTAIN), _LEAST, 1)
         p = dr.select(radiance < 0, 1, p)
+        if vertex.medium is not None:
+            # Nothing is known of media, and paths scatter there often
+            by_throughput, _ = super().survival((), vertex, path, active)
+            p = dr.select(vertex.medium.scatters, by_throughput, p)
         return dr.select(path.depth >= _DEEP, dr.minimum(p, _DEEP_PROBABILITY), p), state

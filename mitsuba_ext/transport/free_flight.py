@@ -1,0 +1,100 @@
+"""How far a path flies in a medium before it scatters."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+class FlightNumbers:
+    """Which random numbers choose the distances of free flights: uniform ones. What replaces them
+    has to return numbers in [0, 1)."""
+
+    def draw(self, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
+        """The number of the next flight, where ``active``."""
+        return sampler.next_1d(active)
+
+
+def component(σ: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
+    """One colour of an extinction. In spectral and monochromatic variants it is the first: the
+    hero wavelength is distributed as each of the others."""
+    chosen = σ[0]
+    if mi.is_rgb:
+        for index in range(1, len(σ)):
+            chosen = dr.select(channel == index, σ[index], chosen)
+    return chosen
+
+
+def interaction_at(ray: mi.Ray3f, p: mi.Point3f, medium: mi.MediumPtr) -> mi.MediumInteraction3f:
+    """The interaction of a ray with a medium at ``p``, without its coefficients."""
+    mei = dr.zeros(mi.MediumInteraction3f)
+    mei.p, mei.wi, mei.time, mei.wavelengths = p, -ray.d, ray.time, ray.wavelengths
+    mei.sh_frame, mei.medium = mi.Frame3f(mei.wi), medium
+    return mei
+
+
+def extinction(medium: mi.MediumPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Spectrum:
+    """The extinction that chooses distances (of homogeneous media: the true one); 0 where not
+    ``active``."""
+    σ = medium.get_majorant(interaction_at(ray, mi.Point3f(0), medium), active)
+    return dr.select(active, mi.Spectrum(σ), 0)
+
+
+def attenuation(σ: mi.Spectrum, t: mi.Float) -> mi.Spectrum:
+    """exp(−σ t), also where t is infinite and σ zero."""
+    return mi.Spectrum(dr.select(σ == 0, 1, dr.exp(-t * σ)))
+
+
+@dr.syntax
+def track(
+    numbers: FlightNumbers,
+    sampler: mi.Sampler,
+    ray: mi.Ray3f,
+    end: mi.Float,
+    medium: mi.MediumPtr,
+    channel: mi.UInt32,
+    t: mi.Float,
+    β: mi.Spectrum,
+    active: mi.Bool,
+) -> tuple[mi.Float, mi.Spectrum, mi.Bool]:
+    """Delta tracking: collisions at the density of the majorant, of which some change nothing.
+
+    Parameters:
+        numbers: Choose distances.
+        ray, end: The ray, and the distance of the surface that it meets.
+        medium, channel: Where it flies, and whose colour chooses distances.
+        t, β: Where not ``active``, these are returned; ``β`` is the throughput up to the ray.
+        active: Where a medium of varying density begins.
+
+    Returns:
+        The distance of the first real collision, the throughput up to that (coefficient of
+        scattering included) or to the surface, and where there is a collision.
+    """
+    ray = mi.Ray3f(ray)
+    start, t, β = mi.Point3f(ray.o), mi.Float(t), mi.Spectrum(β)
+    collides = mi.Bool(False)
+    active = mi.Bool(active)
+    end = mi.Float(end)
+    while dr.hint(active, label="flight"):
+        mei = medium.sample_interaction(ray, numbers.draw(sampler, active), channel, active)
+        is_inside = active & mei.is_valid() & ~(end < mei.t)
+        # By how much the colour that chose the distance is more likely to get there than others
+        σ = mei.combined_extinction
+        chosen = component(σ, channel)
+        flown = dr.minimum(dr.select(is_inside, mei.t, dr.inf), end) - mei.mint
+        weight = attenuation(σ - chosen, flown) * dr.select(is_inside, dr.rcp(chosen), 1)
+        # Is the collision a real one?
+        passing = dr.mean(dr.select(σ > 0, mei.sigma_n / σ, 0))
+        is_null = is_inside & (sampler.next_1d(is_inside) < passing)
+        is_real = is_inside & ~is_null
+        weight *= dr.select(is_null, mei.sigma_n / passing, 1)
+        real = dr.mean(dr.select(σ > 0, mei.sigma_t / σ, 0))
+        weight *= dr.select(is_real, mei.sigma_s / real, 1)
+        β = dr.select(active, β * mi.Spectrum(weight), β)
+        t = dr.select(is_real, dr.norm(mei.p - start), t)
+        collides |= is_real
+        sampler.next_1d(is_null)  # `volpath` plays roulette at each collision
+        ray.o = dr.select(is_null, mei.p, ray.o)
+        end = dr.select(is_null, end - mei.t, end)
+        active &= is_null
+    return t, β, collides

@@ -1,0 +1,304 @@
+"""What participating media do to the random walk.
+
+The walk asks one of two objects: :class:`NoMedia` leaves nothing in the kernel, :class:`Media` is
+made where the scene has media. It decides as Mitsuba's ``volpath`` does, and draws the same random
+numbers in the same order:
+
+- a path that is in a medium scatters at a sampled distance, or reaches the surface
+  (``free_flight.py``); then its vertex lies in the medium, and the phase function stands in for the
+  BSDF;
+- shadow rays pass through media and index-matched surfaces (``transmittance.py``);
+- index-matched surfaces do not count as vertices: the path keeps its depth, and the density with
+  which it left the last vertex.
+
+A vertex in a medium is given to all decisions as a surface interaction that has a position, but no
+shape, no BSDF (a null pointer, whose calls return zero) and no normal.
+
+Sources: Mitsuba 3.9.1, ``volpath``; E. Woodcock et al., *Techniques used in the GEM code*, 1965
+(null collisions); J. Novák et al., *Monte Carlo Methods for Volumetric Light Transport Simulation*,
+Computer Graphics Forum 37(2), 2018, sections 3 and 4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..media import may_have_grids, may_have_media
+from .free_flight import (
+    FlightNumbers,
+    attenuation,
+    component,
+    extinction,
+    interaction_at,
+    track,
+)
+from .hidden_emitters import behind_emitters
+from .path_decisions import SceneQuery
+from .transmittance import transmittance
+from .vertex import Arrival, MediumVertex, PathState, Vertex
+
+
+@dataclass
+class Inside:
+    """Where a path is, between two vertices.
+
+    Attributes:
+        medium: The medium; null in a vacuum.
+        channel: The colour whose extinction chooses distances.
+        reach: The distance at which a homogeneous medium scatters, if nothing is in between.
+    """
+
+    medium: mi.MediumPtr
+    channel: mi.UInt32
+    reach: mi.Float
+
+
+class NoMedia:
+    """There are no media: everything is as in ``path``."""
+
+    exist = False
+
+    def begin(self, sampler, medium) -> Any:
+        """The state of camera rays that begin in ``medium`` (``None``: in a vacuum)."""
+        return ()
+
+    def launch(self, inside, sampler, ray, active) -> tuple[mi.Ray3f, Any]:
+        """A ray that ends where a homogeneous medium scatters, and the state."""
+        return ray, inside
+
+    def behind(
+        self, query: SceneQuery, scene, ray, pi, active
+    ) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
+        """See :func:`behind_emitters`."""
+        return behind_emitters(query, scene, ray, pi, active)
+
+    def fly(
+        self, inside, sampler, ray, si, β, active
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum, MediumVertex | None]:
+        """The next vertex of a path that ``ray`` leads to ``si``: there, or in a medium on the way;
+        the throughput up to there, and what is known of a vertex in a medium."""
+        return si, β, None
+
+    def goes_on(self, vertex: Vertex, max_depth: int, active) -> tuple[mi.Bool, mi.Bool]:
+        """May a path leave ``vertex``, and may that be connected to lights?"""
+        goes_on = (vertex.depth + 1 < max_depth) & vertex.si.is_valid()
+        return goes_on, goes_on & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
+
+    def turns(self, vertex: Vertex, active) -> mi.Bool:
+        """Where, of ``active``, may the direction change?"""
+        return active
+
+    def scatter(self, vertex: Vertex, sample_1, sample_2, bs, weight):
+        """The direction sample of ``vertex``, and its weight, where the BSDF has given these."""
+        return bs, weight
+
+    def scattered(self, bs, active) -> mi.Bool:
+        """Where, of ``active``, does the sample ``bs`` count as a vertex?"""
+        return active
+
+    def leave(self, vertex: Vertex, bs, path: PathState) -> PathState:
+        """What a path carries on when it leaves ``vertex`` with the sample ``bs``."""
+        return path
+
+    def is_within(self, path: PathState, max_depth: int, active) -> mi.Bool:
+        """Which of the ``active`` paths may have one more vertex?"""
+        return active
+
+    def kept(self, bs, before: Any, after: Any) -> Any:
+        """The state of the next event decision: the new one, but for index-matched surfaces."""
+        return after
+
+    def cross(self, inside, si, d) -> Any:
+        """The state behind the surface ``si``, in the direction ``d``."""
+        return inside
+
+    def result(self, L, valid) -> mi.Spectrum:
+        """The radiance of a path that has met something, or not."""
+        return dr.select(valid, L, 0)
+
+    def visible_emission(self, emitted, path: PathState) -> mi.Spectrum:
+        """What a path gains from a light that it runs into."""
+        return emitted
+
+
+# Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
+class Media(NoMedia):
+    """There are media.
+
+    Parameters:
+        hide_emitters: Are lights invisible to rays that nothing has scattered yet?
+        numbers: Which random numbers choose distances.
+        has_grids: May there be media that are not homogeneous?
+    """
+
+    exist = True
+
+    def __init__(self, hide_emitters: bool, numbers: FlightNumbers, has_grids: bool = True) -> None:
+        self._hides, self._numbers, self._has_grids = hide_emitters, numbers, has_grids
+
+    def begin(self, sampler, medium):
+        channel = mi.UInt32(0)
+        if mi.is_rgb:
+            count = len(mi.Spectrum())
+            channel = mi.UInt32(dr.minimum(sampler.next_1d() * count, count - 1))
+        sampler.next_1d()  # the roulette of `volpath`, which spares the camera's rays
+        return Inside(mi.MediumPtr(medium), channel, mi.Float(dr.inf))
+
+    def launch(self, inside, sampler, ray, active):
+        in_medium = active & (inside.medium != None)  # noqa: E711
+        known = in_medium & inside.medium.is_homogeneous()
+        σ = component(extinction(inside.medium, ray, known), inside.channel)
+        # 1 − u > 0; no extinction gives an infinite distance
+        t = -dr.log(1 - self._numbers.draw(sampler, known)) / σ
+        inside.reach = dr.select(known & (t <= ray.maxt), t, dr.inf)
+        ray = mi.Ray3f(ray)
+        ray.maxt = dr.minimum(ray.maxt, inside.reach)
+        return ray, inside
+
+    def behind(self, query, scene, ray, pi, active):
+        last, behind = behind_emitters(query, scene, ray, pi, active)
+        # The light that is passed is not a vertex: distances are those from the ray's origin
+        behind.t += dr.norm(last.o - ray.o)
+        behind.valid &= behind.t <= ray.maxt
+        behind.t = dr.select(behind.valid, behind.t, dr.inf)
+        return ray, dr.select(active, behind, pi)
+
+    def fly(self, inside, sampler, ray, si, β, active):
+        in_medium = active & (inside.medium != None)  # noqa: E711
+        is_homogeneous = in_medium & inside.medium.is_homogeneous()
+        σ = extinction(inside.medium, ray, is_homogeneous)
+        scatters = is_homogeneous & ~si.is_valid() & (inside.reach < dr.inf)
+        t = dr.minimum(inside.reach, si.t)
+        chosen = component(σ, inside.channel)
+        ratio = attenuation(σ - chosen, t)
+        mei = interaction_at(ray, ray(t), inside.medium)
+        σ_s, _, _ = inside.medium.get_scattering_coefficients(mei, scatters)
+        sampler.next_1d(scatters)  # `volpath` asks whether the collision is a real one
+        weight = ratio * dr.select(scatters, σ_s / chosen, 1)
+        β = dr.select(is_homogeneous, β * mi.Spectrum(weight), β)
+        # ----- Media of varying density -----
+        if self._has_grids:
+            tracks = in_medium & ~is_homogeneous
+            t, β, collides = track(
+                self._numbers, sampler, ray, si.t, inside.medium, inside.channel, t, β, tracks
+            )
+            scatters |= collides
+        mei = interaction_at(ray, ray(t), inside.medium)
+        return _at(si, mei, t, scatters), β, MediumVertex(scatters, mei)
+
+    def goes_on(self, vertex, max_depth, active):
+        flags, in_medium = vertex.bsdf.flags(), vertex.medium
+        counts = vertex.depth + 1 < max_depth
+        may_pass = mi.has_flag(flags, mi.BSDFFlags.Null)
+        goes_on = active & vertex.si.is_valid() & (counts | may_pass)
+        connects = in_medium.scatters & in_medium.mei.medium.use_emitter_sampling()
+        connects |= mi.has_flag(flags, mi.BSDFFlags.Smooth)
+        return goes_on, goes_on & counts & connects
+
+    def turns(self, vertex, active):
+        is_matched = vertex.bsdf.flags() & mi.UInt32(+mi.BSDFFlags.All) == +mi.BSDFFlags.Null
+        return active & ~is_matched
+
+    def eval(self, vertex: Vertex, d, value, pdf, active) -> tuple[mi.Spectrum, mi.Float]:
+        """The value and the density of the direction ``d`` (in world space), where the BSDF has
+        given these."""
+        in_medium = vertex.medium
+        phase = in_medium.mei.medium.phase_function()
+        active = active & in_medium.scatters
+        phase_value, phase_pdf = phase.eval_pdf(_context(), in_medium.mei, d, active)
+        return dr.select(active, phase_value, value), dr.select(active, phase_pdf, pdf)
+
+    def transmittance(
+        self, query, scene, vertex: Vertex, ds, inside, sampler, active
+    ) -> mi.Spectrum:
+        """What is left of the light that ``ds`` is about at ``vertex``; see
+        :func:`transmittance`."""
+        return transmittance(
+            query, scene, vertex.si, ds, inside.medium, inside.channel, self._has_grids, sampler,
+            active,
+        )  # fmt: skip
+
+    def scatter(self, vertex, sample_1, sample_2, bs, weight):
+        in_medium, si = vertex.medium, vertex.si
+        scatters, mei = in_medium.scatters, in_medium.mei
+        phase = mei.medium.phase_function()
+        wo, phase_weight, pdf = phase.sample(_context(), mei, sample_1, sample_2, scatters)
+        bs = mi.BSDFSample3f(bs)
+        bs.wo = dr.select(scatters, si.to_local(wo), bs.wo)
+        bs.pdf = dr.select(scatters, pdf, bs.pdf)
+        bs.eta = dr.select(scatters, 1, bs.eta)
+        is_smooth = dr.select(
+            mei.medium.use_emitter_sampling(),
+            mi.UInt32(+mi.BSDFFlags.DiffuseTransmission),
+            # No connection finds what it leads to
+            mi.UInt32(+mi.BSDFFlags.DeltaTransmission),
+        )
+        bs.sampled_type = dr.select(scatters, is_smooth, bs.sampled_type)
+        phase_weight = dr.select(pdf > 0, phase_weight, 0)
+        return bs, dr.select(scatters, phase_weight, weight)
+
+    def scattered(self, bs, active):
+        return active & ~_passes(bs)
+
+    def leave(self, vertex, bs, path):
+        passes = _passes(bs)
+        before = vertex.path
+        arrival = Arrival(
+            dr.select(passes, before.arrival.ref, path.arrival.ref),
+            dr.select(passes, before.arrival.pdf, path.arrival.pdf),
+            dr.select(passes, before.arrival.is_delta, path.arrival.is_delta),
+        )
+        depth = dr.select(passes, before.depth, path.depth)
+        return PathState(
+            path.β, path.η, path.sampling_weight, depth, arrival, path.hero_is_alone, path.sums
+        )
+
+    def is_within(self, path, max_depth, active):
+        # Surfaces that may let a path pass were allowed one vertex too many
+        return active & (path.depth < max_depth)
+
+    def kept(self, bs, before, after):
+        return dr.select(_passes(bs), before, after)
+
+    def cross(self, inside, si, d):
+        medium = dr.select(si.is_medium_transition(), si.target_medium(d), inside.medium)
+        return Inside(medium, inside.channel, inside.reach)
+
+    def result(self, L, valid):
+        return L
+
+    def visible_emission(self, emitted, path):
+        if not self._hides:
+            return emitted
+        return dr.select(path.depth == 0, 0, emitted)
+
+
+def media_of(scene: mi.Scene, hide_emitters: bool, numbers: FlightNumbers) -> NoMedia:
+    """What the walk has to ask in ``scene``."""
+    if not may_have_media(scene):
+        return NoMedia()
+    return Media(hide_emitters, numbers, may_have_grids(scene))
+
+
+def _passes(bs: mi.BSDFSample3f) -> mi.Bool:
+    """Where does the sample go through an index-matched surface?"""
+    return mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+
+
+def _context() -> mi.PhaseFunctionContext:
+    return mi.PhaseFunctionContext(None)
+
+
+def _at(
+    si: mi.SurfaceInteraction3f, mei: mi.MediumInteraction3f, t: mi.Float, scatters: mi.Bool
+) -> mi.SurfaceInteraction3f:
+    """The interaction of a vertex in a medium, where there is one; elsewhere ``si``."""
+    point = dr.zeros(mi.SurfaceInteraction3f)
+    point.t, point.p, point.time, point.wavelengths = t, mei.p, mei.time, mei.wavelengths
+    # Rays leave a point without a normal where it is
+    point.sh_frame, point.wi = mei.sh_frame, mi.Vector3f(0, 0, 1)
+    return dr.select(scatters, point, si)

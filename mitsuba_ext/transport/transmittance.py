@@ -1,0 +1,100 @@
+"""What is left of light on its way through media and index-matched surfaces."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .free_flight import attenuation, component, extinction
+from .path_decisions import SceneQuery
+
+
+@dr.syntax
+def transmittance(
+    query: SceneQuery,
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    ds: mi.DirectionSample3f,
+    medium: mi.MediumPtr,
+    channel: mi.UInt32,
+    has_grids: bool,
+    sampler: mi.Sampler,
+    active: mi.Bool,
+) -> mi.Spectrum:
+    """An unbiased estimate of the transmittance between a vertex and a point of a light: one
+    random distance in each homogeneous medium, ratio tracking in others (Novák et al., section
+    4.2). 0 where a surface that is not index-matched is in between.
+
+    Parameters:
+        query: How rays meet the scene.
+        si, ds: The vertex, and the direction of the light.
+        medium, channel: The medium in front of the vertex, and the colour that chooses distances.
+        has_grids: May there be media that are not homogeneous?
+    """
+    medium = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
+    ray = query.shadow_ray(scene, si, ds)
+    # Light from infinity is attenuated as far as Mitsuba's point of the light, and blocked by all
+    left = si.spawn_ray_to(ds.p).maxt
+    T = mi.Spectrum(1)
+    active = mi.Bool(active)
+    while dr.hint(active, label="transmittance"):
+        in_medium = active & (medium != None)  # noqa: E711
+        is_homogeneous = in_medium & medium.is_homogeneous()
+        σ = extinction(medium, ray, is_homogeneous)
+        chosen = component(σ, channel)
+        t = -dr.log(1 - sampler.next_1d(is_homogeneous)) / chosen
+        collides = is_homogeneous & (t <= left)
+        segment = mi.Ray3f(ray)
+        segment.maxt = dr.select(collides, dr.minimum(t, ray.maxt), ray.maxt)
+        pi = query.closest(scene, segment, coherent=False, active=active)
+        is_met = active & pi.is_valid()
+        end = dr.minimum(dr.select(is_met, pi.t, dr.inf), left)
+        # ----- Attenuation up to the next surface, or to the light -----
+        T = dr.select(collides & ~is_met, 0, T)
+        T = dr.select(is_homogeneous, T * attenuation(σ - chosen, end), T)
+        if dr.hint(has_grids, mode="scalar"):
+            T = ratio_tracking(ray, end, medium, channel, sampler, T, in_medium & ~is_homogeneous)
+        # ----- Does the surface let it pass? -----
+        met = query.interaction(pi, segment)
+        is_met &= dr.max(T) > 0
+        passing = met.bsdf(segment).eval_null_transmission(met, is_met)
+        T = dr.select(is_met, T * mi.Spectrum(passing), T)
+        is_met &= dr.max(T) > 0
+        crosses = is_met & met.is_medium_transition()
+        medium = dr.select(crosses, met.target_medium(ray.d), medium)
+        onward = met.spawn_ray(ray.d)
+        onward.maxt = ray.maxt - met.t
+        ray = dr.select(is_met, onward, ray)
+        left = dr.select(is_met, left - met.t, left)
+        active &= is_met & (ray.maxt > 0)
+    return T
+
+
+@dr.syntax
+def ratio_tracking(
+    ray: mi.Ray3f,
+    end: mi.Float,
+    medium: mi.MediumPtr,
+    channel: mi.UInt32,
+    sampler: mi.Sampler,
+    T: mi.Spectrum,
+    active: mi.Bool,
+) -> mi.Spectrum:
+    """``T`` times an estimate of the transmittance of a medium of varying density up to the
+    distance ``end``: the product of the shares of null collisions."""
+    ray = mi.Ray3f(ray)
+    ray.maxt = end
+    T = mi.Spectrum(T)
+    active = mi.Bool(active)
+    while dr.hint(active, label="ratio tracking"):
+        mei = medium.sample_interaction(ray, sampler.next_1d(active), channel, active)
+        is_inside = active & mei.is_valid()
+        σ = mei.combined_extinction
+        chosen = component(σ, channel)
+        flown = dr.minimum(mei.t, ray.maxt) - mei.mint
+        share = attenuation(σ - chosen, flown) * dr.select(is_inside, mei.sigma_n / chosen, 1)
+        T = dr.select(active, T * mi.Spectrum(share), T)
+        ray.o = dr.select(is_inside, mei.p, ray.o)
+        ray.maxt = dr.select(is_inside, ray.maxt - mei.t, ray.maxt)
+        active &= is_inside & (dr.max(T) > 0)
+    return T
