@@ -28,6 +28,8 @@ PICTURES = {
     "defocus": 2048,
     "fast_balls": 512,
     "fan": 512,
+    "six_balls": 256,
+    "colour_wheel": 512,
     "flint": 1024,
     "caustic": 256,
     "glass_lamp": 96,
@@ -45,6 +47,7 @@ PICTURES = {
 INTEGRATORS = {
     **dict.fromkeys(["caustic", "glass_lamp", "corridor", "ring", "shaded_lamp"], "bdpt"),
     **dict.fromkeys(["pool", "keyhole"], "erpt"),
+    **dict.fromkeys(["six_balls", "colour_wheel"], "swarm_path"),
 }
 
 #: Scenes that are not 16 : 9.

@@ -43,7 +43,7 @@ class AdaptiveSampling(WrappingIntegrator):
          :monosp:`specfilm`. (Default: false)
      * - (Common parameters)
        - |float|
-       - Those of :class:`StagedIntegrator`: timeout.
+       - Those of :class:`StagedIntegrator`: timeout, checkpoint.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
@@ -146,8 +146,7 @@ class AdaptiveSampling(WrappingIntegrator):
             "nested": str(self.nested).replace("\n", "\n  "),
         }
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        self.is_cancelled = False
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         return render(self, scene, sensor, seed, spp, develop, evaluate, AdaptiveJob)
 
     def aov_names(self) -> list[str]:

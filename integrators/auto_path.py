@@ -36,7 +36,8 @@ class AutoPath(WalkIntegrator):
          saved. (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** you do not know which technique a scene needs, with 16 samples per pixel or
     more. **Not when** an image has fewer samples (there is nothing to learn from), or when light

@@ -76,7 +76,8 @@ class BidirectionalIntegrator(WalkIntegrator):
          :monosp:`path`)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** light reaches the scene by ways that camera paths find rarely: caustics of
     lamps, lamps in fittings or near walls, indirect light from hidden lamps. **Not when**
@@ -158,6 +159,11 @@ class BidirectionalIntegrator(WalkIntegrator):
                     f'"{self.name}": the parameter "{slot}" cannot be combined with '
                     f'"{key} = {getattr(self, key)}"; leave it out'
                 )
+        if self.technique_images and self.checkpoint:
+            raise ValueError(
+                f'"{self.name}": "technique_images" and "checkpoint" exclude each other: the '
+                f"images are those of one render"
+            )
         if self.technique_images and not self.technique_images.endswith(".exr"):
             raise ValueError(
                 f'"{self.name}": "technique_images" is "{self.technique_images}"; the name of the '
@@ -220,11 +226,11 @@ class BidirectionalIntegrator(WalkIntegrator):
             walk, side.emission, side.sensor, self.connections, selection, choice.observer
         )
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         self.techniques = None
         if self.technique_images:
             self.check_target("technique_images", self.technique_images)
-        image = super().render(scene, sensor, seed, spp, develop, evaluate)
+        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
         if self.techniques is not None:
             self.techniques.write(Path(self.technique_images), self.statistics.spp)
         elif self.technique_images:

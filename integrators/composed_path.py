@@ -70,15 +70,17 @@ class ComposedPath(WalkIntegrator):
      * - aperture, time, wavelength
        - |string| or |decision|
        - Which numbers choose the point on the aperture, the time, and the wavelengths of a camera
-         ray: those of the sensor's :monosp:`sampler`, those of sets of a pattern (:monosp:`sobol`,
+         ray: those of the sensor's :monosp:`sampler`, those that maps of tiles have learned
+         (:monosp:`swarm`, see :monosp:`swarm_path`), those of sets of a pattern (:monosp:`sobol`,
          :monosp:`lattice`, …), or those of a nested :monosp:`weighted_numbers`. wavelength needs a
          spectral variant. (Default: sampler)
      * - pilot_spp
        - |int|
-       - Samples per pixel from which is learned, at most a quarter of all. They count towards the
-         image. Known only where something learns; with 0 nothing is learned. A sampler that is
-         stratified over all samples may need longer pilots. (Default: 32 with guided directions,
-         4 where only :monosp:`triple_product` learns, otherwise 16)
+       - Samples per pixel from which is learned, at most a quarter of all (half, where only
+         :monosp:`swarm` learns). They count towards the image. Known only where something learns;
+         with 0 nothing is learned. A sampler that is stratified over all samples may need longer
+         pilots. (Default: 64 with :monosp:`swarm`, 32 with guided directions, 4 where only
+         :monosp:`triple_product` learns, otherwise 16)
      * - save_learned, load_learned
        - |string|
        - Files. The first is written: what was learned, as a whole. The second is read in place of
@@ -86,7 +88,8 @@ class ComposedPath(WalkIntegrator):
          saved. (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** you want :monosp:`path` with passes of bounded memory, a time budget, statistics
     or progress, or to combine techniques. **Not when** you need gradients (use :monosp:`prb`), or a

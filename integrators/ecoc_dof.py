@@ -60,7 +60,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
          :monosp:`mitsuba-oidn`). They are collected with a box filter then. (Default: false)
      * - (Common parameters)
        - |float|
-       - Those of :class:`StagedIntegrator`: timeout.
+       - Those of :class:`StagedIntegrator`: timeout, checkpoint.
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as
@@ -159,8 +159,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
             "nested": str(self.nested).replace("\n", "\n  "),
         }
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        self.is_cancelled = False
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         self._is_rendering = True
         try:
             return render(self, scene, sensor, seed, spp, develop, evaluate, LayeredJob)

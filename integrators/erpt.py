@@ -93,7 +93,7 @@ class EnergyRedistribution(MetropolisIntegrator):
      * - (Common parameters)
        - |several|
        - Those of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
-         max_depth, rr_depth, hide_emitters, timeout, aovs.
+         max_depth, rr_depth, hide_emitters, timeout, aovs, checkpoint.
 
     ``spp`` is the number of independent samples per pixel.
 

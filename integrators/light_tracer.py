@@ -44,7 +44,8 @@ class LightTracerIntegrator(WalkIntegrator):
          hides. (Default: uniform)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** light reaches diffuse surfaces through glass or by mirrors (caustics), above all
     from small lamps, points and spots, or as an independent check of other integrators. **Not

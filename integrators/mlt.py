@@ -66,7 +66,7 @@ class PathMetropolis(ChainIntegrator):
      * - (Common parameters)
        - |several|
        - Those of :class:`ChainIntegrator`: direct_samples, chain_file, max_depth, rr_depth,
-         hide_emitters, timeout, aovs.
+         hide_emitters, timeout, aovs, checkpoint.
 
     ``spp`` is the number of mutations per pixel. New paths are independent samples besides, and
     count as such. Chains sample paths of up to 32 segments; camera samples find longer ones, if

@@ -64,7 +64,8 @@ class PSSGuided(WalkIntegrator):
        - Memory for what is recorded and learned, in MiB. (Default: 512)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** light comes by way of other surfaces: through doors, windows and gaps, from lit
     corners, along mirrors and glossy things. **Not when** most light is direct (use :monosp:`neepp`

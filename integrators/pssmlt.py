@@ -60,7 +60,7 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
      * - (Common parameters)
        - |several|
        - Those of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
-         max_depth, rr_depth, hide_emitters, timeout, aovs.
+         max_depth, rr_depth, hide_emitters, timeout, aovs, checkpoint.
 
     ``spp`` is the number of mutations per pixel.
 

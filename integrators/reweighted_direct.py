@@ -50,7 +50,8 @@ class ReweightedDirect(WalkIntegrator):
          another integrator. (Default: 0)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** the noise comes from soft shadows and large lights, and edges, defocus or
     materials do not need many camera samples. **Not when** most light is indirect (more camera
@@ -82,9 +83,9 @@ class ReweightedDirect(WalkIntegrator):
         read = self.reader(props, {"count": "light_samples"}, count=256)
         self.fill(props, connections=Connections(read))
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        spp = spp or self.camera_samples
-        return super().render(scene, sensor, seed, spp, develop, evaluate)
+    @property
+    def default_spp(self) -> int:
+        return self.camera_samples
 
     def parameters(self) -> dict[str, Any]:
         return {"camera_samples": self.camera_samples, **super().parameters()}

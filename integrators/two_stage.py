@@ -57,7 +57,8 @@ class TwoStage(WalkIntegrator):
        - With maps: as in :class:`composed_path`. (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     **Use it when** you compare methods, or the light of an uneven map on rough metal makes the
     noise, and the number of camera samples is limited by something else.

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_ext import registry
+from mitsuba_ext.nesting import refuse_checkpoint
 from mitsuba_ext.parameters import MOST_SPP, read_parameter
 from mitsuba_ext.rendering.batches import Batches, batch_seeds, each_batch, sample_count
 from mitsuba_ext.rendering.camera import develop as develop_film
@@ -136,6 +137,7 @@ class Variance(mi.AdjointIntegrator):
         # type(self) and not ``Variance``, which is another class once another variant is selected
         if isinstance(children[0], type(self)):
             raise ValueError(f'"{self.name}": cannot be nested in another "{self.name}"')
+        refuse_checkpoint(self.name, children[0])
         taken = {_PREFIX + color for color in "RGBXYZ"} & set(children[0].aov_names())
         if taken:
             raise ValueError(

@@ -21,6 +21,20 @@ def class_name(integrator: mi.Integrator) -> str:
     return python_class.__name__ if is_python else name
 
 
+def refuse_checkpoint(name: str, nested: mi.Integrator) -> None:
+    """
+    Raises:
+        ValueError: An integrator that is nested in the plugin ``name`` has the parameter
+            ``checkpoint``: a part of a render cannot be kept.
+    """
+    for each in with_nested(nested):
+        if getattr(each, "checkpoint", ""):
+            raise ValueError(
+                f'"{name}": the parameter "checkpoint" of the nested "{each.name}" has no effect: '
+                f"give it to the outermost integrator, if that is one of ours"
+            )
+
+
 def _children(integrator: mi.Integrator) -> list[mi.Integrator]:
     # Our integrators keep a nested one in this attribute, and do not traverse it
     nested = getattr(integrator, "nested", None)

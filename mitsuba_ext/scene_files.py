@@ -58,9 +58,7 @@ def _named_in_xml(files: list[Path], parameters: Mapping[str, str]) -> Iterator[
         except (OSError, ElementTree.ParseError):
             continue
         elements += [(file, element) for element in found]
-        values.update(
-            (e.get("name", ""), e.get("value", "")) for e in found if e.tag == "default"
-        )
+        values.update((e.get("name", ""), e.get("value", "")) for e in found if e.tag == "default")
     values.update(parameters)
     for file, element in elements:
         if name := element.get("filename"):

@@ -101,7 +101,7 @@ def test_a_cluster_divides_a_render_and_one_of_its_workers_is_killed(make_scene,
 
 
 def _rendered(request: RenderRequest, spp: int, address: str = "", progress=lambda render: None):
-    render = LongRender(BatchRenderer(request), request, RenderState(), progress)
+    render = LongRender(BatchRenderer(request), RenderState(), progress)
     if not address:
         assert render.run(Goal(spp))
         return render.state

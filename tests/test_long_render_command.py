@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from conftest import PATH, in_subprocess
 
-from mitsuba_ext.cli.common import Interval
 from mitsuba_ext.compare import load_reference, read_exr
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer
 from mitsuba_ext.long_renders.folder import CheckpointFolder
+from mitsuba_ext.long_renders.intervals import Interval
 
 pytestmark = pytest.mark.usefixtures("batches_of_sixteen_samples")
 

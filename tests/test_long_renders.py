@@ -31,7 +31,7 @@ def request_of(make_scene):
 
 def rendered(request: RenderRequest, state: RenderState | None = None, spp: int = 64, **options):
     renderer = BatchRenderer(request)
-    render = LongRender(renderer, request, state or RenderState())
+    render = LongRender(renderer, state or RenderState())
     render.run(Goal(spp), **options)
     return render.state
 
@@ -139,7 +139,7 @@ def test_who_renders_does_not_matter(request_of):
 def test_it_ends_when_the_error_is_small_enough(request_of):
     """The error that batches announce is that of the image."""
     request = request_of("path")
-    render = LongRender(BatchRenderer(request), request, RenderState())
+    render = LongRender(BatchRenderer(request), RenderState())
     assert render.run(Goal(error=4e-3))
     assert 8 * 16 <= render.state.spp < 1 << 12 and render.error <= 4e-3
     truth = rendered(request_of("path", seed=7), spp=1 << 13)
@@ -172,7 +172,7 @@ def test_the_first_batches_tell_how_many_fit_into_the_time(request_of, monkeypat
         return batch(self, which, learned)
 
     monkeypatch.setattr(BatchRenderer, "render", timed)
-    render = LongRender(BatchRenderer(request), request, RenderState())
+    render = LongRender(BatchRenderer(request), RenderState())
     assert render.run(Goal(seconds=15))
     assert len(render.state.done) == 11
 

@@ -47,6 +47,7 @@ VALUES = {
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
     **dict.fromkeys(["mutation_size_low", "mutation_size_high"], 0.01),
     **dict.fromkeys(["sample_count", "seed", "dimensions", "film_width"], 6),
+    "checkpoint": "kept", "checkpoint_every": "9s",
     "chain_file": "chains.npz", "mutations": "path", "outliers": 2.0, "p_large": 0.5,
     **dict.fromkeys(["bidirectional_mutation", "lens_perturbation"], True),
     **dict.fromkeys(["multi_chain_perturbation", "caustic_perturbation"], True),
@@ -68,6 +69,10 @@ CONDITIONS = {
     ("erpt", "bidirectional_mutation"): {"mutations": "path"},
     ("neepp", "refine"): {"rejection": True, "light_sampling": "uniform"},
 }
+
+
+#: Of all integrators of ours.
+CHECKPOINT = {"checkpoint_every": {"checkpoint": "kept"}}
 
 
 def make(name: str, **values: object) -> tuple[mi.Object, list[str]]:
@@ -135,7 +140,8 @@ def test_pages_have_what_their_readers_look_for(name):
 @pytest.mark.parametrize("name", [*WALKS, *DECISIONS, *SEQUENCES])
 def test_every_parameter_of_a_page_is_known(name):
     for key in described(name):
-        _, unknown = make(name, **{key: VALUES[key], **CONDITIONS.get((name, key), {})})
+        condition = CONDITIONS.get((name, key), CHECKPOINT.get(key, {}))
+        _, unknown = make(name, **{key: VALUES[key], **condition})
         assert not unknown
 
 

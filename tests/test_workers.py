@@ -33,7 +33,7 @@ def no_scene_is_kept():
 
 
 def rendered(request: RenderRequest, spp: int = 64, executor: Executor | None = None, workers=2):
-    render = LongRender(BatchRenderer(request), request, RenderState())
+    render = LongRender(BatchRenderer(request), RenderState())
     assert render.run(Goal(spp), executor=executor, workers=workers)
     return render.state
 
@@ -170,7 +170,7 @@ def test_files_that_cannot_travel_are_named(scattered_scene, tmp_path):
     scene = tmp_path / "home" / "scenes" / "scene.xml"
     ours = scene.read_text()
     worker = ForeignWorker(tmp_path / "home")
-    render = LongRender(BatchRenderer(scattered_scene), scattered_scene, RenderState())
+    render = LongRender(BatchRenderer(scattered_scene), RenderState())
     scene.write_text(ours + "<!-- changed -->")
     with pytest.raises(InputError, match="its files have changed since the render began"):
         render.run(Goal(16), executor=worker)
@@ -195,7 +195,7 @@ def test_a_worker_with_another_version_refuses(make_scene, monkeypatch):
     description = {**renderer.description(), "versions": {"mitsuba": "4"}}
     monkeypatch.setattr(renderer, "description", lambda: description)
     with pytest.raises(InputError, match='would render another image: "versions" differs'):
-        LongRender(renderer, request, RenderState()).run(Goal(16), executor=Worker())
+        LongRender(renderer, RenderState()).run(Goal(16), executor=Worker())
 
 
 # ---- What is learned ----

@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
+from ..long_renders.intervals import Interval
+from . import candidates
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -40,28 +42,6 @@ class Numbers(click.ParamType):
         if not re.fullmatch(r"[1-9]\d*(,[1-9]\d*)*", value):
             self.fail(f'expected something like 4,16,64, found "{value}"', param, ctx)
         return tuple(map(int, value.split(",")))
-
-
-@dataclass(frozen=True)
-class Interval:
-    """How often a render is kept: every so many seconds, or samples per pixel."""
-
-    seconds: float = 0.0
-    spp: int = 0
-
-    @classmethod
-    def parse(cls, text: str) -> Interval:
-        """Of text such as ``60s``, ``10m`` or ``100spp``.
-
-        Raises:
-            ValueError: It is none.
-        """
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|m|h|spp)", text)
-        if not match or float(match[1]) == 0 or (match[2] == "spp" and "." in match[1]):
-            raise ValueError(f'expected something like 60s, 10m or 100spp, found "{text}"')
-        if match[2] == "spp":
-            return cls(spp=int(match[1]))
-        return cls(seconds=float(match[1]) * {"s": 1, "m": 60, "h": 3600}[match[2]])
 
 
 class Every(click.ParamType):
@@ -109,11 +89,13 @@ def scene_options(command: Callable) -> Callable:
         ),
         click.option(
             "--plugin", "plugins", multiple=True, metavar="MODULE",
+            shell_complete=candidates.modules,
             help="A Python module, or its .py file, that registers integrators of your own. Can be "
             "repeated.",
         ),
         click.option(
-            "--variant", default="llvm_ad_rgb", show_default=True, help="Mitsuba's variant."
+            "--variant", default="llvm_ad_rgb", show_default=True, help="Mitsuba's variant.",
+            shell_complete=candidates.variants,
         ),
     ):
         command = decorator(command)

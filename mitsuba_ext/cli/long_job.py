@@ -18,12 +18,12 @@ from ..errors import InputError
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
 from ..long_renders.dask_cluster import dask_cluster
 from ..long_renders.folder import CheckpointFolder
+from ..long_renders.intervals import Interval, LastKept
 from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
 from ..long_renders.workers import Workers
 from ..rendering.interrupts import deferred_interrupt
 from ..rendering.totals import RenderTotals
-from .common import Interval
 from .reports import Report, Speed, time_left
 
 
@@ -122,7 +122,7 @@ class LongJob:
             spp = state.spp + options.add
         elif spp is None and options.until is None and seconds is None:
             spp = self._renderer.sensor.sampler().sample_count()
-        last = _Last(state.spp)
+        last = LastKept(state.spp)
         is_due_at_once = options.has_preview
 
         def keep(is_asked: bool) -> None:
@@ -167,7 +167,7 @@ class LongJob:
                     except OSError as problem:
                         report.warn(f"the render could not be kept: {problem}; it goes on")
 
-            self._render = LongRender(self._renderer, self._request, state, progress)
+            self._render = LongRender(self._renderer, state, progress)
             goal = Goal(spp, options.until, seconds)
             is_reached = False
             try:
@@ -254,22 +254,6 @@ class LongJob:
     def totals(self) -> RenderTotals:
         """The cost of these samples, whoever rendered them."""
         return self._state.totals
-
-
-class _Last:
-    """When a render was kept last."""
-
-    def __init__(self, spp: int) -> None:
-        self.begin = time.perf_counter()
-        self.mark(spp)
-
-    def mark(self, spp: int) -> None:
-        self._time, self._spp = time.perf_counter(), spp
-
-    def is_due(self, every: Interval, spp: int) -> bool:
-        if every.spp:
-            return spp - self._spp >= every.spp
-        return time.perf_counter() - self._time >= every.seconds
 
 
 @contextlib.contextmanager

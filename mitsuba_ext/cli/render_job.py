@@ -67,6 +67,11 @@ class RenderJob:
                     self._passes = SeedPasses(
                         self.integrator, self.scene, self.sensor, self._seed
                     )
+                if seconds is not None and getattr(self.integrator, "checkpoint", ""):
+                    raise ValueError(
+                        '--time would measure what "checkpoint" keeps: give the integrator a '
+                        '"timeout" instead'
+                    )
                 if seconds is not None and not (self._passes and is_independent(self.sensor)):
                     spp, seconds = self._measured(seconds, bars), None
                     begin = time.perf_counter()

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..marks import has_crashed, mark_of, marked, renew
+from ..nesting import with_nested
 from ..progress import Step
 from ..scenes import InputError, LoadedScene, one_line
 from ..specifications import NamedIntegrator, Specification, make_named
@@ -377,6 +378,12 @@ def make_all(
         if labels.count(label) > 1:
             raise InputError(
                 f'the integrator "{label}" is given twice; for more runs of it, increase --seeds'
+            )
+    for named in made:
+        if any(getattr(each, "checkpoint", "") for each in with_nested(named.integrator)):
+            raise InputError(
+                f'the integrator "{named.label}" has the parameter "checkpoint", with which it '
+                f"does not render everything: leave it out"
             )
     return made
 

@@ -66,7 +66,8 @@ class ChainIntegrator(WalkIntegrator):
          known as well as the first render found it. (Default: none)
      * - (Common parameters)
        - |several|
-       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
 
     Attributes:
         missing_in_samples: Why its camera samples alone are not its image.
@@ -85,6 +86,11 @@ class ChainIntegrator(WalkIntegrator):
             props, "direct_samples", 0, minimum=-1, maximum=1 << 20
         )
         self.chain_file = self.parameter(props, "chain_file", "")
+        if self.chain_file and self.checkpoint:
+            raise ValueError(
+                f'"{self.name}": "chain_file" and "checkpoint" exclude each other: the first keeps '
+                f"one long render, the second begins chains in each batch"
+            )
 
     def read_luminance_samples(self, props: mi.Properties) -> int:
         """The parameter ``luminance_samples``."""
@@ -150,7 +156,7 @@ class ChainIntegrator(WalkIntegrator):
         return replace(self.walk(query=self.query(setting.scene), **decisions),
                        max_depth=max_depth)
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         start = time.perf_counter()
         sensor = find_sensor(scene, sensor)
         try:
@@ -194,7 +200,7 @@ class ChainIntegrator(WalkIntegrator):
         if self.finds_direct:
             count = self.direct_samples or max(count, int(_DIRECT_SHARE * spp))
         try:
-            super().render(scene, sensor, seed, count, develop=False, evaluate=False)
+            super().render_once(scene, sensor, seed, count, False, False)
         finally:
             self.progress, self.timeout = report, timeout
 

@@ -33,7 +33,7 @@ class MetropolisIntegrator(ChainIntegrator):
      * - (Common parameters)
        - |several|
        - Those of :class:`ChainIntegrator`: direct_samples, chain_file, max_depth, rr_depth,
-         hide_emitters, timeout, aovs.
+         hide_emitters, timeout, aovs, checkpoint.
 
     Attributes:
         bidirectional: Do chains sample paths from both ends?

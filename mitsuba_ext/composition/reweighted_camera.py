@@ -41,6 +41,13 @@ class ReweightedCamera(WrappingIntegrator):
        - Seconds after which to stop, 0 or less for no limit; kept as by :monosp:`composed_path`.
          With a limit, sets have at most 64 points, and the render ends after a whole set.
          (Default: -1)
+     * - checkpoint
+       - |string|
+       - A folder that keeps the render; see :class:`composed_path`. (Default: none)
+     * - checkpoint_every
+       - |string|
+       - How often it is kept, such as :monosp:`60s` or :monosp:`100spp`. Only with
+         :monosp:`checkpoint`. (Default: 60s)
      * - (Nested plugin)
        - |integrator|
        - The integrator to render with, exactly one: any that samples camera rays, such as

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..garbage import garbage_left_alone
 from ..movers import check_motion_is_seen
+from ..nesting import refuse_checkpoint
 from ..rendering.staged_integrator import StagedIntegrator
 from ..rendering.stages import OneStage, Schedule
 from ..transport.estimator import CameraRays, Sample
@@ -65,6 +66,7 @@ class WrappingIntegrator(StagedIntegrator):
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """A sample of the nested integrator: the ray is another's."""
+        self.check_sampled()
         return self.nested.sample(scene, sampler, ray, medium, active)
 
     def aov_names(self) -> list[str]:
@@ -90,6 +92,7 @@ class WrappingIntegrator(StagedIntegrator):
                 f'"{self.name}" is nested already); found {found}'
             )
         nested = children[0]
+        refuse_checkpoint(self.name, nested)
         if reason := getattr(nested, "missing_in_samples", ""):
             raise ValueError(
                 f'"{self.name}" renders with the camera samples of the nested integrator, which '

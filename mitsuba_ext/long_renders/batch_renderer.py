@@ -1,39 +1,20 @@
-"""Renders one batch after the other, in any process."""
+"""Renders the batches of a scene file, in any process."""
 
 from __future__ import annotations
 
 import contextlib
-import math
-import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
-import numpy as np
-
 from ..chosen import LastScene
 from ..compare.machine import versions
 from ..errors import InputError
-from ..rendering.batches import batch_seeds, each_batch, sample_count
-from ..rendering.camera import film_extent
-from ..rendering.film_sums import FilmSums
-from ..rendering.seed_passes import can_render, is_independent, pass_length
-from ..rendering.totals import RenderTotals, forget_memory_peak
+from ..nesting import with_nested
 from ..scenes import one_line
 from .bundle import Bundle
+from .integrator_batches import IntegratorBatches
 from .state import Batch, BatchResult
-
-#: About how many samples a batch of ours has: each traces its kernels anew, and begins its chains.
-_SAMPLES = {dr.JitBackend.LLVM: 1 << 22, dr.JitBackend.CUDA: 1 << 25}
-
-#: Samples per pixel of a batch of ours, at least, and of one whose samples are stratified.
-_SPP, _STRUCTURED_SPP = 16, 64
-
-#: Samples per pixel of the batch that the others learn from, if there are so many.
-_LEARNING_SPP = 128
 
 
 @dataclass(frozen=True)
@@ -67,7 +48,7 @@ class RenderRequest:
     description: str = ""
 
 
-class BatchRenderer:
+class BatchRenderer(IntegratorBatches):
     """Renders the batches of a request.
 
     Parameters:
@@ -76,9 +57,8 @@ class BatchRenderer:
         scenes: Keeps the scene.
 
     Attributes:
+        request: What to render.
         chosen: The scene, the integrator and the sensor.
-        sensor: The sensor.
-        learns: Does the integrator learn something that can be kept?
 
     Raises:
         InputError: The scene, the integrator or the sensor cannot be used.
@@ -87,11 +67,7 @@ class BatchRenderer:
     def __init__(
         self, request: RenderRequest, bundle: Bundle | None = None, scenes: LastScene | None = None
     ) -> None:
-        if not dr.is_jit_v(mi.Float):
-            raise InputError(
-                f'batches need a variant such as "llvm_ad_rgb", and not "{mi.variant()}"'
-            )
-        self._request = request
+        self.request = request
         with bundle.unpacked() if bundle else contextlib.nullcontext() as moved:
             scene, specification = request.scene, request.specification
             if moved:
@@ -101,18 +77,18 @@ class BatchRenderer:
                 request.sensor, request.values, moved,
             )  # fmt: skip
         self.chosen.loaded.path = Path(request.scene)
-        self.sensor = self.chosen.sensor
         integrator = self.chosen.named.integrator
-        # Its own file, if it has one, holds for all batches already
-        self.learns = bool(
-            getattr(integrator, "can_learn", False)
-            and not integrator.save_learned
-            and not integrator.load_learned
-        )
+        if any(getattr(each, "checkpoint", "") for each in with_nested(integrator)):
+            raise InputError(
+                f'{self.chosen.loaded.source}: "{self.chosen.named.name}": its parameter '
+                f'"checkpoint" keeps the render already: leave it out, or the options of the '
+                f"command"
+            )
+        super().__init__(integrator, self.chosen.scene, self.chosen.sensor, request.seed)
 
     def description(self) -> dict[str, Any]:
         """What the image depends on, but for the number of samples."""
-        request, film = self._request, self.sensor.film()
+        request, film = self.request, self.sensor.film()
         loaded, named = self.chosen.loaded, self.chosen.named
         return {
             "scene": loaded.source,
@@ -127,66 +103,14 @@ class BatchRenderer:
             "versions": {k: v for k, v in versions().items() if k not in ("numpy", "python")},
         }
 
-    def length(self, spp: int, teaches: bool) -> int:
-        """The samples per pixel of the next batch, of ``spp`` that are left. It does not depend on
-        the speed, so that the same command gives the same image.
-
-        Args:
-            teaches: Do the batches after it use what it learns?
-        """
-        if can_render(self.chosen.named.integrator):
-            return min(pass_length(self.sensor), spp)
-        limit = _SAMPLES[dr.backend_v(mi.Float)] // math.prod(film_extent(self.sensor.film()))
-        limit = max(limit, _SPP if is_independent(self.sensor) else _STRUCTURED_SPP)
-        if teaches:
-            limit = max(limit, _LEARNING_SPP)
-        return min(sample_count(self.sensor, 1 << (limit.bit_length() - 1)), spp)
-
     def render(self, batch: Batch, learned: bytes | None = None) -> BatchResult:
         """
-        Args:
-            learned: What an earlier batch has learned; empty if there was nothing to learn;
-                ``None`` if this batch is the one that learns it.
-
         Raises:
             InputError: The integrator cannot render this scene.
             KeyboardInterrupt: The batch was interrupted: it is lost.
         """
-        if not self.learns:
-            return self._rendered(batch)
-        integrator = self.chosen.named.integrator
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "learned.npz"
-            if learned:
-                file.write_bytes(learned)
-                integrator.load_learned = str(file)
-            elif learned is None:
-                integrator.save_learned = str(file)
-            try:
-                result = self._rendered(batch)
-            finally:
-                integrator.load_learned = integrator.save_learned = ""
-            if learned is None:
-                result = result._replace(learned=file.read_bytes() if file.exists() else b"")
-            return result
-
-    def _rendered(self, batch: Batch) -> BatchResult:
-        loaded, named, film = self.chosen.loaded, self.chosen.named, self.sensor.film()
-        integrator = named.integrator
-        seed = batch_seeds(batch.seed, 1, batch.index)[0]
-        forget_memory_peak()
-        begin = time.perf_counter()
         try:
-            batches = each_batch(integrator, loaded.scene, self.sensor, batch.spp, [seed])
-            images = next(batches)
+            return super().render(batch, learned)
         except (ValueError, TypeError, RuntimeError) as error:
-            message = f'{loaded.source}: "{named.name}": {one_line(error)}'
-            raise InputError(message) from error
-        totals = RenderTotals.of(integrator, film, images.spp, time.perf_counter() - begin)
-        sums = FilmSums()
-        sums.add(film, images.spp)
-        return BatchResult(
-            batch._replace(spp=images.spp), sums.contents.astype(np.float32), sums.has_weights,
-            images.mean.astype(np.float32), images.channels, images.image_channel_count,
-            tuple(integrator.aov_names()), totals,
-        )  # fmt: skip
+            source, name = self.chosen.loaded.source, self.chosen.named.name
+            raise InputError(f'{source}: "{name}": {one_line(error)}') from error

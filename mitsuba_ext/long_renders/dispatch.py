@@ -65,21 +65,20 @@ class Dispatch:
 
     Parameters:
         executor: Who renders. Its workers need this package, but not the scene's files.
-        request, renderer: What is rendered.
+        renderer: What is rendered.
         workers: Says how many batches the executor renders at a time.
     """
 
     def __init__(
         self,
         executor: Executor,
-        request: RenderRequest,
         renderer: BatchRenderer,
         workers: Callable[[], int],
     ) -> None:
         self._executor, self._renderer, self._workers = executor, renderer, workers
         # Workers have another current folder, and perhaps other files
         description = json.dumps(renderer.description(), default=str)
-        self._request = replace(_absolute(request), description=description)
+        self._request = replace(_absolute(renderer.request), description=description)
         self._tasks: dict[Batch, _Task] = {}
         self._running: dict[Future, Batch] = {}
         self._seconds: deque[float] = deque(maxlen=_REMEMBERED)

@@ -9,8 +9,8 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 
 from ..compare import images, metrics
-from .batch_renderer import BatchRenderer, RenderRequest
 from .dispatch import QUEUE, Dispatch
+from .integrator_batches import IntegratorBatches
 from .state import Batch, BatchResult, RenderState
 
 #: Batches, at least, that tell the error of an image.
@@ -38,7 +38,7 @@ class LongRender:
     added as they come: it does not matter who renders them.
 
     Parameters:
-        renderer, request: What to render.
+        renderer: Renders the batches.
         state: What has been rendered already.
         progress: Called after each batch.
 
@@ -49,12 +49,11 @@ class LongRender:
 
     def __init__(
         self,
-        renderer: BatchRenderer,
-        request: RenderRequest,
+        renderer: IntegratorBatches,
         state: RenderState,
         progress: Callable[[LongRender], None] = lambda render: None,
     ) -> None:
-        self._renderer, self._request, self._progress = renderer, request, progress
+        self._renderer, self._progress = renderer, progress
         self.state, self.goal_spp = state, 0
 
     def run(
@@ -69,8 +68,8 @@ class LongRender:
         Args:
             goal: When to end.
             is_stopped: Asked after each batch, and while batches of others are awaited.
-            executor: Who renders: see :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`.
-                ``None`` for this process.
+            executor: Who renders what a ``BatchRenderer`` does: see
+                :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`. ``None`` for this process.
             workers: How many batches the executor renders at a time, or a function that says so.
 
         Raises:
@@ -81,7 +80,7 @@ class LongRender:
         if executor is None:
             results = self._here()
         else:
-            dispatch = Dispatch(executor, self._request, self._renderer, count_workers)
+            dispatch = Dispatch(executor, self._renderer, count_workers)
             results = dispatch.results(self._batches(), lambda: self._learned, is_stopped)
         # Speed is measured between the first result and this one
         measured = 1 + QUEUE * count_workers()
@@ -139,7 +138,7 @@ class LongRender:
 
     def _batches(self) -> Iterator[Batch]:
         """The next batches: first those that were still to come when others had been added."""
-        seed, spp = self._request.seed, self.state.spp
+        seed, spp = self._renderer.seed, self.state.spp
         known = {batch.index for batch in self.state.done if batch.seed == seed}
         for index in itertools.count():
             if self.goal_spp and spp >= self.goal_spp:

@@ -6,17 +6,25 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
+import operator
+import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 
+from ..long_renders.intervals import Interval
 from ..parameters import read_parameter
+from . import camera
 from . import render as rendering
 from .stages import Schedule
 
 #: What stands for "as many as there are".
 NO_LIMIT = 0xFFFFFFFF
+
+#: Parameters on which a render that is kept does not depend.
+_NOT_OF_THE_IMAGE = ("timeout", "checkpoint", "checkpoint_every")
 
 
 class StagedIntegrator(mi.SamplingIntegrator):
@@ -32,6 +40,17 @@ class StagedIntegrator(mi.SamplingIntegrator):
          that stopping does not prefer fast samples. Pilots get at most a quarter of the samples
          that fit. The time is kept as well as the speed is steady; a short pass of each pilot, and
          one of the rest, are always taken. (Default: -1)
+
+     * - checkpoint
+       - |string|
+       - A folder that keeps the render: a second one (the same scene, seed and parameters) goes on
+         from there, up to ``spp``, which may be higher than before. It renders in batches, as
+         ``mitsuba-ext render --checkpoint`` does. Only the outermost integrator can have it.
+         (Default: none)
+     * - checkpoint_every
+       - |string|
+       - How often it is kept: :monosp:`60s`, :monosp:`10m`, :monosp:`2h` or :monosp:`100spp`. Only
+         with :monosp:`checkpoint`. (Default: 60s)
 
     Attributes:
         sees_motion: It renders ``moving`` shapes.
@@ -49,6 +68,10 @@ class StagedIntegrator(mi.SamplingIntegrator):
         super().__init__(props)
         # Deprecated by Mitsuba, which says so in the log
         self.samples_per_pass = self.parameter(props, "samples_per_pass", NO_LIMIT, minimum=1)
+        self.checkpoint = self.parameter(props, "checkpoint", "")
+        if self.checkpoint:
+            self.checkpoint_every = self._interval(props)
+        self._is_batch = False
         self.progress: Callable[[float], None] | None = None
         self.statistics = rendering.RenderStatistics()
         self.is_cancelled = False
@@ -80,6 +103,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
         sentence in an error message, and says what to change."""
         return ""
 
+    @property
+    def default_spp(self) -> int:
+        """Samples per pixel of a render that does not say how many; 0 for the sampler's number."""
+        return 0
+
     def schedule(
         self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
     ) -> Schedule:
@@ -93,12 +121,28 @@ class StagedIntegrator(mi.SamplingIntegrator):
 
     def common_parameters(self) -> dict[str, Any]:
         """What ``str()`` shows of all integrators of a kind."""
-        return {"timeout": self.timeout}
+        if not self.checkpoint:
+            return {"timeout": self.timeout}
+        every = self.checkpoint_every
+        return {
+            "timeout": self.timeout,
+            "checkpoint": self.checkpoint,
+            "checkpoint_every": f"{every.spp}spp" if every.spp else f"{every.seconds:g}s",
+        }
 
     # ---- What Mitsuba calls ----
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        spp = spp or self.default_spp
+        if self._is_batch:
+            return self.render_once(scene, sensor, seed, spp, develop, evaluate)
         self.is_cancelled = False
+        if self.checkpoint:
+            return self._render_kept(scene, sensor, seed, spp, develop, evaluate)
+        return self.render_once(scene, sensor, seed, spp, develop, evaluate)
+
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
+        """The render as a whole, or a batch of one that is kept."""
         return rendering.render(self, scene, sensor, seed, spp, develop, evaluate)
 
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
@@ -120,6 +164,56 @@ class StagedIntegrator(mi.SamplingIntegrator):
         parameters = {**self.common_parameters(), **self.parameters()}
         lines = ",\n".join(f"  {key} = {value}" for key, value in parameters.items())
         return f"{self.name}[\n{lines}\n]"
+
+    # ---- Renders that are kept ----
+
+    def _interval(self, props: mi.Properties) -> Interval:
+        text = self.parameter(props, "checkpoint_every", "60s")
+        try:
+            return Interval.parse(text)
+        except ValueError as error:
+            raise ValueError(f'"{self.name}": the parameter "checkpoint_every": {error}') from None
+
+    def _render_kept(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
+        # Batches stand above a single render
+        from ..long_renders.kept_render import KeptRender
+
+        begin = time.perf_counter()
+        sensor = camera.find_sensor(scene, sensor)
+        seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
+        shown = {**self.common_parameters(), **self.parameters()}
+        shown = {key: value for key, value in shown.items() if key not in _NOT_OF_THE_IMAGE}
+        kept = KeptRender(self, Path(self.checkpoint), self.checkpoint_every, str(shown))
+        timeout, progress = self.timeout, self.progress
+        self.timeout, self.progress, self._is_batch = -1.0, None, True
+        try:
+            state, is_interrupted = kept.run(
+                scene, sensor, seed & 0xFFFFFFFF, spp, timeout if timeout > 0 else None, progress
+            )
+        finally:
+            self.timeout, self.progress, self._is_batch = timeout, progress, False
+        totals = state.totals
+        self.statistics = rendering.RenderStatistics(
+            len(state.done), state.spp, time.perf_counter() - begin, totals.compile_seconds,
+            totals.learning_seconds, dict(totals.rays), totals.connections,
+            self.statistics.zero_radiance, totals.learned, totals.memory_bytes,
+            is_interrupted or self.is_cancelled,
+        )  # fmt: skip
+        image = camera.develop(sensor.film(), develop, evaluate)
+        if is_interrupted:
+            raise KeyboardInterrupt
+        return image
+
+    def check_sampled(self) -> None:
+        """
+        Raises:
+            ValueError: Another integrator draws samples of one that is to keep its render.
+        """
+        if self.checkpoint:
+            raise ValueError(
+                f'"{self.name}": the parameter "checkpoint" has no effect where another integrator '
+                f"draws the samples: leave it out"
+            )
 
     # ---- Helpers ----
 

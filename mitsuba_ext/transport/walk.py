@@ -122,6 +122,7 @@ class Walk:
         shadow_state = self.shadow_test.begin(sampler, ray)
         roulette_state = self.roulette.begin(sampler, ray, pixel)
         self.observer.begin(dr.width(ray), pixel)
+        self.observer.camera(rays)
 
         inside = media.begin(sampler, rays)
         ray, path, inside = media.launch(inside, sampler, ray, path, active)

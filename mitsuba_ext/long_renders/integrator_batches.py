@@ -1,0 +1,117 @@
+"""Batches of a render by an integrator."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import InputError
+from ..rendering.batches import batch_seeds, each_batch, sample_count
+from ..rendering.camera import film_extent
+from ..rendering.film_sums import FilmSums
+from ..rendering.seed_passes import can_render, is_independent, pass_length
+from ..rendering.totals import RenderTotals, forget_memory_peak
+from .state import Batch, BatchResult
+
+#: About how many samples a batch of ours has: each traces its kernels anew, and begins its chains.
+_SAMPLES = {dr.JitBackend.LLVM: 1 << 22, dr.JitBackend.CUDA: 1 << 25}
+
+#: Samples per pixel of a batch of ours, at least, and of one whose samples are stratified.
+_SPP, _STRUCTURED_SPP = 16, 64
+
+#: Samples per pixel of the batch that the others learn from, if there are so many.
+_LEARNING_SPP = 128
+
+
+class IntegratorBatches:
+    """Renders batches.
+
+    Parameters:
+        integrator, scene, sensor, seed: What to render.
+
+    Attributes:
+        sensor, seed: The sensor and the seed.
+        learns: Does the integrator learn something that can be kept?
+
+    Raises:
+        InputError: The variant has no batches.
+    """
+
+    def __init__(
+        self, integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int
+    ) -> None:
+        if not dr.is_jit_v(mi.Float):
+            raise InputError(
+                f'batches need a variant such as "llvm_ad_rgb", and not "{mi.variant()}"'
+            )
+        self._integrator, self._scene, self.sensor = integrator, scene, sensor
+        self.seed = seed
+        # Its own file, if it has one, holds for all batches already
+        self.learns = bool(
+            getattr(integrator, "can_learn", False)
+            and not integrator.save_learned
+            and not integrator.load_learned
+        )
+
+    def length(self, spp: int, teaches: bool) -> int:
+        """The samples per pixel of the next batch, of ``spp`` that are left. It does not depend on
+        the speed, so that the same command gives the same image.
+
+        Args:
+            teaches: Do the batches after it use what it learns?
+        """
+        if can_render(self._integrator):
+            return min(pass_length(self.sensor), spp)
+        limit = _SAMPLES[dr.backend_v(mi.Float)] // math.prod(film_extent(self.sensor.film()))
+        limit = max(limit, _SPP if is_independent(self.sensor) else _STRUCTURED_SPP)
+        if teaches:
+            limit = max(limit, _LEARNING_SPP)
+        return min(sample_count(self.sensor, 1 << (limit.bit_length() - 1)), spp)
+
+    def render(self, batch: Batch, learned: bytes | None = None) -> BatchResult:
+        """
+        Args:
+            learned: What an earlier batch has learned; empty if there was nothing to learn;
+                ``None`` if this batch is the one that learns it.
+
+        Raises:
+            KeyboardInterrupt: The batch was interrupted: it is lost.
+        """
+        if not self.learns:
+            return self._rendered(batch)
+        integrator = self._integrator
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "learned.npz"
+            if learned:
+                file.write_bytes(learned)
+                integrator.load_learned = str(file)
+            elif learned is None:
+                integrator.save_learned = str(file)
+            try:
+                result = self._rendered(batch)
+            finally:
+                integrator.load_learned = integrator.save_learned = ""
+            if learned is None:
+                result = result._replace(learned=file.read_bytes() if file.exists() else b"")
+            return result
+
+    def _rendered(self, batch: Batch) -> BatchResult:
+        integrator, film = self._integrator, self.sensor.film()
+        seed = batch_seeds(batch.seed, 1, batch.index)[0]
+        forget_memory_peak()
+        begin = time.perf_counter()
+        images = next(each_batch(integrator, self._scene, self.sensor, batch.spp, [seed]))
+        totals = RenderTotals.of(integrator, film, images.spp, time.perf_counter() - begin)
+        sums = FilmSums()
+        sums.add(film, images.spp)
+        return BatchResult(
+            batch._replace(spp=images.spp), sums.contents.astype(np.float32), sums.has_weights,
+            images.mean.astype(np.float32), images.channels, images.image_channel_count,
+            tuple(integrator.aov_names()), totals,
+        )  # fmt: skip

@@ -1,0 +1,140 @@
+"""``checkpoint`` of our integrators: a render that goes on from a folder."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from ..compare.machine import versions
+from ..content_hash import hash_code
+from ..decisions.next_event.light_map_file import fingerprint
+from ..nesting import with_nested
+from ..rendering.batches import sample_count
+from ..rendering.interrupts import deferred_interrupt
+from .folder import CheckpointFolder
+from .integrator_batches import IntegratorBatches
+from .intervals import Interval, LastKept
+from .long_render import Goal, LongRender
+from .state import Batch, BatchResult, RenderState
+
+
+class KeptRender:
+    """A render in batches that a folder keeps.
+
+    Parameters:
+        integrator: An integrator whose ``render()`` renders a batch, and which has the attribute
+            ``is_cancelled``.
+        folder, every: Where it is kept, and how often.
+        parameters: Of the integrator, as far as the image depends on them.
+    """
+
+    def __init__(
+        self, integrator: mi.Integrator, folder: Path, every: Interval, parameters: str
+    ) -> None:
+        self._integrator, self._every, self._parameters = integrator, every, parameters
+        self._folder = CheckpointFolder(folder)
+
+    def run(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        seed: int,
+        spp: int,
+        seconds: float | None = None,
+        progress: Callable[[float], None] | None = None,
+    ) -> tuple[RenderState, bool]:
+        """Renders what is missing, and leaves the image in the film. Returns what has been
+        rendered, and whether it was interrupted.
+
+        Args:
+            spp: Samples per pixel of the whole image; 0 for the number of the sampler.
+            seconds: The time of this call, if it is limited.
+            progress: Called after each batch with the fraction done.
+
+        Raises:
+            InputError: The folder holds another render, or cannot be used.
+            KeyboardInterrupt: Ctrl-C, before there was an image.
+        """
+        goal = Goal(sample_count(sensor, spp), seconds=seconds)
+        batches = _Batches(self._integrator, scene, sensor, seed)
+        sensor.film().prepare(self._integrator.aov_names())
+        with self._folder.in_use():
+            self._folder.describe(self._description(scene, sensor, seed))
+            state = self._folder.load()
+            last = LastKept(state.spp)
+
+            def after_batch(render: LongRender) -> None:
+                if last.is_due(self._every, state.spp):
+                    last.mark(state.spp)
+                    self._save(state)
+                if progress is not None:
+                    progress(min(1.0, state.spp / (render.goal_spp or goal.spp)))
+
+            render = LongRender(batches, state, after_batch)
+            is_interrupted = False
+            with deferred_interrupt() as interrupt:
+
+                def is_stopped() -> bool:
+                    return interrupt.is_set() or self._integrator.is_cancelled
+
+                try:
+                    render.run(goal, is_stopped)
+                except _CancelledError:
+                    pass
+                except KeyboardInterrupt:
+                    is_interrupted = True
+                finally:
+                    if state.done:
+                        state.fill(sensor.film())
+                        self._save(state)
+                is_interrupted |= interrupt.is_set()
+        if is_interrupted and not state.done:
+            raise KeyboardInterrupt
+        return state, is_interrupted
+
+    def _save(self, state: RenderState) -> None:
+        try:
+            self._folder.save(state)
+        except OSError as problem:  # a full disk may have room later
+            mi.Log(mi.LogLevel.Warn, f"the render could not be kept: {problem}")
+
+    def _description(self, scene: mi.Scene, sensor: mi.Sensor, seed: int) -> dict[str, Any]:
+        """What the image depends on, but for the number of samples."""
+        integrator, film = self._integrator, sensor.film()
+        return {
+            "scene hash": fingerprint(scene),
+            "size": "x".join(map(str, film.crop_size())),
+            "integrator": integrator.name,
+            "parameters": self._parameters,
+            "integrator hash": hash_code(type(each) for each in with_nested(integrator)),
+            "sensor hash": _digest(sensor),
+            "seed": seed,
+            "versions": {k: v for k, v in versions().items() if k not in ("numpy", "python")},
+        }
+
+
+class _CancelledError(Exception):
+    """The running batch was cancelled."""
+
+
+class _Batches(IntegratorBatches):
+    """A batch that was cancelled has fewer samples than it should: it is lost."""
+
+    def render(self, batch: Batch, learned: bytes | None = None) -> BatchResult:
+        result = super().render(batch, learned)
+        if self._integrator.is_cancelled:
+            raise _CancelledError
+        return result
+
+
+def _digest(sensor: mi.Sensor) -> str:
+    """Of a sensor, its film, filter and sampler."""
+    values, film = mi.traverse(sensor), sensor.film()
+    text = [f"{key}={values[key]}" for key in sorted(values.keys())]
+    text += [sensor.class_name(), sensor.sampler().class_name(), film.class_name()]
+    text += [film.rfilter(), film.size(), film.crop_offset(), getattr(sensor, "motion", "")]
+    return hashlib.sha256(" ".join(map(str, text)).encode()).hexdigest()
