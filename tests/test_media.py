@@ -90,8 +90,8 @@ def test_shadow_rays_are_attenuated_by_absorbing_media(name: str) -> None:
     left, right = images[:, :, :4].mean(axis=(1, 2, 3)), images[:, :, 4:].mean(axis=(1, 2, 3))
     expected = np.exp([-1.4, -1.4] if name == "homogeneous" else [-1.4, -0.6])
     for values, exact in zip((left, right), expected):
-        # Homogeneous media leave no noise
-        z, error = z_exact(values, exact, allowance=1e-5)
+        # Homogeneous media leave no noise, but for where rays begin
+        z, error = z_exact(values, exact, allowance=1e-4)
         assert abs(z) < 4 and error < 0.005
 
 
