@@ -40,6 +40,7 @@ PICTURES = {
     "corridor": 64,
     "night_classroom": 128,
     "near_lights": 256,
+    "fog": 1024,
 }
 
 #: Scenes rendered by light paths or chains, or in which nothing is learned of visibility; all

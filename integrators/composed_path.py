@@ -96,9 +96,10 @@ class ComposedPath(WalkIntegrator):
     scalar or polarized variant.
 
     Where the scene has participating media, this is :monosp:`volpath`: homogeneous and grid media,
-    all phase functions, index-matched surfaces, cameras and lights in fog. Only the rule of the
-    roulette is that of :monosp:`path`, and :monosp:`hide_emitters` also hides a light that the
-    camera sees through fog. :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`,
+    all phase functions, index-matched surfaces, cameras and lights in fog. The rule of the roulette
+    is that of :monosp:`path`, the transmittance of homogeneous media for shadow rays is computed,
+    which leaves less noise, and :monosp:`hide_emitters` also hides a light that the camera sees
+    through fog. :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`,
     :monosp:`spatial`, :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility` there; the
     others need a surface and refuse the scene. :monosp:`directions` guided by regions of surfaces
     are guided at surfaces, and by tiles everywhere. As with :monosp:`volpath`, distances follow one

@@ -73,7 +73,7 @@ class SwarmPath(WalkIntegrator):
     variance is lower: below 3 %, a map is given up. After a render,
     :monosp:`integrator.statistics.learned` tells what was found.
 
-    Participating media are ignored, as by :monosp:`path`. Gradients are not supported (use
+    Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
     pilot.
 
