@@ -28,6 +28,7 @@ PICTURES = {
     "defocus": 2048,
     "fast_balls": 512,
     "fan": 512,
+    "lantern": 2048,
     "flint": 1024,
     "caustic": 256,
     "glass_lamp": 96,
