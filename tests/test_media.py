@@ -20,6 +20,7 @@ from statistical import (
 
 from mitsuba_ext.media import has_media, may_have_media
 from mitsuba_ext.transport.estimator import CameraRays
+from mitsuba_ext.transport.free_flight import Distances
 from mitsuba_ext.transport.path_decisions import DirectionSamples
 from mitsuba_ext.transport.walk import Walk
 
@@ -89,7 +90,8 @@ def test_shadow_rays_are_attenuated_by_absorbing_media(name: str) -> None:
     left, right = images[:, :, :4].mean(axis=(1, 2, 3)), images[:, :, 4:].mean(axis=(1, 2, 3))
     expected = np.exp([-1.4, -1.4] if name == "homogeneous" else [-1.4, -0.6])
     for values, exact in zip((left, right), expected):
-        z, error = z_exact(values, exact)
+        # Homogeneous media leave no noise, but for where rays begin
+        z, error = z_exact(values, exact, allowance=1e-4)
         assert abs(z) < 4 and error < 0.005
 
 
@@ -141,6 +143,10 @@ SAME_PATHS = {
 }
 
 
+class _DistancesOfVolpath(Distances):
+    exact_transmittance = False
+
+
 @pytest.mark.parametrize("name", some("grid", "chromatic", of=SAME_PATHS))
 def test_walk_draws_the_numbers_of_volpath(name: str) -> None:
     """Every path is the same, where no connection is left out because its BSDF is black, and where
@@ -148,7 +154,7 @@ def test_walk_draws_the_numbers_of_volpath(name: str) -> None:
     scene = mi.load_dict(SAME_PATHS[name]())
     sensor = scene.sensors()[0]
     values = []
-    walk = Walk(8, 100, directions=_OrderOfVolpath())
+    walk = Walk(8, 100, directions=_OrderOfVolpath(), distance=_DistancesOfVolpath())
     volpath = _volpath(8, rr_depth=100)
     for integrator in (walk, volpath):
         sampler = sensor.sampler().clone()

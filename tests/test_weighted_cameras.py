@@ -98,7 +98,7 @@ def test_purposes_pixels_and_sets_draw_numbers_of_their_own(variant):
     sets = vars(stage.camera).values()
     for one in sets:
         one._sets._opaque_sets = mi.UInt32(1)  # the same set for all: what differs is the shift
-    turns = [[one.draw(pixel, mi.UInt32(16 * turn))[0] for one in sets] for turn in (0, 1)]
+    turns = [[one.draw(None, pixel, mi.UInt32(16 * turn))[0] for one in sets] for turn in (0, 1)]
     numbers = [n for turn in turns for u in turn for n in (u if isinstance(u, mi.Point2f) else [u])]
     numbers = np.array([np.array(n) for n in numbers])
     assert len(numbers) == 8

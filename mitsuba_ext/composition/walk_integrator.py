@@ -26,7 +26,7 @@ from ..transport.estimator import CameraRays, Estimator
 from ..transport.path_decisions import SceneQuery
 from ..transport.walk import Walk
 from . import learned_file
-from .camera_numbers import PURPOSES, samples_per_set
+from .camera_numbers import WeightedNumbers, samples_per_set
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 from .schedule import Schedule, pilot_samples
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
@@ -158,13 +158,13 @@ class WalkIntegrator(StagedIntegrator):
         return max((parameters.sample_cost for parameters in self.slots.values()), default=1)
 
     def samples_per_set(self, spp: int) -> int:
-        is_needed = any(slot in PURPOSES for slot in self.slots)
+        is_needed = any(isinstance(p, WeightedNumbers) for p in self.slots.values())
         return samples_per_set(spp, self.timeout > 0) if is_needed else 1
 
     @property
     def needs_equal_samples(self) -> str:
-        for slot in self.slots:
-            if slot in PURPOSES:
+        for slot, parameters in self.slots.items():
+            if isinstance(parameters, WeightedNumbers):
                 return f'the sets of numbers of "{slot}" belong together: leave the parameter out'
         return ""
 
@@ -190,7 +190,7 @@ class WalkIntegrator(StagedIntegrator):
             path = Path(self.save_learned)
             learned = functools.partial(learned_file.save, path, scene, made_by)
         schedule = Schedule(
-            self.name, self.slots, setting, len(pilots), self.estimators(scene, sensor),
+            self.name, self.slots, setting, samples, self.estimators(scene, sensor),
             self.query(scene), restored, learned,
         )  # fmt: skip
         self.learners = schedule.learners

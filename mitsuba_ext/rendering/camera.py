@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.colour import to_rgb
 from ..transport.estimator import CameraRays, Sample, Splats
 from ..transport.numbers import Numbers
 from .camera_samples import CameraSamples
@@ -127,18 +128,22 @@ def draw_numbers(
         if samples.aperture is None:
             numbers.aperture = sampler.next_2d()
         else:
-            numbers.aperture, numbers.weight = samples.aperture.draw(lanes.pixel, lanes.index)
+            numbers.aperture, numbers.weight = samples.aperture.draw(
+                sampler, lanes.pixel, lanes.index
+            )
     if sensor.shutter_open_time() > 0:
         if samples.time is None:
             numbers.time = sampler.next_1d()
         else:
-            numbers.time, weight = samples.time.draw(lanes.pixel, lanes.index)
+            numbers.time, weight = samples.time.draw(sampler, lanes.pixel, lanes.index)
             numbers.weight *= weight
     if mi.is_spectral:
         if samples.wavelength is None:
             numbers.wavelength = sampler.next_1d()
         else:
-            numbers.wavelength, hero, all_four = samples.wavelength.draw(lanes.pixel, lanes.index)
+            numbers.wavelength, hero, all_four = samples.wavelength.draw(
+                sampler, lanes.pixel, lanes.index
+            )
             numbers.weight *= all_four
             numbers.hero_weight = hero / all_four
     return numbers
@@ -247,13 +252,6 @@ def _channels(
     rgb = to_rgb(L, wavelengths)
     has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
     return [rgb.x, rgb.y, rgb.z, *([alpha] if has_alpha else [])]
-
-
-def to_rgb(L: mi.Spectrum, wavelengths: mi.Spectrum | None) -> mi.Color3f:
-    """Radiance as the colour that films store."""
-    if mi.is_spectral:
-        return mi.spectrum_to_srgb(L, wavelengths)
-    return mi.Color3f(L.x) if mi.is_monochromatic else L
 
 
 def develop(film: mi.Film, develop: bool, evaluate: bool) -> mi.TensorXf:

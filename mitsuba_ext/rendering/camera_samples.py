@@ -7,13 +7,17 @@ from typing import Any, Protocol
 
 import mitsuba as mi
 
+from ..transport.numbers import Numbers
+
 
 class PixelNumbers(Protocol):
     """Numbers for one purpose."""
 
-    def draw(self, pixel: mi.UInt32, index: mi.UInt32) -> tuple[Any, ...]:
+    def draw(
+        self, sampler: Numbers, pixel: mi.UInt32, index: mi.UInt32
+    ) -> tuple[Any, ...]:
         """The number, and its weight (or two), of the sample ``index``, of those of the whole
-        render, of each pixel."""
+        render, of each pixel. ``sampler`` is that of the sensor."""
 
 
 @dataclass

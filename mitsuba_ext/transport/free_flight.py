@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
+from .vertex import PathState
 
-class FlightNumbers:
-    """Which random numbers choose the distances of free flights: uniform ones. What replaces them
-    has to return numbers in [0, 1)."""
 
-    def draw(self, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
-        """The number of the next flight, where ``active``."""
-        return sampler.next_1d(active)
+class Distances:
+    """Which random numbers choose the distances of flights in homogeneous media: uniform ones.
+
+    Attributes:
+        exact_transmittance: Is the transmittance of homogeneous media for shadow rays computed?
+            ``volpath`` estimates it by a random distance each, with more noise in the same time.
+    """
+
+    exact_transmittance = True
+
+    def begin(self, sampler: mi.Sampler, pixel: mi.UInt32 | None) -> Any:
+        """The state of paths that begin in ``pixel`` of the film."""
+        return ()
+
+    def draw(
+        self, state: Any, sampler: mi.Sampler, path: PathState, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float | float, Any]:
+        """The number, in [0, 1), of the next flight of ``path``; the factor by which its throughput
+        is to be multiplied (1 / density of the number) where ``active``; the new state."""
+        return sampler.next_1d(active), 1.0, state
 
 
 def component(σ: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
@@ -47,7 +64,6 @@ def attenuation(σ: mi.Spectrum, t: mi.Float) -> mi.Spectrum:
 
 @dr.syntax
 def track(
-    numbers: FlightNumbers,
     sampler: mi.Sampler,
     ray: mi.Ray3f,
     end: mi.Float,
@@ -60,7 +76,6 @@ def track(
     """Delta tracking: collisions at the density of the majorant, of which some change nothing.
 
     Parameters:
-        numbers: Choose distances.
         ray, end: The ray, and the distance of the surface that it meets.
         medium, channel: Where it flies, and whose colour chooses distances.
         t, β: Where not ``active``, these are returned; ``β`` is the throughput up to the ray.
@@ -76,7 +91,7 @@ def track(
     active = mi.Bool(active)
     end = mi.Float(end)
     while dr.hint(active, label="flight"):
-        mei = medium.sample_interaction(ray, numbers.draw(sampler, active), channel, active)
+        mei = medium.sample_interaction(ray, sampler.next_1d(active), channel, active)
         is_inside = active & mei.is_valid() & ~(end < mei.t)
         # By how much the colour that chose the distance is more likely to get there than others
         σ = mei.combined_extinction
