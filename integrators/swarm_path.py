@@ -9,7 +9,10 @@ from mitsuba_ext.composition.swarm import MAPS
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 
 #: By parameter, the slot that its maps fill.
-_SLOTS = {"time_map": "time", "lens_map": "aperture", "wavelength_map": "wavelength"}
+_SLOTS = {
+    "time_map": "time", "lens_map": "aperture", "wavelength_map": "wavelength",
+    "distance_map": "distance",
+}  # fmt: skip
 
 
 @registry.plugin
@@ -37,6 +40,9 @@ class SwarmPath(WalkIntegrator):
      * - wavelength_map
        - |bool|
        - Learn at which wavelengths? It has an effect in spectral variants. (Default: true)
+     * - distance_map
+       - |bool|
+       - Learn at which distances in a homogeneous medium camera rays find light? (Default: true)
      * - always_use
        - |bool|
        - Use all maps, also where the pilots show that it does not pay? (Default: false)
