@@ -60,6 +60,19 @@ def test_a_long_render_is_denoised_too(run, make_scene, tmp_path, calls):
     assert len(calls) == 1 and (tmp_path / "a.noisy.exr").exists()
 
 
+def test_guides_are_in_the_form_that_the_denoiser_takes(calls):
+    scene = mi.load_dict(mi.cornell_box() | {"sensor": {
+        "type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0],
+        [0, 1, 0]), "film": {"type": "hdrfilm", "width": 6, "height": 4}}})  # fmt: skip
+    guides = denoising.render_guides(scene, scene.sensors()[0])
+    albedo, normal = np.split(np.stack(list(guides.values()), axis=2), 2, axis=2)
+    image = denoising.denoise(np.ones((4, 6, 3)), albedo, normal)
+    assert image.shape == (4, 6, 3) and image.dtype == np.float32 and (image == 0.5).all()
+    np.testing.assert_array_equal(calls[0].albedo, albedo)
+    denoising.denoise(np.ones((4, 6, 3)), normal=normal)
+    assert calls[1].albedo is None and calls[1].normal is None
+
+
 def test_an_image_is_guided_by_its_layers(run, tmp_path, calls):
     rng = np.random.default_rng(1)
     names = ["R", "G", "B", *(f"View.Albedo.{c}" for c in "RGB"), *(f"normal.{c}" for c in "XYZ")]
