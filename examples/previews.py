@@ -28,6 +28,7 @@ PICTURES = {
     "defocus": 2048,
     "fast_balls": 512,
     "fan": 512,
+    "lantern": 2048,
     "six_balls": 256,
     "colour_wheel": 512,
     "flint": 1024,
