@@ -31,7 +31,13 @@ class ComposedPath(WalkIntegrator):
      * - directions
        - |string| or |decision|
        - Which random numbers choose the direction in which a path goes on: :monosp:`uniform` ones,
-         :monosp:`guided` ones, or a nested :monosp:`guided_directions`. (Default: uniform)
+         :monosp:`guided` ones, or a nested :monosp:`guided_directions`. With :monosp:`swarm`, maps
+         as in :monosp:`swarm_path` choose between reflection and transmission. (Default: uniform)
+     * - scattering
+       - |string|
+       - Where a path goes on: where the :monosp:`bsdf` sends it, or at the first vertex that is no
+         mirror also in directions of learned maps, :monosp:`swarm` (see :monosp:`swarm_path`).
+         (Default: bsdf)
      * - next_event
        - |string| or |decision|
        - Which light a vertex is connected to, and which point of it. Not learned: :monosp:`uniform`
@@ -45,6 +51,12 @@ class ComposedPath(WalkIntegrator):
          :monosp:`triple_product` (as :monosp:`two_stage`, and by what is visible),
          :monosp:`contribution`, :monosp:`visibility`, or a nested :monosp:`learned_lights`.
          (Default: uniform)
+     * - light_numbers
+       - |string|
+       - Which random numbers choose the light and the point on it, at the first vertex that is
+         connected to lights: :monosp:`uniform` ones, or those of learned maps, :monosp:`swarm` (see
+         :monosp:`swarm_path`). It needs a :monosp:`next_event` that does not learn. (Default:
+         uniform)
      * - roulette
        - |string|
        - Which paths go on from :monosp:`rr_depth` on. With :monosp:`automatic`, where directions
@@ -74,6 +86,10 @@ class ComposedPath(WalkIntegrator):
          (:monosp:`swarm`, see :monosp:`swarm_path`), those of sets of a pattern (:monosp:`sobol`,
          :monosp:`lattice`, …), or those of a nested :monosp:`weighted_numbers`. wavelength needs a
          spectral variant. (Default: sampler)
+     * - distance
+       - |string|
+       - Which numbers choose how far a camera ray flies in a homogeneous medium: those of the
+         :monosp:`sampler`, or :monosp:`swarm` (maps, as :monosp:`swarm_path`). (Default: sampler)
      * - pilot_spp
        - |int|
        - Samples per pixel from which is learned, at most a quarter of all (half, where only
@@ -96,9 +112,10 @@ class ComposedPath(WalkIntegrator):
     scalar or polarized variant.
 
     Where the scene has participating media, this is :monosp:`volpath`: homogeneous and grid media,
-    all phase functions, index-matched surfaces, cameras and lights in fog. Only the rule of the
-    roulette is that of :monosp:`path`, and :monosp:`hide_emitters` also hides a light that the
-    camera sees through fog. :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`,
+    all phase functions, index-matched surfaces, cameras and lights in fog. The rule of the roulette
+    is that of :monosp:`path`, the transmittance of homogeneous media for shadow rays is computed,
+    which leaves less noise, and :monosp:`hide_emitters` also hides a light that the camera sees
+    through fog. :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`,
     :monosp:`spatial`, :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility` there; the
     others need a surface and refuse the scene. :monosp:`directions` guided by regions of surfaces
     are guided at surfaces, and by tiles everywhere. As with :monosp:`volpath`, distances follow one

@@ -12,6 +12,7 @@ from ..decisions.swarm.cells import Cells
 from ..decisions.swarm.direction_maps import DirectionMapLearner, MappedScattering
 from ..decisions.swarm.light_maps import LightMapLearner, LightMaps, light_cells
 from ..decisions.swarm.lobe_maps import LobeMapLearner, MappedLobes, divides
+from ..media import has_homogeneous_media
 from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 
@@ -113,8 +114,8 @@ class LightMapsChoice(Swarm):
         lights = slots.get("next_event")
         if lights is not None and lights.pilot_spp:
             raise ValueError(
-                f'"{plugin}": the parameter "light_numbers" needs lights that are not learned; leave '
-                f"it out"
+                f'"{plugin}": the parameter "light_numbers" needs lights that are not learned; '
+                f"leave it out"
             )
         self._lights = lights
 
@@ -153,9 +154,22 @@ class DirectionMaps(Swarm):
         return DirectionMapLearner(self.summary, maps, width, height, always=self._always)
 
 
+class DistanceMaps(Swarm):
+    """Maps of the first distance in a homogeneous medium."""
+
+    slots, summary = ("distance",), "distances"
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        return spp > 0 and has_homogeneous_media(scene)
+
+    def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
+        numbers = MappedNumbers(Cells.line(7))
+        return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
+
+
 #: By slot, the maps that it can hold.
 MAPS: dict[str, type[Swarm]] = {
-    "aperture": LensMaps, "time": TimeMaps, "wavelength": WavelengthMaps,
+    "aperture": LensMaps, "time": TimeMaps, "wavelength": WavelengthMaps, "distance": DistanceMaps,
     "light_numbers": LightMapsChoice, "directions": LobeMaps, "scattering": DirectionMaps,
 }  # fmt: skip
 

@@ -201,8 +201,8 @@ class WalkIntegrator(StagedIntegrator):
         return self.walk
 
     def walk(self, **decisions: Any) -> Walk:
-        """A walk with this integrator's parameters and the given decisions. ``light_numbers``, if it
-        is among them, warps the numbers of ``next_event``."""
+        """A walk with this integrator's parameters and the given decisions. If ``light_numbers`` is
+        among them, it warps the numbers of ``next_event``."""
         light_numbers = decisions.pop("light_numbers", None)
         if light_numbers is not None:
             inner = decisions.get("next_event", EmitterSampling())

@@ -47,8 +47,8 @@ class MapLearner(Learner):
 
     Attributes:
         decision: See above.
-        total, importance: Of the pass that ends: what each lane has brought, and the factor from that
-            to what its pixel gets.
+        total, importance: Of the pass that ends: what each lane has brought, and the factor from
+            that to what its pixel gets.
         tiles: The tiles that share maps.
         cells: The cells of each.
         gain: By how much the maps are expected to lower the variance, or did so in the last pilot.
