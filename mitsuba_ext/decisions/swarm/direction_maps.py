@@ -137,6 +137,8 @@ def _to_square(d: mi.Vector3f) -> list[mi.Float]:
 class DirectionMapLearner(MapLearner):
     """Learns the maps of :class:`MappedScattering`, which is its ``decision``."""
 
+    needs_measurement = True
+
     def __init__(
         self, name: str, decision: MappedScattering, width: int, height: int, **how
     ) -> None:

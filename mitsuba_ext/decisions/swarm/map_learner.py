@@ -75,6 +75,10 @@ class MapLearner(Learner):
 
     # ---- What a subclass says ----
 
+    #: Are maps used only after a stage has shown what they are worth? Where something else takes
+    #: a part of the decisions, what maps promise over uniform numbers says nothing.
+    needs_measurement = False
+
     def choices(self, radiance: mi.Float) -> Choices:
         """What the decision chose in each lane of the pass that ends; ``radiance`` is what each
         lane brought to its pixel."""
@@ -127,7 +131,10 @@ class MapLearner(Learner):
         widths = self.cells.widths
         shares = estimate(array, squares, widths)
         mass = density(shares, widths, form)
-        expected = counts.expected_gain(expected_ratio(mass, widths))
+        if self.needs_measurement:
+            expected = np.inf if len(gains) > 0 else 0.0
+        else:
+            expected = counts.expected_gain(expected_ratio(mass, widths))
         if len(gains) == 0:
             self.gain = expected
         self.decision.maps = None
