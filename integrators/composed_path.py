@@ -74,6 +74,10 @@ class ComposedPath(WalkIntegrator):
          (:monosp:`swarm`, see :monosp:`swarm_path`), those of sets of a pattern (:monosp:`sobol`,
          :monosp:`lattice`, …), or those of a nested :monosp:`weighted_numbers`. wavelength needs a
          spectral variant. (Default: sampler)
+     * - distance
+       - |string|
+       - Which numbers choose how far a camera ray flies in a homogeneous medium: those of the
+         :monosp:`sampler`, or :monosp:`swarm` (maps, as :monosp:`swarm_path`). (Default: sampler)
      * - pilot_spp
        - |int|
        - Samples per pixel from which is learned, at most a quarter of all (half, where only

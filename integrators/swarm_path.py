@@ -9,7 +9,10 @@ from mitsuba_ext.composition.swarm import MAPS
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 
 #: By parameter, the slot that its maps fill.
-_SLOTS = {"time_map": "time", "lens_map": "aperture", "wavelength_map": "wavelength"}
+_SLOTS = {
+    "time_map": "time", "lens_map": "aperture", "wavelength_map": "wavelength",
+    "distance_map": "distance",
+}  # fmt: skip
 
 
 @registry.plugin
@@ -37,6 +40,9 @@ class SwarmPath(WalkIntegrator):
      * - wavelength_map
        - |bool|
        - Learn at which wavelengths? It has an effect in spectral variants. (Default: true)
+     * - distance_map
+       - |bool|
+       - Learn at which distances in a homogeneous medium camera rays find light? (Default: true)
      * - always_use
        - |bool|
        - Use all maps, also where the pilots show that it does not pay? (Default: false)
@@ -56,21 +62,22 @@ class SwarmPath(WalkIntegrator):
 
     **Use it when** most noise comes from a decision that neighbouring pixels take alike, and that
     nothing else samples well: fast things before a dark background, small lights out of focus,
-    lamps with spectral lines. **Not when** the noise is that of many bounces (use
-    :monosp:`pss_guided`), or when an image has fewer than 8 samples per pixel.
+    lamps with spectral lines, beams in fog (as far as their light scatters once). **Not when** the
+    noise is that of many bounces (use :monosp:`pss_guided`), or when an image has fewer than 8
+    samples per pixel.
 
     The first pilot has one sample per pixel, and each pilot as many as all before it. Its samples
     are drawn from the maps of the earlier ones, and count with a weight that is fixed before the
     render: less in the first pilots, whose maps are poor, as long as that costs no more than 1.5 %
     where no map helps.
 
-    A tile has 4 pixels along each edge in maps of one dimension (64 cells) and 8 in those of two
-    (32 x 32 cells), and more where the film is large: a map has 8 million cells at most, which take
-    160 MiB while it is learned, and 32 MiB afterwards. What a tile has found is drawn to what
-    larger tiles around it have found, as far as the differences are no more than chance. From the
-    samples of each pilot follows which density would have been best (in proportion to the mean of
-    what a cell brings, with 5 % of uniform numbers, or to its root, with 20 %), and by how much the
-    variance is lower: below 3 %, a map is given up. After a render,
+    A tile has 4 pixels along each edge in maps of one dimension (64 cells, 128 for distances) and 8
+    in those of two (32 x 32 cells), and more where the film is large: a map has 8 million cells at
+    most, which take 160 MiB while it is learned, and 32 MiB afterwards. What a tile has found is
+    drawn to what larger tiles around it have found, as far as the differences are no more than
+    chance. From the samples of each pilot follows which density would have been best (in proportion
+    to the mean of what a cell brings, with 5 % of uniform numbers, or to its root, with 20 %), and
+    by how much the variance is lower: below 3 %, a map is given up. After a render,
     :monosp:`integrator.statistics.learned` tells what was found.
 
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use

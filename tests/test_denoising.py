@@ -156,6 +156,17 @@ def test_guides_are_those_of_what_is_behind_glass_and_holes():
     assert (_guides({"type": "sphere", "center": [9, 9, 9]}) == 0).all()
 
 
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"], indirect=True)
+def test_guides_have_colours_in_spectral_variants_too(variant):
+    mirror = {"type": "conductor", "material": "none"}
+    for body in ([_wall(4, _diffuse(0.2, 0.4, 0.6))],
+                 [_wall(4, mirror), _wall(-3, _diffuse(0.2, 0.4, 0.6), 0)]):  # fmt: skip
+        found = _guides(*body)[..., :3].mean((0, 1))
+        expected = [0.2, 0.4, 0.6] if variant == "llvm_ad_spectral" else found[0]
+        np.testing.assert_allclose(found, expected, atol=0.03)
+        assert found.min() > 0.1
+
+
 def test_two_mirrors_end():
     mirror = {"type": "conductor", "material": "none"}
     found = _guides(_wall(4, mirror), _wall(-3, mirror, 0))

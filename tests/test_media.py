@@ -298,6 +298,7 @@ SEEING = {
     "power": {"type": "composed_path", "next_event": "power"},
     "spatial": {"type": "composed_path", "next_event": "spatial"},
     "portals": {"type": "composed_path", "next_event": "portals"},
+    "distances": {"type": "swarm_path", "always_use": True},
 }  # fmt: skip
 
 
@@ -307,6 +308,18 @@ def test_technique_has_the_mean_of_volpath_in_fog(name: str) -> None:
     scene = mi.load_dict(fog("environment", **lamps))
     integrator = mi.load_dict({**SEEING[name], "max_depth": 5})
     _compare(scene, integrator, _volpath(5), 512, 0.03)
+
+
+def test_maps_of_distances_leave_the_radiance_of_a_white_world() -> None:
+    """Camera rays fly where the map says, which weighs each of them."""
+    lamp = {**LIGHTS["point_inside"], "intensity": 1e-3}  # something to learn
+    scene = mi.load_dict({"type": "scene", "sensor": camera(), "sky": {"type": "constant"},
+                          "fog": cube(homogeneous(2.0, 1.0)), "lamp": lamp})  # fmt: skip
+    swarm = mi.load_dict({"type": "swarm_path", "always_use": True})
+    images = batches(scene, swarm, 128, SEEDS[:4])
+    assert "distances" in swarm.statistics.learned
+    z, error = z_exact(images.mean(axis=(1, 2, 3)), 1.0, allowance=2e-3)
+    assert abs(z) < 4 and error < 0.01
 
 
 @pytest.mark.parametrize("parameters", [

@@ -39,7 +39,7 @@ SLOTS: dict[str, dict[str, _Maker | None]] = {
     "connections": {"one": None},
     "mis": {HEURISTICS[0]: None, **{name: MisHeuristic.named(name) for name in HEURISTICS[1:]}},
     "shadow_test": {"always": None, "visibility_roulette": RejectedShadowRays},
-    **{slot: {"sampler": None, "swarm": MAPS[slot]} for slot in PURPOSES},
+    **{slot: {"sampler": None, "swarm": MAPS[slot]} for slot in (*PURPOSES, "distance")},
 }
 
 #: The same of bidirectional integrators, which have some of the others as well.

@@ -9,6 +9,7 @@ import mitsuba as mi
 from ..decisions.learner import Learner
 from ..decisions.swarm.camera_maps import CameraMapLearner, MappedNumbers
 from ..decisions.swarm.cells import Cells
+from ..media import has_homogeneous_media
 from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 
@@ -99,9 +100,22 @@ class WavelengthMaps(Swarm):
         return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
 
 
+class DistanceMaps(Swarm):
+    """Maps of the first distance in a homogeneous medium."""
+
+    slots, summary = ("distance",), "distances"
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        return spp > 0 and has_homogeneous_media(scene)
+
+    def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
+        numbers = MappedNumbers(Cells.line(7))
+        return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
+
+
 #: By slot, the maps that it can hold.
 MAPS: dict[str, type[Swarm]] = {
-    "aperture": LensMaps, "time": TimeMaps, "wavelength": WavelengthMaps,
+    "aperture": LensMaps, "time": TimeMaps, "wavelength": WavelengthMaps, "distance": DistanceMaps,
 }  # fmt: skip
 
 

@@ -106,7 +106,7 @@ class CameraNumbers:
         film: Where in its pixel the ray begins.
         aperture, time, wavelength: Point of the aperture, time in the shutter interval, and what
             chooses the wavelengths.
-        weight, hero_weight: See :class:`CameraRays`.
+        weight, hero_weight, distance: See :class:`CameraRays`.
     """
 
     film: mi.Point2f
@@ -115,6 +115,7 @@ class CameraNumbers:
     wavelength: mi.Float
     weight: mi.Float | float = 1.0
     hero_weight: mi.Float | float = 1.0
+    distance: mi.Float | None = None
 
 
 def draw_numbers(
@@ -146,6 +147,9 @@ def draw_numbers(
             )
             numbers.weight *= all_four
             numbers.hero_weight = hero / all_four
+    if samples.distance is not None:
+        numbers.distance, weight = samples.distance.draw(sampler, lanes.pixel, lanes.index)
+        numbers.weight *= weight
     return numbers
 
 
@@ -171,7 +175,7 @@ def camera_rays(
         position = mi.Point2f(lanes.corner)
     return CameraRays(
         ray, lanes.pixel, importance, position, numbers.weight, numbers.hero_weight,
-        sensor.get_medium(),
+        sensor.get_medium(), numbers.distance,
     )  # fmt: skip
 
 

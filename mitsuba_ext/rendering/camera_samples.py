@@ -30,8 +30,10 @@ class CameraSamples:
         time: Times of the shutter interval.
         wavelength: What chooses the four wavelengths u + k/4, with a second weight for spectra that
             all four find: they repeat themselves after 1/4.
+        distance: What chooses the first distance of a path in a homogeneous medium.
     """
 
     aperture: PixelNumbers | None = None
     time: PixelNumbers | None = None
     wavelength: PixelNumbers | None = None
+    distance: PixelNumbers | None = None

@@ -7,11 +7,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .vertex import PathState
+from .estimator import CameraRays
 
 
 class Distances:
-    """Which random numbers choose the distances of flights in homogeneous media: uniform ones.
+    """Which random numbers choose the distances of flights in homogeneous media: for the first one
+    that of the camera ray, if it has one (its density is part of the ray's weight); uniform ones.
 
     Attributes:
         exact_transmittance: Is the transmittance of homogeneous media for shadow rays computed?
@@ -20,16 +21,18 @@ class Distances:
 
     exact_transmittance = True
 
-    def begin(self, sampler: mi.Sampler, pixel: mi.UInt32 | None) -> Any:
-        """The state of paths that begin in ``pixel`` of the film."""
-        return ()
+    def begin(self, rays: CameraRays) -> Any:
+        """The state before the first flight: has the number of the ray been used?"""
+        return () if rays.distance is None else mi.Bool(False)
 
     def draw(
-        self, state: Any, sampler: mi.Sampler, path: PathState, active: mi.Bool
-    ) -> tuple[mi.Float, mi.Float | float, Any]:
-        """The number, in [0, 1), of the next flight of ``path``; the factor by which its throughput
-        is to be multiplied (1 / density of the number) where ``active``; the new state."""
-        return sampler.next_1d(active), 1.0, state
+        self, state: Any, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
+    ) -> tuple[mi.Float, Any]:
+        """The number, in [0, 1), of the next flight where ``active``, and the new state."""
+        if rays.distance is None:
+            return sampler.next_1d(active), state
+        u = dr.select(state, sampler.next_1d(active & state), rays.distance)
+        return u, state | active
 
 
 def component(σ: mi.Spectrum, channel: mi.UInt32) -> mi.Float:

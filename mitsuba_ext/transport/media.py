@@ -70,12 +70,10 @@ class NoMedia:
         """The state of camera rays."""
         return ()
 
-    def launch(
-        self, inside, sampler, ray, path: PathState, active
-    ) -> tuple[mi.Ray3f, PathState, Any]:
-        """A ray that ends where a homogeneous medium scatters, the path with the weight of that
-        distance, and the state."""
-        return ray, path, inside
+    def launch(self, inside, sampler, rays: CameraRays, ray, active) -> tuple[mi.Ray3f, Any]:
+        """A ray that ends where a homogeneous medium scatters, and the state; the path began as one
+        of ``rays``."""
+        return ray, inside
 
     def behind(
         self, query: SceneQuery, scene, ray, pi, active
@@ -153,23 +151,20 @@ class Media(NoMedia):
             count = len(mi.Spectrum())
             channel = mi.UInt32(dr.minimum(sampler.next_1d() * count, count - 1))
         sampler.next_1d()  # the roulette of `volpath`, which spares the camera's rays
-        distances = self._distances.begin(sampler, rays.pixel)
+        distances = self._distances.begin(rays)
         return Inside(mi.MediumPtr(rays.medium), channel, mi.Float(dr.inf), distances)
 
-    def launch(self, inside, sampler, ray, path, active):
+    def launch(self, inside, sampler, rays, ray, active):
         in_medium = active & (inside.medium != None)  # noqa: E711
         known = in_medium & inside.medium.is_homogeneous()
         σ = component(extinction(inside.medium, ray, known), inside.channel)
         # 1 − u > 0; no extinction gives an infinite distance
-        u, weight, distances = self._distances.draw(inside.distances, sampler, path, known)
+        u, distances = self._distances.draw(inside.distances, sampler, rays, known)
         t = -dr.log(1 - u) / σ
         reach = dr.select(known & (t <= ray.maxt), t, dr.inf)
         ray = mi.Ray3f(ray)
         ray.maxt = dr.minimum(ray.maxt, reach)
-        path = replace(
-            path, β=path.β * weight, sampling_weight=mi.Float(path.sampling_weight * weight)
-        )
-        return ray, path, Inside(inside.medium, inside.channel, reach, distances)
+        return ray, Inside(inside.medium, inside.channel, reach, distances)
 
     def behind(self, query, scene, ray, pi, active):
         last, behind = behind_emitters(query, scene, ray, pi, active)

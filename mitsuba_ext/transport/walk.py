@@ -125,7 +125,7 @@ class Walk:
         self.observer.camera(rays)
 
         inside = media.begin(sampler, rays)
-        ray, path, inside = media.launch(inside, sampler, ray, path, active)
+        ray, inside = media.launch(inside, sampler, rays, ray, active)
         pi = self.query.closest(scene, ray, coherent=True, active=active)
         if dr.hint(self.hide_emitters, mode="scalar"):
             ray, pi = media.behind(self.query, scene, ray, pi, active)
@@ -236,7 +236,7 @@ class Walk:
             active = active_next & (~rr_active | rr_continue) & ~is_black
             path.β[rr_active] *= dr.rcp(survival)
 
-            ray, path, inside = media.launch(inside, sampler, ray, path, active)
+            ray, inside = media.launch(inside, sampler, rays, ray, active)
             pi = self.query.closest(scene, ray, coherent=False, active=active)
             if dr.hint(media.exist and self.hide_emitters, mode="scalar"):
                 ray, pi = media.behind(self.query, scene, ray, pi, active & (path.depth == 0))
