@@ -210,9 +210,8 @@ def test_maps_lower_the_noise_where_they_promise_to() -> None:
     assert "less variance" in integrator.statistics.learned
 
 
-@pytest.mark.parametrize(
-    "adversary", ["one_hot", pytest.param("random", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("adversary", ["one_hot", "random"])
 def test_wrong_maps_only_make_noise(monkeypatch, adversary: str) -> None:
     """All mass in one cell, or anywhere: the share of uniform numbers keeps the mean right."""
 
@@ -233,6 +232,7 @@ def test_wrong_maps_only_make_noise(monkeypatch, adversary: str) -> None:
     assert_same_pixels_on_average(images, expected, 0.08)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_image() -> None:
     integrator = swarm(always_use=True)
     with one_thread():
@@ -296,11 +296,8 @@ _ONE_MAP = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("only", [
-    "light_map", pytest.param("lobe_map", marks=pytest.mark.slow),
-    pytest.param("direction_map", marks=pytest.mark.slow),
-    pytest.param("all", marks=pytest.mark.slow),
-])  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.parametrize("only", [*_ONE_MAP, "all"])
 def test_mean_with_maps_along_the_path(only: str) -> None:
     scene = _glass_and_spots()
     maps = {name: only in (name, "all") for name in _ONE_MAP}
