@@ -33,12 +33,14 @@ class Kind:
             that the mean of its images is that of the interval.
         depth: Parameters of integrators that this kind prescribes.
         allowance: Accepted relative difference of the means.
+        reference: Mitsuba's integrator, where it is not ``path``.
     """
 
     make: Callable[[int, Path, float | None], Scene]
     strata: int = 1
     depth: dict[str, int] = field(default_factory=dict)
     allowance: float = 0.0
+    reference: str = "path"
 
 
 def _plain(seed: int, folder: Path, time: float | None) -> Scene:
@@ -186,8 +188,46 @@ def _closed(maker: Maker) -> Any:
     )()
 
 
+# ---- Participating media ----
+
+
+def _media(seed: int, folder: Path, time: float | None) -> Scene:
+    """One or two clouds, of which one may hold the camera and all else."""
+    scene, maker = Maker(seed, folder).scene(), Maker(seed, folder, stream=17)
+    for index in range(maker.rng.integers(1, 3)):
+        boundary = {"type": maker.choice("sphere", "cube"), "to_world": maker.place(uniform=True)}
+        bsdf = {"type": maker.choice("null", "null", "dielectric", "thindielectric")}
+        scene[f"cloud_{index}"] = {**boundary, "bsdf": bsdf, "interior": _medium(maker)}
+    if maker.chance(0.3):
+        around = {**_medium(maker, is_grid=False), "id": "around", "scale": 0.05}
+        # References look back: the medium comes first
+        scene = {"type": scene.pop("type"), "around": around, **scene}
+        reference = {"type": "ref", "id": "around"}
+        scene["sensor"] |= {"medium": reference}
+        scene["air"] = {"type": "sphere", "radius": 100.0, "bsdf": {"type": "null"},
+                        "interior": reference}  # fmt: skip
+    return scene
+
+
+def _medium(maker: Maker, is_grid: bool | None = None) -> Scene:
+    phase = maker.choice(
+        {"type": "isotropic"}, {"type": "hg", "g": maker.number(-0.6, 0.8)}, {"type": "rayleigh"}
+    )
+    if maker.chance(0.4) if is_grid is None else is_grid:
+        density = maker.rng.random((4, 3, 5, 1), dtype=np.float32) * maker.number(0.5, 8)
+        place = mi.ScalarTransform4f().translate([-3, -3, -1]).scale(6)
+        volume = {"type": "gridvolume", "grid": mi.VolumeGrid(density), "to_world": place}
+        return {"type": "heterogeneous", "phase": phase, "albedo": maker.colour(),
+                "sigma_t": volume}  # fmt: skip
+    # Colours that differ much make too much noise
+    return {"type": "homogeneous", "phase": phase, "albedo": maker.colour(),
+            "sigma_t": maker.colour(0.4, 0.9), "scale": maker.number(0.5, 8),
+            "sample_emitters": maker.chance(0.9)}  # fmt: skip
+
+
 KINDS = {
     "plain": Kind(_plain),
+    "media": Kind(_media, reference="volpath"),
     "moving": Kind(_moving, strata=16),
     "moving_camera": Kind(_moving_camera, strata=16),
     "moving_lights": Kind(_moving_lights, strata=16),
