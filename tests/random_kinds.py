@@ -47,7 +47,7 @@ def _plain(seed: int, folder: Path, time: float | None) -> Scene:
     return Maker(seed, folder).scene()
 
 
-# ---- Moving shapes and cameras ----
+# ---- Moving shapes, cameras and lights ----
 
 
 def _moving(seed: int, folder: Path, time: float | None) -> Scene:
@@ -89,6 +89,30 @@ def _moving_camera(seed: int, folder: Path, time: float | None) -> Scene:
     else:
         place = mi.ScalarTransform4f(pose(opens + time * lasts))
         scene["sensor"] = {**still, "to_world": place @ still["to_world"]}
+    return scene
+
+
+def _moving_lights(seed: int, folder: Path, time: float | None) -> Scene:
+    """All lights move but those at infinity."""
+    scene, maker = Maker(seed, folder).scene(), Maker(seed, folder, stream=29)
+    opens, lasts = maker.number(0, 0.3), maker.number(0.2, 1)
+    scene["sensor"] |= {"shutter_open": opens, "shutter_close": opens + lasts}
+    for name in [name for name in scene if name.startswith("light_")]:
+        light = scene[name]
+        if light["type"] == "directional":
+            continue
+        translate, axis = maker.rng.normal(size=(2, 3))
+        parameters, pose = uniform((0.3 * translate).tolist(), axis.tolist(),
+                                   maker.number(-90, 90), maker.point())  # fmt: skip
+        if time is None:
+            plugin = "moving" if "emitter" in light else "moving_light"
+            scene[name] = {"type": plugin, **parameters, "light": light}
+            continue
+        there = mi.ScalarTransform4f(pose(opens + time * lasts))
+        if "position" in light:
+            light["position"] = (there @ mi.ScalarPoint3f(light["position"])).numpy().tolist()
+        else:
+            light["to_world"] = there @ light["to_world"]
     return scene
 
 
@@ -206,6 +230,7 @@ KINDS = {
     "media": Kind(_media, reference="volpath"),
     "moving": Kind(_moving, strata=16),
     "moving_camera": Kind(_moving_camera, strata=16),
+    "moving_lights": Kind(_moving_lights, strata=16),
     "constant_index": Kind(_constant_index),
     # Long paths without roulette: a small max_depth would lose energy, and in RGB roulette would be
     # the only source of noise
