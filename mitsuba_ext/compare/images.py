@@ -36,38 +36,33 @@ def check_target(path: Path) -> None:
 
 
 def write_exr(
-    path: Path,
-    pixels: np.ndarray,
-    channels: Sequence[str],
-    metadata: Mapping[str, object],
-    is_compressed: bool = True,
+    path: Path, pixels: np.ndarray, channels: Sequence[str], metadata: Mapping[str, object]
 ) -> None:
-    """Writes 32-bit channels; ``pixels`` has the shape (height, width, number of channels). Without
-    compression, files of noisy images are 1.1 times as large, and written in a sixth of the time.
-    """
+    """Writes 32-bit channels; ``pixels`` has the shape (height, width, number of channels)."""
     import mitsuba as mi
 
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
-    if not is_compressed:
-        _write_uncompressed(path, pixels, channels, metadata)
-        return
     # Without the format, up to four channels would be called R, G, B and A
     bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, list(channels))
-    _annotate(bitmap, metadata)
+    attributes = bitmap.metadata()
+    for key, value in metadata.items():
+        attributes[key] = _attribute(value)
     _save(bitmap, path)
 
 
-def _write_uncompressed(
-    path: Path, pixels: np.ndarray, channels: Sequence[str], metadata: Mapping[str, object]
+def write_exr_fast(
+    path: Path, planes: Mapping[str, np.ndarray], metadata: Mapping[str, object]
 ) -> None:
+    """Writes 32-bit channels, (height, width), without compression: files of noisy images are 1.1
+    times as large, and written in a sixth of the time."""
     import OpenEXR
 
     header = {key: _attribute(value) for key, value in metadata.items()}
     header.update(compression=OpenEXR.NO_COMPRESSION, type=OpenEXR.scanlineimage)
-    planes = np.ascontiguousarray(np.moveaxis(pixels, 2, 0))
+    planes = {key: np.ascontiguousarray(x, dtype=np.float32) for key, x in planes.items()}
     with replacing(path) as temporary:
         try:
-            OpenEXR.File(header, dict(zip(channels, planes))).write(str(temporary))
+            OpenEXR.File(header, planes).write(str(temporary))
         except RuntimeError as error:
             raise OSError(f"{path}: {one_line(error)}") from error
 
@@ -148,18 +143,21 @@ def write_film(
     others: Mapping[str, np.ndarray] | None = None,
     is_compressed: bool = True,
 ) -> None:
-    """Writes the image of a film: all channels to an EXR (see :func:`write_exr`), also ``others``,
-    which are arrays (height, width); RGB to HDR and PFM, 8-bit sRGB to the other formats."""
+    """Writes the image of a film: all channels to an EXR, also ``others``, which are arrays
+    (height, width); RGB to HDR and PFM, 8-bit sRGB to the other formats."""
     import mitsuba as mi
 
     bitmap = film.bitmap()
     suffix = path.suffix.lower()
     if suffix == ".exr":
         # The film's own bitmap may be of half precision
+        pixels = np.moveaxis(np.array(film.develop()), 2, 0)
         names = [entry.name for entry in bitmap.struct_()]
-        layers = [np.array(film.develop()), *(x[..., None] for x in (others or {}).values())]
-        pixels = np.concatenate([x.astype(np.float32, copy=False) for x in layers], axis=2)
-        write_exr(path, pixels, [*names, *(others or {})], metadata, is_compressed)
+        planes = {**dict(zip(names, pixels)), **(others or {})}
+        if is_compressed:
+            write_exr(path, np.stack(list(planes.values()), axis=2), list(planes), metadata)
+        else:
+            write_exr_fast(path, planes, metadata)
         return
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         bitmap = bitmap.split()[0][1]  # the image without its AOVs
