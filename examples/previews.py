@@ -28,6 +28,9 @@ PICTURES = {
     "defocus": 2048,
     "fast_balls": 512,
     "fan": 512,
+    "lantern": 2048,
+    "six_balls": 256,
+    "colour_wheel": 512,
     "flint": 1024,
     "caustic": 256,
     "glass_lamp": 96,
@@ -38,6 +41,7 @@ PICTURES = {
     "corridor": 64,
     "night_classroom": 128,
     "near_lights": 256,
+    "fog": 1024,
 }
 
 #: Scenes rendered by light paths or chains, or in which nothing is learned of visibility; all
@@ -45,6 +49,7 @@ PICTURES = {
 INTEGRATORS = {
     **dict.fromkeys(["caustic", "glass_lamp", "corridor", "ring", "shaded_lamp"], "bdpt"),
     **dict.fromkeys(["pool", "keyhole"], "erpt"),
+    **dict.fromkeys(["six_balls", "colour_wheel"], "swarm_path"),
 }
 
 #: Scenes that are not 16 : 9.

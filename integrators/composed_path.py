@@ -70,15 +70,21 @@ class ComposedPath(WalkIntegrator):
      * - aperture, time, wavelength
        - |string| or |decision|
        - Which numbers choose the point on the aperture, the time, and the wavelengths of a camera
-         ray: those of the sensor's :monosp:`sampler`, those of sets of a pattern (:monosp:`sobol`,
+         ray: those of the sensor's :monosp:`sampler`, those that maps of tiles have learned
+         (:monosp:`swarm`, see :monosp:`swarm_path`), those of sets of a pattern (:monosp:`sobol`,
          :monosp:`lattice`, …), or those of a nested :monosp:`weighted_numbers`. wavelength needs a
          spectral variant. (Default: sampler)
+     * - distance
+       - |string|
+       - Which numbers choose how far a camera ray flies in a homogeneous medium: those of the
+         :monosp:`sampler`, or :monosp:`swarm` (maps, as :monosp:`swarm_path`). (Default: sampler)
      * - pilot_spp
        - |int|
-       - Samples per pixel from which is learned, at most a quarter of all. They count towards the
-         image. Known only where something learns; with 0 nothing is learned. A sampler that is
-         stratified over all samples may need longer pilots. (Default: 32 with guided directions,
-         4 where only :monosp:`triple_product` learns, otherwise 16)
+       - Samples per pixel from which is learned, at most a quarter of all (half, where only
+         :monosp:`swarm` learns). They count towards the image. Known only where something learns;
+         with 0 nothing is learned. A sampler that is stratified over all samples may need longer
+         pilots. (Default: 64 with :monosp:`swarm`, 32 with guided directions, 4 where only
+         :monosp:`triple_product` learns, otherwise 16)
      * - save_learned, load_learned
        - |string|
        - Files. The first is written: what was learned, as a whole. The second is read in place of
@@ -94,9 +100,10 @@ class ComposedPath(WalkIntegrator):
     scalar or polarized variant.
 
     Where the scene has participating media, this is :monosp:`volpath`: homogeneous and grid media,
-    all phase functions, index-matched surfaces, cameras and lights in fog. Only the rule of the
-    roulette is that of :monosp:`path`, and :monosp:`hide_emitters` also hides a light that the
-    camera sees through fog. :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`,
+    all phase functions, index-matched surfaces, cameras and lights in fog. The rule of the roulette
+    is that of :monosp:`path`, the transmittance of homogeneous media for shadow rays is computed,
+    which leaves less noise, and :monosp:`hide_emitters` also hides a light that the camera sees
+    through fog. :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`,
     :monosp:`spatial`, :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility` there; the
     others need a surface and refuse the scene. :monosp:`directions` guided by regions of surfaces
     are guided at surfaces, and by tiles everywhere. As with :monosp:`volpath`, distances follow one

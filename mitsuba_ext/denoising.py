@@ -71,6 +71,36 @@ def render_guides(scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> dict[str
     return guides.render_guides(scene, sensor, scene_query(scene), seed)
 
 
+def denoise(
+    pixels: np.ndarray, albedo: np.ndarray | None = None, normal: np.ndarray | None = None,
+    is_linear: bool = True,
+) -> np.ndarray:  # fmt: skip
+    """An image without its noise.
+
+    Args:
+        pixels: RGB, (height, width, 3).
+        albedo: Guides it; the same shape, in [0, 1].
+        normal: Guides it, if there is an albedo too; the same shape, in [-1, 1].
+        is_linear: ``False`` for images with 8 bits, in [0, 1].
+
+    Returns:
+        RGB, (height, width, 3). It may have NaN where ``pixels`` has.
+
+    Raises:
+        InstallationError: See :func:`denoiser`.
+    """
+    oidn = denoiser()
+    # Without the albedo, it accepts no normals
+    guides = {} if albedo is None else {"albedo": _without_noise(oidn, albedo, 1, 0)}
+    if guides and normal is not None:
+        guides["normal"] = _without_noise(oidn, normal, 2, -1)
+    result = oidn.denoise(
+        np.ascontiguousarray(pixels, dtype=np.float32), **guides, hdr=is_linear,
+        clean_aux=bool(guides),
+    )  # fmt: skip
+    return np.array(result, dtype=np.float32)
+
+
 def denoise_file(
     source: Path, targets: Iterable[Path], metadata: Mapping[str, object]
 ) -> list[str]:
@@ -96,16 +126,10 @@ def denoise_file(
         channels, _ = images.read_exr(source)
     guides = {name: _layer(channels, name) for name in _GUIDES}
     guides = {name: guide for name, guide in guides.items() if guide is not None}
-    # Without the albedo, it accepts no normals
     if "albedo" not in guides:
         guides = {}
     is_linear = source.suffix.lower() in (".exr", ".hdr", ".pfm", ".npy", ".npz")
-    result = oidn.denoise(
-        np.ascontiguousarray(pixels, dtype=np.float32),
-        **{name: _without_noise(oidn, guide, name) for name, guide in guides.items()},
-        hdr=is_linear, clean_aux=bool(guides),
-    )  # fmt: skip
-    result = np.array(result, dtype=np.float32)
+    result = denoise(pixels, **guides, is_linear=is_linear)
     if not np.isfinite(result).all():
         raise InputError(f"{source}: cannot be denoised: the result has NaN or infinite pixels")
     about = {
@@ -117,10 +141,13 @@ def denoise_file(
     return list(guides)
 
 
-def _without_noise(oidn: ModuleType, guide: np.ndarray, name: str) -> np.ndarray:
-    """A guide that has been denoised itself, as an image of values in [0, 1]: a denoiser that can
-    trust its guides keeps more detail."""
-    scale, offset = (2, -1) if name == "normal" else (1, 0)
+def _without_noise(
+    oidn: ModuleType, guide: np.ndarray, scale: float, offset: float
+) -> np.ndarray:
+    """A guide that has been denoised itself, as an image of values in [0, 1], of which it is
+    ``scale`` times the value plus ``offset``: a denoiser that can trust its guides keeps more
+    detail."""
+    guide = np.asarray(guide, dtype=np.float32)
     result = np.array(oidn.denoise(np.ascontiguousarray((guide - offset) / scale), hdr=False))
     return np.ascontiguousarray(scale * result + offset, dtype=np.float32)
 

@@ -29,6 +29,11 @@ def may_have_grids(scene: mi.Scene) -> bool:
     return not is_known or any(not medium.is_homogeneous() for medium in _media(scene))
 
 
+def has_homogeneous_media(scene: mi.Scene) -> bool:
+    """Is there a homogeneous medium in ``scene``, as far as one can see?"""
+    return any(medium.is_homogeneous() for medium in _media(scene))
+
+
 def refuse_media(scene: mi.Scene, what: str, instead: str) -> None:
     """Raises an error if there are media in ``scene``.
 

@@ -9,7 +9,7 @@ everything is at rest.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -130,17 +130,13 @@ class Pose:
         moved.d = self.rotation.T @ ray.d
         return moved
 
+    def ray_to_rest(self, ray: mi.RayDifferential3f) -> mi.RayDifferential3f:
+        """:meth:`to_rest` of a ray and its differentials."""
+        return _moved(ray, self.point_to_rest, self.rotation.T)
+
     def ray_to_world(self, ray: mi.Ray3f) -> mi.Ray3f:
         """The ray of the rest frame, and its differentials if it has them, in the world."""
-        moved = type(ray)(ray)
-        parts = [("o", "d")]
-        if isinstance(ray, mi.RayDifferential3f):
-            moved.has_differentials = ray.has_differentials
-            parts += [("o_x", "d_x"), ("o_y", "d_y")]
-        for o, d in parts:
-            setattr(moved, o, self.point_to_world(getattr(ray, o)))
-            setattr(moved, d, self.rotation @ getattr(ray, d))
-        return moved
+        return _moved(ray, self.point_to_world, self.rotation)
 
     def point_to_rest(self, p: mi.Point3f) -> mi.Point3f:
         """The point in the rest frame."""
@@ -161,6 +157,18 @@ class Pose:
         si.dp_du, si.dp_dv = R @ si.dp_du, R @ si.dp_dv
         si.dn_du, si.dn_dv = R @ si.dn_du, R @ si.dn_dv
         return si
+
+
+def _moved(ray: mi.Ray3f, move: Callable, rotation: mi.Matrix3f) -> mi.Ray3f:
+    moved = type(ray)(ray)
+    parts = [("o", "d")]
+    if isinstance(ray, mi.RayDifferential3f):
+        moved.has_differentials = ray.has_differentials
+        parts += [("o_x", "d_x"), ("o_y", "d_y")]
+    for o, d in parts:
+        setattr(moved, o, move(getattr(ray, o)))
+        setattr(moved, d, rotation @ getattr(ray, d))
+    return moved
 
 
 class PoseTable:

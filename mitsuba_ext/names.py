@@ -15,7 +15,7 @@ from typing import Any
 
 from . import registry
 from .errors import InputError
-from .pages import read_page
+from .pages import Parameter, read_page
 from .plugin_text import parse_plugin
 
 #: Mitsuba's own integrators.
@@ -63,9 +63,14 @@ def unknown_parameter(kind: str, name: str, key: str) -> InputError:
 
 def parameter_names(name: str) -> list[str]:
     """The parameters on the page of a plugin of ours; none for any other plugin."""
+    return [key for row in parameter_rows(name) for key in row.name.split(", ")]
+
+
+def parameter_rows(name: str) -> list[Parameter]:
+    """The rows of the table of parameters on the page of a plugin of ours."""
     files = [file for kind in registry.plugin_names() for file in registry.plugin_files(kind)]
     pages = [read_page(file) for file in files if file.stem == name]
-    return [key for page in pages for row in page.parameters for key in row.name.split(", ")]
+    return [row for page in pages for row in page.parameters]
 
 
 def check_integrator(specification: str) -> None:

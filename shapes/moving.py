@@ -75,8 +75,11 @@ class Moving(mi.Mesh):
     Only integrators of this package see these shapes. **Mitsuba's own**, such as :monosp:`path` or
     :monosp:`aov`, **render the scene without them, and there is no way to stop them** (a light
     among them still lights connections, with a wrong weight); use :monosp:`composed_path`, which is
-    :monosp:`path` otherwise. The parameter :monosp:`aovs` is
-    refused.
+    :monosp:`path` otherwise.
+
+    The parameter :monosp:`aovs` of our integrators sees them at the time of each ray, in the world
+    (:monosp:`shape_index` is the number of the nested shape), and so the mean over the shutter
+    interval is in the film. For one time, close the shutter there.
 
     Every motion costs time: its shapes have an acceleration structure of their own, which all rays
     traverse that hit the bounding box of the motion. Compared with the same shapes at rest, one

@@ -82,6 +82,8 @@ REGRESSIONS = {
         Regression("ecoc_dof", "defocus", {"nested": "path"}),
         Regression("reweighted_time", "fan", {"nested": "composed_path"}),
         Regression("composed_path", "fast_balls"),
+        Regression("composed_path", "lantern", max_depth=2, spp=512),
+        Regression("swarm_path", "six_balls", {"always_use": True}, max_depth=2, spp=64),
         Regression("composed_path", "near_lights", max_depth=4, is_slow=True),
         Regression("composed_path", "flint", variant="llvm_ad_spectral"),
         Regression("reweighted_wavelength", "prism", {"nested": "composed_path"},

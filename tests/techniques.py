@@ -167,6 +167,14 @@ TECHNIQUES: dict[str, Technique] = {
         ),
         thorough=EVERYTHING,
     ),
+    # ``test_swarm.py`` has furnaces, motion and lenses. On small films, maps pay little
+    "swarm_path": Technique(
+        "swarm_path", {"always_use": True}, is_plugin=True,
+        checks=Checks(cases=["thin_lens", "no_light"]),
+        thorough=Checks(
+            ["cornell_box", "sunny_gloss"], ["llvm_ad_spectral"], FURNACES, [2, -1], _LEARNERS
+        ),
+    ),
     "auto_path": Technique(
         "auto_path", is_plugin=True,
         checks=Checks(

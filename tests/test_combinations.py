@@ -60,8 +60,15 @@ def _cases(offset: int) -> list:
     return cases
 
 
-def _moving(row_or_choice: str, child: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "moving", **_SPIN, "child": child} if row_or_choice == "moving" else child
+def _moving(choice: str, child: dict[str, Any], plugin: str = "moving") -> dict[str, Any]:
+    return {"type": plugin, **_SPIN, "child": child} if choice == "moving" else child
+
+
+def _camera(choice: str, *arguments: Any, **changes: Any) -> dict[str, Any]:
+    still = sensor("thinlens", *arguments, **_OPTICS, **changes)
+    if choice != "moving":
+        return still
+    return {"type": "moving_camera", "translate": [0.1, 0.05, 0.0], "child": still}
 
 
 # ---- Exact ----
@@ -69,7 +76,7 @@ def _moving(row_or_choice: str, child: dict[str, Any]) -> dict[str, Any]:
 
 def _furnace(choice: str) -> mi.Scene:
     """A room whose walls emit what they absorb: the radiance is 1 everywhere, also on the white
-    things in it, whether they move or not."""
+    things in it, and on what moves there and emits what it absorbs itself."""
     T = mi.ScalarTransform4f
     wall = {"bsdf": diffuse(0.5), "emitter": area(0.5)}
     turns = {
@@ -80,9 +87,9 @@ def _furnace(choice: str) -> mi.Scene:
         name: rectangle(T().rotate(axis, angle), T().translate([0, 0, -2]).scale([2, 2, 1]), **wall)
         for name, (axis, angle) in turns.items()
     }
-    camera = sensor("thinlens", lookat([0, 0, 1.8], [0, 0, 0], [0, 1, 0]), film=film(), **_OPTICS)
-    cube = {"type": "cube", "to_world": T().translate([-0.5, 0.1, 0]).scale(0.35),
-            "bsdf": diffuse(1.0)}  # fmt: skip
+    camera = _camera(choice, lookat([0, 0, 1.8], [0, 0, 0], [0, 1, 0]), film=film())
+    skin = wall if choice == "moving" else {"bsdf": diffuse(1.0)}
+    cube = {"type": "cube", "to_world": T().translate([-0.5, 0.1, 0]).scale(0.35), **skin}
     ball = {"type": "sphere", "center": [0.7, 0.1, 0.0], "radius": 0.4,
             "bsdf": {"type": "conductor", "material": "none"}}  # fmt: skip
     return mi.load_dict({
@@ -121,9 +128,10 @@ def _lamps(choice: str) -> mi.Scene:
     point = {"type": "point", "position": [-1, -1, 1.5], "intensity": 0.7}
     block = {"type": "cube", "bsdf": diffuse(0.3, 0.6, 0.3),
              "to_world": T().translate([0.5, 0, 0.4]).scale([0.3, 0.3, 0.4])}  # fmt: skip
-    camera = sensor("thinlens", film=film(20, 16), **_OPTICS)
+    camera = _camera(choice, film=film(20, 16))
+    point, block = _moving(choice, point, "moving_light"), _moving(choice, block)
     return mi.load_dict(
-        stage(camera=camera, lamp=lamp, point=point, block=_moving(choice, block))
+        stage(camera=camera, lamp=_moving(choice, lamp), point=point, block=block)
     )
 
 

@@ -60,6 +60,19 @@ def test_a_long_render_is_denoised_too(run, make_scene, tmp_path, calls):
     assert len(calls) == 1 and (tmp_path / "a.noisy.exr").exists()
 
 
+def test_guides_are_in_the_form_that_the_denoiser_takes(calls):
+    scene = mi.load_dict(mi.cornell_box() | {"sensor": {
+        "type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0],
+        [0, 1, 0]), "film": {"type": "hdrfilm", "width": 6, "height": 4}}})  # fmt: skip
+    guides = denoising.render_guides(scene, scene.sensors()[0])
+    albedo, normal = np.split(np.stack(list(guides.values()), axis=2), 2, axis=2)
+    image = denoising.denoise(np.ones((4, 6, 3)), albedo, normal)
+    assert image.shape == (4, 6, 3) and image.dtype == np.float32 and (image == 0.5).all()
+    np.testing.assert_array_equal(calls[0].albedo, albedo)
+    denoising.denoise(np.ones((4, 6, 3)), normal=normal)
+    assert calls[1].albedo is None and calls[1].normal is None
+
+
 def test_an_image_is_guided_by_its_layers(run, tmp_path, calls):
     rng = np.random.default_rng(1)
     names = ["R", "G", "B", *(f"View.Albedo.{c}" for c in "RGB"), *(f"normal.{c}" for c in "XYZ")]
@@ -141,6 +154,17 @@ def test_guides_are_those_of_what_is_behind_glass_and_holes():
     found = _guides(_wall(4, plastic), _wall(-3, _diffuse(1, 1, 1), 0))
     np.testing.assert_allclose(found[..., 5], -1, atol=1e-5)
     assert (_guides({"type": "sphere", "center": [9, 9, 9]}) == 0).all()
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"], indirect=True)
+def test_guides_have_colours_in_spectral_variants_too(variant):
+    mirror = {"type": "conductor", "material": "none"}
+    for body in ([_wall(4, _diffuse(0.2, 0.4, 0.6))],
+                 [_wall(4, mirror), _wall(-3, _diffuse(0.2, 0.4, 0.6), 0)]):  # fmt: skip
+        found = _guides(*body)[..., :3].mean((0, 1))
+        expected = [0.2, 0.4, 0.6] if variant == "llvm_ad_spectral" else found[0]
+        np.testing.assert_allclose(found, expected, atol=0.03)
+        assert found.min() > 0.1
 
 
 def test_two_mirrors_end():

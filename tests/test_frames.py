@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from unittest import mock
 
@@ -120,6 +123,32 @@ def test_frames_are_kept_each_in_a_folder(
     code, out, _ = run(*command, "--spp", 80)
     assert code == 0 and out.count("80 spp") == 2
     assert read_exr(tmp_path / "a.03.exr")[1]["spp"] == 80
+
+
+@pytest.mark.slow
+def test_frames_go_on_after_the_process_was_killed(make_scene, tmp_path):
+    (tmp_path / "animate.py").write_text(FUNCTION)
+    scene = make_scene(body=BODY.replace("<shape", '<shape id="ball"'))
+    command = [sys.executable, "-m", "mitsuba_ext", *map(str, (
+        "render", scene, "-o", tmp_path / "a.#.exr", "--frames", "0:2", "--spp", 1 << 15,
+        "--size", "32x32", "--parameters", f"{tmp_path / 'animate.py'}:kernels",
+        "--checkpoint", tmp_path / "kept", "--every", "1spp",
+    ))]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    second = CheckpointFolder(tmp_path / "kept" / "1")
+    deadline = time.monotonic() + 120
+    while not (second.path / "state.npz").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    before = second.load()
+    assert before.spp > 0 and not (tmp_path / "a.1.exr").exists()
+    finished = (tmp_path / "a.0.exr").read_bytes()
+    assert subprocess.run(command, capture_output=True, timeout=300).returncode == 0
+    assert (tmp_path / "a.0.exr").read_bytes() == finished
+    after = second.load()
+    assert after.spp == 1 << 15 and after.done[: len(before.done)] == before.done
+    assert {file.name for file in tmp_path.glob("a.*")} == {f"a.{n}.exr" for n in range(3)}
 
 
 FUNCTION = """

@@ -104,7 +104,7 @@ def test_nested_integrators_take_over_the_settings_and_are_checked(variant):
             '"learned_lights" or "spatial_lights"',
         ),
         ("composed_path:connections=-3", 'the parameter "connections" is -3; it must be at least'),
-        ("composed_path:time=latice", "one of sampler, independent, stratified,"),
+        ("composed_path:time=latice", "one of sampler, swarm, independent, stratified,"),
         ("composed_path:next_event=[independent]", "is IndependentSampler; it must be one of"),
         ("composed_path:pilot_spp=4", 'nothing here uses the parameter "pilot_spp"'),
         ("pss_guided:nee_first_bounce=false,count=3", 'has no parameter "count"'),

@@ -8,8 +8,9 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
-from ..rendering.camera import Lanes, camera_rays, draw_numbers, film_extent, to_rgb
+from ..rendering.camera import Lanes, camera_rays, draw_numbers, film_extent
 from ..rendering.camera_samples import CameraSamples
+from ..transport.colour import to_rgb
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.numbers import Numbers
 

@@ -17,6 +17,7 @@ from .. import __version__
 from ..errors import InputError, InstallationError
 from .common import INTERRUPTED, say
 from .compare import compare
+from .completion import completion, register
 from .denoise import denoise
 from .diff import diff
 from .merge import merge
@@ -44,12 +45,13 @@ def doctor() -> int:
     return doctor_module.main()
 
 
-for command in (render, merge, denoise, compare, diff, list_plugins, doctor):
+for command in (render, merge, denoise, compare, diff, list_plugins, doctor, completion):
     cli.add_command(command)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command and returns its exit code."""
+    register()
     try:
         # Only if started from a shell, and not from Python, do comparisons run in worker processes
         obj = SUPERVISED if arguments is None else None

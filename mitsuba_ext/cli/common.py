@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..long_renders.intervals import Interval
+from . import candidates
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -88,11 +89,13 @@ def scene_options(command: Callable) -> Callable:
         ),
         click.option(
             "--plugin", "plugins", multiple=True, metavar="MODULE",
+            shell_complete=candidates.modules,
             help="A Python module, or its .py file, that registers integrators of your own. Can be "
             "repeated.",
         ),
         click.option(
-            "--variant", default="llvm_ad_rgb", show_default=True, help="Mitsuba's variant."
+            "--variant", default="llvm_ad_rgb", show_default=True, help="Mitsuba's variant.",
+            shell_complete=candidates.variants,
         ),
     ):
         command = decorator(command)

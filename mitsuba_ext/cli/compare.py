@@ -14,7 +14,7 @@ import click
 
 from ..names import check_integrator
 from ..variants import select_variant
-from . import supervisor
+from . import candidates, supervisor
 from .common import (
     INTERRUPTED,
     FilledPath,
@@ -59,10 +59,12 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--reference-integrator", default="path", show_default=True, metavar="INTEGRATOR",
+    shell_complete=candidates.integrators,
     help="Integrator that renders the reference.",
 )
 @click.option(
     "--out", type=FilledPath(), default="out/compare", show_default=True, metavar="DIR",
+    shell_complete=candidates.folders,
     help="Folder for report.html, results.json, the images, and rendered references. Runs that it "
     "holds are used again; they are only timed again where new runs are compared with them.",
 )
@@ -81,7 +83,10 @@ if TYPE_CHECKING:
 )
 @click.option("--worker", type=click.Choice(supervisor.JOBS), hidden=True)
 @scene_options
-@click.argument("names", nargs=-1, required=True, metavar="SCENE… INTEGRATOR…")
+@click.argument(
+    "names", nargs=-1, required=True, metavar="SCENE… INTEGRATOR…",
+    shell_complete=candidates.integrators,
+)
 @click.pass_context
 def compare(
     context: click.Context,

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from . import candidates
 from .common import FilledPath, say
 
 
@@ -15,7 +16,10 @@ from .common import FilledPath, say
     "-o", "--output", type=FilledPath(), required=True, metavar="DIR",
     help="The folder to make; render --checkpoint DIR goes on with it, and writes the image.",
 )
-@click.argument("folders", type=FilledPath(), nargs=-1, required=True, metavar="DIR…")
+@click.argument(
+    "folders", type=FilledPath(), nargs=-1, required=True, metavar="DIR…",
+    shell_complete=candidates.folders,
+)
 def merge(folders: Sequence[Path], output: Path) -> int:
     """Merge the samples of renders that ``render --checkpoint DIR`` has kept: of the same scene, by
     the same integrator, with different seeds. Each counts by its samples."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from . import candidates
 from .common import console_for_tables
 
 _MITSUBA_PLUGINS = "https://mitsuba.readthedocs.io/en/stable/src/plugin_reference.html"
@@ -13,7 +14,7 @@ _MITSUBA_INTEGRATORS = (
 
 
 @click.command("list", short_help="Show the plugins, or the parameters of one.")
-@click.argument("name", required=False)
+@click.argument("name", required=False, shell_complete=candidates.plugins)
 def list_plugins(name: str | None) -> int:
     """Show the plugins, or the page of the plugin NAME."""
     from rich.table import Table

@@ -11,6 +11,7 @@ from ..long_renders.intervals import Interval
 from ..names import check_integrator
 from ..parameters import MOST_SPP
 from ..variants import select_variant
+from . import candidates
 from .common import (
     MAX_SEED,
     Every,
@@ -27,7 +28,7 @@ from .frames import FrameRange, Sensors, pictures
     "floats), .png or .jpg (8 bits: the sRGB curve, clipped at 1, no exposure or tone mapping).",
 )
 @click.option(
-    "--integrator", "specification", metavar="INTEGRATOR",
+    "--integrator", "specification", metavar="INTEGRATOR", shell_complete=candidates.integrators,
     help="Integrator to use instead of the scene's: NAME[:key=value,…], or an XML or JSON file. It "
     "inherits max_depth and rr_depth of the scene's integrator unless it sets them.",
 )
@@ -57,13 +58,13 @@ from .frames import FrameRange, Sensors, pictures
     "n.",
 )
 @click.option(
-    "--parameters", metavar="FILE.py:FUNCTION",
+    "--parameters", metavar="FILE.py:FUNCTION", shell_complete=candidates.modules,
     help="With --frames: a Python function of the frame's number that returns a dict of the "
     "frame's parameters. Keys with a dot are those of mi.traverse, which are set without loading "
     "the scene again; others are $KEY parameters of the scene file.",
 )
 @click.option(
-    "--checkpoint", type=FilledPath(), metavar="DIR",
+    "--checkpoint", type=FilledPath(), metavar="DIR", shell_complete=candidates.folders,
     help="A folder that keeps the render. The same command goes on from there. Of several frames "
     "or sensors, each has a folder in it.",
 )
@@ -111,7 +112,7 @@ from .frames import FrameRange, Sensors, pictures
     help="Threads of each process, at least 2.  [default: all cores, divided among --workers]",
 )
 @scene_options
-@click.argument("scene", type=FilledPath())
+@click.argument("scene", type=FilledPath(), shell_complete=candidates.scenes)
 def render(
     scene: Path,
     output: Path,

@@ -11,6 +11,7 @@ from ..decisions.camera.pixel_sets import PixelSets
 from ..decisions.weighted_sets import WEIGHTS, WeightedSets
 from ..pointsets import PATTERNS
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
+from .swarm import check_has_wavelengths
 
 #: Points of a set, at most, and with a timeout.
 _MOST_POINTS, _MOST_POINTS_TIMED = 1024, 64
@@ -63,12 +64,8 @@ class WeightedNumbers(DecisionParameters):
                 f'"{plugin}": the parameter "{slot}" has weights = {self.weights}; it must be one '
                 f"of {', '.join(accepted)}"
             )
-        if slot == "wavelength" and not mi.is_spectral:
-            raise RuntimeError(
-                f'"{plugin}": the parameter "wavelength" does not work in the variant '
-                f'"{mi.variant()}", which has no wavelengths: use a spectral one, such as '
-                f'"llvm_ad_spectral".'
-            )
+        if slot == "wavelength":
+            check_has_wavelengths(plugin)
 
     def numbers(self, plugin: str, slot: str, setting: Setting) -> PixelSets | None:
         """The numbers of a render; ``None``, with a warning, where they do not matter."""

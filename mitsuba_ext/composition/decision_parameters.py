@@ -114,6 +114,7 @@ class DecisionParameters:
         slots: The slots of an integrator that it can fill.
         pilot_spp: Samples per pixel from which it would learn, by default; 0 if it does not learn.
         pilot_paths: So many samples of the whole film are enough for it; 0 if it can use all.
+        doubles: Is one sample enough to begin with? Each pilot then has as many as all before.
         tries: Does what it learns in a first pilot make the next ones better?
         camera_paths_only: Does it ask what only camera paths know of a vertex (from where it is
             seen, its depth, with what density scattering finds a light)?
@@ -126,6 +127,7 @@ class DecisionParameters:
     slots: tuple[str, ...] = ()
     pilot_spp = 0
     pilot_paths = 0
+    doubles = False
     tries = False
     camera_paths_only = False
     sees_media = True

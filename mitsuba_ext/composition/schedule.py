@@ -15,8 +15,13 @@ from ..transport.estimator import Estimator
 from ..transport.observer import Observers
 from ..transport.path_decisions import NoConnections
 from ..transport.walk import Walk
+from .camera_numbers import WeightedNumbers
 from .decision_parameters import DecisionParameters, Setting
 from .learned_file import States
+from .swarm import Swarm, doubling_pilots, stage_weights
+
+#: Where pilots double, from so many samples on they may have half of all: they cost little then.
+_MANY_SAMPLES = 8
 
 #: Paths of each of the first two pilots, about: they show what learning is worth.
 _TRIAL_PATHS = 1 << 17
@@ -50,6 +55,8 @@ def pilot_samples(
         enough = max(parameters.pilot_paths for parameters in learning)
         # Two of a pixel show their variance
         samples = min(samples, max(2, -(-enough // pixel_count)))
+    if all(parameters.doubles for parameters in learning):
+        return doubling_pilots(min(pilot_spp, spp // 2 if spp >= _MANY_SAMPLES else spp // 4))
     if samples < 3 or all(not parameters.tries for parameters in learning):
         return [samples]
     quarter = samples // 4 or 1
@@ -67,7 +74,7 @@ class Schedule:
         plugin: What errors and warnings call the integrator.
         slots: What fills the slots of the walk.
         setting: What is rendered.
-        pilot_count: Number of pilots.
+        stages: Samples per pixel of each stage: pilots, and the last one.
         estimator: Makes the estimator of a stage, with the integrator's parameters, from the
             decisions that differ from those of ``path``.
         query: How rays meet the scene.
@@ -85,18 +92,22 @@ class Schedule:
         plugin: str,
         slots: Mapping[str, DecisionParameters],
         setting: Setting,
-        pilot_count: int,
+        stages: Sequence[int],
         estimator: Callable[..., Estimator],
         query: Any,
         restored: States | None = None,
         learned: Callable[[States], None] | None = None,
     ) -> None:
-        self._setting, self._pilot_count, self._estimator = setting, pilot_count, estimator
+        self._setting, self._pilot_count, self._estimator = setting, len(stages) - 1, estimator
+        #: How many samples of the last stage a sample of each stage counts for
+        self._weights = [1.0] * len(stages)
+        if any(isinstance(parameters, Swarm) for parameters in slots.values()):
+            self._weights = stage_weights(stages)
         self.decisions: dict[str, Any] = {"query": query}
         self.learners: dict[str, Learner] = {}
         self._camera = CameraSamples()
         for slot, parameters in slots.items():
-            if hasattr(self._camera, slot):
+            if isinstance(parameters, WeightedNumbers):
                 setattr(self._camera, slot, parameters.numbers(plugin, slot, setting))
                 continue
             decision = parameters.decision(setting)
@@ -129,7 +140,11 @@ class Schedule:
         if self._finished_stages > 0:
             self._learn(is_last=False)
         observer = _one_observer(learners)
-        return Stage(self._estimator(observer=observer, **self.decisions), camera=self._camera)
+        return Stage(
+            self._estimator(observer=observer, **self.decisions),
+            camera=self._camera,
+            weight=self._weights[self._finished_stages],
+        )
 
     def _restored_stage(self, states: States) -> Stage:
         for slot, learner in self.learners.items():
@@ -162,7 +177,11 @@ class Schedule:
                 learner.finish()
 
     def _replace(self, slot: str, decision: Any | None) -> None:
-        if decision is not None:
+        if decision is None:
+            return
+        if hasattr(self._camera, slot):
+            setattr(self._camera, slot, decision)
+        else:
             self.decisions[slot] = decision
 
 

@@ -25,6 +25,7 @@ from .next_event import (
 from .roulette import GuidedRoulette
 from .shadow_test import RejectedShadowRays
 from .subpath_selection import LearnedSubpaths
+from .swarm import MAPS
 
 _Maker = Callable[[ParameterReader], DecisionParameters]
 
@@ -38,7 +39,7 @@ SLOTS: dict[str, dict[str, _Maker | None]] = {
     "connections": {"one": None},
     "mis": {HEURISTICS[0]: None, **{name: MisHeuristic.named(name) for name in HEURISTICS[1:]}},
     "shadow_test": {"always": None, "visibility_roulette": RejectedShadowRays},
-    **{slot: {"sampler": None} for slot in PURPOSES},
+    **{slot: {"sampler": None, "swarm": MAPS[slot]} for slot in (*PURPOSES, "distance")},
 }
 
 #: The same of bidirectional integrators, which have some of the others as well.
@@ -78,7 +79,11 @@ def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameter
     if not isinstance(value, str) or value not in words:
         raise ValueError(f'"{plugin}": the parameter "{slot}" is {_accepted(slot, value)}')
     maker = words[value]
-    return None if maker is None else maker(ParameterReader.of_defaults(plugin))
+    if maker is None:
+        return None
+    parameters = maker(ParameterReader.of_defaults(plugin))
+    parameters.check_slot(plugin, slot)
+    return parameters
 
 
 def _accepted(slot: str, value: object) -> str:

@@ -13,11 +13,12 @@ from typing import Any
 import mitsuba as mi
 
 from ..decisions.learner import Learner
+from ..decisions.query.moving_aovs import moving_aovs
 from ..decisions.query.moving_scene import scene_query
 from ..errors import InputError
 from ..files import check_target
 from ..media import refuse_media, refuse_missing_colours, refuse_moving_grids
-from ..movers import refuse_movers
+from ..movers import movers
 from ..rendering.aovs import check_aovs
 from ..rendering.camera import film_extent
 from ..rendering.staged_integrator import NO_LIMIT, StagedIntegrator
@@ -25,7 +26,7 @@ from ..transport.estimator import CameraRays, Estimator
 from ..transport.path_decisions import SceneQuery
 from ..transport.walk import Walk
 from . import learned_file
-from .camera_numbers import PURPOSES, samples_per_set
+from .camera_numbers import WeightedNumbers, samples_per_set
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 from .schedule import Schedule, pilot_samples
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
@@ -157,13 +158,13 @@ class WalkIntegrator(StagedIntegrator):
         return max((parameters.sample_cost for parameters in self.slots.values()), default=1)
 
     def samples_per_set(self, spp: int) -> int:
-        is_needed = any(slot in PURPOSES for slot in self.slots)
+        is_needed = any(isinstance(p, WeightedNumbers) for p in self.slots.values())
         return samples_per_set(spp, self.timeout > 0) if is_needed else 1
 
     @property
     def needs_equal_samples(self) -> str:
-        for slot in self.slots:
-            if slot in PURPOSES:
+        for slot, parameters in self.slots.items():
+            if isinstance(parameters, WeightedNumbers):
                 return f'the sets of numbers of "{slot}" belong together: leave the parameter out'
         return ""
 
@@ -189,7 +190,7 @@ class WalkIntegrator(StagedIntegrator):
             path = Path(self.save_learned)
             learned = functools.partial(learned_file.save, path, scene, made_by)
         schedule = Schedule(
-            self.name, self.slots, setting, len(pilots), self.estimators(scene, sensor),
+            self.name, self.slots, setting, samples, self.estimators(scene, sensor),
             self.query(scene), restored, learned,
         )  # fmt: skip
         self.learners = schedule.learners
@@ -224,6 +225,8 @@ class WalkIntegrator(StagedIntegrator):
         """The values of the channels that :meth:`aov_names` names."""
         if self._aovs is None:
             return []
+        if movers(scene):  # Mitsuba knows no motion
+            return moving_aovs(self._aovs, self.aovs, scene_query(scene), scene, sampler, ray)
         return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
 
     def common_parameters(self) -> dict[str, Any]:
@@ -241,14 +244,12 @@ class WalkIntegrator(StagedIntegrator):
         return {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
 
     def query(self, scene: mi.Scene) -> SceneQuery:
-        """How rays meet ``scene``. The output variables are Mitsuba's, which knows no motion.
+        """How rays meet ``scene``.
 
         Raises:
             NotImplementedError: There is something in ``scene`` that this integrator does not see.
         """
         self._check_media(scene)
-        if self._aovs is not None:
-            refuse_movers(scene, f'"{self.name}": the parameter "aovs"', "leave it out")
         return scene_query(scene)
 
     def _check_media(self, scene: mi.Scene) -> None:

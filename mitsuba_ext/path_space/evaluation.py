@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..bidirectional.scattering import geometric_cosine, reverse_density
-from ..rendering.camera import to_rgb
+from ..transport.colour import to_rgb
 from ..transport.hidden_emitters import behind_emitters
 from ..transport.numbers import Numbers
 from .light_subpaths import HIGH, LOW

@@ -123,7 +123,7 @@ class AdaptiveJob(Job):
         rays = camera.camera_rays(self.sensor, lanes, numbers, self.plan.spp)
         sample = self._sample(stage, sampler, rays, dr.gather(mi.Float, weight, pixel))
         # dr.mean() would write the number of lanes into the kernel: a kernel for each pass
-        brightness = dr.sum(sample.L * rays.importance) / len(sample.L)
+        brightness = dr.sum(sample.L * (rays.importance * rays.weight)) / len(sample.L)
         dr.eval(brightness, self.block.tensor(), self.tally)
         dr.sync_thread()
         self.moments.add(pixels, np.broadcast_to(brightness.numpy(), size))

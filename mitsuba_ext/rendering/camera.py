@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.colour import to_rgb
 from ..transport.estimator import CameraRays, Sample, Splats
 from ..transport.numbers import Numbers
 from .camera_samples import CameraSamples
@@ -105,7 +106,7 @@ class CameraNumbers:
         film: Where in its pixel the ray begins.
         aperture, time, wavelength: Point of the aperture, time in the shutter interval, and what
             chooses the wavelengths.
-        weight, hero_weight: See :class:`CameraRays`.
+        weight, hero_weight, distance: See :class:`CameraRays`.
     """
 
     film: mi.Point2f
@@ -114,6 +115,7 @@ class CameraNumbers:
     wavelength: mi.Float
     weight: mi.Float | float = 1.0
     hero_weight: mi.Float | float = 1.0
+    distance: mi.Float | None = None
 
 
 def draw_numbers(
@@ -127,20 +129,27 @@ def draw_numbers(
         if samples.aperture is None:
             numbers.aperture = sampler.next_2d()
         else:
-            numbers.aperture, numbers.weight = samples.aperture.draw(lanes.pixel, lanes.index)
+            numbers.aperture, numbers.weight = samples.aperture.draw(
+                sampler, lanes.pixel, lanes.index
+            )
     if sensor.shutter_open_time() > 0:
         if samples.time is None:
             numbers.time = sampler.next_1d()
         else:
-            numbers.time, weight = samples.time.draw(lanes.pixel, lanes.index)
+            numbers.time, weight = samples.time.draw(sampler, lanes.pixel, lanes.index)
             numbers.weight *= weight
     if mi.is_spectral:
         if samples.wavelength is None:
             numbers.wavelength = sampler.next_1d()
         else:
-            numbers.wavelength, hero, all_four = samples.wavelength.draw(lanes.pixel, lanes.index)
+            numbers.wavelength, hero, all_four = samples.wavelength.draw(
+                sampler, lanes.pixel, lanes.index
+            )
             numbers.weight *= all_four
             numbers.hero_weight = hero / all_four
+    if samples.distance is not None:
+        numbers.distance, weight = samples.distance.draw(sampler, lanes.pixel, lanes.index)
+        numbers.weight *= weight
     return numbers
 
 
@@ -166,7 +175,7 @@ def camera_rays(
         position = mi.Point2f(lanes.corner)
     return CameraRays(
         ray, lanes.pixel, importance, position, numbers.weight, numbers.hero_weight,
-        sensor.get_medium(),
+        sensor.get_medium(), numbers.distance,
     )  # fmt: skip
 
 
@@ -247,13 +256,6 @@ def _channels(
     rgb = to_rgb(L, wavelengths)
     has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
     return [rgb.x, rgb.y, rgb.z, *([alpha] if has_alpha else [])]
-
-
-def to_rgb(L: mi.Spectrum, wavelengths: mi.Spectrum | None) -> mi.Color3f:
-    """Radiance as the colour that films store."""
-    if mi.is_spectral:
-        return mi.spectrum_to_srgb(L, wavelengths)
-    return mi.Color3f(L.x) if mi.is_monochromatic else L
 
 
 def develop(film: mi.Film, develop: bool, evaluate: bool) -> mi.TensorXf:

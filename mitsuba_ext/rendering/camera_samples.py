@@ -7,13 +7,17 @@ from typing import Any, Protocol
 
 import mitsuba as mi
 
+from ..transport.numbers import Numbers
+
 
 class PixelNumbers(Protocol):
     """Numbers for one purpose."""
 
-    def draw(self, pixel: mi.UInt32, index: mi.UInt32) -> tuple[Any, ...]:
+    def draw(
+        self, sampler: Numbers, pixel: mi.UInt32, index: mi.UInt32
+    ) -> tuple[Any, ...]:
         """The number, and its weight (or two), of the sample ``index``, of those of the whole
-        render, of each pixel."""
+        render, of each pixel. ``sampler`` is that of the sensor."""
 
 
 @dataclass
@@ -26,8 +30,10 @@ class CameraSamples:
         time: Times of the shutter interval.
         wavelength: What chooses the four wavelengths u + k/4, with a second weight for spectra that
             all four find: they repeat themselves after 1/4.
+        distance: What chooses the first distance of a path in a homogeneous medium.
     """
 
     aperture: PixelNumbers | None = None
     time: PixelNumbers | None = None
     wavelength: PixelNumbers | None = None
+    distance: PixelNumbers | None = None

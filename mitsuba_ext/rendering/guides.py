@@ -22,6 +22,9 @@ _SPP = 32
 #: Samples of a pass, about.
 _PASS_SAMPLES = 1 << 22
 
+#: RGB of a spectrum that is 1 everywhere.
+_WHITE = (1.206, 0.949, 0.910)
+
 #: Surfaces, at most, that a camera ray passes or is mirrored by.
 _MOST_BOUNCES = 16
 
@@ -53,30 +56,39 @@ def render_guides(
         sampler.seed(pass_seed, width * height * length)
         rays = camera.sample_rays(sensor, sampler, length, _SPP, CameraSamples(), first)
         si, throughput, _ = _follow(
-            scene, query, sampler, mi.Ray3f(rays.ray), mi.Bool(True), mi.Color3f(1)
+            scene, query, sampler, mi.Ray3f(rays.ray), mi.Bool(True), mi.UnpolarizedSpectrum(1)
         )
-        nothing = Sample(mi.Spectrum(0), mi.Bool(False))
-        camera.put(film, block, rays, nothing, guides_of(si, si.is_valid(), throughput))
+        nothing, hit = Sample(mi.Spectrum(0), mi.Bool(False)), si.is_valid()
+        albedo = _albedo(si, hit) * throughput
+        if mi.is_spectral:
+            importance = mi.unpolarized_spectrum(rays.importance)
+            colour = camera.to_rgb(albedo * importance, rays.ray.wavelengths) / mi.Color3f(_WHITE)
+        else:
+            colour = dr.clip(_grey_or_rgb(albedo), 0, 1)
+        found = [*dr.select(hit, colour, 0), *dr.select(hit, si.sh_frame.n, 0)]
+        camera.put(film, block, rays, nothing, found)
         dr.eval(block.tensor())
     film.put_block(block)
-    image = np.array(film.develop())
-    return {name: image[..., n - len(CHANNELS)] for n, name in enumerate(CHANNELS)}
+    image = np.array(film.develop())[..., -len(CHANNELS) :]
+    # Wavelengths are samples, whose colours may be negative
+    image[..., :3] = np.clip(image[..., :3], 0, 1)
+    return {name: image[..., n] for n, name in enumerate(CHANNELS)}
 
 
-def guides_of(
-    si: mi.SurfaceInteraction3f, active: mi.Bool, throughput: mi.Color3f | float = 1.0
-) -> list[mi.Float]:
-    """RGB of the albedo, times what specular surfaces have left of it, and the shading normal."""
-    albedo = _colour(si.bsdf().eval_diffuse_reflectance(si, active)) * throughput
-    return [*dr.select(active, dr.clip(albedo, 0, 1), 0), *dr.select(active, si.sh_frame.n, 0)]
+def guides_of(si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Float]:
+    """RGB of a surface's albedo (grey in spectral variants) and its shading normal."""
+    albedo = _albedo(si, active)
+    colour = dr.clip(_grey_or_rgb(albedo), 0, 1)
+    return [*dr.select(active, colour, 0), *dr.select(active, si.sh_frame.n, 0)]
 
 
-def _colour(value: mi.Spectrum) -> mi.Color3f:
-    """A reflectance as RGB; grey in spectral variants, where it belongs to a few wavelengths."""
-    value = mi.unpolarized_spectrum(value)
-    if mi.is_spectral or mi.is_monochromatic:
-        return mi.Color3f(dr.mean(value))
-    return mi.Color3f(value)
+def _grey_or_rgb(value: mi.UnpolarizedSpectrum) -> mi.Color3f:
+    is_grey = mi.is_spectral or mi.is_monochromatic
+    return mi.Color3f(dr.mean(value) if is_grey else value)
+
+
+def _albedo(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+    return mi.unpolarized_spectrum(si.bsdf().eval_diffuse_reflectance(si, active))
 
 
 @dr.syntax
@@ -95,7 +107,8 @@ def _follow(scene, query, sampler, ray, going, throughput):
         is_specular |= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         is_specular &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         going &= si.is_valid() & is_specular & (bounces < _MOST_BOUNCES)
-        throughput = dr.select(going, throughput * _colour(weight), throughput)
+        weight = mi.unpolarized_spectrum(weight)
+        throughput = dr.select(going, throughput * weight, throughput)
         ray = dr.select(going, si.spawn_ray(si.to_world(bs.wo)), ray)
         bounces += 1
     return si, throughput, bounces

@@ -12,6 +12,7 @@ from ..defocus.denoised import denoised
 from ..defocus.filters import Capture, make_filter
 from ..defocus.images import Size
 from ..defocus.layers import LayerSums
+from ..transport.colour import to_rgb
 from ..transport.estimator import CameraRays, Sample
 from . import camera
 from .layer_blocks import LayerBlocks
@@ -106,7 +107,7 @@ class LayeredJob(Job):
     def _put(
         self, rays, sample, surface: Surface, weight, active, behind: mi.Float | None = None
     ) -> None:
-        L = camera.to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
+        L = to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
         alpha = dr.select(sample.valid, mi.Float(1), 0)
         self.layers.put(rays.position, mi.Color3f(L), alpha, surface, weight, active, behind)
 

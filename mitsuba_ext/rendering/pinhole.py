@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..defocus.thin_lens import ThinLens
+from ..transport.numbers import Numbers
 from ..transport.path_decisions import SceneQuery
 from .guides import guides_of
 
@@ -28,7 +29,9 @@ _LEAST_STEP = 2.0
 class LensCentre:
     """Camera rays from the middle of the aperture (``CameraSamples.aperture``)."""
 
-    def draw(self, pixel: mi.UInt32, index: mi.UInt32) -> tuple[mi.Point2f, float]:
+    def draw(
+        self, sampler: Numbers, pixel: mi.UInt32, index: mi.UInt32
+    ) -> tuple[mi.Point2f, float]:
         return mi.Point2f(0.5), 1.0
 
 

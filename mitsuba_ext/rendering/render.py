@@ -259,7 +259,8 @@ class Job:
         rays = camera.sample_rays(
             self.sensor, sampler, spp, self.plan.spp, stage.camera, self.statistics.spp, pixels
         )
-        sample = self._sample(stage, sampler, rays)
+        count = stage.weight if stage.weight == 1 else dr.opaque(mi.Float, stage.weight)
+        sample = self._sample(stage, sampler, rays, count)
         for splats in sample.splats:
             if self.splats is None:
                 self.splats = self.film.create_block()

@@ -18,12 +18,15 @@ class Stage:
         learned: What had been learned before.
         is_scout: Does it take one sample per pixel that is not added to the film?
         camera: What chooses points of the aperture, times and wavelengths.
+        weight: How many samples of the last stage each of its samples counts for. It must not
+            depend on any sample.
     """
 
     estimator: Estimator
     learned: str = ""
     is_scout: bool = False
     camera: CameraSamples = field(default_factory=CameraSamples)
+    weight: float = 1.0
 
 
 class Schedule(Protocol):

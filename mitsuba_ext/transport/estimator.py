@@ -23,6 +23,8 @@ class CameraRays:
         hero_weight: The factor of ``weight`` for paths of which only the first wavelength is left
             (``heroes.py``). The estimator applies it.
         medium: The participating medium in which the rays begin; ``None`` in a vacuum.
+        distance: The number that chooses the first distance in a homogeneous medium; ``None`` for
+            that of the sampler.
     """
 
     ray: mi.RayDifferential3f
@@ -32,6 +34,7 @@ class CameraRays:
     weight: mi.Float | float = 1.0
     hero_weight: mi.Float | float = 1.0
     medium: mi.Medium | None = None
+    distance: mi.Float | None = None
 
 
 @dataclass

@@ -2,17 +2,37 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
+from .estimator import CameraRays
 
-class FlightNumbers:
-    """Which random numbers choose the distances of free flights: uniform ones. What replaces them
-    has to return numbers in [0, 1)."""
 
-    def draw(self, sampler: mi.Sampler, active: mi.Bool) -> mi.Float:
-        """The number of the next flight, where ``active``."""
-        return sampler.next_1d(active)
+class Distances:
+    """Which random numbers choose the distances of flights in homogeneous media: for the first one
+    that of the camera ray, if it has one (its density is part of the ray's weight); uniform ones.
+
+    Attributes:
+        exact_transmittance: Is the transmittance of homogeneous media for shadow rays computed?
+            ``volpath`` estimates it by a random distance each, with more noise in the same time.
+    """
+
+    exact_transmittance = True
+
+    def begin(self, rays: CameraRays) -> Any:
+        """The state before the first flight: has the number of the ray been used?"""
+        return () if rays.distance is None else mi.Bool(False)
+
+    def draw(
+        self, state: Any, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
+    ) -> tuple[mi.Float, Any]:
+        """The number, in [0, 1), of the next flight where ``active``, and the new state."""
+        if rays.distance is None:
+            return sampler.next_1d(active), state
+        u = dr.select(state, sampler.next_1d(active & state), rays.distance)
+        return u, state | active
 
 
 def component(σ: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
@@ -47,7 +67,6 @@ def attenuation(σ: mi.Spectrum, t: mi.Float) -> mi.Spectrum:
 
 @dr.syntax
 def track(
-    numbers: FlightNumbers,
     sampler: mi.Sampler,
     ray: mi.Ray3f,
     end: mi.Float,
@@ -60,7 +79,6 @@ def track(
     """Delta tracking: collisions at the density of the majorant, of which some change nothing.
 
     Parameters:
-        numbers: Choose distances.
         ray, end: The ray, and the distance of the surface that it meets.
         medium, channel: Where it flies, and whose colour chooses distances.
         t, β: Where not ``active``, these are returned; ``β`` is the throughput up to the ray.
@@ -76,7 +94,7 @@ def track(
     active = mi.Bool(active)
     end = mi.Float(end)
     while dr.hint(active, label="flight"):
-        mei = medium.sample_interaction(ray, numbers.draw(sampler, active), channel, active)
+        mei = medium.sample_interaction(ray, sampler.next_1d(active), channel, active)
         is_inside = active & mei.is_valid() & ~(end < mei.t)
         # By how much the colour that chose the distance is more likely to get there than others
         σ = mei.combined_extinction

@@ -1,8 +1,9 @@
 """What participating media do to the random walk.
 
 The walk asks one of two objects: :class:`NoMedia` leaves nothing in the kernel, :class:`Media` is
-made where the scene has media. It decides as Mitsuba's ``volpath`` does, and draws the same random
-numbers in the same order:
+made where the scene has media. It decides as Mitsuba's ``volpath`` does, and (but for shadow rays
+through homogeneous media, whose transmittance is known) draws the same random numbers in the same
+order:
 
 - a path that is in a medium scatters at a sampled distance, or reaches the surface
   (``free_flight.py``); then its vertex lies in the medium, and the phase function stands in for the
@@ -21,15 +22,16 @@ Computer Graphics Forum 37(2), 2018, sections 3 and 4.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..media import may_have_grids, may_have_media
+from .estimator import CameraRays
 from .free_flight import (
-    FlightNumbers,
+    Distances,
     attenuation,
     component,
     extinction,
@@ -50,11 +52,13 @@ class Inside:
         medium: The medium; null in a vacuum.
         channel: The colour whose extinction chooses distances.
         reach: The distance at which a homogeneous medium scatters, if nothing is in between.
+        distances: The state of who chooses distances.
     """
 
     medium: mi.MediumPtr
     channel: mi.UInt32
     reach: mi.Float
+    distances: Any
 
 
 class NoMedia:
@@ -62,12 +66,13 @@ class NoMedia:
 
     exist = False
 
-    def begin(self, sampler, medium) -> Any:
-        """The state of camera rays that begin in ``medium`` (``None``: in a vacuum)."""
+    def begin(self, sampler, rays: CameraRays) -> Any:
+        """The state of camera rays."""
         return ()
 
-    def launch(self, inside, sampler, ray, active) -> tuple[mi.Ray3f, Any]:
-        """A ray that ends where a homogeneous medium scatters, and the state."""
+    def launch(self, inside, sampler, rays: CameraRays, ray, active) -> tuple[mi.Ray3f, Any]:
+        """A ray that ends where a homogeneous medium scatters, and the state; the path began as one
+        of ``rays``."""
         return ray, inside
 
     def behind(
@@ -131,33 +136,35 @@ class Media(NoMedia):
 
     Parameters:
         hide_emitters: Are lights invisible to rays that nothing has scattered yet?
-        numbers: Which random numbers choose distances.
+        distances: Which random numbers choose distances.
         has_grids: May there be media that are not homogeneous?
     """
 
     exist = True
 
-    def __init__(self, hide_emitters: bool, numbers: FlightNumbers, has_grids: bool = True) -> None:
-        self._hides, self._numbers, self._has_grids = hide_emitters, numbers, has_grids
+    def __init__(self, hide_emitters: bool, distances: Distances, has_grids: bool = True) -> None:
+        self._hides, self._distances, self._has_grids = hide_emitters, distances, has_grids
 
-    def begin(self, sampler, medium):
+    def begin(self, sampler, rays):
         channel = mi.UInt32(0)
         if mi.is_rgb:
             count = len(mi.Spectrum())
             channel = mi.UInt32(dr.minimum(sampler.next_1d() * count, count - 1))
         sampler.next_1d()  # the roulette of `volpath`, which spares the camera's rays
-        return Inside(mi.MediumPtr(medium), channel, mi.Float(dr.inf))
+        distances = self._distances.begin(rays)
+        return Inside(mi.MediumPtr(rays.medium), channel, mi.Float(dr.inf), distances)
 
-    def launch(self, inside, sampler, ray, active):
+    def launch(self, inside, sampler, rays, ray, active):
         in_medium = active & (inside.medium != None)  # noqa: E711
         known = in_medium & inside.medium.is_homogeneous()
         σ = component(extinction(inside.medium, ray, known), inside.channel)
         # 1 − u > 0; no extinction gives an infinite distance
-        t = -dr.log(1 - self._numbers.draw(sampler, known)) / σ
-        inside.reach = dr.select(known & (t <= ray.maxt), t, dr.inf)
+        u, distances = self._distances.draw(inside.distances, sampler, rays, known)
+        t = -dr.log(1 - u) / σ
+        reach = dr.select(known & (t <= ray.maxt), t, dr.inf)
         ray = mi.Ray3f(ray)
-        ray.maxt = dr.minimum(ray.maxt, inside.reach)
-        return ray, inside
+        ray.maxt = dr.minimum(ray.maxt, reach)
+        return ray, Inside(inside.medium, inside.channel, reach, distances)
 
     def behind(self, query, scene, ray, pi, active):
         last, behind = behind_emitters(query, scene, ray, pi, active)
@@ -183,9 +190,7 @@ class Media(NoMedia):
         # ----- Media of varying density -----
         if self._has_grids:
             tracks = in_medium & ~is_homogeneous
-            t, β, collides = track(
-                self._numbers, sampler, ray, si.t, inside.medium, inside.channel, t, β, tracks
-            )
+            t, β, collides = track(sampler, ray, si.t, inside.medium, inside.channel, t, β, tracks)
             scatters |= collides
         mei = interaction_at(ray, ray(t), inside.medium)
         return _at(si, mei, t, scatters), β, MediumVertex(scatters, mei)
@@ -218,8 +223,8 @@ class Media(NoMedia):
         """What is left of the light that ``ds`` is about at ``vertex``; see
         :func:`transmittance`."""
         return transmittance(
-            query, scene, vertex.si, ds, inside.medium, inside.channel, self._has_grids, sampler,
-            active,
+            query, scene, vertex.si, ds, inside.medium, inside.channel, self._has_grids,
+            self._distances.exact_transmittance, sampler, active,
         )  # fmt: skip
 
     def scatter(self, vertex, sample_1, sample_2, bs, weight):
@@ -266,7 +271,7 @@ class Media(NoMedia):
 
     def cross(self, inside, si, d):
         medium = dr.select(si.is_medium_transition(), si.target_medium(d), inside.medium)
-        return Inside(medium, inside.channel, inside.reach)
+        return replace(inside, medium=medium)
 
     def result(self, L, valid):
         return L
@@ -277,11 +282,11 @@ class Media(NoMedia):
         return dr.select(path.depth == 0, 0, emitted)
 
 
-def media_of(scene: mi.Scene, hide_emitters: bool, numbers: FlightNumbers) -> NoMedia:
+def media_of(scene: mi.Scene, hide_emitters: bool, distances: Distances) -> NoMedia:
     """What the walk has to ask in ``scene``."""
     if not may_have_media(scene):
         return NoMedia()
-    return Media(hide_emitters, numbers, may_have_grids(scene))
+    return Media(hide_emitters, distances, may_have_grids(scene))
 
 
 def _passes(bs: mi.BSDFSample3f) -> mi.Bool:

@@ -7,6 +7,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from .estimator import CameraRays
 from .vertex import PathState, Vertex
 
 
@@ -16,6 +17,9 @@ class Observer:
 
     No observer is a dataclass: Dr.Jit would take one that a loop uses for a part of its state.
     """
+
+    def camera(self, rays: CameraRays) -> None:
+        """The camera rays of the pass that begins."""
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         """A pass of so many paths begins, one in each lane, in ``pixel`` of the film."""
@@ -91,6 +95,10 @@ class Observers(Observer):
 
     def __init__(self, observers: Sequence[Observer]) -> None:
         self._observers = observers
+
+    def camera(self, rays: CameraRays) -> None:
+        for observer in self._observers:
+            observer.camera(rays)
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         for observer in self._observers:

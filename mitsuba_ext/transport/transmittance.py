@@ -18,18 +18,20 @@ def transmittance(
     medium: mi.MediumPtr,
     channel: mi.UInt32,
     has_grids: bool,
+    exact: bool,
     sampler: mi.Sampler,
     active: mi.Bool,
 ) -> mi.Spectrum:
-    """An unbiased estimate of the transmittance between a vertex and a point of a light: one
-    random distance in each homogeneous medium, ratio tracking in others (Novák et al., section
-    4.2). 0 where a surface that is not index-matched is in between.
+    """An unbiased estimate of the transmittance between a vertex and a point of a light: that of
+    homogeneous media is known, or found by a random distance in each; in others, ratio tracking
+    (Novák et al., section 4.2). 0 where a surface that is not index-matched is in between.
 
     Parameters:
         query: How rays meet the scene.
         si, ds: The vertex, and the direction of the light.
         medium, channel: The medium in front of the vertex, and the colour that chooses distances.
         has_grids: May there be media that are not homogeneous?
+        exact: No random distances in homogeneous media?
     """
     medium = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
     ray = query.shadow_ray(scene, si, ds)
@@ -41,8 +43,7 @@ def transmittance(
         in_medium = active & (medium != None)  # noqa: E711
         is_homogeneous = in_medium & medium.is_homogeneous()
         σ = extinction(medium, ray, is_homogeneous)
-        chosen = component(σ, channel)
-        t = -dr.log(1 - sampler.next_1d(is_homogeneous)) / chosen
+        t, rate = _flight(σ, channel, exact, sampler, is_homogeneous)
         collides = is_homogeneous & (t <= left)
         segment = mi.Ray3f(ray)
         segment.maxt = dr.select(collides, dr.minimum(t, ray.maxt), ray.maxt)
@@ -51,7 +52,7 @@ def transmittance(
         end = dr.minimum(dr.select(is_met, pi.t, dr.inf), left)
         # ----- Attenuation up to the next surface, or to the light -----
         T = dr.select(collides & ~is_met, 0, T)
-        T = dr.select(is_homogeneous, T * attenuation(σ - chosen, end), T)
+        T = dr.select(is_homogeneous, T * attenuation(rate, end), T)
         if dr.hint(has_grids, mode="scalar"):
             T = ratio_tracking(ray, end, medium, channel, sampler, T, in_medium & ~is_homogeneous)
         # ----- Does the surface let it pass? -----
@@ -68,6 +69,17 @@ def transmittance(
         left = dr.select(is_met, left - met.t, left)
         active &= is_met & (ray.maxt > 0)
     return T
+
+
+def _flight(
+    σ: mi.Spectrum, channel: mi.UInt32, exact: bool, sampler: mi.Sampler, active: mi.Bool
+) -> tuple[mi.Float, mi.Spectrum]:
+    """The distance at which light ends, and by what rate it is attenuated up to there."""
+    if exact:
+        return mi.Float(dr.inf), σ
+    chosen = component(σ, channel)
+    # How likely it is to get somewhere is what the chosen colour loses on the way
+    return -dr.log(1 - sampler.next_1d(active)) / chosen, σ - chosen
 
 
 @dr.syntax

@@ -19,7 +19,7 @@ from ..garbage import garbage_left_alone
 from .connection import Connection, Connector
 from .emission import can_be_hit, emission
 from .estimator import CameraRays, Sample
-from .free_flight import FlightNumbers
+from .free_flight import Distances
 from .heroes import Heroes
 from .media import media_of
 from .observer import Observer
@@ -53,7 +53,7 @@ class Walk:
         shadow_test: Whether the shadow ray of a connection is traced.
         roulette: Which paths go on.
         query: How a ray meets the scene.
-        flights: Which random numbers choose how far a path flies in a medium.
+        distance: Which random numbers choose how far a path flies in a medium.
         mis: How what connections find is weighed against what scattering finds.
         subpaths: Other subpaths whose vertices are connected to those of the path.
         observer: Is told what happens.
@@ -69,7 +69,7 @@ class Walk:
     shadow_test: ShadowTest = field(default_factory=AlwaysTest)
     roulette: Roulette = field(default_factory=Roulette)
     query: SceneQuery = field(default_factory=SceneQuery)
-    flights: FlightNumbers = field(default_factory=FlightNumbers)
+    distance: Distances = field(default_factory=Distances)
     mis: Weights = field(default_factory=Weights)
     subpaths: Subpaths | None = None
     observer: Observer = field(default_factory=Observer)
@@ -89,7 +89,7 @@ class Walk:
         can_hit_emitters = has_emitters and can_be_hit(scene)
         sees_environment = scene.environment() is not None and not self.hide_emitters
 
-        media = media_of(scene, self.hide_emitters, self.flights)
+        media = media_of(scene, self.hide_emitters, self.distance)
         heroes = Heroes(scene, rays.hero_weight)
         ctx = heroes.context()
         connector = Connector(
@@ -122,9 +122,10 @@ class Walk:
         shadow_state = self.shadow_test.begin(sampler, ray)
         roulette_state = self.roulette.begin(sampler, ray, pixel)
         self.observer.begin(dr.width(ray), pixel)
+        self.observer.camera(rays)
 
-        inside = media.begin(sampler, rays.medium)
-        ray, inside = media.launch(inside, sampler, ray, active)
+        inside = media.begin(sampler, rays)
+        ray, inside = media.launch(inside, sampler, rays, ray, active)
         pi = self.query.closest(scene, ray, coherent=True, active=active)
         if dr.hint(self.hide_emitters, mode="scalar"):
             ray, pi = media.behind(self.query, scene, ray, pi, active)
@@ -235,7 +236,7 @@ class Walk:
             active = active_next & (~rr_active | rr_continue) & ~is_black
             path.β[rr_active] *= dr.rcp(survival)
 
-            ray, inside = media.launch(inside, sampler, ray, active)
+            ray, inside = media.launch(inside, sampler, rays, ray, active)
             pi = self.query.closest(scene, ray, coherent=False, active=active)
             if dr.hint(media.exist and self.hide_emitters, mode="scalar"):
                 ray, pi = media.behind(self.query, scene, ray, pi, active & (path.depth == 0))

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...transport.numbers import Numbers
 from ..weighted_sets import WeightedSets
 
 
@@ -24,7 +25,9 @@ class PixelSets:
         key = int(np.random.SeedSequence(seed).generate_state(1)[0])
         self._key, self._count = (dr.opaque(mi.UInt32, n) for n in (key, sets.count))
 
-    def draw(self, pixel: mi.UInt32, index: mi.UInt32) -> tuple[Any, ...]:
+    def draw(
+        self, sampler: Numbers, pixel: mi.UInt32, index: mi.UInt32
+    ) -> tuple[Any, ...]:
         """The point and its weights (:meth:`WeightedSets.draw`) of the sample ``index``, of those
         of the whole render, of each pixel."""
         turn = index // self._count

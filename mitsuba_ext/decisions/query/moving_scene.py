@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...motion import PoseTable
+from ...motion import Pose, PoseTable
 from ...movers import movers
 from ...transport.path_decisions import SceneQuery
 
@@ -34,10 +34,13 @@ class MovingSceneQuery(SceneQuery):
     Parameters:
         scene: The static scene.
         moving: The movers, as from :func:`movers`.
+
+    Attributes:
+        scenes (list[mi.Scene]): What each of them moves, at rest.
     """
 
     def __init__(self, scene: mi.Scene, moving: Sequence[mi.Shape]) -> None:
-        self._scenes = [mover.at_rest for mover in moving]
+        self.scenes = [mover.at_rest for mover in moving]
         self._poses = PoseTable([mover.motion for mover in moving])
         self._boxes = [_Box(mover.bbox()) for mover in moving]
         self._owners = self._find_owners(scene, moving)
@@ -46,7 +49,7 @@ class MovingSceneQuery(SceneQuery):
     def closest(self, scene, ray, coherent, active):
         pi = super().closest(scene, ray, coherent, active)
         ray = mi.Ray3f(ray)
-        for index, (at_rest, box) in enumerate(zip(self._scenes, self._boxes)):
+        for index, (at_rest, box) in enumerate(zip(self.scenes, self._boxes)):
             # Shapes behind the closest hit so far cannot be hit
             ray.maxt = dr.select(pi.valid, pi.t, ray.maxt)
             pi = dr.if_stmt(
@@ -65,13 +68,21 @@ class MovingSceneQuery(SceneQuery):
         return dr.select(found.valid, found, pi)
 
     def interaction(self, pi, ray):
-        shape = dr.select(pi.instance != None, pi.instance, pi.shape)  # noqa: E711
-        owner = dr.gather(mi.UInt32, self._owners, _number(shape), pi.valid)
-        moves = pi.valid & (owner != _NOBODY)
+        owner, moves = self.owner(pi)
         # A single call of the shape's method, for resting and moving shapes together
         ray = dr.if_stmt((owner, ray), moves, self._to_rest, lambda _owner, ray: ray)
         si = super().interaction(pi, ray)
         return dr.if_stmt((owner, si), moves, self._to_world, lambda _owner, si: si)
+
+    def owner(self, pi: mi.PreliminaryIntersection3f) -> tuple[mi.UInt32, mi.Bool]:
+        """The number of the mover that a ray has met, and whether it has met one."""
+        shape = dr.select(pi.instance != None, pi.instance, pi.shape)  # noqa: E711
+        owner = dr.gather(mi.UInt32, self._owners, _number(shape), pi.valid)
+        return owner, pi.valid & (owner != _NOBODY)
+
+    def pose(self, index: mi.UInt32, time: mi.Float) -> Pose:
+        """The pose of a mover."""
+        return self._poses.pose(index, time)
 
     def emitter(self, si, emitter):
         if self._lights is None:
@@ -84,7 +95,7 @@ class MovingSceneQuery(SceneQuery):
     def occluded(self, scene, si, ds, active):
         ray = self.shadow_ray(scene, si, ds)
         occluded = scene.ray_test(ray, active=active)
-        for index, (at_rest, box) in enumerate(zip(self._scenes, self._boxes)):
+        for index, (at_rest, box) in enumerate(zip(self.scenes, self._boxes)):
             occluded = dr.if_stmt(
                 (occluded, ray),
                 active & ~occluded & box.is_met(ray),
@@ -100,15 +111,15 @@ class MovingSceneQuery(SceneQuery):
     # ---- Helpers ----
 
     def _to_rest(self, index: mi.UInt32, ray: mi.Ray3f) -> mi.Ray3f:
-        return self._poses.pose(index, ray.time).to_rest(ray)
+        return self.pose(index, ray.time).to_rest(ray)
 
     def _to_world(self, index: mi.UInt32, si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
-        return self._poses.pose(index, si.time).to_world(si)
+        return self.pose(index, si.time).to_world(si)
 
     def _find_owners(self, scene: mi.Scene, moving: Sequence[mi.Shape]) -> mi.UInt32:
         """The index of the mover to which a shape belongs, by the number of the shape."""
         numbers = [[_number_of(shape) for shape in scene.shapes()]]
-        numbers += [[_number_of(shape) for shape in at_rest.shapes()] for at_rest in self._scenes]
+        numbers += [[_number_of(shape) for shape in at_rest.shapes()] for at_rest in self.scenes]
         owners = np.full(max(map(max, numbers)) + 1, _NOBODY, dtype=np.uint32)
         taken = set(numbers[0])
         for index, mover in enumerate(moving):

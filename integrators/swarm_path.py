@@ -1,0 +1,123 @@
+"""Sample swarming."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitsuba_ext import registry
+from mitsuba_ext.composition.swarm import MAPS
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+
+#: By parameter, the slot that its maps fill.
+_SLOTS = {
+    "time_map": "time", "lens_map": "aperture", "wavelength_map": "wavelength",
+    "distance_map": "distance",
+}  # fmt: skip
+
+
+@registry.plugin
+class SwarmPath(WalkIntegrator):
+    r"""
+    .. _integrator-swarm_path:
+
+    Sample swarming (:monosp:`swarm_path`)
+    --------------------------------------
+
+    A path tracer whose pixels tell their neighbours which random numbers found light. For each
+    kind of decision, every tile of the film has a map: a table of probabilities over the numbers
+    that take the decision, learned from the samples of the image itself. It is unbiased, and uses
+    only the maps that pay. It is :monosp:`composed_path` with the word :monosp:`swarm` in several
+    slots.
+
+    .. pluginparameters::
+
+     * - time_map
+       - |bool|
+       - Learn at which times of the shutter interval light comes? (Default: true)
+     * - lens_map
+       - |bool|
+       - Learn through which parts of the aperture? (Default: true)
+     * - wavelength_map
+       - |bool|
+       - Learn at which wavelengths? It has an effect in spectral variants. (Default: true)
+     * - distance_map
+       - |bool|
+       - Learn at which distances in a homogeneous medium camera rays find light? (Default: true)
+     * - always_use
+       - |bool|
+       - Use all maps, also where the pilots show that it does not pay? (Default: false)
+     * - pilot_spp
+       - |int|
+       - Samples per pixel from which is learned, at most half of all, and a quarter of fewer than
+         8. They count towards the image. With 0, or fewer than 4 samples, nothing is learned.
+         (Default: 64)
+     * - save_learned, load_learned
+       - |string|
+       - Files. The first is written: what was learned, as a whole. The second is read in place of
+         pilots: what a render of the same scene, with the same parameters and size of film, has
+         saved. (Default: none)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.
+
+    **Use it when** most noise comes from a decision that neighbouring pixels take alike, and that
+    nothing else samples well: fast things before a dark background, small lights out of focus,
+    lamps with spectral lines, beams in fog (as far as their light scatters once). **Not when** the
+    noise is that of many bounces (use :monosp:`pss_guided`), or when an image has fewer than 8
+    samples per pixel.
+
+    The first pilot has one sample per pixel, and each pilot as many as all before it. Its samples
+    are drawn from the maps of the earlier ones, and count with a weight that is fixed before the
+    render: less in the first pilots, whose maps are poor, as long as that costs no more than 1.5 %
+    where no map helps.
+
+    A tile has 4 pixels along each edge in maps of one dimension (64 cells, 128 for distances) and 8
+    in those of two (32 x 32 cells), and more where the film is large: a map has 8 million cells at
+    most, which take 160 MiB while it is learned, and 32 MiB afterwards. What a tile has found is
+    drawn to what larger tiles around it have found, as far as the differences are no more than
+    chance. From the samples of each pilot follows which density would have been best (in proportion
+    to the mean of what a cell brings, with 5 % of uniform numbers, or to its root, with 20 %), and
+    by how much the variance is lower: below 3 %, a map is given up. After a render,
+    :monosp:`integrator.statistics.learned` tells what was found.
+
+    Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
+    :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
+    pilot.
+
+    Source: D. Cline, PhD dissertation, BYU 2007, chapter 9 (Tables 9.1 and 9.2). The source keeps
+    the maps of two rows of pixels, and averages those of seven neighbours in the order of
+    rendering; passes and tiles, which hear from all sides, the estimate, and the measurement of the
+    gain are ours, as are maps of wavelengths, which it proposes.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="swarm_path">
+                <integer name="max_depth" value="8"/>
+                <boolean name="lens_map" value="false"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'swarm_path',
+            'max_depth': 8,
+            'lens_map': False
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        always = self.parameter(props, "always_use", False)
+        is_wanted = {key: self.parameter(props, key, True) for key in _SLOTS}
+        self._shown = {**is_wanted, "always_use": always}
+        # Every slot is filled, also those whose numbers the scene does not ask for
+        self.fill(
+            props,
+            **{
+                slot: MAPS[slot](self.reader(props), always)
+                for key, slot in _SLOTS.items()
+                if is_wanted[key]
+            },
+        )
+
+    def parameters(self):
+        return {**super().parameters(), **self._shown}

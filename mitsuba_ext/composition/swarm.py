@@ -1,0 +1,168 @@
+"""Sample swarming: maps of primary samples that tiles of pixels share, one for each decision."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import mitsuba as mi
+
+from ..decisions.learner import Learner
+from ..decisions.swarm.camera_maps import CameraMapLearner, MappedNumbers
+from ..decisions.swarm.cells import Cells
+from ..media import has_homogeneous_media
+from ..rendering.camera import film_extent
+from .decision_parameters import DecisionParameters, ParameterReader, Setting
+
+#: By how much unequal weights of samples may raise the variance of images in which no map helps.
+_MOST_LOSS = 0.015
+
+#: Weights of the first stages where that is no matter: their samples are drawn from poor maps.
+_FIRST_WEIGHTS = (0.1, 0.5, 0.75, 0.9)
+
+
+class Swarm(DecisionParameters):
+    """Maps of one decision. A subclass says of which.
+
+    Parameters:
+        always: Use the maps also where pilots show that they do not pay? For tests.
+
+    Attributes:
+        summary: What the log calls the maps.
+    """
+
+    name = "swarm"
+    pilot_spp, doubles = 64, True
+    summary = ""
+
+    def __init__(self, read: ParameterReader, always: bool = False) -> None:
+        self._always = always
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        return spp > 0 and any(map(self.is_asked, scene.sensors()))
+
+    def is_asked(self, sensor: mi.Sensor) -> bool:
+        """Does the sensor ask for such numbers?"""
+        return True
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        if not self.can_learn(setting.scene, setting.pilot_spp) or not self.is_asked(
+            setting.sensor
+        ):
+            return None
+        width, height = film_extent(setting.sensor.film())
+        return self.map_learner(setting, width, height)
+
+    def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
+        """Who learns, for a film of this size."""
+        raise NotImplementedError
+
+
+class TimeMaps(Swarm):
+    """Maps of the time in the shutter interval."""
+
+    slots, summary = ("time",), "times"
+
+    def is_asked(self, sensor: mi.Sensor) -> bool:
+        return sensor.shutter_open_time() > 0
+
+    def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
+        numbers = MappedNumbers(Cells.line(6))
+        return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
+
+
+class LensMaps(Swarm):
+    """Maps of the aperture."""
+
+    slots, summary = ("aperture",), "lens"
+
+    def is_asked(self, sensor: mi.Sensor) -> bool:
+        return sensor.needs_aperture_sample()
+
+    def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
+        numbers = MappedNumbers(Cells.square(5))
+        return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
+
+
+class WavelengthMaps(Swarm):
+    """Maps of the number that chooses wavelengths."""
+
+    slots, summary = ("wavelength",), "wavelengths"
+
+    def check_slot(self, plugin: str, slot: str) -> None:
+        super().check_slot(plugin, slot)
+        check_has_wavelengths(plugin)
+
+    def is_asked(self, sensor: mi.Sensor) -> bool:
+        return mi.is_spectral
+
+    def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
+        numbers = MappedNumbers(Cells.line(6), periods=4)
+        return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
+
+
+class DistanceMaps(Swarm):
+    """Maps of the first distance in a homogeneous medium."""
+
+    slots, summary = ("distance",), "distances"
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        return spp > 0 and has_homogeneous_media(scene)
+
+    def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
+        numbers = MappedNumbers(Cells.line(7))
+        return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
+
+
+#: By slot, the maps that it can hold.
+MAPS: dict[str, type[Swarm]] = {
+    "aperture": LensMaps, "time": TimeMaps, "wavelength": WavelengthMaps, "distance": DistanceMaps,
+}  # fmt: skip
+
+
+def check_has_wavelengths(plugin: str) -> None:
+    """
+    Raises:
+        RuntimeError: The variant has no wavelengths.
+    """
+    if not mi.is_spectral:
+        raise RuntimeError(
+            f'"{plugin}": the parameter "wavelength" does not work in the variant '
+            f'"{mi.variant()}", which has no wavelengths: use a spectral one, such as '
+            f'"llvm_ad_spectral".'
+        )
+
+
+def doubling_pilots(samples: int) -> list[int]:
+    """The samples per pixel of each pilot: one, and then as many as all before."""
+    pilots = [1]
+    while 2 * sum(pilots) <= samples:
+        pilots.append(sum(pilots))
+    pilots[-1] += samples - sum(pilots)
+    return pilots
+
+
+def stage_weights(stages: Sequence[int]) -> list[float]:
+    """How many samples of the last stage a sample of each stage counts for. Where maps help much,
+    samples of the first stages would make most of the noise; where they do not help, the loss is
+    1.5 % at most, which decides how unequal the weights are.
+
+    Parameters:
+        stages: Samples per pixel of each stage.
+    """
+    wanted = [*_FIRST_WEIGHTS, *[1.0] * len(stages)][: len(stages) - 1] + [1.0]
+
+    def weights(share: float) -> list[float]:
+        return [1 - share * (1 - weight) for weight in wanted]
+
+    def loss(share: float) -> float:
+        pairs = list(zip(stages, weights(share)))
+        mean = sum(n * w for n, w in pairs)
+        return sum(stages) * sum(n * w * w for n, w in pairs) / mean**2 - 1
+
+    low, high = 0.0, 1.0
+    if loss(high) <= _MOST_LOSS:
+        return weights(high)
+    for _ in range(30):
+        middle = (low + high) / 2
+        low, high = (middle, high) if loss(middle) <= _MOST_LOSS else (low, middle)
+    return weights(low)

@@ -1,0 +1,1 @@
+"""Sample swarming: maps of primary samples that tiles of pixels learn and share."""

@@ -1,0 +1,158 @@
+"""What the samples of pilots have brought, by tile and cell: integers, so that equal seeds count
+equally."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .film_tiles import FilmTiles
+
+#: Fixed point of counts and of their squares, of radiance, and of squared radiance.
+_ONE, _ONE_X, _ONE_X2 = 2.0**12, 2.0**16, 2.0**12
+
+#: The largest count, in units of the root mean square of what samples of the tile bring; and the
+#: largest square that is believed when gains are measured.
+_LARGEST, _LARGEST_MEASURED = 32.0, 4096.0
+
+#: The largest radiance that is counted, in units of that of the film.
+_BRIGHTEST = 1024.0
+
+#: Squared radiance of a dark tile, in units of the squared mean of the film.
+_FLOOR = 1e-2
+
+
+@dataclass
+class Choices:
+    """What one decision has chosen in each lane of a pass.
+
+    Attributes:
+        map: Which map of the lane's tile was asked.
+        cell: Its cell.
+        density: The density of the numbers, relative to uniform ones.
+        value: What followed from it, divided by all densities.
+        active: Lanes in which the decision was taken.
+    """
+
+    map: mi.UInt32
+    cell: mi.UInt32
+    density: mi.Float
+    value: mi.Float
+    active: mi.Bool
+
+
+class TileCounts:
+    """Counters of one kind of map.
+
+    Parameters:
+        tiles: Tiles of the film.
+        maps: Maps of a tile.
+        cells: Cells of a map.
+
+    Attributes:
+        candidates: Densities relative to uniform ones, one for each [table, cell], that are tried
+            on the samples of the running stage.
+    """
+
+    def __init__(self, tiles: FilmTiles, maps: int, cells: int) -> None:
+        self._tiles, self._maps, self._cells = tiles, maps, cells
+        self._counts = dr.zeros(mi.UInt32, tiles.count * maps * cells)
+        self._squares = dr.zeros(mi.UInt64, tiles.count * maps)
+        self.candidates: list[mi.Float] = []
+        #: Second moments under uniform numbers, by table, and variances of all pixels, of all
+        #: samples and of those of the stage
+        self._second, self._variance = np.zeros(tiles.count * maps), 0.0
+        self.begin_stage([])
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the counters and of the candidates."""
+        tried = sum(4 * len(table) for table in self.candidates)
+        return 4 * len(self._counts) + 8 * len(self._squares) + tried
+
+    def begin_stage(self, candidates: Sequence[mi.Float]) -> None:
+        """Tries ``candidates`` from now on."""
+        self.candidates = list(candidates)
+        #: Squares as they were drawn, under uniform numbers, and under each candidate
+        self._moments, self._stage_variance = np.zeros(2 + len(candidates)), 0.0
+
+    def gains(self) -> np.ndarray:
+        """By how much each candidate lowers the variance of the image, relative to what it is with
+        uniform numbers; as the samples of the stage tell."""
+        drawn, uniform, *tried = self._moments
+        variance = self._stage_variance + uniform - drawn
+        return (uniform - np.array(tried)) / variance if variance > 0 else np.zeros(len(tried))
+
+    def expected_gain(self, ratios: np.ndarray) -> float:
+        """The same for maps whose second moments, relative to uniform numbers, are ``ratios``, by
+        table; as all samples tell."""
+        saved = (self._second * (1 - ratios.ravel())).sum()
+        return float(saved) / self._variance if self._variance > 0 else 0.0
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Counts, [row, column, map, cell], and sums of squares, [row, column, map]."""
+        shape = (self._tiles.rows, self._tiles.columns, self._maps)
+        counts = self._counts.numpy().reshape(*shape, self._cells)
+        return counts, self._squares.numpy().reshape(shape).astype(np.float64) * _ONE
+
+    def add(self, pixel: mi.UInt32, radiance: mi.Float, choices: Choices) -> None:
+        """Adds the samples of a pass; ``radiance`` is what each brought to its pixel."""
+        tile, count = self._tiles.tile(pixel), self._tiles.count
+        radiance = dr.select(dr.isfinite(radiance), radiance, 0)
+        mean = float(dr.mean(radiance)[0])
+        if not mean > 0:
+            return
+        # A power of two: no sum that depends on the order of additions decides
+        inverse_unit = dr.opaque(mi.Float, 2.0 ** -round(np.log2(mean)))
+        x = dr.minimum(radiance * inverse_unit, _BRIGHTEST)
+        first, second, samples = _sums(
+            count, tile, [x * _ONE_X, dr.square(x) * _ONE_X2, mi.Float(1)]
+        )
+        samples = np.maximum(samples, 1)
+        first, second = first / samples / _ONE_X, second / samples / _ONE_X2
+        floor = _FLOOR * np.average(first, weights=samples) ** 2
+        scale, brightness = second + floor, np.square(first) + floor
+        weight = np.repeat(scale / brightness, self._maps)
+        value = dr.select(choices.active & dr.isfinite(choices.value), choices.value, 0)
+        value *= inverse_unit * dr.gather(mi.Float, mi.Float(1 / np.sqrt(scale)), tile)
+        self._add_choices(tile, choices, value, weight)
+        variance = np.maximum(second - np.square(first), 0) / brightness
+        total = float((samples * variance).sum())
+        self._variance += total
+        self._stage_variance += total
+
+    def _add_choices(self, tile, choices: Choices, value: mi.Float, weight: np.ndarray) -> None:
+        """``value`` is relative to the root mean square of what samples bring to the tile;
+        ``weight`` turns its squares into squares of relative errors, by table."""
+        table = tile * self._maps + choices.map
+        cell = table * self._cells + choices.cell
+        # Drawn in proportion to the density, and divided by it: a sum of these is an integral
+        fixed = mi.UInt32(dr.minimum(value, _LARGEST) * _ONE + 0.5)
+        dr.scatter_add(self._counts, fixed, cell, choices.active)
+        wide = mi.UInt64(fixed)
+        dr.scatter_add(self._squares, (wide * wide) // int(_ONE), table, choices.active)
+        square = dr.minimum(dr.square(value), _LARGEST_MEASURED) * _ONE
+        # Mean over uniform numbers: what was drawn with a density stands for fewer of them
+        uniform = square * choices.density
+        tried = [
+            uniform / dr.gather(mi.Float, q, cell, choices.active) for q in self.candidates
+        ]
+        sums = _sums(len(weight), table, [square, uniform, *tried], choices.active)
+        dr.eval(self._counts, self._squares)
+        self._second += sums[1] * weight / _ONE
+        self._moments += [float((total * weight).sum()) / _ONE for total in sums]
+
+
+def _sums(
+    size: int, index: mi.UInt32, values: Sequence[mi.Float], active: mi.Bool | bool = True
+) -> list[np.ndarray]:
+    """Sums of values by their index; their fractions are lost."""
+    totals = [dr.zeros(mi.UInt64, size) for _ in values]
+    for total, value in zip(totals, values):
+        dr.scatter_add(total, mi.UInt64(value), index, mi.Bool(active))
+    dr.eval(totals)
+    return [total.numpy().astype(np.float64) for total in totals]

@@ -1,0 +1,127 @@
+"""The exit codes of each subcommand: those of the table in docs/command.md."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import in_subprocess
+
+from mitsuba_ext import cli, denoising, doctor
+from mitsuba_ext.cli import supervisor
+from mitsuba_ext.compare import images, write_exr
+from mitsuba_ext.compare.experiment import Experiment
+from mitsuba_ext.rendering.seed_passes import SeedPasses
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+PAGE = Path(__file__).parents[1] / "docs" / "command.md"
+
+
+
+def documented() -> dict[str, set[int]]:
+    """The codes of each subcommand, as the page says."""
+    rows = re.findall(r"^\| `([a-z]+)` \|(.*)\|$", PAGE.read_text(), re.MULTILINE)
+    columns = (0, 1, 2, 130, 143, 129)
+    return {
+        name: {code for code, cell in zip(columns, cells.split("|")) if cell.strip() != "–"}
+        for name, cells in rows
+    }
+
+
+def test_the_page_names_all_subcommands():
+    assert set(documented()) == set(cli.cli.commands)
+
+
+@pytest.fixture
+def exits(run, tmp_path):
+    """Checks the codes of calls against what the page says of their subcommand."""
+
+    def check(name: str, *calls: tuple[int, tuple]) -> None:
+        for code, arguments in calls:
+            found, _, err = run(name, *arguments)
+            assert found == code and code in documented()[name], (arguments, found, err)
+
+    return check
+
+
+@pytest.fixture
+def image(tmp_path) -> Path:
+    write_exr(tmp_path / "image.exr", np.ones((4, 5, 3), np.float32), "RGB", {})
+    return tmp_path / "image.exr"
+
+
+def test_render(exits, make_scene, tmp_path, monkeypatch):
+    target = ("-o", tmp_path / "a.exr", "--spp", 4)
+    exits("render", (0, (make_scene(), *target)), (2, (tmp_path / "no.xml", *target)))
+    monkeypatch.setattr(images, "count_non_finite", lambda film: (3, 48))
+    exits("render", (1, (make_scene(), *target)))
+    run_pass = SeedPasses._run_pass
+    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)):
+
+        def signalled(self, spp, number=number):
+            os.kill(os.getpid(), number)
+            return run_pass(self, spp)
+
+        monkeypatch.setattr(SeedPasses, "_run_pass", signalled)
+        exits("render", (code, (make_scene(), "-o", tmp_path / "a.exr", "--spp", 1 << 16)))
+
+
+def test_merge(exits, run, make_scene, tmp_path):
+    for seed in "12":
+        assert run("render", make_scene(), "-o", tmp_path / "a.exr", "--seed", seed, "--spp", 4,
+                   "--checkpoint", tmp_path / seed)[0] == 0  # fmt: skip
+    folders = (tmp_path / "1", tmp_path / "2", "-o", tmp_path / "both")
+    exits("merge", (0, folders), (2, folders))
+
+
+def test_denoise(exits, image, tmp_path, monkeypatch):
+    monkeypatch.setattr(denoising, "denoiser", lambda: None)
+    monkeypatch.setattr(denoising, "denoise_file", lambda *_: [])
+    exits("denoise", (0, (image,)), (2, (image, "-o", image)))
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(denoising, "denoise_file", interrupted)
+    exits("denoise", (130, (image,)))
+
+
+def test_compare(exits, make_scene, tmp_path, monkeypatch, without_report):
+    options = ("--spp", 2, "--seeds", 1, "--reference-spp", 64, "--out", tmp_path / "out")
+    exits("compare", (0, (make_scene(), "path", *options)), (2, (make_scene(), "path")))
+    # A scene that is broken, beside one that is not
+    broken = make_scene("broken.xml", body="<shape type='nothing'/>")
+    exits("compare", (1, (make_scene(), broken, "path", *options)))
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Experiment, "_take", interrupted)
+    exits("compare", (130, (make_scene(), "path", *options, "--seeds", 2)))
+    # SIGTERM and SIGHUP: tests/test_supervisor.py
+    assert {143, 129} <= documented()["compare"] and supervisor.GRACE
+
+
+def test_the_others(exits, image, tmp_path, monkeypatch):
+    exits("diff", (0, (image, image)), (2, (image, tmp_path / "no.exr")))
+    exits("list", (0, ()), (0, ("neepp",)), (2, ("nothing",)))
+    exits("completion", (0, ("bash",)), (2, ("tcsh",)))
+    for code in (0, 1):
+        monkeypatch.setattr(doctor, "main", lambda code=code: code)
+        exits("doctor", (code, ()))
+    exits("doctor", (2, ("--nothing",)))
+
+
+@pytest.mark.slow
+def test_processes_have_these_codes_too(make_scene, tmp_path):
+    scene = make_scene()
+    assert in_subprocess("render", scene, "-o", tmp_path / "a.exr").returncode == 0
+    assert in_subprocess("render", scene, "-o", tmp_path / "a.nothing").returncode == 2
+    assert in_subprocess("diff", scene, scene).returncode == 2
+    assert in_subprocess("nothing").returncode == 2
+    assert in_subprocess().returncode == 2

@@ -1,0 +1,266 @@
+"""Sample swarming: maps of numbers that tiles of pixels share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_cases import area, diffuse, film, lookat, rectangle, sensor, stage
+from statistical import assert_exact, assert_same_pixels_on_average, batches, load, one_thread
+
+from mitsuba_ext.composition.swarm import doubling_pilots, stage_weights
+from mitsuba_ext.decisions.swarm import map_learner
+from mitsuba_ext.decisions.swarm.cells import CellDensities, Cells
+from mitsuba_ext.decisions.swarm.estimate import Form, density, estimate
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+_BOUNDS = np.array([0, 0.1, 0.1, 0.35, 0.6, 0.61, 1, 1, 1], np.float32)
+
+CELLS = {
+    "line": lambda: Cells.line(6),
+    "square": lambda: Cells.square(3),
+    "uneven": lambda: Cells([0, 0, 0], _BOUNDS),
+    "joint": lambda: Cells([0, 0, 0, 1, 2, 1, 2], _BOUNDS),
+}
+
+# ---- Densities over cells ----
+
+
+def _table(kind: str, cells: Cells) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    mass = {
+        "random": rng.random(cells.count),
+        "one_hot": np.arange(cells.count) == cells.count // 3,
+        "half_empty": rng.random(cells.count) * (rng.random(cells.count) < 0.5),
+        "uniform": np.ones(cells.count),
+    }[kind] * (cells.widths > 0)
+    return np.stack([np.full(cells.count, 1 / cells.count), mass / mass.sum()])
+
+
+@pytest.mark.parametrize("kind", ["random", "one_hot", "half_empty", "uniform"])
+@pytest.mark.parametrize("name", CELLS)
+def test_samples_have_their_density(name: str, kind: str) -> None:
+    cells = CELLS[name]()
+    mass = _table(kind, cells)
+    maps, count = CellDensities(cells, mass), 1 << 18
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(3, count)
+    u = [sampler.next_1d() for _ in range(cells.dimension)]
+    table = dr.full(mi.UInt32, 1, count)
+    drawn, pdf, cell = maps.sample(table, u)
+    assert all((0 <= x.numpy()).all() and (x.numpy() < 1).all() for x in drawn)
+    # Where a number lies is its cell, but for rounding at the edges
+    assert (cells.find(drawn).numpy() == cell.numpy()).mean() > 0.999
+    np.testing.assert_allclose(maps.density(table, cell).numpy(), pdf.numpy(), rtol=1e-3)
+    expected = mass[1] * count
+    found = np.bincount(cell.numpy(), minlength=cells.count)
+    assert not found[expected == 0].any()
+    chi2 = (np.square(found - expected)[expected > 0] / expected[expected > 0]).sum()
+    freedom = (expected > 0).sum() - 1
+    assert chi2 < freedom + 5 * np.sqrt(2 * freedom) + 1e-6 * count
+    # Within a cell, numbers are uniform
+    reached = cells.widths[mass[1] > 0].sum()
+    np.testing.assert_allclose((1 / pdf.numpy()).mean(), reached, rtol=0.02)
+
+
+def test_inactive_lanes_keep_their_numbers() -> None:
+    maps = CellDensities(Cells.line(3), _table("one_hot", Cells.line(3)))
+    u = mi.Float([0.1, 0.9])
+    (drawn,), pdf, _ = maps.sample(mi.UInt32([1, 1]), [u], mi.Bool([False, True]))
+    assert drawn.numpy()[0] == u.numpy()[0] and pdf.numpy()[0] == 1
+
+
+# ---- Estimates ----
+
+
+def _estimated(counts: np.ndarray, widths: np.ndarray | None = None) -> np.ndarray:
+    """Of samples that count one each."""
+    widths = np.full(counts.shape[-1], 1 / counts.shape[-1]) if widths is None else widths
+    return estimate(counts, counts.sum(-1), widths)
+
+
+def test_without_samples_maps_are_uniform() -> None:
+    widths = np.array([0.5, 0.25, 0.25, 0])
+    shares = _estimated(np.zeros((3, 5, 2, 4)), widths)
+    np.testing.assert_allclose(shares, np.broadcast_to(widths, shares.shape), atol=1e-6)
+    for form in (Form(True, 0.2), Form(False, 0.05)):
+        np.testing.assert_allclose(density(shares, widths, form).sum(-1), 1, rtol=1e-5)
+
+
+def test_one_sample_is_not_believed() -> None:
+    counts = np.zeros((4, 4, 1, 16))
+    counts[1, 2, 0, 5] = 1e9
+    shares = estimate(counts, np.square(counts.sum(-1)), np.full(16, 1 / 16))
+    np.testing.assert_allclose(shares, 1 / 16, rtol=1e-4)
+
+
+def test_noise_stays_nearly_uniform() -> None:
+    rng = np.random.default_rng(2)
+    counts = rng.multinomial(20, np.full(64, 1 / 64), size=(30, 40, 1)).astype(float)
+    shares = _estimated(counts)
+    assert (1 / (64 * shares)).mean() < 1.005  # the loss of drawing from it
+
+
+def test_a_window_that_moves_over_the_film_is_found() -> None:
+    rng, rows, columns = np.random.default_rng(3), 20, 30
+    counts, truth = np.zeros((rows, columns, 1, 64)), np.zeros((rows, columns, 1, 64))
+    for column in range(columns):
+        begin = 5 + column
+        truth[:, column, 0, begin : begin + 8] = 1 / 8
+        counts[:, column, 0] = rng.multinomial(4, truth[0, column, 0], size=rows)
+    shares = _estimated(counts)
+    loss = (truth / (64 * np.maximum(shares, 1e-6) * 0.9 + 0.1)).sum(-1)
+    assert loss.mean() < 0.35  # 1 for uniform numbers, 1/8 at best
+
+
+# ---- Stages ----
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3, 8, 21, 64])
+def test_pilots_double(samples: int) -> None:
+    pilots = doubling_pilots(samples)
+    assert sum(pilots) == samples and pilots[0] == 1
+    assert all(n >= sum(pilots[:i]) for i, n in enumerate(pilots))
+
+
+@pytest.mark.parametrize("spp", [4, 6, 8, 16, 64, 1024])
+def test_weights_of_stages_cost_little(spp: int) -> None:
+    pilots = doubling_pilots(max(1, min(spp // 4, 64)))
+    stages = [*pilots, spp - sum(pilots)]
+    n, w = np.array(stages), np.array(stage_weights(stages))
+    assert w[-1] == 1 and (w > 0).all() and (np.diff(w) >= 0).all()
+    assert n.sum() * (n * w**2).sum() / (n * w).sum() ** 2 < 1.0151
+    assert stage_weights([5]) == [1]
+
+
+# ---- Renders ----
+
+_OPTICS = {
+    "aperture_radius": 0.1, "focus_distance": 3.0, "shutter_open": 0.25, "shutter_close": 0.75,
+}  # fmt: skip
+
+
+def swarm(**parameters: Any) -> mi.Integrator:
+    return mi.load_dict({"type": "swarm_path", "max_depth": 4, **parameters})
+
+
+def _furnace() -> mi.Scene:
+    """A room whose walls emit what they absorb, with a white thing that turns in it."""
+    T = mi.ScalarTransform4f
+    turns = {
+        "back": ([1, 0, 0], 0), "front": ([1, 0, 0], 180), "floor": ([1, 0, 0], -90),
+        "ceiling": ([1, 0, 0], 90), "left": ([0, 1, 0], 90), "right": ([0, 1, 0], -90),
+    }  # fmt: skip
+    wall = {"bsdf": diffuse(0.5), "emitter": area(0.5)}
+    walls = {
+        name: rectangle(T().rotate(*turn) @ T().translate([0, 0, -2]).scale([2, 2, 1]), **wall)
+        for name, turn in turns.items()
+    }
+    cube = {"type": "cube", "to_world": T().scale(0.35), "bsdf": diffuse(1.0)}
+    moving = {"type": "moving", "axis": [1, 2, 0.5], "angle": 200.0, "cube": cube}
+    camera = sensor("thinlens", lookat([0, 0, 1.8], [0, 0, 0], [0, 1, 0]), film=film(), **_OPTICS)
+    return mi.load_dict({"type": "scene", "sensor": camera, **walls, "thing": moving})
+
+
+def test_furnace_has_the_exact_radiance() -> None:
+    integrator = swarm(always_use=True, max_depth=-1)
+    assert_exact(batches(_furnace(), integrator, 128, [1, 2]), 1.0, precision=0.006)
+    assert "uniform" not in integrator.statistics.learned
+
+
+def _streaks(width: int = 24, height: int = 18, **changes: Any) -> mi.Scene:
+    """A small bright ball that flies past, out of focus, and a lamp."""
+    T = mi.ScalarTransform4f
+    ball = {"type": "sphere", "radius": 0.15, "center": [-1, 0, 0.5], "bsdf": diffuse(0.8)}
+    moving = {"type": "moving", "translate": [2, 0, 0.4], "ball": ball}
+    lamp = rectangle(
+        T().translate([0.8, 1.8, 1.2]).rotate([1, 0, 0], 90).scale(0.06), bsdf=diffuse(0.0),
+        emitter=area(40.0),
+    )  # fmt: skip
+    changes = {"film": film(width, height), **_OPTICS, "shutter_open": 0.0, "shutter_close": 1.0,
+               "aperture_radius": 0.3, **changes}  # fmt: skip
+    camera = sensor("thinlens", **changes)
+    return mi.load_dict(stage(camera=camera, moving=moving, lamp=lamp))
+
+
+@pytest.mark.parametrize("variant", [
+    "llvm_ad_rgb", pytest.param("llvm_ad_spectral", marks=pytest.mark.slow),
+], indirect=True)  # fmt: skip
+def test_mean_is_that_of_uniform_numbers(variant: str) -> None:
+    scene = _streaks()
+    plain = mi.load_dict({"type": "composed_path", "max_depth": 4})
+    expected = batches(scene, plain, 512, [1001, 1002])
+    images = batches(scene, swarm(always_use=True), 256, [1, 2])
+    tolerance = 9.0 if mi.is_spectral else 0.0
+    assert_same_pixels_on_average(images, expected, 0.03, tolerance=tolerance)
+
+
+def test_maps_lower_the_noise_where_they_promise_to() -> None:
+    scene = load("six_balls", width=96, height=54)
+    plain = mi.load_dict({"type": "composed_path", "max_depth": 2})
+    noise = batches(scene, plain, 32, [1, 2]).var(axis=0).mean()
+    integrator = swarm(max_depth=2)
+    ours = batches(scene, integrator, 32, [1, 2]).var(axis=0).mean()
+    assert ours < 0.6 * noise
+    assert "less variance" in integrator.statistics.learned
+
+
+@pytest.mark.parametrize(
+    "adversary", ["one_hot", pytest.param("random", marks=pytest.mark.slow)]
+)
+def test_wrong_maps_only_make_noise(monkeypatch, adversary: str) -> None:
+    """All mass in one cell, or anywhere: the share of uniform numbers keeps the mean right."""
+
+    def wrong(counts, squares, widths):
+        rng = np.random.default_rng(len(counts))
+        if adversary == "random":
+            mass = rng.random(counts.shape) ** 4 * (widths > 0)
+        else:
+            mass = np.zeros(counts.shape)
+            mass[..., counts.shape[-1] // 5] = 1
+        return mass / mass.sum(-1, keepdims=True)
+
+    monkeypatch.setattr(map_learner, "estimate", wrong)
+    scene = _streaks(12, 10)
+    plain = mi.load_dict({"type": "composed_path", "max_depth": 2})
+    expected = batches(scene, plain, 512, [1001, 1002])
+    images = batches(scene, swarm(always_use=True, max_depth=2), 1024, [1, 2])
+    assert_same_pixels_on_average(images, expected, 0.08)
+
+
+def test_the_same_seed_gives_the_same_image() -> None:
+    integrator = swarm(always_use=True)
+    with one_thread():
+        a, b, other = batches(_streaks(), integrator, 16, [1, 1, 2])
+    np.testing.assert_array_equal(a, b)
+    assert np.abs(a - other).mean() > 0.01 * a.mean()
+
+
+@pytest.mark.parametrize("spp", [1, 3, 4])
+def test_few_samples_cost_nothing(spp: int) -> None:
+    integrator = swarm()
+    mi.render(_streaks(5, 3), integrator=integrator, spp=spp)
+    assert (integrator.statistics.learned == "") == (spp < 4)
+
+
+def test_what_is_learned_can_be_saved(tmp_path) -> None:
+    scene, path = _streaks(), str(tmp_path / "maps.npz")
+    learning = swarm(always_use=True, save_learned=path)
+    first = batches(scene, learning, 64, [1])
+    loaded = swarm(always_use=True, load_learned=path)
+    again = batches(scene, loaded, 64, [2, 3])
+    assert loaded.statistics.passes == 1 and "uniform" not in loaded.statistics.learned
+    np.testing.assert_allclose(again.mean(), first.mean(), rtol=0.1)
+
+
+def test_a_scene_names_it_and_wrong_values_are_named() -> None:
+    text = str(swarm(lens_map=False, pilot_spp=8))
+    assert "lens_map = False" in text and "pilot_spp = 8" in text and "aperture" not in text
+    with pytest.raises((RuntimeError, TypeError), match="time_map"):
+        swarm(time_map=3)
+    with pytest.raises(RuntimeError, match="wavelength"):
+        mi.load_dict({"type": "composed_path", "wavelength": "swarm"})
