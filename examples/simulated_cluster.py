@@ -96,6 +96,9 @@ class Cluster(Executor):
     def put(self, future: Future) -> None:
         self._finished.append(future)
 
+    def empty(self) -> bool:
+        return not self._finished
+
     def get(self, timeout: float) -> Future:
         end = self.now + timeout
         while not self._finished:

@@ -122,7 +122,8 @@ class Dispatch:
                     result = self._taken(future, learned(), is_stopped)
                     if result is not None:
                         yield result
-                self._give_late_ones(learned())
+                if self._finished.empty():
+                    self._give_late_ones(learned())
         finally:
             for future in self._running:
                 future.cancel()
