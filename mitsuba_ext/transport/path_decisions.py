@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .mis import Heuristic, power_heuristic
+from .scene_query import SceneQuery as SceneQuery  # one of the decisions
 from .vertex import PathState, Vertex
 
 
@@ -334,51 +335,6 @@ class AlwaysTest(ShadowTest):
 
     def probability(self, state, choice, si, ds, active):
         return None, state
-
-
-class SceneQuery:
-    """How a ray meets the scene."""
-
-    def closest(
-        self, scene: mi.Scene, ray: mi.Ray3f, coherent: bool, active: mi.Bool
-    ) -> mi.PreliminaryIntersection3f:
-        """The closest intersection. ``coherent`` is a hint that neighbouring rays are alike."""
-        reorder = not coherent and dr.flag(dr.JitFlag.LoopRecord)
-        return scene.ray_intersect_preliminary(
-            ray, coherent=coherent, reorder=reorder, active=active
-        )
-
-    def interaction(
-        self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f
-    ) -> mi.SurfaceInteraction3f:
-        """Everything about an intersection that :meth:`closest` found."""
-        return pi.compute_surface_interaction(ray, mi.RayFlags.All)
-
-    def emitter(self, si: mi.SurfaceInteraction3f, emitter: mi.EmitterPtr) -> mi.EmitterPtr:
-        """The light of ``scene.emitters()`` that ``si`` belongs to, by Mitsuba's answer."""
-        return emitter
-
-    def occluded(
-        self,
-        scene: mi.Scene,
-        si: mi.SurfaceInteraction3f,
-        ds: mi.DirectionSample3f,
-        active: mi.Bool,
-    ) -> mi.Bool:
-        """Is there anything between ``si`` and the light that ``ds`` is about?"""
-        return scene.ray_test(self.shadow_ray(scene, si, ds), active=active)
-
-    def shadow_ray(
-        self, scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f
-    ) -> mi.Ray3f:
-        """The ray from ``si`` to the light that ``ds`` is about."""
-        ray = si.spawn_ray_to(ds.p)
-        if any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters()):
-            # Mitsuba puts ds.p behind the bounds of the scene, which it knows wrongly where
-            # rectangles were merged (``bounds.py``): its shadow rays may end before a wall
-            is_infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-            ray.maxt = dr.select(is_infinite, dr.largest(mi.Float), ray.maxt)
-        return ray
 
 
 #: The largest probability with which ``path`` lets a path go on.
