@@ -63,9 +63,9 @@ class MovingCamera(mi.Sensor):
     Mitsuba's :monosp:`ptracer` does so as well. :monosp:`ecoc_dof`, which needs one depth for each
     pixel, refuses moving cameras.
 
-    A ray costs three table look-ups and a rotation more; nothing of it is in the kernels of other
-    sensors. Parameters of the nested sensor are known to :monosp:`mi.traverse` by their usual
-    names. Its shutter interval cannot be changed after loading.
+    A camera ray costs a look-up in a small table and a rotation more; nothing of it is in the
+    kernels of other sensors. Parameters of the nested sensor are known to :monosp:`mi.traverse` by
+    their usual names. Its shutter interval cannot be changed after loading.
 
     Errors: other sensors are refused, and so are poses with scales.
 

@@ -19,7 +19,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +171,7 @@ class Trial:
 
     def _images_of_path(self, times: int) -> np.ndarray:
         count, strata = times * _REFERENCE_SEEDS, self._kind.strata
-        integrator = REFERENCE.make(**self._depth)
+        integrator = replace(REFERENCE, plugin=self._kind.reference).make(**self._depth)
         rng = self._rng("path", times)
         if strata == 1:
             return self._render(0.0, integrator, _scattered(rng, count))

@@ -33,19 +33,21 @@ class Kind:
             that the mean of its images is that of the interval.
         depth: Parameters of integrators that this kind prescribes.
         allowance: Accepted relative difference of the means.
+        reference: Mitsuba's integrator, where it is not ``path``.
     """
 
     make: Callable[[int, Path, float | None], Scene]
     strata: int = 1
     depth: dict[str, int] = field(default_factory=dict)
     allowance: float = 0.0
+    reference: str = "path"
 
 
 def _plain(seed: int, folder: Path, time: float | None) -> Scene:
     return Maker(seed, folder).scene()
 
 
-# ---- Moving shapes and cameras ----
+# ---- Moving shapes, cameras and lights ----
 
 
 def _moving(seed: int, folder: Path, time: float | None) -> Scene:
@@ -87,6 +89,30 @@ def _moving_camera(seed: int, folder: Path, time: float | None) -> Scene:
     else:
         place = mi.ScalarTransform4f(pose(opens + time * lasts))
         scene["sensor"] = {**still, "to_world": place @ still["to_world"]}
+    return scene
+
+
+def _moving_lights(seed: int, folder: Path, time: float | None) -> Scene:
+    """All lights move but those at infinity."""
+    scene, maker = Maker(seed, folder).scene(), Maker(seed, folder, stream=29)
+    opens, lasts = maker.number(0, 0.3), maker.number(0.2, 1)
+    scene["sensor"] |= {"shutter_open": opens, "shutter_close": opens + lasts}
+    for name in [name for name in scene if name.startswith("light_")]:
+        light = scene[name]
+        if light["type"] == "directional":
+            continue
+        translate, axis = maker.rng.normal(size=(2, 3))
+        parameters, pose = uniform((0.3 * translate).tolist(), axis.tolist(),
+                                   maker.number(-90, 90), maker.point())  # fmt: skip
+        if time is None:
+            plugin = "moving" if "emitter" in light else "moving_light"
+            scene[name] = {"type": plugin, **parameters, "light": light}
+            continue
+        there = mi.ScalarTransform4f(pose(opens + time * lasts))
+        if "position" in light:
+            light["position"] = (there @ mi.ScalarPoint3f(light["position"])).numpy().tolist()
+        else:
+            light["to_world"] = there @ light["to_world"]
     return scene
 
 
@@ -162,10 +188,49 @@ def _closed(maker: Maker) -> Any:
     )()
 
 
+# ---- Participating media ----
+
+
+def _media(seed: int, folder: Path, time: float | None) -> Scene:
+    """One or two clouds, of which one may hold the camera and all else."""
+    scene, maker = Maker(seed, folder).scene(), Maker(seed, folder, stream=17)
+    for index in range(maker.rng.integers(1, 3)):
+        boundary = {"type": maker.choice("sphere", "cube"), "to_world": maker.place(uniform=True)}
+        bsdf = {"type": maker.choice("null", "null", "dielectric", "thindielectric")}
+        scene[f"cloud_{index}"] = {**boundary, "bsdf": bsdf, "interior": _medium(maker)}
+    if maker.chance(0.3):
+        around = {**_medium(maker, is_grid=False), "id": "around", "scale": 0.05}
+        # References look back: the medium comes first
+        scene = {"type": scene.pop("type"), "around": around, **scene}
+        reference = {"type": "ref", "id": "around"}
+        scene["sensor"] |= {"medium": reference}
+        scene["air"] = {"type": "sphere", "radius": 100.0, "bsdf": {"type": "null"},
+                        "interior": reference}  # fmt: skip
+    return scene
+
+
+def _medium(maker: Maker, is_grid: bool | None = None) -> Scene:
+    phase = maker.choice(
+        {"type": "isotropic"}, {"type": "hg", "g": maker.number(-0.6, 0.8)}, {"type": "rayleigh"}
+    )
+    if maker.chance(0.4) if is_grid is None else is_grid:
+        density = maker.rng.random((4, 3, 5, 1), dtype=np.float32) * maker.number(0.5, 8)
+        place = mi.ScalarTransform4f().translate([-3, -3, -1]).scale(6)
+        volume = {"type": "gridvolume", "grid": mi.VolumeGrid(density), "to_world": place}
+        return {"type": "heterogeneous", "phase": phase, "albedo": maker.colour(),
+                "sigma_t": volume}  # fmt: skip
+    # Colours that differ much make too much noise
+    return {"type": "homogeneous", "phase": phase, "albedo": maker.colour(),
+            "sigma_t": maker.colour(0.4, 0.9), "scale": maker.number(0.5, 8),
+            "sample_emitters": maker.chance(0.9)}  # fmt: skip
+
+
 KINDS = {
     "plain": Kind(_plain),
+    "media": Kind(_media, reference="volpath"),
     "moving": Kind(_moving, strata=16),
     "moving_camera": Kind(_moving_camera, strata=16),
+    "moving_lights": Kind(_moving_lights, strata=16),
     "constant_index": Kind(_constant_index),
     # Long paths without roulette: a small max_depth would lose energy, and in RGB roulette would be
     # the only source of noise
