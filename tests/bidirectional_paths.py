@@ -223,7 +223,7 @@ def weights_of_techniques(
             return hits["weight"]
 
     path.sums = weights.arrive(path, si)
-    emission(scene, si, path, next_event, state, Record())
+    emission(scene, SceneQuery(), si, path, next_event, state, Record())
     found.append(dr.select(is_hit, hits["weight"], 0))
 
     probability = next_event.probability(

@@ -54,10 +54,10 @@ def test_error_slope_and_efficiency_of_a_known_noise_are_found(clock, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "costs", some((3.0, 0.01), (0.0, 1.7), of=[(0.0, 0.01), (3.0, 0.01), (0.0, 1.7), (0.1, 0.0003)])
+    "fixed, cost",
+    some((3.0, 0.01), (0.0, 1.7), of=[(0.0, 0.01), (3.0, 0.01), (0.0, 1.7), (0.1, 0.0003)]),
 )
-def test_equal_time_is_used_fully(clock, tmp_path, costs):
-    fixed, cost = costs
+def test_equal_time_is_used_fully(clock, tmp_path, fixed, cost):
     integrators = {
         "first": noisy_integrator(clock, cost=0.05),
         "other": noisy_integrator(clock, cost=cost, fixed=fixed),

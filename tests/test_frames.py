@@ -90,6 +90,11 @@ def test_all_sensors(run, make_scene, tmp_path):
     assert shapes == [(6, 8), (2, 3)]
     assert run("render", scene, "-o", tmp_path / "b.exr", "--sensor", "1", "--spp", 1)[0] == 0
     assert read_exr(tmp_path / "b.exr")[0]["R"].shape == (2, 3)
+    kept = ("--frames", "7:8", "--spp", 1, "--checkpoint", tmp_path / "kept")
+    assert run("render", scene, "-o", tmp_path / "c.##.exr", "--sensor", "all", *kept)[0] == 0
+    names = [f"0{frame}.sensor{sensor}" for frame in (7, 8) for sensor in (0, 1)]
+    assert sorted(folder.name for folder in (tmp_path / "kept").iterdir()) == names
+    assert all((tmp_path / f"c.{name}.exr").exists() for name in names)
 
 
 def test_frames_are_kept_each_in_a_folder(
