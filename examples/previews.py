@@ -31,6 +31,8 @@ PICTURES = {
     "lantern": 2048,
     "six_balls": 256,
     "colour_wheel": 512,
+    "spotlights": 128,
+    "panes": 256,
     "flint": 1024,
     "caustic": 256,
     "glass_lamp": 96,
@@ -49,7 +51,7 @@ PICTURES = {
 INTEGRATORS = {
     **dict.fromkeys(["caustic", "glass_lamp", "corridor", "ring", "shaded_lamp"], "bdpt"),
     **dict.fromkeys(["pool", "keyhole"], "erpt"),
-    **dict.fromkeys(["six_balls", "colour_wheel"], "swarm_path"),
+    **dict.fromkeys(["six_balls", "colour_wheel", "spotlights", "panes"], "swarm_path"),
 }
 
 #: Scenes that are not 16 : 9.

@@ -31,7 +31,13 @@ class ComposedPath(WalkIntegrator):
      * - directions
        - |string| or |decision|
        - Which random numbers choose the direction in which a path goes on: :monosp:`uniform` ones,
-         :monosp:`guided` ones, or a nested :monosp:`guided_directions`. (Default: uniform)
+         :monosp:`guided` ones, or a nested :monosp:`guided_directions`. With :monosp:`swarm`, maps
+         as in :monosp:`swarm_path` choose between reflection and transmission. (Default: uniform)
+     * - scattering
+       - |string|
+       - Where a path goes on: where the :monosp:`bsdf` sends it, or at the first vertex that is no
+         mirror also in directions of learned maps, :monosp:`swarm` (see :monosp:`swarm_path`).
+         (Default: bsdf)
      * - next_event
        - |string| or |decision|
        - Which light a vertex is connected to, and which point of it. Not learned: :monosp:`uniform`
@@ -45,6 +51,12 @@ class ComposedPath(WalkIntegrator):
          :monosp:`triple_product` (as :monosp:`two_stage`, and by what is visible),
          :monosp:`contribution`, :monosp:`visibility`, or a nested :monosp:`learned_lights`.
          (Default: uniform)
+     * - light_numbers
+       - |string|
+       - Which random numbers choose the light and the point on it, at the first vertex that is
+         connected to lights: :monosp:`uniform` ones, or those of learned maps, :monosp:`swarm` (see
+         :monosp:`swarm_path`). It needs a :monosp:`next_event` that does not learn. (Default:
+         uniform)
      * - roulette
        - |string|
        - Which paths go on from :monosp:`rr_depth` on. With :monosp:`automatic`, where directions

@@ -11,7 +11,8 @@ from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 #: By parameter, the slot that its maps fill.
 _SLOTS = {
     "time_map": "time", "lens_map": "aperture", "wavelength_map": "wavelength",
-    "distance_map": "distance",
+    "distance_map": "distance", "light_map": "light_numbers", "lobe_map": "directions",
+    "direction_map": "scattering",
 }  # fmt: skip
 
 
@@ -43,6 +44,17 @@ class SwarmPath(WalkIntegrator):
      * - distance_map
        - |bool|
        - Learn at which distances in a homogeneous medium camera rays find light? (Default: true)
+     * - light_map
+       - |bool|
+       - Learn which light, and which point of it, the first connection of a path is to go to?
+         (Default: true)
+     * - lobe_map
+       - |bool|
+       - Learn whether to be reflected or transmitted, at the first eight bounces? (Default: true)
+     * - direction_map
+       - |bool|
+       - Learn from which directions light comes to the first vertex that is no mirror? Half of its
+         directions are chosen by the map. (Default: true)
      * - always_use
        - |bool|
        - Use all maps, also where the pilots show that it does not pay? (Default: false)
@@ -62,9 +74,9 @@ class SwarmPath(WalkIntegrator):
 
     **Use it when** most noise comes from a decision that neighbouring pixels take alike, and that
     nothing else samples well: fast things before a dark background, small lights out of focus,
-    lamps with spectral lines, beams in fog (as far as their light scatters once). **Not when** the
-    noise is that of many bounces (use :monosp:`pss_guided`), or when an image has fewer than 8
-    samples per pixel.
+    lamps with spectral lines, beams in fog (as far as their light scatters once), dozens of lights
+    that shine on different places, bright things reflected in panes. **Not when** the noise is that
+    of many bounces (use :monosp:`pss_guided`), or when an image has fewer than 8 samples per pixel.
 
     The first pilot has one sample per pixel, and each pilot as many as all before it. Its samples
     are drawn from the maps of the earlier ones, and count with a weight that is fixed before the
@@ -73,7 +85,10 @@ class SwarmPath(WalkIntegrator):
 
     A tile has 4 pixels along each edge in maps of one dimension (64 cells, 128 for distances) and 8
     in those of two (32 x 32 cells), and more where the film is large: a map has 8 million cells at
-    most, which take 160 MiB while it is learned, and 32 MiB afterwards. What a tile has found is
+    most, which take 160 MiB while it is learned, and 32 MiB afterwards. Lights and points on them
+    have one joint map, of 2048 cells at most; the choice of a lobe has maps of 32 cells for each
+    bounce and for no, one, and more reflections before; directions are mixed with those of the BSDF
+    (multiple importance sampling), by height and angle around the z axis. What a tile has found is
     drawn to what larger tiles around it have found, as far as the differences are no more than
     chance. From the samples of each pilot follows which density would have been best (in proportion
     to the mean of what a cell brings, with 5 % of uniform numbers, or to its root, with 20 %), and

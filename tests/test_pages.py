@@ -39,6 +39,7 @@ VALUES = {
     "aovs": "d:depth", "save_map": "map.npz", "load_map": "map.npz", "regions": "surfaces",
     "directions": "guided", "next_event": "power", "shadow_test": "visibility_roulette",
     "aperture": "sobol", "time": "sobol", "wavelength": "sampler", "distance": "swarm",
+    "light_numbers": "swarm", "scattering": "swarm",
     "pattern": "sobol",
     "weights": "torus", "vertices": "all", "law": "affine", "target": "visibility",
     "light_sampling": "visibility", "mis": "balance", "heuristic": "cutoff", "exponent": 3.0,

@@ -15,6 +15,7 @@ from mitsuba_ext.composition.swarm import doubling_pilots, stage_weights
 from mitsuba_ext.decisions.swarm import map_learner
 from mitsuba_ext.decisions.swarm.cells import CellDensities, Cells
 from mitsuba_ext.decisions.swarm.estimate import Form, density, estimate
+from mitsuba_ext.decisions.swarm.light_maps import light_cells
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -209,9 +210,8 @@ def test_maps_lower_the_noise_where_they_promise_to() -> None:
     assert "less variance" in integrator.statistics.learned
 
 
-@pytest.mark.parametrize(
-    "adversary", ["one_hot", pytest.param("random", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("adversary", ["one_hot", "random"])
 def test_wrong_maps_only_make_noise(monkeypatch, adversary: str) -> None:
     """All mass in one cell, or anywhere: the share of uniform numbers keeps the mean right."""
 
@@ -232,6 +232,7 @@ def test_wrong_maps_only_make_noise(monkeypatch, adversary: str) -> None:
     assert_same_pixels_on_average(images, expected, 0.08)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_image() -> None:
     integrator = swarm(always_use=True)
     with one_thread():
@@ -264,3 +265,78 @@ def test_a_scene_names_it_and_wrong_values_are_named() -> None:
         swarm(time_map=3)
     with pytest.raises(RuntimeError, match="wavelength"):
         mi.load_dict({"type": "composed_path", "wavelength": "swarm"})
+
+
+# ---- Lights, lobes, directions ----
+
+
+def _glass_and_spots() -> mi.Scene:
+    """A ball of glass and a pane before a wall, under a lamp and three spot lights."""
+    T = mi.ScalarTransform4f
+    glass = {"type": "dielectric", "int_ior": 1.6}
+    things = {
+        "ball": {"type": "sphere", "center": [0.5, -0.3, 0.5], "radius": 0.3, "bsdf": glass},
+        "pane": rectangle(
+            T().translate([-0.6, -0.6, 0.6]).rotate([1, 0, 0], 70).scale(0.5),
+            bsdf={"type": "thindielectric"},
+        ),
+        "gloss": {"type": "sphere", "center": [-0.4, 0.5, 0.3], "radius": 0.3,
+                  "bsdf": {"type": "roughplastic", "alpha": 0.1}},
+    }  # fmt: skip
+    for index, x in enumerate((-1.0, 0.0, 1.0)):
+        things[f"spot_{index}"] = {
+            "type": "spot", "to_world": lookat([x, -1, 1.8], [x / 2, 0, 0], [0, 1, 0]),
+            "intensity": 1.0 + index, "cutoff_angle": 25.0,
+        }  # fmt: skip
+    return mi.load_dict(stage(camera=sensor(film=film(20, 16)), **things))
+
+
+_ONE_MAP = {
+    "light_map": "lights", "lobe_map": "lobes", "direction_map": "directions",
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("only", [*_ONE_MAP, "all"])
+def test_mean_with_maps_along_the_path(only: str) -> None:
+    scene = _glass_and_spots()
+    maps = {name: only in (name, "all") for name in _ONE_MAP}
+    integrator = swarm(always_use=True, **maps)
+    plain = mi.load_dict({"type": "composed_path", "max_depth": 4})
+    expected = batches(scene, plain, 256, [1001, 1002])
+    images = batches(scene, integrator, 256, [1, 2])
+    assert_same_pixels_on_average(images, expected, 0.03)
+    learned = integrator.statistics.learned
+    assert all((word in learned) == maps[name] for name, word in _ONE_MAP.items())
+    assert "uniform" not in learned
+
+
+@pytest.mark.parametrize("depth", [pytest.param(4, marks=pytest.mark.slow), -1])
+def test_furnace_of_glass_is_exact(depth: int) -> None:
+    scene = load("furnace_glass", width=16, height=16)
+    integrator = swarm(always_use=True, max_depth=depth, rr_depth=1000)
+    images = batches(scene, integrator, 64, [1, 2])
+    if depth == -1:
+        # Rounding at smooth glass: 4e-5 (docs/mitsuba_faults.md)
+        assert_exact(images, 1.0, allowance=1e-4, precision=0.005)
+        return
+    plain = mi.load_dict({"type": "composed_path", "max_depth": depth, "rr_depth": 1000})
+    expected = batches(scene, plain, 256, [1001, 1002])
+    assert_same_pixels_on_average(images, expected, 0.01)
+
+
+def test_lights_have_cells_of_their_probabilities() -> None:
+    scene = mi.load_dict({
+        "type": "scene",
+        **{f"lamp_{i}": {"type": "point", "sampling_weight": w} for i, w in enumerate((1, 0, 3))},
+    })  # fmt: skip
+    widths = light_cells(scene, 0).widths
+    assert sorted(widths[widths > 0]) == pytest.approx([0.25, 0.75])
+    assert light_cells(scene, 1).dimension == 1
+
+
+def test_learned_lights_are_refused_beside_maps_of_their_numbers() -> None:
+    with pytest.raises(RuntimeError, match="lights that are not learned"):
+        mi.load_dict({
+            "type": "composed_path", "light_numbers": "swarm", "next_event": "contribution",
+        })  # fmt: skip

@@ -33,8 +33,10 @@ _Maker = Callable[[ParameterReader], DecisionParameters]
 #: defaults; ``None`` stands for what Mitsuba's ``path`` does, and comes first. The order is that in
 #: which learners are made, of which later ones can use earlier ones.
 SLOTS: dict[str, dict[str, _Maker | None]] = {
-    "directions": {"uniform": None, "guided": Guided},
+    "directions": {"uniform": None, "guided": Guided, "swarm": MAPS["directions"]},
+    "scattering": {"bsdf": None, "swarm": MAPS["scattering"]},
     "next_event": {**METHODS, **CAMERA_METHODS},
+    "light_numbers": {"uniform": None, "swarm": MAPS["light_numbers"]},
     "roulette": {"automatic": lambda read: GuidedRoulette(), "throughput": None},
     "connections": {"one": None},
     "mis": {HEURISTICS[0]: None, **{name: MisHeuristic.named(name) for name in HEURISTICS[1:]}},

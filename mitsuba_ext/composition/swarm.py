@@ -9,9 +9,12 @@ import mitsuba as mi
 from ..decisions.learner import Learner
 from ..decisions.swarm.camera_maps import CameraMapLearner, MappedNumbers
 from ..decisions.swarm.cells import Cells
+from ..decisions.swarm.direction_maps import DirectionMapLearner, MappedScattering
+from ..decisions.swarm.light_maps import LightMapLearner, LightMaps, light_cells
+from ..decisions.swarm.lobe_maps import LobeMapLearner, MappedLobes, divides
 from ..media import has_homogeneous_media
 from ..rendering.camera import film_extent
-from .decision_parameters import DecisionParameters, ParameterReader, Setting
+from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 
 #: By how much unequal weights of samples may raise the variance of images in which no map helps.
 _MOST_LOSS = 0.015
@@ -100,6 +103,57 @@ class WavelengthMaps(Swarm):
         return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
 
 
+class LightMapsChoice(Swarm):
+    """Maps of the numbers that choose a light and a point on it."""
+
+    slots, summary = ("light_numbers",), "lights"
+
+    _lights: DecisionParameters | None = None
+
+    def check_together(self, plugin: str, slots: Slots) -> None:
+        lights = slots.get("next_event")
+        if lights is not None and lights.pilot_spp:
+            raise ValueError(
+                f'"{plugin}": the parameter "light_numbers" needs lights that are not learned; '
+                f"leave it out"
+            )
+        self._lights = lights
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        return spp > 0 and bool(scene.emitters())
+
+    def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
+        lights = self._lights.decision(setting) if self._lights else None
+        dimension = lights.choice_dimension if lights else 0
+        maps = LightMaps(light_cells(setting.scene, dimension))
+        return LightMapLearner(self.summary, maps, width, height, always=self._always)
+
+
+class LobeMaps(Swarm):
+    """Maps of the number that chooses between reflection and transmission."""
+
+    slots, summary = ("directions",), "lobes"
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        return spp > 0 and divides(scene.shapes())
+
+    def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
+        return LobeMapLearner(self.summary, MappedLobes(), width, height, always=self._always)
+
+
+class DirectionMaps(Swarm):
+    """Maps of directions beside the BSDF."""
+
+    slots, summary = ("scattering",), "directions"
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        return spp > 0 and bool(scene.emitters())
+
+    def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
+        maps = MappedScattering()
+        return DirectionMapLearner(self.summary, maps, width, height, always=self._always)
+
+
 class DistanceMaps(Swarm):
     """Maps of the first distance in a homogeneous medium."""
 
@@ -116,6 +170,7 @@ class DistanceMaps(Swarm):
 #: By slot, the maps that it can hold.
 MAPS: dict[str, type[Swarm]] = {
     "aperture": LensMaps, "time": TimeMaps, "wavelength": WavelengthMaps, "distance": DistanceMaps,
+    "light_numbers": LightMapsChoice, "directions": LobeMaps, "scattering": DirectionMaps,
 }  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from ..rendering.aovs import check_aovs
 from ..rendering.camera import film_extent
 from ..rendering.staged_integrator import NO_LIMIT, StagedIntegrator
 from ..transport.estimator import CameraRays, Estimator
-from ..transport.path_decisions import SceneQuery
+from ..transport.path_decisions import EmitterSampling, SceneQuery
 from ..transport.walk import Walk
 from . import learned_file
 from .camera_numbers import WeightedNumbers, samples_per_set
@@ -201,7 +201,12 @@ class WalkIntegrator(StagedIntegrator):
         return self.walk
 
     def walk(self, **decisions: Any) -> Walk:
-        """A walk with this integrator's parameters and the given decisions."""
+        """A walk with this integrator's parameters and the given decisions. If ``light_numbers`` is
+        among them, it warps the numbers of ``next_event``."""
+        light_numbers = decisions.pop("light_numbers", None)
+        if light_numbers is not None:
+            inner = decisions.get("next_event", EmitterSampling())
+            decisions["next_event"] = light_numbers.around(inner)
         return Walk(self.max_depth, self.rr_depth, self.hide_emitters, **decisions)
 
     # ---- What Mitsuba calls ----

@@ -78,6 +78,6 @@ class CameraMapLearner(MapLearner):
         cell, density = self.decision.drawn
         return Choices(mi.UInt32(0), cell, density, radiance, mi.Bool(True))
 
-    def finish(self) -> None:
-        super().finish()
+    def stop(self) -> None:
+        super().stop()
         self.decision.drawn = None

@@ -11,6 +11,7 @@ import numpy as np
 from ...transport.colour import to_rgb
 from ...transport.estimator import CameraRays
 from ..learner import Learner
+from ..pixel_estimates import brightness
 from .cells import CellDensities, Cells
 from .estimate import Form, density, estimate, expected_ratio
 from .film_tiles import FilmTiles
@@ -46,6 +47,8 @@ class MapLearner(Learner):
 
     Attributes:
         decision: See above.
+        total, importance: Of the pass that ends: what each lane has brought, and the factor from
+            that to what its pixel gets.
         tiles: The tiles that share maps.
         cells: The cells of each.
         gain: By how much the maps are expected to lower the variance, or did so in the last pilot.
@@ -72,10 +75,19 @@ class MapLearner(Learner):
 
     # ---- What a subclass says ----
 
+    #: Are maps used only after a stage has shown what they are worth? Where something else takes
+    #: a part of the decisions, what maps promise over uniform numbers says nothing.
+    needs_measurement = False
+
     def choices(self, radiance: mi.Float) -> Choices:
         """What the decision chose in each lane of the pass that ends; ``radiance`` is what each
         lane brought to its pixel."""
         raise NotImplementedError
+
+    @property
+    def is_learning(self) -> bool:
+        """Are the samples of the running stage wanted?"""
+        return self._counts is not None
 
     # ---- Observer ----
 
@@ -92,6 +104,8 @@ class MapLearner(Learner):
         rays = self._rays
         rgb = to_rgb(L * (rays.importance * rays.weight), rays.ray.wavelengths)
         self._radiance = dr.sqrt(dr.squared_norm(mi.Color3f(rgb)) / 3)
+        self.total = brightness(L)
+        self.importance = dr.select(self.total > 0, self._radiance / self.total, 0)
         self._choices = self.choices(self._radiance)
         dr.schedule(self._radiance, self._pixel, self._choices)
 
@@ -110,13 +124,17 @@ class MapLearner(Learner):
             best = int(np.argmax(gains))
             self.gain, form = float(gains[best]), _FORMS[best]
             if self.gain < _LEAST_GAIN and self.decision.maps is not None and not self._always:
-                self._counts, self.decision.maps = None, None
+                self.decision.maps = None
+                self.stop()
                 return None
         array, squares = counts.arrays()
         widths = self.cells.widths
         shares = estimate(array, squares, widths)
         mass = density(shares, widths, form)
-        expected = counts.expected_gain(expected_ratio(mass, widths))
+        if self.needs_measurement:
+            expected = np.inf if len(gains) > 0 else 0.0
+        else:
+            expected = counts.expected_gain(expected_ratio(mass, widths))
         if len(gains) == 0:
             self.gain = expected
         self.decision.maps = None
@@ -147,7 +165,12 @@ class MapLearner(Learner):
         return self.decision
 
     def finish(self) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """Learns nothing more."""
         self._counts = self._rays = self._pixel = self._choices = None
+        self.total = self.importance = None
 
     def _collect(self) -> None:
         """Counts the last pass."""

@@ -28,14 +28,19 @@ _FLOOR = 1e-2
 
 @dataclass
 class Choices:
-    """What one decision has chosen in each lane of a pass.
+    """What a decision has chosen in a pass.
 
     Attributes:
         map: Which map of the lane's tile was asked.
         cell: Its cell.
         density: The density of the numbers, relative to uniform ones.
         value: What followed from it, divided by all densities.
-        active: Lanes in which the decision was taken.
+        active: Where the decision was taken.
+        lane: Whose decision it was; ``None`` for one in each lane.
+        share: The share of the decisions that the maps take, beside others that something else
+            takes.
+        scale: A density of 1 relative to uniform numbers, in units of the density of that something
+            else; used where ``share`` is below 1. ``density`` is in these units then.
     """
 
     map: mi.UInt32
@@ -43,6 +48,13 @@ class Choices:
     density: mi.Float
     value: mi.Float
     active: mi.Bool
+    lane: mi.UInt32 | None = None
+    share: float = 1.0
+    scale: mi.Float | float = 1.0
+
+    def under(self, q: mi.Float) -> mi.Float:
+        """``density`` if that of the maps, relative to uniform numbers, were ``q``."""
+        return q if self.share == 1 else (1 - self.share) + self.share * self.scale * q
 
 
 class TileCounts:
@@ -117,6 +129,8 @@ class TileCounts:
         floor = _FLOOR * np.average(first, weights=samples) ** 2
         scale, brightness = second + floor, np.square(first) + floor
         weight = np.repeat(scale / brightness, self._maps)
+        if choices.lane is not None:
+            tile = dr.gather(mi.UInt32, tile, choices.lane)
         value = dr.select(choices.active & dr.isfinite(choices.value), choices.value, 0)
         value *= inverse_unit * dr.gather(mi.Float, mi.Float(1 / np.sqrt(scale)), tile)
         self._add_choices(tile, choices, value, weight)
@@ -139,7 +153,8 @@ class TileCounts:
         # Mean over uniform numbers: what was drawn with a density stands for fewer of them
         uniform = square * choices.density
         tried = [
-            uniform / dr.gather(mi.Float, q, cell, choices.active) for q in self.candidates
+            uniform / choices.under(dr.gather(mi.Float, q, cell, choices.active))
+            for q in self.candidates
         ]
         sums = _sums(len(weight), table, [square, uniform, *tried], choices.active)
         dr.eval(self._counts, self._squares)

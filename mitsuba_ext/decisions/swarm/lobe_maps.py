@@ -1,0 +1,123 @@
+"""Maps of the number that decides between reflection and transmission, at the first bounces of a
+path.
+
+Source: D. Cline, PhD dissertation, BYU 2007, section 9.2.2 (bifurcation). The source has an entry
+for each bounce; here each bounce has a map for none, one, and more reflections before.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...transport.path_decisions import DirectionSamples
+from ..pixel_estimates import brightness
+from .bounce_records import BounceRecords
+from .cells import CellDensities, Cells
+from .map_learner import MapLearner
+from .tile_counts import Choices
+
+#: Bounces with maps, and numbers of reflections before that have maps of their own.
+_BOUNCES, _REFLECTIONS = 8, 3
+
+#: Bits of a cell's number, and the end of the first cell. The others grow by a factor: reflectances
+#: of glass are small, and what a number decides changes where it equals them.
+_BITS, _FIRST_END = 5, 0.01
+
+
+def lobe_cells() -> Cells:
+    """The cells of the number that chooses a lobe."""
+    ends = _FIRST_END ** (1 - np.arange(1 << _BITS) / ((1 << _BITS) - 1))
+    return Cells([0] * _BITS, np.concatenate([[0], ends]))
+
+
+def divides(shapes) -> bool:
+    """May a path be reflected or transmitted at any of these shapes?"""
+    return any(
+        bool(shape.bsdf() and _flags(shape.bsdf().flags()))
+        or shape.class_name() == "Instance"
+        or divides(getattr(shape, "children", ()))
+        for shape in shapes
+    )
+
+
+def _flags(flags):
+    """Has a BSDF with these flags lobes of both kinds?"""
+    F = mi.BSDFFlags
+    reflects = F.DiffuseReflection | F.GlossyReflection | F.DeltaReflection
+    transmits = F.DiffuseTransmission | F.GlossyTransmission | F.DeltaTransmission
+    return ((flags & int(reflects)) != 0) & ((flags & int(transmits)) != 0)
+
+
+class MappedLobes(DirectionSamples):
+    """Warps the number that chooses a lobe, where light is reflected or transmitted.
+
+    Attributes:
+        cells, maps, tiles: See :class:`~mitsuba_ext.decisions.swarm.camera_maps.MappedNumbers`.
+        is_recorded: Does somebody learn?
+        records: What the running pass chose, if somebody learns.
+    """
+
+    def __init__(self) -> None:
+        self.cells = lobe_cells()
+        self.maps: CellDensities | None = None
+        self.tiles: Any = None
+        self.is_recorded = False
+        self.records: BounceRecords | None = None
+
+    def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
+        self.records = BounceRecords(dr.width(ray), _BOUNCES) if self.is_recorded else None
+        if pixel is None or (self.maps is None and self.records is None):
+            return ()
+        # The tile, the number of reflections, and from which side the last surface was met
+        return self.tiles.tile(pixel), mi.UInt32(0), mi.Bool(False)
+
+    def draw(self, state, sampler, vertex, active):
+        sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
+        if isinstance(state, tuple) and not state:
+            return sample_1, sample_2, 1.0, state
+        tile, reflections, was_front = state
+        incident = vertex.si.to_world(vertex.si.wi)
+        stays = (dr.dot(vertex.path.arrival.ref.n, -incident) > 0) == was_front
+        is_reflected = active & (vertex.depth > 0) & stays
+        reflections += dr.select(is_reflected, mi.UInt32(1), 0)
+        is_mapped = active & (vertex.depth < _BOUNCES) & _flags(vertex.bsdf.flags())
+        which = vertex.depth * _REFLECTIONS + dr.minimum(reflections, _REFLECTIONS - 1)
+        weight = density = mi.Float(1)
+        if self.maps is None:
+            cell = self.cells.find([sample_1])
+        else:
+            table = tile * (_BOUNCES * _REFLECTIONS) + which
+            (sample_1,), density, cell = self.maps.sample(table, [sample_1], is_mapped)
+            weight = dr.rcp(density)
+        if self.records is not None:
+            self.records.choose(vertex.depth, which, cell, density, is_mapped)
+        is_front = dr.dot(vertex.si.n, incident) > 0
+        return sample_1, sample_2, weight, (tile, reflections, is_front)
+
+
+class LobeMapLearner(MapLearner):
+    """Learns the maps of :class:`MappedLobes`, which is its ``decision``."""
+
+    def __init__(self, name: str, decision: MappedLobes, width: int, height: int, **how) -> None:
+        maps = _BOUNCES * _REFLECTIONS
+        super().__init__(name, decision, width, height, decision.cells, 8, maps, **how)
+        decision.tiles, decision.is_recorded = self.tiles, True
+
+    def direction(self, vertex, sample, weight, L, active) -> None:
+        if self.is_learning:
+            self.decision.records.before(vertex.depth, brightness(L), active)
+
+    def choices(self, radiance: mi.Float) -> Choices:
+        records = self.decision.records
+        value = records.after(self.total) * dr.gather(mi.Float, self.importance, records.lane)
+        return Choices(
+            records.map, records.cell, records.density, value, records.density > 0, records.lane
+        )
+
+    def stop(self) -> None:
+        super().stop()
+        self.decision.is_recorded, self.decision.records = False, None
