@@ -123,6 +123,7 @@ def test_closed_shutter_shows_the_view_of_its_time() -> None:
         assert_same_image(batches(moving, technique.make(4), 16, [5])[0], wanted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"], indirect=True)
 def test_closed_shutter_in_variant(variant: str) -> None:
     test_closed_shutter_shows_the_view_of_its_time()
@@ -161,11 +162,11 @@ def reference(case: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("case", "name"),
     [
-        ("pan", "composed_path"),
-        ("keys_through_a_lens", "bdpt"),
         *(
             pytest.param(case, name, marks=pytest.mark.slow)
             for case, name in (
+                ("pan", "composed_path"),
+                ("keys_through_a_lens", "bdpt"),
                 ("keys_through_a_lens", "composed_path"),
                 ("keys_through_a_lens", "light_tracer"),
                 ("keys_through_a_lens", "light_tracer_visibility"),

@@ -210,7 +210,7 @@ def test_image_is_the_average_of_images_at_rest(light: str, name: str) -> None:
     assert_same_pixels_on_average(images, reference(light), precision=0.004, tile=4)
 
 
-@pytest.mark.parametrize("depth", [1, 3])
+@pytest.mark.parametrize("depth", [3, pytest.param(1, marks=pytest.mark.slow)])
 def test_furnace_that_moves_around_the_camera(depth: int) -> None:
     """All walls of a closed cube emit 1 and reflect a half, wherever they are."""
     walls = {"type": "cube", "flip_normals": True, "bsdf": diffuse(0.5), "emitter": area(1.0)}

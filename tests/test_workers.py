@@ -12,10 +12,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.compare import InputError
+from mitsuba_ext.compare import InputError, load_scene, render_reference
 from mitsuba_ext.long_renders import dispatch, tasks
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer, RenderRequest
 from mitsuba_ext.long_renders.bundle import Bundle
+from mitsuba_ext.long_renders.divided_references import ReferenceWorkers
 from mitsuba_ext.long_renders.long_render import Goal, LongRender
 from mitsuba_ext.long_renders.state import Batch, RenderState
 from mitsuba_ext.long_renders.tasks import Missing, render_batch
@@ -276,3 +277,42 @@ def test_a_process_that_dies_costs_what_it_was_doing_and_one_that_hangs_ends_wit
         begin = time.monotonic()
         workers.shutdown(cancel_futures=True)
         assert time.monotonic() - begin < 30
+
+
+# ---- References of comparisons ----
+
+
+def test_references_are_those_of_one_process(make_scene, tmp_path):
+    class Backwards(Worker):
+        """Results come two at a time, and the later one first."""
+
+        waiting = []
+
+        def submit(self, function, *arguments):
+            future = Future()
+            self.waiting.append((future, super().submit(function, *arguments)))
+            if len(self.waiting) == 2:
+                for outer, inner in reversed(self.waiting):
+                    outer.set_result(inner.result())
+                self.waiting.clear()
+            return future
+
+    scene = load_scene(make_scene(), keep_integrator=False)
+    for name in ("here", "there"):
+        (tmp_path / name).mkdir()
+    here = render_reference(scene, 64, tmp_path / "here")
+    workers = ReferenceWorkers(Backwards(), 2)
+    there = render_reference(scene, 64, tmp_path / "there", workers=workers)
+    np.testing.assert_allclose(there.mean, here.mean, rtol=1e-5)
+    np.testing.assert_allclose(there.variance, here.variance, rtol=1e-3, atol=1e-9)
+    with pytest.raises(InputError, match="cannot be sent to others"):
+        render_reference(scene, 128, tmp_path / "there", {"type": "path"}, workers=workers)
+
+
+@pytest.mark.slow
+def test_compare_renders_references_in_processes(run, make_scene, tmp_path):
+    command = ("compare", make_scene(), "path", "--spp", 4, "--seeds", 1, "--out", tmp_path / "out")
+    assert run(*command, "--workers", 2)[0] == 0
+    assert list((tmp_path / "out").glob("*references/*.exr"))
+    code, _, err = run(*command, "--workers", 2, "--dask", "tcp://127.0.0.1:1")
+    assert code == 2 and "exclude each other" in err

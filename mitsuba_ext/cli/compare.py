@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,6 +22,9 @@ from .common import (
     say,
     scene_options,
 )
+
+if TYPE_CHECKING:
+    from ..long_renders.divided_references import ReferenceWorkers
 
 
 @click.command(short_help="Measure the speed and the error of integrators on scenes.")
@@ -69,6 +73,14 @@ from .common import (
     help="Seconds that a render may take, compilation included. An integrator that takes longer is "
     "ended and reported as failed, and the rest goes on. References have no limit.",
 )
+@click.option(
+    "--workers", type=click.IntRange(1, 1024), metavar="N",
+    help="Render references in N processes of this machine. What is measured is rendered by one.",
+)
+@click.option(
+    "--dask", metavar="ADDRESS",
+    help="Render references on the workers of the Dask scheduler at ADDRESS: tcp://host:port.",
+)
 @click.option("--worker", type=click.Choice(supervisor.JOBS), hidden=True)
 @scene_options
 @click.argument(
@@ -89,6 +101,8 @@ def compare(
     reference_integrator: str,
     out: Path,
     limit: float | None,
+    workers: int | None,
+    dask: str | None,
     worker: str | None,
     size: tuple[int, int] | None,
     definitions: Sequence[tuple[str, str]],
@@ -112,6 +126,8 @@ def compare(
         raise click.UsageError(f"give one of {', '.join(given)}")
     if reference and reference_spp:
         raise click.UsageError("--reference and --reference-spp exclude each other")
+    if workers is not None and dask is not None:
+        raise click.UsageError("--workers and --dask exclude each other")
     scenes, integrators = _sort_out(names)
     if not plugins:
         for specification in (*integrators, reference_integrator):
@@ -134,6 +150,7 @@ def compare(
     }
     (budget,) = (make[name](value) for name, value in given.items() if value is not None)
     select_variant(variant, plugins)
+    executors = contextlib.ExitStack()
     comparison = Comparison(
         [SceneSetup(scene, size, dict(definitions), reference) for scene in scenes],
         integrators,
@@ -144,10 +161,12 @@ def compare(
         reference_integrator=reference_integrator,
         command=shlex.join(["mitsuba-ext", *supervisor.without_job(sys.argv[1:])]),
         only_stored=worker == supervisor.STORED,
+        reference_workers=_reference_workers(executors, workers, dask, tuple(plugins)),
     )
     interrupted = worker == supervisor.STORED
     try:
-        comparison.run()
+        with executors:
+            comparison.run()
     except KeyboardInterrupt:
         interrupted = True
     results = comparison.results()
@@ -161,6 +180,24 @@ def compare(
         say("interrupted: the results are of the finished runs")
         return INTERRUPTED
     return 1 if any(map(_has_trouble, results["scenes"])) else 0
+
+
+def _reference_workers(
+    executors: contextlib.ExitStack, workers: int | None, dask: str | None, plugins: tuple[str, ...]
+) -> ReferenceWorkers | None:
+    """Those who render references, whose executor ends with ``executors``."""
+    from ..long_renders.dask_cluster import dask_cluster
+    from ..long_renders.divided_references import ReferenceWorkers
+    from ..long_renders.workers import Workers, threads_of_each
+
+    if dask is not None:
+        executor, _check = executors.enter_context(dask_cluster(dask))
+        return ReferenceWorkers(executor, executor.count(), plugins)
+    if workers is None:
+        return None
+    executor = Workers(workers)
+    executors.callback(executor.shutdown, cancel_futures=True)
+    return ReferenceWorkers(executor, workers, plugins, threads_of_each(workers))
 
 
 def _has_trouble(scene: Mapping[str, Any]) -> bool:

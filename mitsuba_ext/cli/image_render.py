@@ -102,13 +102,17 @@ def render_image(
             **job.about(),
         }
 
-    def write(target: Path, others: Mapping[str, np.ndarray] | None = None) -> None:
-        images.write_film(target, job.film, metadata(), {**job.variance(), **(others or {})})
+    def write(
+        target: Path, others: Mapping[str, np.ndarray] | None = None, is_final: bool = True
+    ) -> None:
+        layers = {**job.variance(), **(others or {})}
+        # The render waits for an image that is soon replaced
+        images.write_film(target, job.film, metadata(), layers, is_compressed=is_final)
 
     def show(is_asked: bool) -> None:
         if is_asked or (long and long.folder):
             # A frame that is there counts as finished
-            write(picture.unfinished if order.is_one_of_many else output)
+            write(picture.unfinished if order.is_one_of_many else output, is_final=False)
         if order.preview:
             images.write_film(order.preview, job.film, metadata())
 

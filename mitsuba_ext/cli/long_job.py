@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +20,7 @@ from ..long_renders.folder import CheckpointFolder
 from ..long_renders.intervals import Interval, LastKept
 from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
-from ..long_renders.workers import Workers
+from ..long_renders.workers import Workers, threads_of_each
 from ..rendering.interrupts import deferred_interrupt
 from ..rendering.totals import RenderTotals
 from .reports import Report, Speed, time_left
@@ -74,8 +73,7 @@ class LongJob:
         """
         self._options = options
         self._folder = CheckpointFolder(options.folder) if options.folder else None
-        # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR file
-        threads = max(2, (os.cpu_count() or 1) // options.workers) if options.workers else 0
+        threads = threads_of_each(options.workers) if options.workers else 0
         self._request = replace(request, threads=request.threads or threads)
         self._renderer = BatchRenderer(self._request, scenes=scenes)
         named = self._renderer.chosen.named
@@ -239,7 +237,8 @@ class LongJob:
         if batches is None or batches.count < 2:
             return {}
         colours = [name for name in batches.channels[: batches.image_channel_count] if name != "A"]
-        return {f"variance.{name}": batches.variance[..., n] for n, name in enumerate(colours)}
+        variance = batches.variance
+        return {f"variance.{name}": variance[..., n] for n, name in enumerate(colours)}
 
     def about(self) -> Mapping[str, Any]:
         """What the metadata of the image say besides."""

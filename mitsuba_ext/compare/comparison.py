@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Union
+from typing import TYPE_CHECKING, Any, Union
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +26,9 @@ from .experiment import Experiment, make_all
 from .machine import machine, versions
 from .references import Reference
 from .report import write_report
+
+if TYPE_CHECKING:
+    from ..long_renders.divided_references import ReferenceWorkers
 
 SceneSource = Union[str, Path, Mapping[str, Any]]
 
@@ -66,6 +69,9 @@ class Comparison:
             longest run. With a time budget: as many as take 16 times that long. With ``until``:
             enough for a relMSE of 1/16 of the target.
         reference_integrator: The integrator that renders references.
+        reference_workers: Those who render references. What is measured is rendered here, one
+            render at a time, because times on other machines or shared cores tell nothing.
+            Default: this process.
         command: The command line, for the report.
         only_stored: Render nothing; make figures and report from the runs in the folder.
 
@@ -86,6 +92,7 @@ class Comparison:
         reference_integrator: Specification = "path",
         command: str | None = None,
         only_stored: bool = False,
+        reference_workers: ReferenceWorkers | None = None,
     ) -> None:
         self.only_stored = only_stored
         self.scenes = _setups(scenes)
@@ -110,6 +117,7 @@ class Comparison:
         self.command = command
         self._reference_spp = reference_spp
         self._reference_integrator = reference_integrator
+        self._reference_workers = reference_workers
         self._temporary = None
         if folder is None:
             self._temporary = tempfile.TemporaryDirectory(prefix="mitsuba_ext_")
@@ -232,6 +240,7 @@ class Comparison:
             lambda done: progress(Step(f"reference {done:.0%}", 0.0, None)),
             # A derived number varies with the measurement: a stored reference with half will do
             enough=asked or spp // 2,
+            workers=self._reference_workers,
         )
 
     def _derived_spp(self, scene: LoadedScene) -> int:

@@ -1,7 +1,7 @@
 """Reads and writes images. A file is replaced as a whole, never left half written, and an EXR holds
 metadata about its render.
 
-EXRs go through ``mi.Bitmap``, not the OpenEXR package: for a damaged file, the latter prints
+EXRs are read by ``mi.Bitmap``, not by the OpenEXR package: for a damaged file, the latter prints
 warnings to the terminal and returns an empty image.
 """
 
@@ -44,8 +44,27 @@ def write_exr(
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
     # Without the format, up to four channels would be called R, G, B and A
     bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, list(channels))
-    _annotate(bitmap, metadata)
+    attributes = bitmap.metadata()
+    for key, value in metadata.items():
+        attributes[key] = _attribute(value)
     _save(bitmap, path)
+
+
+def write_exr_fast(
+    path: Path, planes: Mapping[str, np.ndarray], metadata: Mapping[str, object]
+) -> None:
+    """Writes 32-bit channels, (height, width), without compression: files of noisy images are 1.1
+    times as large, and written in a sixth of the time."""
+    import OpenEXR
+
+    header = {key: _attribute(value) for key, value in metadata.items()}
+    header.update(compression=OpenEXR.NO_COMPRESSION, type=OpenEXR.scanlineimage)
+    planes = {key: np.ascontiguousarray(x, dtype=np.float32) for key, x in planes.items()}
+    with replacing(path) as temporary:
+        try:
+            OpenEXR.File(header, planes).write(str(temporary))
+        except RuntimeError as error:
+            raise OSError(f"{path}: {one_line(error)}") from error
 
 
 def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
@@ -122,6 +141,7 @@ def write_film(
     film: mi.Film,
     metadata: Mapping[str, object],
     others: Mapping[str, np.ndarray] | None = None,
+    is_compressed: bool = True,
 ) -> None:
     """Writes the image of a film: all channels to an EXR, also ``others``, which are arrays
     (height, width); RGB to HDR and PFM, 8-bit sRGB to the other formats."""
@@ -131,9 +151,13 @@ def write_film(
     suffix = path.suffix.lower()
     if suffix == ".exr":
         # The film's own bitmap may be of half precision
+        pixels = np.moveaxis(np.array(film.develop()), 2, 0)
         names = [entry.name for entry in bitmap.struct_()]
-        layers = [np.array(film.develop()), *(x[..., None] for x in (others or {}).values())]
-        write_exr(path, np.concatenate(layers, axis=2), [*names, *(others or {})], metadata)
+        planes = {**dict(zip(names, pixels)), **(others or {})}
+        if is_compressed:
+            write_exr(path, np.stack(list(planes.values()), axis=2), list(planes), metadata)
+        else:
+            write_exr_fast(path, planes, metadata)
         return
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         bitmap = bitmap.split()[0][1]  # the image without its AOVs
@@ -200,10 +224,14 @@ def _save(bitmap: mi.Bitmap, path: Path) -> None:
 
 
 def _annotate(bitmap: mi.Bitmap, metadata: Mapping[str, object]) -> None:
-    """Header attributes: text and numbers as they are, everything else as JSON."""
     attributes = bitmap.metadata()
     for key, value in metadata.items():
-        plain = isinstance(value, (str, float)) or (
-            isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**31
-        )
-        attributes[key] = value if plain else json.dumps(value)
+        attributes[key] = _attribute(value)
+
+
+def _attribute(value: object) -> str | float | int:
+    """What stands in the header of an EXR: text and numbers as they are, all else as JSON."""
+    plain = isinstance(value, (str, float)) or (
+        isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**31
+    )
+    return value if plain else json.dumps(value)

@@ -19,6 +19,7 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,6 +30,9 @@ from ..scenes import InputError, LoadedScene, one_line, scene_name
 from ..specifications import NamedIntegrator, Specification, make_named
 from . import images, metrics
 from .machine import versions
+
+if TYPE_CHECKING:
+    from ..long_renders.divided_references import ReferenceWorkers
 
 #: Number of batches of a rendered reference, from whose spread its variance is estimated.
 BATCH_COUNT = 16
@@ -112,6 +116,7 @@ def render_reference(
     integrator: Specification = "path",
     progress: Callable[[float], None] | None = None,
     enough: int | None = None,
+    workers: ReferenceWorkers | None = None,
 ) -> Reference:
     """Renders a reference with the settings of the scene's integrator, or loads it from ``folder``.
 
@@ -125,6 +130,7 @@ def render_reference(
         integrator: The integrator that renders it; it must be unbiased.
         progress: Called after each batch with the fraction that is done.
         enough: A stored reference with at least so many samples is used. Default: ``spp``.
+        workers: Those who render it. Default: this process.
 
     Raises:
         InputError: ``spp`` is below 8, the integrator fails, or the image is black or holds NaN or
@@ -137,7 +143,7 @@ def render_reference(
     if cached is not None and (cached.spp or 0) >= min(spp, enough or spp):
         return cached
     try:
-        return _render(scene, spp, folder, named, progress)
+        return _render(scene, spp, folder, named, integrator, progress, workers)
     except InputError as error:
         raise InputError(f'{scene.source}: the reference of "{named.label}" {error}') from error
     except Exception as error:  # an integrator may raise anything
@@ -157,7 +163,9 @@ def _render(
     spp: int,
     folder: Path,
     named: NamedIntegrator,
+    specification: Specification,
     progress: Callable[[float], None] | None,
+    workers: ReferenceWorkers | None,
 ) -> Reference:
     batch_count = min(BATCH_COUNT, spp)
     batch_spp = -(-spp // batch_count)
@@ -165,10 +173,16 @@ def _render(
     path = folder / f"{identity['stem']}_{batch_spp * batch_count}spp.exr"
     partial = path.with_suffix(".partial.npz")
     batches = unfinished = _unfinished(partial)
-    seeds = batch_seeds(FIRST_SEED, batch_count)[unfinished.count if unfinished else 0 :]
+    if workers is None:
+        seeds = batch_seeds(FIRST_SEED, batch_count)[unfinished.count if unfinished else 0 :]
+        rendered = each_batch(named.integrator, scene.scene, 0, batch_spp, seeds, unfinished)
+    else:
+        rendered = workers.batches(
+            scene, specification, FIRST_SEED, batch_count, batch_spp, unfinished
+        )
     start = time.perf_counter()
     with marked(mark_of(folder, f"{named.label}_{scene.content_hash}")):
-        for batches in each_batch(named.integrator, scene.scene, 0, batch_spp, seeds, unfinished):
+        for batches in rendered:
             if fault := metrics.describe_non_finite(images.to_rgb(batches.mean, batches.channels)):
                 raise InputError(f"has {fault}")
             with replacing(partial) as temporary:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import queue
 import statistics
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from concurrent.futures import CancelledError, Executor, Future
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,9 @@ class Dispatch:
         self._request = replace(_absolute(renderer.request), description=description)
         self._tasks: dict[Batch, _Task] = {}
         self._running: dict[Future, Batch] = {}
+        # Waiting for thousands of futures by ``concurrent.futures.wait`` takes milliseconds
+        self._finished: queue.SimpleQueue[Future] = queue.SimpleQueue()
+        self._looked = 0.0
         self._seconds: deque[float] = deque(maxlen=_REMEMBERED)
         self._shared: dict[str, Any] = {}
         self._bundle: Bundle | None = None
@@ -109,14 +113,17 @@ class Dispatch:
                     self._give(batch, learned())
                 if not self._tasks:
                     return
-                finished = wait(self._running, _PERIOD, FIRST_COMPLETED).done
-                if not finished and is_stopped():
-                    return
-                for future in finished:
+                try:
+                    future = self._finished.get(timeout=_PERIOD)
+                except queue.Empty:
+                    if is_stopped():
+                        return
+                else:
                     result = self._taken(future, learned(), is_stopped)
                     if result is not None:
                         yield result
-                self._give_late_ones(learned())
+                if self._finished.empty():
+                    self._give_late_ones(learned())
         finally:
             for future in self._running:
                 future.cancel()
@@ -134,6 +141,7 @@ class Dispatch:
         )
         self._running[future] = batch
         task.futures += (future,)
+        future.add_done_callback(self._finished.put)
 
     def _taken(
         self, future: Future, learned: bytes | None, is_stopped: Callable[[], bool]
@@ -168,10 +176,13 @@ class Dispatch:
         return None
 
     def _give_late_ones(self, learned: bytes | None) -> None:
+        now = time.monotonic()
+        if now - self._looked < _PERIOD:
+            return
+        self._looked = now
         limit = _UNKNOWN_LATE
         if self._seconds:
             limit = max(_FIRST_LATE, _LATE * statistics.median(self._seconds))
-        now = time.monotonic()
         for batch, task in self._tasks.items():
             # Each time it may take longer: perhaps the batch is slow, and not its worker
             if now - task.given > limit * 2**task.copies:

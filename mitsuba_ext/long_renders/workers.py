@@ -19,6 +19,12 @@ from ..rendering import interrupts
 _PR_SET_PDEATHSIG = 1
 
 
+def threads_of_each(count: int) -> int:
+    """Threads of each of ``count`` processes that share this machine."""
+    # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR file
+    return max(2, (os.cpu_count() or 1) // count)
+
+
 class Workers(Executor):
     """Processes, each of which does one thing at a time. One that dies is replaced: only what it
     was doing fails. (In a single ``ProcessPoolExecutor``, everything would.)

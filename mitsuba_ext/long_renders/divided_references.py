@@ -1,0 +1,95 @@
+"""References of comparisons, rendered by others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Executor
+
+import mitsuba as mi
+
+from ..chosen import Chosen, LastScene
+from ..errors import InputError
+from ..rendering.batches import Batches
+from ..scenes import LoadedScene
+from .batch_renderer import BatchRenderer, RenderRequest
+from .dispatch import Dispatch
+from .state import Batch
+
+
+class ReferenceWorkers:
+    """Those who render the references of a comparison. What is measured is rendered elsewhere, one
+    render at a time: times of machines that differ, or of cores that are shared, cannot be
+    compared.
+
+    Parameters:
+        executor: Who renders: see :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`.
+        count: How many batches it renders at a time.
+        plugins: Modules that register other plugins.
+        threads: Of each process; 0 for as many as there are cores.
+    """
+
+    def __init__(
+        self, executor: Executor, count: int = 1, plugins: tuple[str, ...] = (), threads: int = 0
+    ) -> None:
+        if not callable(getattr(executor, "submit", None)):
+            raise InputError(f"an executor has a method submit(), found {executor!r}")
+        self._executor, self._count = executor, count
+        self._plugins, self._threads = plugins, threads
+
+    def batches(
+        self,
+        scene: LoadedScene,
+        specification: object,
+        seed: int,
+        count: int,
+        spp: int,
+        batches: Batches | None,
+    ) -> Iterator[Batches]:
+        """The sum of the batches so far, after each of them: as
+        :func:`~mitsuba_ext.rendering.batches.each_batch`.
+
+        Args:
+            scene: The scene, from a file.
+            specification: The integrator, as text.
+            seed: Of the reference.
+            count, spp: Of the batches, those of ``batches`` included, and of samples in each.
+            batches: The first ones, if they are there already.
+
+        Raises:
+            InputError: The scene or the integrator cannot be sent, or a batch fails.
+        """
+        if scene.path is None or not isinstance(specification, str):
+            raise InputError(
+                "cannot be sent to others: for an executor, the scene must be a file, and the "
+                "reference's integrator text"
+            )
+        film = scene.scene.sensors()[0].film()
+        has_crop_window = tuple(film.crop_size()) != tuple(film.size())
+        request = RenderRequest(
+            str(scene.path), None if has_crop_window else tuple(map(int, film.size())),
+            tuple(scene.parameters.items()), specification, seed=seed, variant=mi.variant(),
+            plugins=self._plugins, threads=self._threads,
+        )  # fmt: skip
+        renderer = BatchRenderer(request, scenes=_Loaded(scene))
+        dispatch = Dispatch(self._executor, renderer, lambda: self._count)
+        index = batches.count if batches else 0
+        waiting = (Batch(seed, number, spp) for number in range(index, count))
+        # Added in their order: the batches of an interrupted reference are those that come first
+        early = {}
+        for result in dispatch.results(waiting, lambda: b"", lambda: False):
+            early[result.batch.index] = result
+            while result := early.pop(index, None):
+                batches = batches or Batches(result.channels, result.image_channel_count)
+                batches.add(result.image, result.batch.spp)
+                index += 1
+                yield batches
+
+
+class _Loaded(LastScene):
+    """A scene that is there already."""
+
+    def __init__(self, loaded: LoadedScene) -> None:
+        self._given = loaded
+
+    def choose(self, path, size, definitions, specification, sensor_index, *_others) -> Chosen:
+        return Chosen.of(self._given, specification, sensor_index)
