@@ -145,8 +145,11 @@ _OPTICS = {
 }  # fmt: skip
 
 
+_ALL_ON = {"lobe_map": True, "direction_map": True}
+
+
 def swarm(**parameters: Any) -> mi.Integrator:
-    return mi.load_dict({"type": "swarm_path", "max_depth": 4, **parameters})
+    return mi.load_dict({"type": "swarm_path", "max_depth": 4, **_ALL_ON, **parameters})
 
 
 def _furnace() -> mi.Scene:
