@@ -15,7 +15,7 @@ _SLOTS = {
     "direction_map": "scattering",
 }  # fmt: skip
 
-#: Maps that have made images noisier.
+#: Maps that have made an image noisier, or have not been shown to pay.
 _OFF_BY_DEFAULT = ("lobe_map", "direction_map")
 
 
@@ -54,14 +54,14 @@ class SwarmPath(WalkIntegrator):
      * - lobe_map
        - |bool|
        - Learn whether to be reflected or transmitted, at the first eight bounces? Off by default:
-         the weights of several bounces multiply, and rare paths become spots; in panes the error
-         was 1.8 times that of uniform numbers. (Default: false)
+         in panes the error was 1.8 times that of uniform numbers, which the measure of the gain did
+         not foresee. (The cause is not known; perhaps weights of several bounces multiply.)
+         (Default: false)
      * - direction_map
        - |bool|
        - Learn from which directions light comes to the first vertex that is no mirror? Half of its
-         directions are chosen by the map. Off by default: with the other maps, it has made images
-         of glass noisier, which its own measure did not foresee; :monosp:`pss_guided` is the better
-         choice for the same noise. (Default: false)
+         directions are chosen by the map. Off by default: no scene has shown yet that it
+         pays. (Default: false)
      * - always_use
        - |bool|
        - Use all maps, also where the pilots show that it does not pay? (Default: false)
