@@ -81,8 +81,8 @@ class SwarmPath(WalkIntegrator):
     **Use it when** most noise comes from a decision that neighbouring pixels take alike, and that
     nothing else samples well: fast things before a dark background, small lights out of focus,
     lamps with spectral lines, beams in fog (as far as their light scatters once), dozens of lights
-    that shine on different places. **Not when** the noise is that
-    of many bounces (use :monosp:`pss_guided`), or when an image has fewer than 8 samples per pixel.
+    that shine on different places, reflections in panes of glass. **Not when** the noise is that of
+    many bounces (use :monosp:`pss_guided`), or when an image has fewer than 8 samples per pixel.
 
     The first pilot has one sample per pixel, and each pilot as many as all before it. Its samples
     are drawn from the maps of the earlier ones, and count with a weight that is fixed before the
