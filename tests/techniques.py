@@ -434,11 +434,12 @@ TECHNIQUES: dict[str, Technique] = {
 REFERENCE = Technique("path", draws_like_path=True)
 
 DEFAULTS = [name for name, technique in TECHNIQUES.items() if technique.is_plugin]
-#: Paths from lights take seconds to compile: their tests are slow.
+#: Paths from lights and seven maps take seconds to compile: their tests are slow.
 EACH_PLUGIN = [
-    pytest.param(name, marks=pytest.mark.slow) if TECHNIQUES[name].makes_splats else name
+    pytest.param(name, marks=pytest.mark.slow)
+    if TECHNIQUES[name].makes_splats or name == "swarm_path" else name
     for name in DEFAULTS
-]
+]  # fmt: skip
 FOLLOWERS = [name for name, technique in TECHNIQUES.items() if technique.draws_like_path]
 
 

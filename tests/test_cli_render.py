@@ -244,12 +244,12 @@ def test_signals_do_not_interrupt_the_writing_of_the_image(
     monkeypatch.setattr(interrupts, "TOGETHER", 0.02)
     monkeypatch.setattr(os, "_exit", exits.append)
 
-    def interrupted(path, film, metadata, *others):
+    def interrupted(path, film, metadata, *others, **options):
         for name in ("SIGTERM", "SIGINT") if metadata else ():  # else it is the trial
             time.sleep(0.05)
             os.kill(os.getpid(), getattr(signal, name))
         time.sleep(0.05)
-        write(path, film, metadata, *others)
+        write(path, film, metadata, *others, **options)
 
     monkeypatch.setattr(images, "write_film", interrupted)
     output = tmp_path / "a.exr"

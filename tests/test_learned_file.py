@@ -26,6 +26,10 @@ def _integrator(text: str, **parameters: str) -> mi.Integrator:
     return mi.load_dict({**parse_plugin(text), "max_depth": 6, **parameters})
 
 
+def _small(name: str) -> mi.Scene:
+    return load(name, width=64, height=36)
+
+
 def _larger_film() -> mi.Sensor:
     film = {"type": "hdrfilm", "width": 80, "height": 60}
     return mi.load_dict({"type": "perspective", "film": film})
@@ -34,7 +38,7 @@ def _larger_film() -> mi.Sensor:
 @pytest.mark.parametrize("name", some("lights and roulette", of=LEARNING))
 def test_a_restored_render_draws_what_the_last_stage_would_have_drawn(name, tmp_path: Path) -> None:
     """Without pilots: the last stage of the same seed is the whole render."""
-    scene, file = load("rooms"), tmp_path / "learned.npz"
+    scene, file = _small("rooms"), tmp_path / "learned.npz"
     first = _integrator(LEARNING[name], save_learned=str(file))
     with one_thread():
         first.render(scene, seed=3, spp=64)
@@ -53,7 +57,7 @@ def test_a_restored_render_draws_what_the_last_stage_would_have_drawn(name, tmp_
 @pytest.mark.slow
 def test_restored_decisions_are_those_that_were_saved(tmp_path: Path) -> None:
     """The tables themselves, bit for bit."""
-    scene, file = load("rooms"), tmp_path / "learned.npz"
+    scene, file = _small("rooms"), tmp_path / "learned.npz"
     integrator = mi.load_dict({
         "type": "composed_path", "max_depth": 6, "rr_depth": 2, "save_learned": str(file),
         "directions": {"type": "guided_directions", "always_guide": True},
@@ -90,23 +94,23 @@ def test_restored_decisions_are_those_that_were_saved(tmp_path: Path) -> None:
 
 def test_files_of_other_scenes_and_parameters_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "learned.npz"
-    _integrator("neepp", save_learned=str(file)).render(load("rooms"), spp=16)
+    _integrator("neepp", save_learned=str(file)).render(_small("rooms"), spp=16)
     with pytest.raises(ValueError, match="another scene"):
-        _integrator("neepp", load_learned=str(file)).render(load("open"), spp=16)
+        _integrator("neepp", load_learned=str(file)).render(_small("open"), spp=16)
     with pytest.raises(ValueError, match="other parameters"):
-        _integrator("neepp:grid=4", load_learned=str(file)).render(load("rooms"), spp=16)
+        _integrator("neepp:grid=4", load_learned=str(file)).render(_small("rooms"), spp=16)
     with pytest.raises(ValueError, match="film = "):
-        _integrator("neepp", load_learned=str(file)).render(load("rooms"), _larger_film(), spp=16)
+        _integrator("neepp", load_learned=str(file)).render(_small("rooms"), _larger_film(), spp=16)
     with pytest.raises(FileNotFoundError, match="does not exist"):
-        _integrator("neepp", load_learned=str(tmp_path / "none")).render(load("rooms"), spp=16)
+        _integrator("neepp", load_learned=str(tmp_path / "none")).render(_small("rooms"), spp=16)
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 0xFF
     file.write_bytes(data)
     with pytest.raises(ValueError, match="damaged"):
-        _integrator("neepp", load_learned=str(file)).render(load("rooms"), spp=16)
+        _integrator("neepp", load_learned=str(file)).render(_small("rooms"), spp=16)
     with pytest.raises(ValueError, match="save_learned"):
         target = tmp_path / "no folder" / "learned.npz"
-        _integrator("neepp", save_learned=str(target)).render(load("rooms"), spp=16)
+        _integrator("neepp", save_learned=str(target)).render(_small("rooms"), spp=16)
 
 
 def test_to_load_and_to_save_at_once_is_refused(tmp_path: Path) -> None:

@@ -310,6 +310,7 @@ def test_technique_has_the_mean_of_volpath_in_fog(name: str) -> None:
     _compare(scene, integrator, _volpath(5), 512, 0.03)
 
 
+@pytest.mark.slow
 def test_maps_of_distances_leave_the_radiance_of_a_white_world() -> None:
     """Camera rays fly where the map says, which weighs each of them."""
     lamp = {**LIGHTS["point_inside"], "intensity": 1e-3}  # something to learn
