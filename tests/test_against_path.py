@@ -57,6 +57,8 @@ def _images_of_path(scene: str, variant: str, seeds: int) -> np.ndarray:
 def _check_mean(scene: str, name: str, variant: str = "llvm_ad_rgb", spp: int = 0) -> None:
     max_depth, default_spp = SCENES[scene]
     technique, spp = TECHNIQUES[name], spp or default_spp
+    # Maps that are used everywhere make rare bright pixels, also where they do not pay
+    spp *= 2 if technique.parameters.get("always_use") else 1
     seeds, test, tolerance = 2, assert_same_pixels_on_average, 0.0
     if technique.makes_splats:
         seeds, test = MANY_SEEDS, assert_same_mean

@@ -13,9 +13,11 @@ from statistical import assert_exact, assert_same_pixels_on_average, batches, lo
 
 from mitsuba_ext.composition.swarm import doubling_pilots, stage_weights
 from mitsuba_ext.decisions.swarm import map_learner
+from mitsuba_ext.decisions.swarm.bounce_records import BounceRecords
 from mitsuba_ext.decisions.swarm.cells import CellDensities, Cells
 from mitsuba_ext.decisions.swarm.estimate import Form, density, estimate
 from mitsuba_ext.decisions.swarm.light_maps import light_cells
+from mitsuba_ext.decisions.swarm.lobe_maps import path_density
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -214,8 +216,10 @@ def test_maps_lower_the_noise_where_they_promise_to() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("adversary", ["one_hot", "random"])
-def test_wrong_maps_only_make_noise(monkeypatch, adversary: str) -> None:
+@pytest.mark.parametrize(("adversary", "kind"), [
+    ("one_hot", "streaks"), ("random", "streaks"), ("one_hot", "glass"), ("random", "glass"),
+])  # fmt: skip
+def test_wrong_maps_only_make_noise(monkeypatch, adversary: str, kind: str) -> None:
     """All mass in one cell, or anywhere: the share of uniform numbers keeps the mean right."""
 
     def wrong(counts, squares, widths):
@@ -228,10 +232,10 @@ def test_wrong_maps_only_make_noise(monkeypatch, adversary: str) -> None:
         return mass / mass.sum(-1, keepdims=True)
 
     monkeypatch.setattr(map_learner, "estimate", wrong)
-    scene = _streaks(12, 10)
-    plain = mi.load_dict({"type": "composed_path", "max_depth": 2})
+    scene, depth = (_streaks(12, 10), 2) if kind == "streaks" else (_glass_and_spots(), 5)
+    plain = mi.load_dict({"type": "composed_path", "max_depth": depth})
     expected = batches(scene, plain, 512, [1001, 1002])
-    images = batches(scene, swarm(always_use=True, max_depth=2), 1024, [1, 2])
+    images = batches(scene, swarm(always_use=True, max_depth=depth), 1024, [1, 2])
     assert_same_pixels_on_average(images, expected, 0.08)
 
 
@@ -312,6 +316,31 @@ def test_mean_with_maps_along_the_path(only: str) -> None:
     learned = integrator.statistics.learned
     assert all((word in learned) == maps[name] for name, word in _ONE_MAP.items())
     assert "uniform" not in learned
+
+
+def test_records_of_bounces_know_what_comes_before_and_after() -> None:
+    records = BounceRecords(2, 3)
+    # Path 0 chooses at bounces 0 and 2, path 1 at bounce 1
+    values = mi.Float([5, 9, 7, 4, 3, 8])
+    records.density = mi.Float([1, 0, 0, 2, 0.5, 0])
+    np.testing.assert_allclose(records.next_one(values).numpy()[[0, 3, 4]], [3, 0, 0])
+    np.testing.assert_allclose(records.products(values).numpy()[[0, 3, 4]], [5, 4, 15])
+
+
+def test_no_path_through_glass_weighs_more_than_the_share_of_uniform_numbers_allows() -> None:
+    density = path_density(mi.Float([0, 1, 1e20])).numpy()
+    np.testing.assert_allclose(density[:2], [0.2, 1], rtol=1e-6)
+    assert 1e19 < density[2] < 1e20
+
+
+def test_maps_of_lobes_lower_the_noise_of_panes() -> None:
+    scene = load("panes", width=64, height=36)
+    plain = mi.load_dict({"type": "composed_path", "max_depth": 8})
+    noise = batches(scene, plain, 64, [1, 2]).var(axis=0).mean()
+    integrator = mi.load_dict({"type": "swarm_path", "max_depth": 8})
+    ours = batches(scene, integrator, 64, [1, 2]).var(axis=0).mean()
+    assert ours < 0.6 * noise
+    assert "lobes: uniform" not in integrator.statistics.learned
 
 
 @pytest.mark.parametrize("depth", [pytest.param(4, marks=pytest.mark.slow), -1])

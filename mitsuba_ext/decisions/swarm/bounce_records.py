@@ -56,3 +56,25 @@ class BounceRecords:
     def after(self, total: mi.Float) -> mi.Float:
         """What the paths of all records brought afterwards; ``total`` is that of each lane."""
         return dr.maximum(dr.gather(mi.Float, total, self.lane) - self._before, 0)
+
+    def next_one(self, values: mi.Float) -> mi.Float:
+        """By record, the value of the next record of its path; 0 where there is none."""
+        result, later = [], mi.Float(0)
+        for k in reversed(range(self._bounces)):
+            result.insert(0, dr.zeros(mi.Float, self._paths) + later)
+            later = dr.select(self._part(self.density, k) > 0, self._part(values, k), later)
+        return dr.concat(result)
+
+    def products(self, values: mi.Float) -> mi.Float:
+        """By record, the product of the values of the records of its path up to itself."""
+        result, product = [], mi.Float(1)
+        for k in range(self._bounces):
+            factor = dr.select(self._part(self.density, k) > 0, self._part(values, k), 1)
+            product = product * factor
+            result.append(product)
+        return dr.concat(result)
+
+    def _part(self, values: mi.Float, bounce: int) -> mi.Float:
+        """Those of one bounce."""
+        first = dr.opaque(mi.UInt32, bounce * self._paths)
+        return dr.gather(mi.Float, values, first + dr.arange(mi.UInt32, self._paths))

@@ -1,12 +1,19 @@
 """Maps of the number that decides between reflection and transmission, at the first bounces of a
 path.
 
+A part of the paths draws uniform numbers at all bounces, and all paths are weighted by the balance
+heuristic: with ``Q`` the product of the densities of the maps up to a bounce, the density of a path
+relative to uniform numbers is ``α + (1 - α) Q``, so that no path weighs more than ``1 / α``. If
+each bounce had its own share of uniform numbers, the largest weights of all bounces would multiply.
+
 Source: D. Cline, PhD dissertation, BYU 2007, section 9.2.2 (bifurcation). The source has an entry
-for each bounce; here each bounce has a map for none, one, and more reflections before.
+for each bounce; here each bounce has a map for none, one, and more reflections before. The balance
+heuristic over whole paths: E. Veach, PhD dissertation, Stanford 1997, section 9.2.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -22,6 +29,9 @@ from .tile_counts import Choices
 
 #: Bounces with maps, and numbers of reflections before that have maps of their own.
 _BOUNCES, _REFLECTIONS = 8, 3
+
+#: The share of the paths that draw uniform numbers.
+_UNIFORM_SHARE = 0.2
 
 #: Bits of a cell's number, and the end of the first cell. The others grow by a factor: reflectances
 #: of glass are small, and what a number decides changes where it equals them.
@@ -72,14 +82,18 @@ class MappedLobes(DirectionSamples):
         self.records = BounceRecords(dr.width(ray), _BOUNCES) if self.is_recorded else None
         if pixel is None or (self.maps is None and self.records is None):
             return ()
-        # The tile, the number of reflections, and from which side the last surface was met
-        return self.tiles.tile(pixel), mi.UInt32(0), mi.Bool(False)
+        is_uniform = mi.Bool(self.maps is None)
+        if self.maps is not None:
+            is_uniform = sampler.next_1d() < _UNIFORM_SHARE
+        # The tile, the number of reflections, from which side the last surface was met, whether the
+        # path draws uniform numbers, and the density of its numbers under the maps
+        return self.tiles.tile(pixel), mi.UInt32(0), mi.Bool(False), is_uniform, mi.Float(1)
 
     def draw(self, state, sampler, vertex, active):
         sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
         if isinstance(state, tuple) and not state:
             return sample_1, sample_2, 1.0, state
-        tile, reflections, was_front = state
+        tile, reflections, was_front, is_uniform, product = state
         incident = vertex.si.to_world(vertex.si.wi)
         stays = (dr.dot(vertex.path.arrival.ref.n, -incident) > 0) == was_front
         is_reflected = active & (vertex.depth > 0) & stays
@@ -90,17 +104,46 @@ class MappedLobes(DirectionSamples):
         if self.maps is None:
             cell = self.cells.find([sample_1])
         else:
-            table = tile * (_BOUNCES * _REFLECTIONS) + which
-            (sample_1,), density, cell = self.maps.sample(table, [sample_1], is_mapped)
-            weight = dr.rcp(density)
+            table, found = tile * (_BOUNCES * _REFLECTIONS) + which, self.cells.find([sample_1])
+            (sample_1,), density, cell = self.maps.sample(
+                table, [sample_1], is_mapped & ~is_uniform
+            )
+            cell = dr.select(is_uniform, found, cell)
+            of_found = self.maps.density(table, cell, is_mapped & is_uniform)
+            density = dr.select(is_mapped & is_uniform, of_found, density)
+            weight = path_density(product) / path_density(product * density)
+            product = product * density
         if self.records is not None:
             self.records.choose(vertex.depth, which, cell, density, is_mapped)
         is_front = dr.dot(vertex.si.n, incident) > 0
-        return sample_1, sample_2, weight, (tile, reflections, is_front)
+        return sample_1, sample_2, weight, (tile, reflections, is_front, is_uniform, product)
+
+
+def path_density(product: mi.Float) -> mi.Float:
+    """The density of the numbers of a path, relative to uniform ones; ``product`` is that under the
+    maps of all bounces so far."""
+    return dr.lerp(product, 1.0, _UNIFORM_SHARE)
+
+
+@dataclass
+class LobeChoices(Choices):
+    """Choices of the bounces of paths, whose densities multiply.
+
+    Attributes:
+        records: The choices of the bounces.
+    """
+
+    records: BounceRecords | None = None
+
+    def under(self, q: mi.Float) -> mi.Float:
+        return path_density(self.records.products(q))
 
 
 class LobeMapLearner(MapLearner):
     """Learns the maps of :class:`MappedLobes`, which is its ``decision``."""
+
+    #: What the maps of single bounces promise does not add up
+    needs_measurement = True
 
     def __init__(self, name: str, decision: MappedLobes, width: int, height: int, **how) -> None:
         maps = _BOUNCES * _REFLECTIONS
@@ -114,9 +157,11 @@ class LobeMapLearner(MapLearner):
     def choices(self, radiance: mi.Float) -> Choices:
         records = self.decision.records
         value = records.after(self.total) * dr.gather(mi.Float, self.importance, records.lane)
-        return Choices(
-            records.map, records.cell, records.density, value, records.density > 0, records.lane
-        )
+        density = path_density(records.products(records.density))
+        return LobeChoices(
+            records.map, records.cell, density, value, records.density > 0, records.lane,
+            later=records.next_one(value), records=records,
+        )  # fmt: skip
 
     def stop(self) -> None:
         super().stop()

@@ -41,6 +41,8 @@ class Choices:
             takes.
         scale: A density of 1 relative to uniform numbers, in units of the density of that something
             else; used where ``share`` is below 1. ``density`` is in these units then.
+        later: The part of ``value`` that follows from later choices of the same path, whose
+            ``density`` says how likely both were; it is not measured a second time here.
     """
 
     map: mi.UInt32
@@ -51,6 +53,7 @@ class Choices:
     lane: mi.UInt32 | None = None
     share: float = 1.0
     scale: mi.Float | float = 1.0
+    later: mi.Float | float = 0.0
 
     def under(self, q: mi.Float) -> mi.Float:
         """``density`` if that of the maps, relative to uniform numbers, were ``q``."""
@@ -131,17 +134,20 @@ class TileCounts:
         weight = np.repeat(scale / brightness, self._maps)
         if choices.lane is not None:
             tile = dr.gather(mi.UInt32, tile, choices.lane)
-        value = dr.select(choices.active & dr.isfinite(choices.value), choices.value, 0)
-        value *= inverse_unit * dr.gather(mi.Float, mi.Float(1 / np.sqrt(scale)), tile)
-        self._add_choices(tile, choices, value, weight)
+        unit = inverse_unit * dr.gather(mi.Float, mi.Float(1 / np.sqrt(scale)), tile)
+        value, later = (
+            dr.select(choices.active & dr.isfinite(x), x, 0) * unit
+            for x in (choices.value, choices.later)
+        )
+        self._add_choices(tile, choices, value, later, weight)
         variance = np.maximum(second - np.square(first), 0) / brightness
         total = float((samples * variance).sum())
         self._variance += total
         self._stage_variance += total
 
-    def _add_choices(self, tile, choices: Choices, value: mi.Float, weight: np.ndarray) -> None:
-        """``value`` is relative to the root mean square of what samples bring to the tile;
-        ``weight`` turns its squares into squares of relative errors, by table."""
+    def _add_choices(self, tile, choices: Choices, value, later, weight: np.ndarray) -> None:
+        """``value`` and ``later`` are relative to the root mean square of what samples bring to the
+        tile; ``weight`` turns their squares into squares of relative errors, by table."""
         table = tile * self._maps + choices.map
         cell = table * self._cells + choices.cell
         # Drawn in proportion to the density, and divided by it: a sum of these is an integral
@@ -149,11 +155,15 @@ class TileCounts:
         dr.scatter_add(self._counts, fixed, cell, choices.active)
         wide = mi.UInt64(fixed)
         dr.scatter_add(self._squares, (wide * wide) // int(_ONE), table, choices.active)
-        square = dr.minimum(dr.square(value), _LARGEST_MEASURED) * _ONE
+        # The terms of a product of two sums have the density of what leads to the earlier one
+        square, square_of_later = (
+            dr.minimum(dr.square(x), _LARGEST_MEASURED) for x in (value, later)
+        )
+        square = dr.maximum(square - square_of_later, 0) * _ONE
         # Mean over uniform numbers: what was drawn with a density stands for fewer of them
         uniform = square * choices.density
         tried = [
-            uniform / choices.under(dr.gather(mi.Float, q, cell, choices.active))
+            uniform / dr.select(choices.active, choices.under(dr.gather(mi.Float, q, cell)), 1)
             for q in self.candidates
         ]
         sums = _sums(len(weight), table, [square, uniform, *tried], choices.active)
