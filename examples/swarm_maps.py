@@ -2,8 +2,8 @@
 ``learned_samples.py`` does for guiding):
 
 ``.venv/bin/python examples/swarm_maps.py scenes/paperweight.xml 60,110 200,75`` writes
-``swarm_maps.png``: the image with the pixels marked, and for each of them the density of every number
-that has a map, relative to uniform numbers.
+``swarm_maps.png``: the image with the pixels marked, and for each of them the density of every
+number that has a map, relative to uniform numbers.
 """
 
 from __future__ import annotations

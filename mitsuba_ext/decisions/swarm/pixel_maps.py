@@ -1,5 +1,5 @@
-"""What swarm maps have learned for a pixel, as arrays: for pictures, and to see why a render is as it
-is."""
+"""What swarm maps have learned for a pixel, as arrays: for pictures, and to see why a render is as
+it is."""
 
 from __future__ import annotations
 
