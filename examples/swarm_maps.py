@@ -28,7 +28,7 @@ _LABELS = {
     "wavelength": ("number of the wavelength", "density"),
     "distance": ("number of the distance", "density"),
     "light_numbers": ("probability", ""),
-    "directions": ("number of the lobe", "bounce, reflections before"),
+    "directions": ("number of the lobe", "bounce, reflections"),
     "scattering": ("angle around z", "height"),
 }
 
@@ -49,7 +49,7 @@ class Pixel(click.ParamType):
         return x, y
 
 
-def _draw_lights(axes: plt.Axes, found: PixelMap, scene: mi.Scene, most: int = 12) -> None:
+def _draw_lights(axes: plt.Axes, found: PixelMap, scene: mi.Scene, most: int = 9) -> None:
     """Bars of the lights that are chosen most often, with the probability without a map."""
     probability, emitters = light_probabilities(scene, found), scene.emitters()
     shown = np.sort(np.argsort(-probability, kind="stable")[:most])[::-1]
@@ -116,26 +116,23 @@ def figure_of(
     if not slots:
         raise click.ClickException("no map pays in this scene (try --always)")
     rows, columns = len(pixels), len(slots)
-    height = image.shape[0] / image.shape[1] * 4.2
+    height = image.shape[0] / image.shape[1] * 5
     figure = plt.figure(
-        figsize=(4.2 + 1.9 * columns, max(height + 0.3, 1.75 * rows)), layout="constrained"
+        figsize=(5 + 1.6 * columns, max(height + 0.3, 1.55 * rows)), layout="constrained"
     )
-    left, right = figure.subfigures(1, 2, width_ratios=(4.2, 1.9 * columns))
+    left, right = figure.subfigures(1, 2, width_ratios=(5, 1.6 * columns))
     axes = left.subplots()
     axes.imshow(np.clip(image, 0, 1) ** (1 / 2.2))
     axes.set_axis_off()
     grid = right.subplots(rows, columns, squeeze=False)
     for (x, y), found, row, colour in zip(pixels, maps, grid, _COLOURS * rows):
         axes.add_patch(Rectangle((x - 4, y - 4), 8, 8, fill=False, color=colour, linewidth=1.5))
-        row[0].annotate(
-            f"{x}, {y}", (0, 0.5), (-40, 0), "axes fraction", "offset points", color=colour,
-            rotation=90, va="center", fontsize=9, fontweight="bold",
-        )  # fmt: skip
         for slot, plot in zip(slots, row):
             if slot in found:
                 _draw(plot, slot, found[slot], scene)
             else:
                 plot.set_axis_off()
+        row[0].set_ylabel(f"{x}, {y}", color=colour, fontsize=9, fontweight="bold")
     for slot, plot in zip(slots, grid[0]):
         plot.set_title(next(found[slot].name for found in maps if slot in found), fontsize=9)
     return figure

@@ -91,7 +91,7 @@ REGRESSIONS = {
         Regression("swarm_path", "burning_glass", {"direction_map": True}, max_depth=5, spp=512,
                    is_slow=True),
         Regression("swarm_path", "paperweight", {"always_use": True}, spp=256, is_slow=True),
-        Regression("swarm_path", "discharge_lamps", {"always_use": True}, max_depth=4, spp=1024,
+        Regression("swarm_path", "discharge_lamps", {"always_use": True}, max_depth=4, spp=2048,
                    variant="llvm_ad_spectral", is_slow=True),
         Regression("composed_path", "near_lights", max_depth=4, is_slow=True),
         Regression("composed_path", "flint", variant="llvm_ad_spectral"),
