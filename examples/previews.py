@@ -35,7 +35,7 @@ PICTURES = {
     "panes": 256,
     "peppers_ghost": 128,
     "bounce_card": 128,
-    "burning_glass": 64,
+    "burning_glass": 256,
     "showroom": 256,
     "discharge_lamps": 512,
     "paperweight": 512,

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from statistical import load
 
-from mitsuba_ext.decisions.swarm.camera_maps import CameraMapLearner, MappedNumbers
-from mitsuba_ext.decisions.swarm.cells import CellDensities, Cells
-from mitsuba_ext.decisions.swarm.light_maps import LightMapLearner, LightMaps, light_cells
-from mitsuba_ext.decisions.swarm.lobe_maps import LobeMapLearner, MappedLobes
+from mitsuba_ext.decisions.swarm.camera_maps import CameraMapLearner
+from mitsuba_ext.decisions.swarm.cells import Cells
+from mitsuba_ext.decisions.swarm.light_maps import LightMapLearner, light_cells
+from mitsuba_ext.decisions.swarm.lobe_maps import LobeMapLearner, lobe_cells
 from mitsuba_ext.decisions.swarm.pixel_maps import light_probabilities, pixel_maps
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-_WIDTH, _HEIGHT = 20, 12
+_WIDTH, _HEIGHT, _EDGE = 20, 12, 4
 
 
 def _sensor(**film) -> mi.Sensor:
@@ -25,13 +27,33 @@ def _sensor(**film) -> mi.Sensor:
     return mi.load_dict({"type": "perspective", "film": film})
 
 
-def _learned(learner) -> np.ndarray:
-    """Gives each table of a learner another random density; returns the masses."""
-    shape = learner.tiles.count * learner.maps, learner.cells.count
-    mass = np.random.default_rng(5).random(shape) * (learner.cells.widths > 0)
-    mass /= mass.sum(1, keepdims=True)
-    learner.decision.maps = CellDensities(learner.cells, mass)
-    return mass
+class _Densities:
+    """Another random density for each table."""
+
+    def __init__(self, cells: Cells, tables: int) -> None:
+        mass = np.random.default_rng(5).random((tables, cells.count)) * (cells.widths > 0)
+        self.mass = mass / mass.sum(1, keepdims=True)
+        widths = np.where(cells.widths > 0, cells.widths, 1)
+        self._table, self._count = mi.Float((self.mass / widths).ravel()), cells.count
+
+    def density(self, table, cell, active=True) -> mi.Float:
+        return dr.gather(mi.Float, self._table, table * self._count + cell, mi.Bool(active))
+
+
+def _learner(kind: type, cells: Cells, maps: int = 1, border: int = 0) -> Any:
+    """One that has learned, without a render."""
+    across, down = (-(-(size + 2 * border) // _EDGE) for size in (_WIDTH, _HEIGHT))
+    width = _WIDTH + 2 * border
+
+    def tile(pixel: mi.UInt32) -> mi.UInt32:
+        return pixel // width // _EDGE * across + pixel % width // _EDGE
+
+    learner = kind.__new__(kind)
+    learner.name, learner.cells, learner.maps = "x", cells, maps
+    learner.decision = SimpleNamespace(
+        maps=_Densities(cells, across * down * maps), tiles=SimpleNamespace(edge=_EDGE, tile=tile)
+    )
+    return learner
 
 
 def _lamps() -> mi.Scene:
@@ -50,58 +72,56 @@ def _panel() -> mi.Scene:
 
 
 _LEARNERS = {
-    "line": lambda: CameraMapLearner("x", MappedNumbers(Cells.line(6)), _WIDTH, _HEIGHT),
-    "square": lambda: CameraMapLearner("x", MappedNumbers(Cells.square(5)), _WIDTH, _HEIGHT),
-    "lamps": lambda: LightMapLearner("x", LightMaps(light_cells(_lamps(), 0)), _WIDTH, _HEIGHT),
-    "panel": lambda: LightMapLearner("x", LightMaps(light_cells(_panel(), 1)), _WIDTH, _HEIGHT),
-    "lobes": lambda: LobeMapLearner("x", MappedLobes(), _WIDTH, _HEIGHT),
+    "line": lambda: _learner(CameraMapLearner, Cells.line(6)),
+    "square": lambda: _learner(CameraMapLearner, Cells.square(5)),
+    "lamps": lambda: _learner(LightMapLearner, light_cells(_lamps(), 0)),
+    "panel": lambda: _learner(LightMapLearner, light_cells(_panel(), 1)),
+    "lobes": lambda: _learner(LobeMapLearner, lobe_cells(), 24),
 }
 
 
 @pytest.mark.parametrize("kind", _LEARNERS)
 def test_arrays_hold_the_density_that_is_drawn_from(kind: str) -> None:
     learner = _LEARNERS[kind]()
-    _learned(learner)
     found = pixel_maps({"slot": learner}, _sensor(), 13, 7)["slot"]
     maps = found.density.reshape(learner.maps, *found.density.shape[-len(found.edges) :])
-    tile = int(learner.tiles.tile(mi.UInt32(7 * _WIDTH + 13))[0])
     u = np.random.default_rng(6).random((len(found.edges), 500)).astype(np.float32)
     places = tuple(np.searchsorted(e, x, "right") - 1 for e, x in zip(found.edges, u))
     cell = learner.cells.find([mi.Float(x) for x in u])
     for which in (0, learner.maps - 1):
-        expected = learner.decision.maps.density(
-            mi.UInt32(np.full(500, tile * learner.maps + which, np.uint32)), cell
-        )
+        # Column 3 of the second row of tiles, of five
+        table = mi.UInt32(np.full(500, 8 * learner.maps + which, np.uint32))
+        expected = learner.decision.maps.density(table, cell)
         np.testing.assert_allclose(maps[which][places], expected.numpy(), rtol=1e-4)
     for axis in range(len(found.edges)):
         edges, density = found.along(axis)
         np.testing.assert_allclose((density * np.diff(edges)).sum(-1), 1, rtol=1e-4)
-    left, top, right, bottom = found.tile
-    assert left <= 13 < right and top <= 7 < bottom and right - left == learner.tiles.edge
+    assert found.tile == (12, 4, 16, 8)
 
 
 def test_lights_have_the_probabilities_of_their_map() -> None:
     scene, learner = _lamps(), _LEARNERS["lamps"]()
-    mass = _learned(learner)
     found = pixel_maps({"light_numbers": learner}, _sensor(), 0, 0)["light_numbers"]
     probability = light_probabilities(scene, found)
     # Cell i holds light i, and only the second has no probability
-    np.testing.assert_allclose(probability, mass[0, :5], rtol=1e-3)
+    np.testing.assert_allclose(probability, learner.decision.maps.mass[0, :5], rtol=1e-3)
     assert probability[1] == 0 and (probability[[0, 2, 3, 4]] > 0).all()
 
 
 def test_pixels_of_a_film_with_a_border_are_those_of_the_image() -> None:
-    learner = CameraMapLearner("x", MappedNumbers(Cells.line(2)), _WIDTH + 4, _HEIGHT + 4)
-    mass = _learned(learner)
     film = {"sample_border": True, "rfilter": {"type": "gaussian"}}
+    border = _sensor(**film).film().rfilter().border_size()
+    assert border == 2
+    learner = _learner(CameraMapLearner, Cells.line(2), border=border)
     found = pixel_maps({"time": learner}, _sensor(**film), 2, 0)["time"]
     # Column 2 is the fifth of the film's extent, behind the first tile
-    np.testing.assert_allclose(found.density, 4 * mass[1], rtol=1e-4)
+    np.testing.assert_allclose(found.density, 4 * learner.decision.maps.mass[1], rtol=1e-4)
     assert found.tile == (2, -2, 6, 2)
 
 
 def test_what_is_not_used_is_missing_and_pixels_are_checked() -> None:
     learner = _LEARNERS["line"]()
+    learner.decision.maps = None
     others = {"time": learner, "next_event": SimpleNamespace()}
     assert pixel_maps(others, _sensor(), 0, 0) == {}
     with pytest.raises(ValueError, match="20 x 12"):

@@ -81,7 +81,7 @@ def pixel_maps(
 
 
 def _map(learner: MapLearner, pixel: int, place: tuple[int, int], border: int) -> PixelMap:
-    cells, maps = learner.cells, learner.maps
+    cells, maps, tiles = learner.cells, learner.maps, learner.decision.tiles
     bits = [cells.axes.count(axis) for axis in range(cells.dimension)]
     edges = [np.linspace(0, 1, (1 << b) + 1) for b in bits]
     if cells.bounds is not None:
@@ -94,7 +94,7 @@ def _map(learner: MapLearner, pixel: int, place: tuple[int, int], border: int) -
         shape = [-1 if axis == a else 1 for a in range(cells.dimension)]
         bit = (np.arange(1 << bits[axis]) >> left[axis]) & 1
         index = (index << 1) | bit.reshape(shape).astype(np.uint32)
-    tile = int(learner.tiles.tile(mi.UInt32(pixel))[0])
+    tile = int(tiles.tile(mi.UInt32(pixel))[0])
     table = np.repeat(np.arange(maps, dtype=np.uint32) + tile * maps, cells.count)
     cell = mi.UInt32(np.tile(index.ravel(), maps))
     # A cell without width has no density
@@ -105,8 +105,8 @@ def _map(learner: MapLearner, pixel: int, place: tuple[int, int], border: int) -
         density = density.reshape(-1, learner.reflections, cells.count)
     else:
         density = density[0]
-    first = [(p + border) // learner.tiles.edge * learner.tiles.edge - border for p in place]
-    ends = [p + learner.tiles.edge for p in first]
+    first = [(p + border) // tiles.edge * tiles.edge - border for p in place]
+    ends = [p + tiles.edge for p in first]
     return PixelMap(learner.name, edges, density, (*first, *ends))
 
 
