@@ -195,10 +195,51 @@ def test_another_render_is_refused(run, make_scene, tmp_path):
         code, _, err = run(*command, *change)
         assert code == 2 and words in err, err
     make_scene(integrator=PATH.replace("3", "4"))
-    assert '"scene files" differs (its files or code have changed)' in run(*command)[2]
+    assert '"scene files" differs (scene.xml has changed)' in run(*command)[2]
     # The same file by another name
     make_scene()
     assert run("render", os.path.relpath(scene), *command[2:])[0] == 0
+
+
+def test_a_changed_file_is_named(run, make_scene, tmp_path):
+    """Of a scene with an included file, a mesh and a texture."""
+    (tmp_path / "parts.xml").write_text(
+        '<scene version="3.0.0"><shape type="ply"><string name="filename" value="mesh.ply"/>'
+        '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
+        '<string name="filename" value="wood.png"/></texture></bsdf></shape></scene>'
+    )
+    rectangle = mi.load_dict({"type": "rectangle"})
+    mesh = mi.Mesh("", 4, 2, has_vertex_texcoords=True)
+    values = mi.traverse(mesh)
+    values["vertex_positions"] = [-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0]
+    values["vertex_texcoords"] = [0, 0, 1, 0, 1, 1, 0, 1]
+    values["faces"] = [0, 1, 2, 2, 3, 0]
+    values.update()
+    assert rectangle.bbox() == mesh.bbox()
+    mesh.write_ply(str(tmp_path / "mesh.ply"))
+    mi.Bitmap(np.full((2, 2, 3), 100, np.uint8)).write(str(tmp_path / "wood.png"))
+    body = '<default name="file" value="parts.xml"/><include filename="$file"/>'
+    command = ("render", make_scene(body=body), "-o", tmp_path / "a.exr", "--spp", 1,
+               "--checkpoint", tmp_path / "kept")  # fmt: skip
+    assert run(*command)[0] == 0
+
+    def refused(name: str, content: bytes) -> None:
+        whole = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(content)
+        code, _, err = run(*command)
+        assert code == 2 and f'"scene files" differs ({name} has changed)' in err, err
+        (tmp_path / name).write_bytes(whole)
+
+    refused("parts.xml", (tmp_path / "parts.xml").read_bytes() + b" ")
+    values["vertex_positions"] = [-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 2, 0]
+    values.update()
+    mesh.write_ply(str(tmp_path / "other.ply"))
+    refused("mesh.ply", (tmp_path / "other.ply").read_bytes())
+    mi.Bitmap(np.full((2, 2, 3), 101, np.uint8)).write(str(tmp_path / "other.png"))
+    refused("wood.png", (tmp_path / "other.png").read_bytes())
+    err = run(*command, "-D", "file=./parts.xml")[2]
+    assert '"scene parameters" differs (file: None there, ./parts.xml here)' in err
+    assert run(*command)[0] == 0
 
 
 # ---- Processes ----

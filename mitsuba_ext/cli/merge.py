@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from . import candidates
 from .common import FilledPath, say
+
+if TYPE_CHECKING:
+    from ..long_renders.folder import CheckpointFolder
+    from ..long_renders.state import RenderState
 
 
 @click.command(short_help="Merge renders that --checkpoint has kept.")
@@ -31,11 +36,11 @@ def merge(folders: Sequence[Path], output: Path) -> int:
     if output.exists():
         raise InputError(f"{output}: exists already")
     first, *others = (CheckpointFolder(folder) for folder in folders)
-    description, state = first.description(), first.load()
+    description, state = first.description(), _loaded(first)
     for other in others:
         check_same(description, other.description(), first.path, free=["seed"])
         try:
-            state = state.plus(other.load())
+            state = state.plus(_loaded(other))
         except InputError as error:
             raise InputError(f"{first.path} and {other.path}: {error}") from None
     target = CheckpointFolder(output)
@@ -44,3 +49,10 @@ def merge(folders: Sequence[Path], output: Path) -> int:
         target.save(state)
     say(f"{output}: {state.spp} spp in {len(state.done)} batches", err=False)
     return 0
+
+
+def _loaded(folder: CheckpointFolder) -> RenderState:
+    state = folder.load()
+    if folder.damaged:
+        say(f"mitsuba-ext: warning: {folder.damaged}: is damaged: the state before it is merged")
+    return state
