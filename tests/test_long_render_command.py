@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
@@ -62,6 +63,26 @@ def test_more_samples_later_and_merged(run, make_scene, tmp_path):
     assert run("render", scene, "-o", tmp_path / "3.exr", *other)[0] == 0
     assert '"scene files" differs' in run(
         "merge", tmp_path / "1", tmp_path / "3", "-o", tmp_path / "c")[2]  # fmt: skip
+
+
+def test_a_merged_folder_is_whole_or_not_there(run, make_scene, tmp_path, monkeypatch):
+    scene, kept = make_scene(), [tmp_path / "a", tmp_path / "b"]
+    for seed, folder in enumerate(kept):
+        assert run("render", scene, "-o", tmp_path / "a.exr", "--checkpoint", folder,
+                   "--seed", seed)[0] == 0  # fmt: skip
+
+    def full(self, state):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = sorted(tmp_path.iterdir())
+    with monkeypatch.context() as patch:
+        patch.setattr(CheckpointFolder, "save", full)
+        code, _, err = run("merge", *kept, "-o", tmp_path / "c")
+    assert code == 2 and "c: cannot be written (No space left on device)" in err
+    assert sorted(tmp_path.iterdir()) == before
+    assert run("merge", *kept, "-o", tmp_path / "new" / "c")[0] == 0
+    assert sorted(f.name for f in (tmp_path / "new").rglob("*")) == [
+        "c", "render.json", "state.npz"]  # fmt: skip
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,6 +31,7 @@ def merge(folders: Sequence[Path], output: Path) -> int:
     """Merge the samples of renders that ``render --checkpoint DIR`` has kept: of the same scene, by
     the same integrator, with different seeds. Each counts by its samples."""
     from ..errors import InputError
+    from ..files import make_folder
     from ..long_renders.folder import CheckpointFolder, check_same
 
     if len(folders) < 2:
@@ -43,10 +46,17 @@ def merge(folders: Sequence[Path], output: Path) -> int:
             state = state.plus(_loaded(other))
         except InputError as error:
             raise InputError(f"{first.path} and {other.path}: {error}") from None
-    target = CheckpointFolder(output)
-    with target.in_use():
-        target.describe(description)
-        target.save(state)
+    # Made beside it: a folder that is half made would pass for the beginning of a render
+    make_folder(output.parent)
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as made:
+            target = CheckpointFolder(Path(made) / output.name)
+            with target.in_use():
+                target.describe(description)
+                target.save(state)
+            os.rename(target.path, output)
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written ({error.strerror})") from error
     say(f"{output}: {state.spp} spp in {len(state.done)} batches", err=False)
     return 0
 
