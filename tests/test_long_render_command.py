@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from conftest import PATH, in_subprocess
 
-from mitsuba_ext.compare import load_reference, read_exr
+from mitsuba_ext.compare import images, load_reference, read_exr
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.intervals import Interval
@@ -149,6 +149,19 @@ def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkey
                          read_exr(tmp_path / "a.exr")[1]["spp"]))  # fmt: skip
         return render(self, batch, learned)
 
+    # It may come at any time, and would end the process by default
+    describe, write = CheckpointFolder.describe, images.write_film
+
+    def before(*arguments):
+        os.kill(os.getpid(), signal.SIGUSR1)
+        describe(*arguments)
+
+    def after(*arguments, **options):
+        os.kill(os.getpid(), signal.SIGUSR1)
+        write(*arguments, **options)
+
+    monkeypatch.setattr(CheckpointFolder, "describe", before)
+    monkeypatch.setattr(images, "write_film", after)
     monkeypatch.setattr(BatchRenderer, "render", signalled)
     code, out, _ = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
                        "--checkpoint", tmp_path / "kept")  # fmt: skip

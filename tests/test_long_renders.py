@@ -182,17 +182,6 @@ def test_a_black_image_has_no_error_to_reach(run, make_scene, tmp_path):
     assert run(*command, "--spp", 1 << 20, "--time", 0.2)[0] == 0
 
 
-def test_pixels_that_are_not_finite_do_not_count(request_of):
-    render = LongRender(BatchRenderer(request_of("path")), RenderState())
-    render.run(Goal(spp=128))
-    error = render.error
-    mean, squares = render.state.images._state[2:]
-    mean[0, 0, 1], squares[2, 2, 0] = np.nan, np.inf
-    assert render.error == pytest.approx(error, rel=0.2) and render.error != error
-    mean[...] = np.nan
-    assert render.error is None
-
-
 def test_the_first_batches_tell_how_many_fit_into_the_time(request_of, monkeypatch):
     class Clock:
         now = 0.0
