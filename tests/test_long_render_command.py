@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -130,6 +131,21 @@ def test_a_full_disk_costs_an_interval_at_most(run, make_scene, tmp_path, monkey
     assert code == 0 and err.count("No space left") == 3 and "64 spp" in out
     assert spps == [16, 16, 16, 64, 64] and not list(kept.glob(".state*"))
     assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64
+
+
+def test_a_folder_that_is_deleted_costs_the_folder_only(run, make_scene, tmp_path, monkeypatch):
+    render, kept = BatchRenderer.render, tmp_path / "kept"
+
+    def deleted(self, batch, learned):
+        if batch.index == 2:
+            shutil.rmtree(kept)
+        return render(self, batch, learned)
+
+    monkeypatch.setattr(BatchRenderer, "render", deleted)
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
+                       "--checkpoint", kept, "--every", "16spp")  # fmt: skip
+    assert code == 0 and "the render could not be kept: [Errno 2] No such file" in err
+    assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64 and not kept.exists()
 
 
 def test_variants_without_batches_are_named(run, make_scene, tmp_path):

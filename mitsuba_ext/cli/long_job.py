@@ -26,7 +26,7 @@ from ..rendering.totals import RenderTotals
 from .reports import Report, Speed, time_left
 
 #: Without --until, the error is computed again after so many times the time that this took.
-_ERROR_PERIOD = 50
+_ERROR_PERIOD = 200
 
 
 @dataclass(frozen=True)
