@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from statistical import load
 
+from mitsuba_ext.composition.pixel_maps import light_probabilities, pixel_maps
 from mitsuba_ext.decisions.swarm.camera_maps import CameraMapLearner
 from mitsuba_ext.decisions.swarm.cells import Cells
 from mitsuba_ext.decisions.swarm.light_maps import LightMapLearner, light_cells
 from mitsuba_ext.decisions.swarm.lobe_maps import LobeMapLearner, lobe_cells
-from mitsuba_ext.decisions.swarm.pixel_maps import light_probabilities, pixel_maps
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -10,10 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...rendering.camera import film_extent
-from ..learner import Learner
-from .lobe_maps import LobeMapLearner
-from .map_learner import MapLearner
+from ..decisions.learner import Learner
+from ..decisions.swarm.lobe_maps import LobeMapLearner
+from ..decisions.swarm.map_learner import MapLearner
+from ..rendering.camera import film_extent
 
 
 @dataclass
