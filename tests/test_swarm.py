@@ -112,25 +112,32 @@ def test_one_sample_is_not_believed() -> None:
     counts[1, 2, 0, 5] = 1e9
     shares = _estimated(counts, squares=np.square(counts.sum(-1)))
     np.testing.assert_allclose(shares, 1 / 16, rtol=1e-4)
+    # Nor one in each tile, in different places
+    tiles = np.arange(16)
+    counts.reshape(16, 16)[tiles, (5 * tiles) % 16] = 1e9
+    shares = _estimated(counts, squares=np.square(counts.sum(-1)))
+    assert shares.max() < 3 / 16 and shares.min() > 0.5 / 16
+
+
+def _believed(h, p, n, variance, tables):
+    """The beta-binomial estimate and its variance at one node, with the ρ of these tables."""
+    excess, weight = (n * (h - p) ** 2 / (p * (1 - p)) - 1).sum(), tables * (n - 1)
+    chance = np.sqrt(2 * tables)
+    rho = np.clip((excess - chance) / weight, 0, 0.5)
+    most = np.clip((max(excess, 0) + chance) / weight, 0, 0.5)
+    believed = n * rho / (n * rho + 1 - rho)
+    left = p + believed * (h - p)
+    return left, (1 - believed) ** 2 * variance + left * (1 - left) * most / (n * most + 1)
 
 
 def test_few_samples_of_a_tile_are_believed_a_little() -> None:
-    """At one node, the beta-binomial estimate by hand."""
     counts = np.zeros((1, 2, 1, 2))
     counts[0, 0, 0], counts[0, 1, 0] = (12, 0), (4, 8)
-    shares = _estimated(counts)[0, :, 0, 0]
-    # The film: h = 2/3 of 24 samples, which differs from 1/2 by more than chance
-    excess, weight, chance = 24 * (1 / 6) ** 2 * 4 - 1, 23, 2
-    rho = (excess - np.sqrt(chance)) / weight
-    film = 1 / 2 + 24 * rho / (24 * rho + 1 - rho) * (2 / 3 - 1 / 2)
-    q = film * (1 - film)
-    h = np.array([1, 1 / 3])
-    excess = (12 * (h - film) ** 2 / q - 1).sum()
-    rho = min((excess - np.sqrt(4)) / 22, 0.5)
-    left = film + 12 * rho / (12 * rho + 1 - rho) * (h - film)
-    variance = left * (1 - left) * rho / (12 * rho + 1)
+    film, variance = _believed(np.array([2 / 3]), 1 / 2, 24, 0, 1)
+    left, variance = _believed(np.array([1, 1 / 3]), film, 12, variance, 2)
     a, b = np.sqrt(left**2 + variance), np.sqrt((1 - left) ** 2 + variance)
-    np.testing.assert_allclose(shares, a / (a + b), rtol=1e-4)
+    np.testing.assert_allclose(_estimated(counts)[0, :, 0, 0], a / (a + b), rtol=1e-4)
+    assert (np.abs(a / (a + b) - [1, 1 / 3]) > 0.05).all()
 
 
 def test_tiles_that_are_joined_have_the_map_of_all_their_samples() -> None:

@@ -126,7 +126,7 @@ class Schedule:
         learns = self._pilot_count > 0 and self.learners and self._stages[0] == 1
         if not self._has_maps or not learns:
             return 1
-        parts = first_parts(pixel_count)
+        parts = first_parts(pixel_count, sum(self._stages))
         self._pilot_count += parts - 1
         self._weights = stage_weights(self._stages, parts)
         return parts

@@ -26,9 +26,10 @@ _MOST_LOSS = 0.015
 _UNIFORM, _HALF = 0.1, 1.5
 
 
-#: Stages into which the first sample of all pixels is divided, at most; and samples of each, at
-#: least: each stage is traced anew, which takes as long as so many samples.
-_MOST_PARTS, _LEAST_PIXELS = 4, 1 << 13
+#: The first sample of all pixels is divided into stages until the first of them takes no more than
+#: this share of all samples, as these are drawn from uniform numbers. It takes so many at least: to
+#: trace a stage takes as long.
+_FIRST_SHARE, _LEAST_PIXELS = 1 / 32, 1 << 13
 
 
 class Swarm(DecisionParameters):
@@ -208,10 +209,10 @@ def doubling_pilots(samples: int) -> list[int]:
     return pilots
 
 
-def first_parts(pixel_count: int) -> int:
-    """Into how many stages the first sample of all pixels is divided."""
+def first_parts(pixel_count: int, spp: int) -> int:
+    """Into how many stages the first sample of all pixels is divided, of ``spp`` ones."""
     parts = 1
-    while parts < _MOST_PARTS and pixel_count >> parts >= _LEAST_PIXELS:
+    while 0.5 ** (parts - 1) > _FIRST_SHARE * spp and pixel_count >> parts >= _LEAST_PIXELS:
         parts += 1
     return parts
 

@@ -1,18 +1,20 @@
 """Estimates densities over cells for all tiles of a film, from few samples of each.
 
 What a tile has counted is drawn towards what larger tiles around it have counted, as far as these
-differ by no more than chance: an empirical Bayes estimate. It goes from one tile that is the whole
-film to the smallest, and in each of them from the root of the tree of cells to its leaves. At a
-node, with ``h`` the share of the left half among ``n`` samples, and ``p`` what the tile around
-expects, the estimate is the mean of a beta distribution::
+differ by no more than chance: an empirical Bayes estimate. It goes from large tiles, around which
+nothing is known but uniform numbers, to the smallest, and in each of them from the root of the tree
+of cells to its leaves. At a node, with ``h`` the share of the left half among ``n`` samples, and
+``p`` what the tile around expects, the estimate is the mean of a beta distribution::
 
     (n h + κ p) / (n + κ)
 
 How far tiles really differ from the ones around them, ρ = 1 / (κ + 1), is estimated from all nodes
 of a tile and its neighbours (the variance of ``h`` is p (1 − p) (1 / n + ρ (1 − 1 / n))). Where
-nothing exceeds chance, ρ is 0, and the tile has the map of the one around it: in the end that of
-the whole film, or uniform numbers. What is drawn from has a little more where little is known: the
-root of the expected square of a share is best there, not its expectation.
+nothing exceeds chance, ρ is 0, and the tile has the map of the one around it.
+
+What is drawn from a density of which we are not sure has the least variance where that is the root
+of the expected square of a share, and not its expectation: cells have a little more where little
+is known. Without that, a few samples that missed a bright cell leave spots.
 
 All tiles of one size are estimated together, on the device: a map of 8 million cells takes a tenth
 of a second. What a node of a tree holds is the difference of two sums over the cells before.
@@ -47,6 +49,9 @@ class Form(NamedTuple):
     floor: float
 
 
+#: Sizes of tiles, at most: the largest are 2^(this - 1) times as wide as the smallest.
+_LEVELS = 6
+
 #: ρ, at most: with κ = 0, a single sample would decide.
 _LARGEST_DIFFERENCE = 0.5
 
@@ -77,6 +82,11 @@ class Grid:
     def count(self) -> int:
         """Number of tables."""
         return self.rows * self.columns * self.maps
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles."""
+        return self.rows * self.columns
 
     @property
     def larger(self) -> Grid:
@@ -127,17 +137,25 @@ def estimate(
     """
     cells = len(widths)
     levels = [(grid, counts, squares)]
-    while max(levels[-1][0].rows, levels[-1][0].columns) > 1:
+    while len(levels) < halvings + _LEVELS and levels[-1][0].tiles > 1:
         levels.append(_halved(*levels[-1], cells))
     levels = levels[min(halvings, len(levels) - 1) :]
     above, shares = levels[-1][0], widths
     if above.count > 1:
         shares = dr.tile(widths, above.count)
+    variance = dr.zeros(mi.Float, len(shares))
     while levels:
         grid, counts, squares = levels.pop()
-        expected = _enlarged(grid, above, shares, cells)
-        shares = _updated(grid, expected, counts, squares, cells, is_last=not levels)
-        dr.eval(shares)
+        if above is not grid:
+            shares, variance = _enlarged(grid, above, (shares, variance), cells)
+        nodes = Nodes(grid.count, cells)
+        left, variance = _updated(grid, nodes, shares, variance, counts, squares)
+        if not levels:
+            # The root of the expected square
+            a, b = (dr.sqrt(dr.square(x) + variance) for x in (left, 1 - left))
+            left = a / (a + b)
+        shares = nodes.masses(left)
+        dr.eval(shares, variance)
         above = grid
     return shares
 
@@ -196,13 +214,14 @@ class Shares:
 
 
 def _updated(
-    grid: Grid, expected: mi.Float, counts: mi.Float, squares: mi.Float, cells: int, is_last: bool
-) -> mi.Float:
-    """What a tile knows, where the tile around it expects these shares; if it has no smaller ones,
-    what is to be drawn from."""
-    own_before, expected_before = sums_before(counts, cells), sums_before(expected, cells)
+    grid: Grid, nodes: Nodes, shares: mi.Float, variance: mi.Float, counts: mi.Float,
+    squares: mi.Float,
+) -> tuple[mi.Float, mi.Float]:  # fmt: skip
+    """What a tile knows, where the tile around it expects these shares: by node, the share of the
+    left half, and its variance; ``variance`` is that of what is expected."""
+    cells = nodes.cells
+    own_before, expected_before = sums_before(counts, cells), sums_before(shares, cells)
     dr.eval(own_before, expected_before)
-    nodes = Nodes(grid.count, cells)
     total = dr.gather(
         mi.Float, own_before, dr.arange(mi.UInt32, grid.count) * cells + (cells - 1)
     )
@@ -218,21 +237,19 @@ def _updated(
     )
     dr.eval(excess, weight, chance)
     excess, weight, chance = _pooled(grid, (excess, weight, chance))
-    # One standard deviation of what chance brings is not believed
-    difference = dr.maximum(excess - dr.sqrt(chance), 0) / dr.maximum(weight, 1e-6)
-    rho = dr.minimum(difference, _LARGEST_DIFFERENCE)
-    dr.eval(rho)
-    rho = dr.gather(mi.Float, rho, nodes.table)
+    # One standard deviation of what chance brings is not believed, but it may be so
+    deviation = dr.sqrt(chance)
+    rho, most = (
+        dr.clip(x / dr.maximum(weight, 1e-6), 0, _LARGEST_DIFFERENCE)
+        for x in (excess - deviation, dr.maximum(excess, 0) + deviation)
+    )
+    dr.eval(rho, most)
+    rho, most = (dr.gather(mi.Float, x, nodes.table) for x in (rho, most))
     # n / (n + κ), without dividing by ρ = 0
     believed = n * rho / dr.maximum(n * rho + (1 - rho), 1e-6)
     left = dr.fma(believed, h - p, p)
-    if is_last:
-        # What is drawn from a density of which we are not sure has the least variance where that is
-        # the root of the expected square: the mean, and the variance of the beta distribution
-        variance = left * (1 - left) * rho / (n * rho + 1)
-        a, b = dr.sqrt(dr.square(left) + variance), dr.sqrt(dr.square(1 - left) + variance)
-        left = a / (a + b)
-    return nodes.masses(left)
+    own_variance = left * (1 - left) * most / (n * most + 1)
+    return left, dr.fma(dr.square(1 - believed), variance, own_variance)
 
 
 def _pooled(grid: Grid, values: tuple[mi.Float, ...]) -> list[mi.Float]:
@@ -271,10 +288,10 @@ def _halved(
     return larger, sums, sums_of_squares
 
 
-def _enlarged(grid: Grid, above: Grid, shares: mi.Float, cells: int) -> mi.Float:
+def _enlarged(
+    grid: Grid, above: Grid, values: tuple[mi.Float, ...], cells: int
+) -> list[mi.Float]:
     """What tiles half as large would have: a bilinear interpolation."""
-    if above is grid:
-        return shares
     row, column, which = grid.all_places()
     nearest = mi.Int32(row >> 1), mi.Int32(column >> 1)
     towards = [mi.Int32(2 * (i & 1)) - 1 for i in (row, column)]
@@ -286,8 +303,11 @@ def _enlarged(grid: Grid, above: Grid, shares: mi.Float, cells: int) -> mi.Float
     dr.eval(parts)
     lane = dr.arange(mi.UInt32, grid.count * cells)
     table, cell = lane // cells, lane & (cells - 1)
-    result = mi.Float(0)
+    results = [mi.Float(0) for _ in values]
     for part, weight in zip(parts, (9 / 16, 3 / 16, 3 / 16, 1 / 16)):
         source = dr.gather(mi.UInt32, part, table) * cells + cell
-        result = dr.fma(weight, dr.gather(mi.Float, shares, source), result)
-    return result
+        results = [
+            dr.fma(weight, dr.gather(mi.Float, value, source), result)
+            for value, result in zip(values, results)
+        ]
+    return results

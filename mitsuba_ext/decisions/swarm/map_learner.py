@@ -28,19 +28,21 @@ _LEAST_GAIN = 0.03
 #: Maps that do not pay after so many samples per pixel, and in so many stages, are given up.
 _ENOUGH_SAMPLES, _VAIN_STAGES = 4, 2
 
-#: Samples of all pilots that a tile has at least, and these for each cell: tiles are as small as
-#: that allows. Before all are taken, there are maps for larger tiles only.
-_LEAST_SAMPLES, _SAMPLES_PER_CELL = 64, 0.25
+#: Samples of all pilots that a tile has, at least, and one for each cell of its maps, which takes
+#: time. Tiles are as small as that allows. Before all are taken, there are maps of larger tiles,
+#: which have at least a part of these.
+_LEAST_SAMPLES, _EARLY_PART = 64, 0.25
 
 
-def tile_edge(samples: int, cells: int) -> int:
+def tile_edge(samples: float, cells: int, share: float = 1.0) -> int:
     """The edge of a tile in pixels.
 
     Parameters:
-        samples: Of the pilots, per pixel.
-        cells: Of a map.
+        samples: Samples per pixel.
+        cells: Of all maps of a tile.
+        share: Of the samples that tiles are to have.
     """
-    wanted = max(_LEAST_SAMPLES, _SAMPLES_PER_CELL * cells)
+    wanted = share * max(_LEAST_SAMPLES, cells)
     edge = 1
     while edge * edge * samples < wanted:
         edge *= 2
@@ -87,7 +89,7 @@ class MapLearner(Learner):
         always: bool = False,
     ) -> None:
         self.name, self.decision, self.cells, self.maps = name, decision, cells, maps
-        edge = tile_edge(samples, cells.count)
+        edge = tile_edge(samples, maps * cells.count)
         self.tiles = FilmTiles.of_cells(width, height, edge, maps * cells.count)
         decision.tiles = self.tiles
         self._widths = mi.Float(cells.widths.astype(np.float32))
@@ -181,7 +183,7 @@ class MapLearner(Learner):
 
     def _halvings(self, samples: float) -> int:
         """How often tiles are joined where each pixel has so many samples."""
-        wanted, halvings = tile_edge(samples, self.cells.count), 0
+        wanted, halvings = tile_edge(samples, self.maps * self.cells.count, _EARLY_PART), 0
         most = max(self.tiles.rows, self.tiles.columns)
         while self.tiles.edge << halvings < wanted and 1 << halvings < most:
             halvings += 1

@@ -23,12 +23,13 @@ class Nodes:
         cells: Leaves of each, a power of two.
 
     Attributes:
+        cells: See above.
         table: Of each lane.
         exist: Is the lane a node?
     """
 
     def __init__(self, tables: int, cells: int) -> None:
-        self._tables, self._cells = tables, cells
+        self._tables, self.cells = tables, cells
         self._depth = cells.bit_length() - 1
         lane = dr.arange(mi.UInt32, tables * cells)
         self.table = lane // cells
@@ -58,9 +59,9 @@ class Nodes:
         """By table and cell, the product of the shares on the way from the root to the cell;
         ``left`` is that of the left half of each node."""
         dr.eval(left)
-        lane = dr.arange(mi.UInt32, self._tables * self._cells)
-        leaf = (lane & (self._cells - 1)) + self._cells
-        base, mass = lane & ~mi.UInt32(self._cells - 1), mi.Float(1)
+        lane = dr.arange(mi.UInt32, self._tables * self.cells)
+        leaf = (lane & (self.cells - 1)) + self.cells
+        base, mass = lane & ~mi.UInt32(self.cells - 1), mi.Float(1)
         for level in range(self._depth):
             p = dr.gather(mi.Float, left, base + (leaf >> (self._depth - level)))
             is_right = ((leaf >> (self._depth - 1 - level)) & 1) == 1
