@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import drjit as dr
+import mitsuba as mi
 import pytest
 
 from mitsuba_ext.cli import long_job, reports, statistics
@@ -45,6 +46,22 @@ def test_a_script_reads_events(run, make_scene, tmp_path, every_event, options):
     assert steps[-2]["seconds_left"] > 0 == steps[-1]["seconds_left"]
     if options:
         assert steps[-1]["samples_per_second"] > 0 and steps[-1]["goal_spp"] == 1 << 16
+
+
+def test_nothing_else_gets_among_the_events(run, make_scene, tmp_path):
+    """Mitsuba prints its warnings to stdout, and so may a module of the user."""
+    module = tmp_path / "loud.py"
+    module.write_text(
+        "import mitsuba as mi\nprint('printed')\nmi.Log(mi.LogLevel.Warn, 'a thing')\n"
+        "mi.Log(mi.LogLevel.Info, 'another')\n"
+    )
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--plugin", module)
+    code, out, err = run(*command, "--json")
+    warning, *_, end = (json.loads(line) for line in out.splitlines())
+    assert code == 0 and err == "printed\n" and end["event"] == "end"
+    assert warning["event"] == "warning" and warning["text"].endswith("a thing")
+    before = mi.logger().appender(0)
+    assert run(*command)[1].startswith("printed") and mi.logger().appender(0) is before
 
 
 @pytest.mark.parametrize(("integrator", "options"), [

@@ -110,6 +110,8 @@ class LongJob:
                 if self._folder:
                     self._folder.describe(self._renderer.description())
                     self._state = self._folder.load()
+                    if damaged := self._folder.damaged:
+                        report.warn(f"{damaged}: is damaged: going on from the state before it")
                 self._run(spp, seconds, write, report)
             finally:
                 self.seconds = time.perf_counter() - begin

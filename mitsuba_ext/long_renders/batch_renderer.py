@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,9 +91,14 @@ class BatchRenderer(IntegratorBatches):
         """What the image depends on, but for the number of samples."""
         request, film = self.request, self.sensor.film()
         loaded, named = self.chosen.loaded, self.chosen.named
+        folder = loaded.path.resolve().parent
         return {
             "scene": loaded.source,
+            "scene parameters": loaded.parameters,
             "scene files hash": loaded.content_hash,
+            "scene files": {
+                os.path.relpath(file, folder): found for file, found in loaded.file_hashes.items()
+            },
             **({"values of the scene": request.values} if request.values else {}),
             "size": "x".join(map(str, film.crop_size())),
             "integrator": named.name,

@@ -8,7 +8,10 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
+import numpy as np
+
 from ..compare import images, metrics
+from ..errors import InputError
 from .dispatch import QUEUE, Dispatch
 from .integrator_batches import IntegratorBatches
 from .state import Batch, BatchResult, RenderState
@@ -101,13 +104,17 @@ class LongRender:
 
     @property
     def error(self) -> float | None:
-        """The relative error that the batches announce, as relMSE; ``None`` before there are enough
-        of them."""
+        """The relative error that the batches announce, as relMSE, over the pixels that are finite;
+        ``None`` before there are enough batches, and for a black image."""
         batches = self.state.images
         if batches is None or batches.count < _FEWEST:
             return None
-        rgb = [images.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance)]
-        return metrics.reference_noise(*rgb)
+        mean, variance = (
+            images.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance)
+        )
+        is_finite = (np.isfinite(mean) & np.isfinite(variance)).all(axis=2)
+        mean, variance = mean[is_finite], variance[is_finite]
+        return metrics.reference_noise(mean, variance) if mean.any() else None
 
     @property
     def spp_left(self) -> int | None:
@@ -123,8 +130,15 @@ class LongRender:
     def _is_reached(self) -> bool:
         if self.goal_spp and self.state.spp >= self.goal_spp:
             return True
-        limit = self._goal.error
-        return limit is not None and (error := self.error) is not None and error <= limit
+        if (limit := self._goal.error) is None:
+            return False
+        error, is_endless = self.error, self._goal.spp is None and self._goal.seconds is None
+        if error is None and is_endless and len(self.state.done) >= _FEWEST:
+            raise InputError(
+                f"the image is black, or not finite, after {self.state.spp} samples per pixel, and "
+                f"has no relative error that could be reached: limit the samples or the time too"
+            )
+        return error is not None and error <= limit
 
     def _plan(self, left: float, seconds: float) -> None:
         """Says how many samples fit into the time that is left, by the seconds of one."""
