@@ -137,7 +137,7 @@ def test_few_samples_of_a_tile_are_believed_a_little() -> None:
     left, variance = _believed(np.array([1, 1 / 3]), film, 12, variance, 2)
     a, b = np.sqrt(left**2 + variance), np.sqrt((1 - left) ** 2 + variance)
     np.testing.assert_allclose(_estimated(counts)[0, :, 0, 0], a / (a + b), rtol=1e-4)
-    assert (np.abs(a / (a + b) - [1, 1 / 3]) > 0.05).all()
+    assert (np.abs(a / (a + b) - [1, 1 / 3]) > 0.03).all()
 
 
 def test_tiles_that_are_joined_have_the_map_of_all_their_samples() -> None:

@@ -26,7 +26,7 @@ from .dither import dithered_parts
 from .filter_weights import put_splats
 from .interrupts import deferred_interrupt
 from .plan import Planned, plan_render
-from .stages import Schedule, Stage
+from .stages import DivisibleSchedule, Schedule, Stage
 from .time_budget import TimeBudget
 
 
@@ -239,7 +239,9 @@ class Job:
     def _first_parts(self, schedule: Schedule) -> list[np.ndarray]:
         """The pixels of the stages into which the schedule divides the first one; none if it is not
         divided."""
-        if not self.divides_stages or self.plan.structured or self.plan.parts > 1:
+        if not (self.divides_stages and isinstance(schedule, DivisibleSchedule)):
+            return []
+        if self.plan.structured or self.plan.parts > 1:
             return []
         count = schedule.divide_first_stage(self.plan.pixel_count)
         return dithered_parts(*camera.film_extent(self.film), count) if count > 1 else []
