@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import numpy as np
 import pytest
 from conftest import PATH, in_subprocess
 
-from mitsuba_ext.compare import load_reference, read_exr
+from mitsuba_ext.compare import images, load_reference, read_exr
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.intervals import Interval
@@ -132,6 +133,21 @@ def test_a_full_disk_costs_an_interval_at_most(run, make_scene, tmp_path, monkey
     assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64
 
 
+def test_a_folder_that_is_deleted_costs_the_folder_only(run, make_scene, tmp_path, monkeypatch):
+    render, kept = BatchRenderer.render, tmp_path / "kept"
+
+    def deleted(self, batch, learned):
+        if batch.index == 2:
+            shutil.rmtree(kept)
+        return render(self, batch, learned)
+
+    monkeypatch.setattr(BatchRenderer, "render", deleted)
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
+                       "--checkpoint", kept, "--every", "16spp")  # fmt: skip
+    assert code == 0 and "the render could not be kept: [Errno 2] No such file" in err
+    assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64 and not kept.exists()
+
+
 def test_variants_without_batches_are_named(run, make_scene, tmp_path):
     code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--until", 0.1,
                        "--variant", "scalar_rgb")  # fmt: skip
@@ -149,6 +165,19 @@ def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkey
                          read_exr(tmp_path / "a.exr")[1]["spp"]))  # fmt: skip
         return render(self, batch, learned)
 
+    # It may come at any time, and would end the process by default
+    describe, write = CheckpointFolder.describe, images.write_film
+
+    def before(*arguments):
+        os.kill(os.getpid(), signal.SIGUSR1)
+        describe(*arguments)
+
+    def after(*arguments, **options):
+        os.kill(os.getpid(), signal.SIGUSR1)
+        write(*arguments, **options)
+
+    monkeypatch.setattr(CheckpointFolder, "describe", before)
+    monkeypatch.setattr(images, "write_film", after)
     monkeypatch.setattr(BatchRenderer, "render", signalled)
     code, out, _ = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
                        "--checkpoint", tmp_path / "kept")  # fmt: skip

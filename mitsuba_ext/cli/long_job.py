@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
@@ -21,9 +20,13 @@ from ..long_renders.intervals import Interval, LastKept
 from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
 from ..long_renders.workers import Workers, threads_of_each
+from ..rendering import interrupts
 from ..rendering.interrupts import deferred_interrupt
 from ..rendering.totals import RenderTotals
 from .reports import Report, Speed, time_left
+
+#: Without --until, the error is computed again after so many times the time that this took.
+_ERROR_PERIOD = 200
 
 
 @dataclass(frozen=True)
@@ -136,17 +139,23 @@ class LongJob:
             write(is_asked)
 
         speed, pixel_count = Speed(), math.prod(self.film.crop_size())
+        error, error_due = None, 0.0
 
         with report.bars() as bars, _asked_to_keep() as asked:
             bar = bars.add_task(self.name, total=None, left="")
 
             def progress(render: LongRender) -> None:
+                nonlocal error, error_due
                 text, left = f"{self.name}, {state.spp} spp", None
                 if (per_second := speed(state.spp)) is not None:
                     text += f", {per_second * pixel_count / 1e6:.3g} million samples/s"
                     left = render.spp_left and render.spp_left / per_second
-                # It takes as long as a small batch
-                error = render.error if options.until else None
+                # To compute it takes as long as a small batch
+                if options.until or (begin := time.perf_counter()) >= error_due:
+                    error = render.error
+                    if not options.until:
+                        now = time.perf_counter()
+                        error_due = now + _ERROR_PERIOD * (now - begin)
                 if error is not None:
                     text += f", relMSE about {error:.2g}"
                 bars.update(
@@ -154,7 +163,8 @@ class LongJob:
                     left=time_left(left),
                 )  # fmt: skip
                 report.progress(
-                    spp=state.spp, goal_spp=render.goal_spp or None, relmse=error,
+                    spp=state.spp, goal_spp=render.goal_spp or None, batches=len(state.done),
+                    relmse=error,
                     samples_per_second=per_second and per_second * pixel_count,
                     seconds=time.perf_counter() - last.begin, seconds_left=left,
                 )  # fmt: skip
@@ -262,21 +272,10 @@ def _asked_to_keep() -> Iterator[Callable[[], bool]]:
     """While active, SIGUSR1 asks to keep the render after the running batch, and to go on. Yields a
     function that says whether that was asked since the last time."""
     asked: list[int] = []
-    number = getattr(signal, "SIGUSR1", None)
-    if number is None:
-        yield lambda: False
-        return
-    try:
-        before = signal.signal(number, lambda *_: asked.append(1))
-    except ValueError:  # not the main thread
-        yield lambda: False
-        return
 
     def take() -> bool:
         was, asked[:] = bool(asked), []
         return was
 
-    try:
+    with interrupts.requests_to_keep(lambda *_: asked.append(1)):
         yield take
-    finally:
-        signal.signal(number, before)

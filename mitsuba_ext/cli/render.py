@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import click
 from ..long_renders.intervals import Interval
 from ..names import check_integrator
 from ..parameters import MOST_SPP
+from ..rendering.interrupts import requests_to_keep
 from ..variants import select_variant
 from . import candidates
 from .common import (
@@ -187,7 +190,9 @@ def render(
         raise click.UsageError("--add is for one image: give --spp, the number that all shall have")
     if parameters is not None and frames is None:
         raise click.UsageError("--parameters needs --frames")
-    with report.only_events():
+    # Before the first batch and after the last one, there is nothing to keep
+    ignored = requests_to_keep(signal.SIG_IGN) if is_long else contextlib.nullcontext()
+    with report.only_events(), ignored:
         function = None
         if parameters is not None:
             from .frame_parameters import load_function

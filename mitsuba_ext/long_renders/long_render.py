@@ -8,10 +8,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-import numpy as np
-
-from ..compare import images, metrics
+from ..compare import images
 from ..errors import InputError
+from .announced_error import announced_error
 from .dispatch import QUEUE, Dispatch
 from .integrator_batches import IntegratorBatches
 from .state import Batch, BatchResult, RenderState
@@ -58,6 +57,8 @@ class LongRender:
     ) -> None:
         self._renderer, self._progress = renderer, progress
         self.state, self.goal_spp = state, 0
+        # After how many batches it was computed last, which takes a while for large images
+        self._error: tuple[int, float | None] = (0, None)
 
     def run(
         self,
@@ -104,17 +105,15 @@ class LongRender:
 
     @property
     def error(self) -> float | None:
-        """The relative error that the batches announce, as relMSE, over the pixels that are finite;
-        ``None`` before there are enough batches, and for a black image."""
+        """The relative error that the batches announce; ``None`` before there are enough of them,
+        and for a black image."""
         batches = self.state.images
         if batches is None or batches.count < _FEWEST:
             return None
-        mean, variance = (
-            images.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance)
-        )
-        is_finite = (np.isfinite(mean) & np.isfinite(variance)).all(axis=2)
-        mean, variance = mean[is_finite], variance[is_finite]
-        return metrics.reference_noise(mean, variance) if mean.any() else None
+        if self._error[0] != batches.count:
+            rgb = [images.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance)]
+            self._error = batches.count, announced_error(*rgb)
+        return self._error[1]
 
     @property
     def spp_left(self) -> int | None:
