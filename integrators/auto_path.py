@@ -9,7 +9,11 @@ from mitsuba_ext.composition.decision_parameters import ParameterReader
 from mitsuba_ext.composition.directions import Guided
 from mitsuba_ext.composition.next_event import LearnedLights
 from mitsuba_ext.composition.roulette import GuidedRoulette
+from mitsuba_ext.composition.swarm import MAPS
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+
+#: The numbers of a camera ray that can have maps.
+_CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
 
 
 @registry.plugin
@@ -77,4 +81,6 @@ class AutoPath(WalkIntegrator):
             directions=Guided(read),
             next_event=LearnedLights(read),
             roulette=GuidedRoulette(),
+            # They do not ask for longer pilots
+            **{slot: MAPS[slot](read, pilot_spp=Guided.pilot_spp) for slot in _CAMERA_NUMBERS},
         )
