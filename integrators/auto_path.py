@@ -24,8 +24,9 @@ class AutoPath(WalkIntegrator):
     Self-configuring path tracer (:monosp:`auto_path`)
     --------------------------------------------------
 
-    A path tracer that tries in its first samples whether guiding directions and learning lights
-    pay in this scene, and keeps what does. There is nothing to choose.
+    A path tracer that tries in its first samples whether guiding directions, learning lights, and
+    learning which times, points of the lens, wavelengths and distances in fog find light pay in
+    this scene, and keeps what does. There is nothing to choose.
 
     .. pluginparameters::
 
@@ -47,18 +48,22 @@ class AutoPath(WalkIntegrator):
     more. **Not when** an image has fewer samples (there is nothing to learn from), or when light
     comes through glass from small lamps (no path from the camera finds it).
 
-    It is a :monosp:`composed_path` with :monosp:`directions=guided` and
-    :monosp:`next_event=contribution`; :monosp:`guided_directions` and :monosp:`learned_lights` tell
-    what is learned, and how. The first two pilots are short: together they predict by how much each
-    of the two lowers the variance of the image. What costs more time than it saves ends there.
+    It is a :monosp:`composed_path` with :monosp:`directions=guided`,
+    :monosp:`next_event=contribution`, and the word :monosp:`swarm` in the slots :monosp:`time`,
+    :monosp:`aperture`, :monosp:`wavelength` and :monosp:`distance`; :monosp:`guided_directions`,
+    :monosp:`learned_lights` and :monosp:`swarm_path` tell what is learned, and how. Maps are for
+    scenes with an open shutter, a lens, fog, or in spectral variants, and cost nothing elsewhere.
+    The first two pilots are short: together they predict by how much each of these lowers the
+    variance of the image. What costs more time than it saves ends there. Maps of reflections and of
+    directions are not tried: guided directions have their place.
     :monosp:`integrator.statistics.learned` says what was kept, and why.
 
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
     pilot.
 
-    Sources: those of :monosp:`guided_directions` and :monosp:`learned_lights`. The predictions are
-    ours.
+    Sources: those of :monosp:`guided_directions`, :monosp:`learned_lights` and
+    :monosp:`swarm_path`. The predictions are ours.
 
     .. tabs::
         .. code-tab:: xml
