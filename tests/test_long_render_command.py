@@ -148,6 +148,15 @@ def test_a_folder_that_is_deleted_costs_the_folder_only(run, make_scene, tmp_pat
     assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64 and not kept.exists()
 
 
+@pytest.mark.parametrize("specification", ["neepp:timeout=9", "variance:in=[neepp:timeout=9]"])
+def test_a_time_limit_of_batches_is_refused(run, make_scene, tmp_path, specification):
+    """Their numbers of samples would be wrong."""
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", specification)
+    code, _, err = run(*command, "--until", "1")
+    assert code == 2 and '"timeout" would cut short each of the batches' in err
+    assert "limit the whole render by --time" in err and not (tmp_path / "a.exr").exists()
+
+
 def test_variants_without_batches_are_named(run, make_scene, tmp_path):
     code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--until", 0.1,
                        "--variant", "scalar_rgb")  # fmt: skip
