@@ -19,6 +19,7 @@ import pytest
 from conftest import PATH, in_subprocess
 
 from mitsuba_ext.compare import images, load_reference, read_exr
+from mitsuba_ext.errors import InputError
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.intervals import Interval
@@ -146,6 +147,26 @@ def test_a_folder_that_is_deleted_costs_the_folder_only(run, make_scene, tmp_pat
                        "--checkpoint", kept, "--every", "16spp")  # fmt: skip
     assert code == 0 and "the render could not be kept: [Errno 2] No such file" in err
     assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64 and not kept.exists()
+
+
+@pytest.mark.parametrize("is_kept", [True, False])
+def test_a_failure_keeps_the_image_so_far(run, make_scene, tmp_path, monkeypatch, is_kept):
+    """As when a scheduler is gone, or three workers have died of the same batch."""
+    render, kept = BatchRenderer.render, tmp_path / "kept"
+
+    def fails(self, batch, learned):
+        if batch.index == 2:
+            raise InputError("the cluster is gone")
+        return render(self, batch, learned)
+
+    monkeypatch.setattr(BatchRenderer, "render", fails)
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64, "--preview",
+               tmp_path / "b.png", *(("--checkpoint", kept) if is_kept else ()))  # fmt: skip
+    code, _, err = run(*command)
+    assert code == 2 and "interrupted after 32 of 64 spp" in err
+    assert err.endswith("mitsuba-ext: the cluster is gone\n")
+    assert read_exr(tmp_path / "a.exr")[1]["spp"] == 32
+    assert not is_kept or CheckpointFolder(kept).load().spp == 32
 
 
 @pytest.mark.parametrize("specification", ["neepp:timeout=9", "variance:in=[neepp:timeout=9]"])

@@ -29,6 +29,7 @@ class RenderJob:
         scene, sensor: What it renders.
         film: The film that holds the image.
         is_interrupted: Did a signal end the render before all samples were taken?
+        failure: Always ``None``: after a failure, there is no image.
         seconds: Wall clock of the render.
     """
 
@@ -38,7 +39,7 @@ class RenderJob:
             named.integrator, named.name, named.parameters
         )  # fmt: skip
         self.scene, self.sensor, self.film = chosen.scene, chosen.sensor, chosen.sensor.film()
-        self.is_interrupted, self.seconds = False, 0.0
+        self.is_interrupted, self.seconds, self.failure = False, 0.0, None
         self._chosen, self._seed = chosen, seed
         self._wanted: int | None = None  # samples per pixel, where it is known
         self._is_measuring = False
