@@ -53,6 +53,7 @@ def rgb(render: LongRender) -> tuple[np.ndarray, np.ndarray]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", nargs="*", default=[scene for scene, *_ in CASES])
     parser.add_argument("--seeds", type=int, default=16)
     parser.add_argument("--reference-spp", type=int, default=1 << 14)
     options = parser.parse_args()
@@ -60,6 +61,8 @@ def main() -> None:
     print("| scene | until | spp | announced | true | true > 2 x announced |")
     print("|---|---|---|---|---|---|")
     for scene, integrator, error in CASES:
+        if scene not in options.scenes:
+            continue
         truth, variance = rgb(rendered(scene, integrator, 1 << 20, Goal(options.reference_spp)))
         before = dict(seed_passes._PASS_SAMPLES)
         seed_passes._PASS_SAMPLES[dr.JitBackend.LLVM] = SIZE[0] * SIZE[1] * BATCH_SPP
