@@ -59,8 +59,8 @@ class SwarmPath(WalkIntegrator):
      * - direction_map
        - |bool|
        - Learn from which directions light comes to the first vertex that is no mirror? Half of its
-         directions are chosen by the map. Off by default: no scene has shown yet that it
-         pays. (Default: false)
+         directions are chosen by the map. Off by default: it pays where light comes
+         from a small bright patch (scenes/bounce_card.xml), and seldom elsewhere. (Default: false)
      * - always_use
        - |bool|
        - Use all maps, also where the pilots show that it does not pay? (Default: false)
@@ -99,7 +99,9 @@ class SwarmPath(WalkIntegrator):
     chance. From the samples of each pilot follows which density would have been best (in proportion
     to the mean of what a cell brings, with 5 % of uniform numbers, or to its root, with 20 %), and
     by how much the variance is lower: below 3 %, a map is given up. After a render,
-    :monosp:`integrator.statistics.learned` tells what was found.
+    :monosp:`integrator.statistics.learned` tells what was found, and
+    :monosp:`mitsuba_ext.composition.pixel_maps` has the maps of a pixel as arrays (see
+    examples/swarm_maps.py).
 
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no

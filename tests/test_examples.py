@@ -56,3 +56,16 @@ def test_notebook_runs_at_a_small_size(tmp_path):
     assert result.returncode == 0, result.stderr
     assert "cut at depth 3" in result.stdout and "standard error of a pixel" in result.stdout
     assert (tmp_path / "out" / "report.html").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scene", "depth"), [("six_balls", 2), ("peppers_ghost", 4)])
+def test_maps_of_pixels_are_drawn(tmp_path, scene: str, depth: int):
+    pytest.importorskip("matplotlib")
+    target = tmp_path / "maps.png"
+    command = [
+        sys.executable, EXAMPLES / "swarm_maps.py", EXAMPLES.parent / f"scenes/{scene}.xml",
+        "100,90", "200,50", "--always", "--spp", "8", "--max-depth", str(depth), "--out", target,
+    ]  # fmt: skip
+    subprocess.run(command, check=True, timeout=300)
+    assert target.stat().st_size > 10_000

@@ -25,7 +25,7 @@ _MANY_SAMPLES = 8
 
 #: Samples of a pass from which maps are learned, at most: the learners of all maps together record
 #: about 150 bytes of each.
-_MAP_LANES = 1 << 22
+_MAP_LANES = 1 << 21
 
 #: Paths of each of the first two pilots, about: they show what learning is worth.
 _TRIAL_PATHS = 1 << 17
