@@ -14,6 +14,7 @@ from ..defocus.images import Size
 from ..defocus.layers import LayerSums
 from ..transport.colour import to_rgb
 from ..transport.estimator import CameraRays, Sample
+from ..transport.lens_view import LensView
 from . import camera
 from .layer_blocks import LayerBlocks
 from .pinhole import PinholeView, Surface
@@ -49,9 +50,8 @@ class LayeredJob(Job):
                 f'use an "hdrfilm".'
             )
         self.lens = integrator.thin_lens(sensor)
-        self.view = PinholeView(
-            scene, sensor, integrator.scene_query(scene), self.lens, integrator.denoise
-        )
+        self._lens_view = LensView(scene, sensor, integrator.scene_query(scene))
+        self.view = PinholeView(self._lens_view, scene, self.lens, integrator.denoise)
         self.filter = make_filter(integrator.filter)
         self._crop = [int(n) for n in self.film.crop_size()]
         # The film and a margin around it
@@ -74,7 +74,7 @@ class LayeredJob(Job):
         _index, pixel = self.size.pixels()
         position = (mi.Point2f(pixel) + 0.5 - self.margin) / mi.Vector2f(self._crop)
         time = self.sensor.shutter_open() + 0.5 * self.sensor.shutter_open_time()
-        ray, _ = self.sensor.sample_ray(time, 0.5, position, mi.Point2f(0.5))
+        ray = self._lens_view.ray(position, 0.5, time)
         return self.view.first(ray).blur.numpy().reshape(self.size.height, self.size.width)
 
     def _trim(self) -> None:
