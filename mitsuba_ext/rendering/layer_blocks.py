@@ -53,11 +53,13 @@ class LayerBlocks:
 
         Parameters:
             surface: What they met.
-            behind: Only to layers behind the one of a surface of this blur.
+            behind: Only to layers behind the one of a surface of this blur; infinite for all.
         """
         known, blur = [], surface.blur
         for k, block in enumerate(self._hits):
-            is_open = active if behind is None else active & ~self.limits.is_before(k, behind)
+            is_open = active
+            if behind is not None:
+                is_open = active & (dr.isinf(behind) | ~self.limits.is_before(k, behind))
             is_hit = is_open & self.limits.contains(k, blur)
             values = [color.x, color.y, color.z, alpha, blur, mi.Float(1), *surface.guides]
             block.put(position, [weight * value for value in values], is_hit)

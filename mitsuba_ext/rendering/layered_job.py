@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 
 import drjit as dr
 import mitsuba as mi
@@ -17,18 +18,19 @@ from ..transport.estimator import CameraRays, Sample
 from ..transport.lens_view import LensView
 from . import camera
 from .layer_blocks import LayerBlocks
+from .layer_samples import least_blur_around, outside_pixels, relative_counts, whole_counts
 from .pinhole import PinholeView, Surface
 from .render import Job
-
-#: Edge of the squares of pixels for which it is decided together whether anything hidden is needed.
-_TILE = 8
-
-#: Where the blurs of neighbouring pixels differ by more, in pixels, one hides something behind it.
-_EDGE = 0.5
 
 #: What lies around the film is blurred into it. So far outside samples are taken at most: this
 #: share of the film's longer edge.
 _WIDEST_MARGIN = 1 / 8
+
+#: This share of the samples is the same for all pixels of the film.
+_EQUAL_SHARE = 1 / 4
+
+#: Marks pixels in a list of which hidden things are wanted.
+_HIDDEN = 0x80000000
 
 #: Samples of a pass over a list of pixels, at most.
 _MOST_LANES = 1 << 21
@@ -62,9 +64,25 @@ class LayeredJob(Job):
         offset = [int(n) - self.margin for n in self.film.crop_offset()]
         # A closed room has nothing behind its walls
         self._sees_sky = bool((self.blurs == np.float32(self.lens.blur_of_sky)).any())
+        self._plan_samples()
         limits = self.filter.limits(self.blurs.ravel())
         self.layers = LayerBlocks(self.film, self.size, offset, limits, integrator.denoise)
         self._last_stage = None
+
+    def _plan_samples(self) -> None:
+        """How many samples each pixel of the film takes, and how many of them all take."""
+        plan, spp = self.plan, self.plan.spp
+        self._equal_spp = max(sum(plan.stages[:-1]), math.ceil(_EQUAL_SHARE * spp))
+        # Stratified samples are the same for all pixels, and so is what fits into a time
+        is_fixed = plan.structured or self.budget.is_limited or self.film.sample_border()
+        if is_fixed or self._equal_spp >= spp:
+            self._equal_spp = spp
+        self.counts = np.full(self.blurs[self._inside].shape, spp, np.uint32)
+        if self._equal_spp < spp:
+            share = relative_counts(self.blurs[self._inside], self._equal_spp / spp)
+            self.counts = np.maximum(whole_counts(spp * share), self._equal_spp)
+        # All samples of a pixel count the same, and together as those of any other pixel
+        self._weights = mi.Float((spp / self.counts).astype(np.float32).ravel())
 
     def _with_margin(self) -> Size:
         return Size(*(n + 2 * self.margin for n in self._crop))
@@ -93,9 +111,18 @@ class LayeredJob(Job):
         m = self.margin
         return slice(m, m + height), slice(m, m + width)
 
+    def _run_stage(self, stage, samples, is_last, interrupt) -> None:
+        if is_last and self._equal_spp < self.plan.spp:
+            samples, is_last = self._equal_spp - self.statistics.spp, False
+        super()._run_stage(stage, samples, is_last, interrupt)
+
     def _sample(self, stage, sampler, rays: CameraRays, count=1.0) -> Sample:
-        sample = super()._sample(stage, sampler, rays, count)
+        # Before the samples are put into the block: null transmission of textures evaluates
+        # something while it is traced, and with it what waits for the block, in another kernel
         first = self.view.first(rays.ray)
+        if self._equal_spp < self.plan.spp:
+            count = count * dr.gather(mi.Float, self._weights, rays.pixel)
+        sample = super()._sample(stage, sampler, rays, count)
         self._put(rays, sample, first, mi.Float(rays.weight * count), mi.Bool(True))
         self._last_stage = stage
         return sample
@@ -113,70 +140,97 @@ class LayeredJob(Job):
 
     def run(self, interrupt) -> None:
         super().run(interrupt)
-        if self._stopped(interrupt):
-            return
-        outside = np.ones_like(self.blurs, dtype=bool)
-        outside[self._inside] = False
-        self._run_pixels(outside, None, interrupt)
+        if not self._stopped(interrupt):
+            self._run_lists(interrupt)
+
+    # ---- What not all pixels of the film take ----
+
+    def _run_lists(self, interrupt) -> None:
+        """Takes the rest of the film's samples; and those of what lies around the film, and of what
+        is hidden by something whose blur is larger by more than 1 than that of the farthest thing
+        around."""
+        # With a timeout, these are fewer
+        spp = self.plan.spp if self._equal_spp < self.plan.spp else self.statistics.spp
+        shape = self.blurs.shape
+        besides = self.integrator.hidden_samples(spp)
+        seen, hidden = np.zeros(shape, np.uint32), np.zeros(shape, np.uint32)
+        seen[outside_pixels(self.blurs, self.margin)] = besides
+        weight = np.full(shape, spp / besides, np.float32)
+        if self._equal_spp < spp:
+            seen[self._inside] = self.counts - self._equal_spp
+            weight[self._inside] = spp / self.counts
+        self._table = mi.Float(weight.ravel())
+        self._hidden_weight = dr.opaque(mi.Float, spp / besides)
         if self.filter.has_layers:
             least = least_blur_around(self.blurs, self.lens.blur_of_sky)
-            self._run_pixels(np.isfinite(least), mi.Float(least.ravel()), interrupt)
-
-    # ---- What the film does not show ----
-
-    def _run_pixels(self, chosen: np.ndarray, least: mi.Float | None, interrupt) -> None:
-        """Takes samples of some pixels: of what is seen first, or where ``least`` is given, of what
-        is hidden by something whose blur is larger than that by more than 1."""
-        spp = self.integrator.hidden_samples(self.statistics.spp)
-        pixels = np.flatnonzero(chosen).astype(np.uint32)
+            hidden[np.isfinite(least)] = besides
+            self._least = mi.Float(least.ravel())
+        # Neighbouring lanes are alike: first what is seen, then what is hidden
+        pixels = np.arange(seen.size, dtype=np.uint32)
+        lanes = np.concatenate([
+            np.repeat(pixels, seen.ravel()), np.repeat(pixels | _HIDDEN, hidden.ravel())
+        ])  # fmt: skip
         most = min(_MOST_LANES // self.integrator.sample_cost, self.integrator.most_lanes)
-        per_pass = max(1, most // spp)
-        for start in range(0, len(pixels), per_pass):
+        for part in np.array_split(lanes, -(-len(lanes) // max(1, most))) if len(lanes) else ():
             if self._stopped(interrupt):
                 return
-            part = pixels[start : start + per_pass]
-            # Numbers that no other part of the render has
-            number = (2 if least is None else 3) * 0x40000000 + start
-            seed = mi.sample_tea_32(mi.UInt32(self.plan.seed), mi.UInt32(number & 0xFFFFFFFF))[0]
-            sampler = mi.load_dict({"type": "independent"})
-            sampler.seed(dr.opaque(mi.UInt32, seed[0]), len(part) * spp)
-            self._run_some_pixels(mi.UInt32(part), spp, sampler, least)
-            dr.eval(self.layers.tensors())
-            dr.sync_thread()
+            self._run_list(part)
+        self.statistics.spp, self.statistics.interrupted = spp, False
+        if self.integrator.progress is not None:
+            self.integrator.progress(1.0)
 
-    def _run_some_pixels(self, pixels, spp, sampler, least) -> None:
-        stage = self._last_stage
-        lane = dr.arange(mi.UInt32, len(pixels) * spp)
-        place = lane // dr.opaque(mi.UInt32, spp)
-        pixel = dr.gather(mi.UInt32, pixels, place)
-        lanes = self._lanes_with_margin(pixel, lane - place * dr.opaque(mi.UInt32, spp))
+    def _run_list(self, part: np.ndarray) -> None:
+        begin, stage = time.perf_counter(), self._last_stage
+        sampler = mi.load_dict({"type": "independent"})
+        # Numbers that no other part of the render has
+        number = (0x80000000 + self.statistics.passes) & 0xFFFFFFFF
+        seed = mi.sample_tea_32(mi.UInt32(self.plan.seed), mi.UInt32(number))[0]
+        sampler.seed(dr.opaque(mi.UInt32, seed[0]), len(part))
+        lane = mi.UInt32(part)
+        pixel, is_hidden = lane & (_HIDDEN - 1), lane >= _HIDDEN
+        lanes, is_film = self._lanes_with_margin(pixel)
         numbers = camera.draw_numbers(self.sensor, sampler, lanes, stage.camera)
         rays = camera.camera_rays(self.sensor, lanes, numbers, self.plan.spp)
+        surface, active, behind = self._surface(rays, pixel, is_hidden)
+        sample = stage.estimator(self.scene, sampler, rays, active)
+        count = dr.select(
+            is_hidden, self._hidden_weight, dr.gather(mi.Float, self._table, pixel)
+        )
+        self._put_into_film(sampler, rays, sample, dr.select(is_film & ~is_hidden, count, 0))
+        self._put(rays, sample, surface, mi.Float(rays.weight * count), active, behind)
+        self.statistics.compile_seconds += time.perf_counter() - begin
+        dr.eval(self.block.tensor(), self.layers.tensors(), self.tally)
+        dr.sync_thread()
+        self.statistics.passes += 1
+        self.statistics.rays["camera"] += len(part)
+
+    def _surface(
+        self, rays: CameraRays, pixel: mi.UInt32, is_hidden: mi.Bool
+    ) -> tuple[Surface, mi.Bool, mi.Float | None]:
+        """What a ray meets, or meets behind that where ``is_hidden``: from there on the ray goes.
+        And where there is something, and the blur of what hides it (infinite for nothing)."""
         first = self.view.first(rays.ray)
-        weight = mi.Float(rays.weight) * dr.opaque(mi.Float, self.statistics.spp / spp)
-        if least is None:
-            sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
-            self._put(rays, sample, first, weight, mi.Bool(True))
-            return
-        rest, hidden, active = self.view.beyond(rays.ray, first)
-        active &= first.blur > dr.gather(mi.Float, least, pixel) + 1
+        if not self.filter.has_layers:
+            return first, mi.Bool(True), None
+        rest, hidden, active = self.view.beyond(rays.ray, first, is_hidden)
+        active &= first.blur > dr.gather(mi.Float, self._least, pixel) + 1
         if not self._sees_sky:
             active &= hidden.is_hit
-        rays.ray.o = rest.o
-        sample = stage.estimator(self.scene, sampler, rays, active)
-        self._put(rays, sample, hidden, weight, active, first.blur)
+        rays.ray.o = dr.select(is_hidden, rest.o, rays.ray.o)
+        behind = dr.select(is_hidden, first.blur, dr.inf)
+        return dr.select(is_hidden, hidden, first), active | ~is_hidden, behind
 
-    def _lanes_with_margin(self, pixel: mi.UInt32, index: mi.UInt32) -> camera.Lanes:
-        """Lanes for pixels of the film and its margin. Tables of the nested integrator that have an
-        entry for each pixel of the film know the nearest one."""
-        width = dr.opaque(mi.UInt32, self.size.width)
-        y = pixel // width
-        corner = mi.Vector2i(mi.Int32(pixel - y * width), mi.Int32(y)) - self.margin
+    def _lanes_with_margin(self, pixel: mi.UInt32) -> tuple[camera.Lanes, mi.Bool]:
+        """Lanes for pixels of the film and its margin, and which of them are in the film. Tables of
+        the nested integrator that have an entry for each pixel of the film know the nearest one."""
+        corner = self.size.position(pixel) - self.margin
         border = self.film.rfilter().border_size() if self.film.sample_border() else 0
         extent = camera.film_extent(self.film)
         inside = dr.clip(corner + border, 0, mi.Vector2i(extent[0] - 1, extent[1] - 1))
         known = mi.UInt32(inside.y * extent[0] + inside.x)
-        return camera.Lanes(known, corner + mi.Vector2i(self.film.crop_offset()), index)
+        is_film = dr.all((corner >= 0) & (corner < mi.Vector2i(self._crop)))
+        index = dr.zeros(mi.UInt32, dr.width(pixel))
+        return camera.Lanes(known, corner + mi.Vector2i(self.film.crop_offset()), index), is_film
 
     # ---- The picture ----
 
@@ -207,42 +261,3 @@ class LayeredJob(Job):
         picture = self.filter.picture(capture)
         shape = (self.size.height, self.size.width, 3)
         return mi.TensorXf(dr.ravel(picture), shape=shape).numpy()[self._inside]
-
-
-def least_blur_around(blurs: np.ndarray, sky: float) -> np.ndarray:
-    """By pixel, the least blur (that of the farthest thing) at an edge which is so near that the
-    lens may see that thing behind the pixel; infinity where there is no such edge. Decided for
-    tiles of pixels together.
-
-    Parameters:
-        blurs: Signed radii in pixels, [y, x].
-        sky: That of infinity.
-    """
-    height, width = blurs.shape
-    edge = np.full_like(blurs, np.inf)
-    for axis in range(2):
-        a = np.moveaxis(blurs, axis, 0)
-        e = np.moveaxis(edge, axis, 0)
-        jump = np.abs(a[1:] - a[:-1]) > _EDGE
-        least = np.where(jump, np.minimum(a[1:], a[:-1]), np.inf)
-        e[1:] = np.minimum(e[1:], least)
-        e[:-1] = np.minimum(e[:-1], least)
-    tiles = -(-height // _TILE), -(-width // _TILE)
-    pad = ((0, tiles[0] * _TILE - height), (0, tiles[1] * _TILE - width))
-
-    def by_tile(image: np.ndarray, fill: float, reduce) -> np.ndarray:
-        padded = np.pad(image, pad, constant_values=fill)
-        return reduce(padded.reshape(tiles[0], _TILE, tiles[1], _TILE), axis=(1, 3))
-
-    least, most = by_tile(edge, np.inf, np.min), by_tile(blurs, -np.inf, np.max)
-    # A ray through the edge of the lens is so far away from where the middle sees it
-    reach = np.ceil((most - sky) / _TILE)
-    found = np.full_like(least, np.inf)
-    for radius in range(int(reach.max()) + 1):
-        found = np.where(reach >= radius, least, found)
-        padded = np.pad(least, 1, mode="edge")
-        least = np.minimum.reduce([
-            padded[y : y + tiles[0], x : x + tiles[1]] for y in range(3) for x in range(3)
-        ])  # fmt: skip
-    found[most <= found + 1] = np.inf
-    return np.repeat(np.repeat(found, _TILE, 0), _TILE, 1)[:height, :width]

@@ -73,8 +73,10 @@ class PinholeView:
         """The first surface along a ray."""
         return self._meet(ray, self._lets_through if self._has_holes else None, mi.Bool(True))
 
-    def beyond(self, ray: mi.Ray3f, first: Surface) -> tuple[mi.Ray3f, Surface, mi.Bool]:
-        """What the ``first`` surface hides.
+    def beyond(
+        self, ray: mi.Ray3f, first: Surface, active: mi.Bool
+    ) -> tuple[mi.Ray3f, Surface, mi.Bool]:
+        """What the ``first`` surface hides, where ``active``.
 
         The ray is moved on, behind what belongs to the same object: where the blur is half as
         large. Behind the focus, that is half of the way to the blur of the sky.
@@ -86,7 +88,7 @@ class PinholeView:
         sky, blur = self._lens.blur_of_sky, first.blur
         start = dr.select(blur > 0, _BEHIND * blur, blur - _BEHIND * (blur - sky))
         start = dr.minimum(start, blur - _LEAST_STEP)
-        active = first.is_hit & (start > sky)
+        active = active & first.is_hit & (start > sky)
         # The depth of which the blur is that of the start
         scale = dr.opaque(mi.Float, self._lens.pixels_per_disparity)
         depth = scale / dr.select(active, start - sky, 1)

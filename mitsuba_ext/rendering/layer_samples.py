@@ -1,0 +1,122 @@
+"""How many samples the pixels of a render in layers take, by how much the lens blurs them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..defocus.lens_points import points_area
+
+#: Edge of the squares of pixels for which things are decided together.
+TILE = 8
+
+#: Where the blurs of neighbouring pixels differ by more, in pixels, one hides something behind it.
+_EDGE = 0.5
+
+#: Samples are distributed in proportion to this power of the area over which the lens averages
+#: them: that makes the mean absolute error of the picture least.
+_POWER = -1 / 3
+
+def relative_counts(blurs: np.ndarray, least: float) -> np.ndarray:
+    """Samples of each pixel, of which the mean is 1: few where the filter of the lens takes means
+    over many pixels, many in focus. The error of the mean over n samples of each of A pixels is in
+    proportion to 1 / √(n A); for a given sum of n, the mean of these errors is least where n is in
+    proportion to A^(-1/3).
+
+    Parameters:
+        blurs: Signed radii in pixels, [y, x].
+        least: Of a pixel, less than 1.
+    """
+    # Around edges, the sharper of the two
+    radius = np.pad(np.abs(blurs), 1, mode="edge")
+    height, width = blurs.shape
+    radius = np.min([radius[y : y + height, x : x + width] for y in range(3) for x in range(3)], 0)
+    share = points_area(radius) ** _POWER
+    # Those that get the least leave less for the others
+    scale = 1 / share.mean()
+    for _ in range(8):
+        scale *= 1 / np.maximum(share * scale, least).mean()
+    return np.maximum(share * scale, least)
+
+
+def whole_counts(counts: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Whole numbers that are right on average: the rest decides by chance, the same for all
+    renders."""
+    below = np.floor(counts)
+    chosen = np.random.default_rng(seed).random(counts.shape) < counts - below
+    return (below + chosen).astype(np.uint32)
+
+
+def outside_pixels(blurs: np.ndarray, margin: int) -> np.ndarray:
+    """The pixels of a margin around the film that are blurred into it, or into which pixels of the
+    film are blurred: these by tiles.
+
+    Parameters:
+        blurs: With the margin, [y, x].
+    """
+    height, width = blurs.shape
+    outside = np.ones((height, width), dtype=bool)
+    outside[margin : height - margin, margin : width - margin] = False
+    reach = np.abs(blurs) + 1
+    film = _spread(_by_tile(np.where(outside, 0, reach), 0, np.max))
+    y, x = np.ogrid[:height, :width]
+    away = [np.maximum(margin - i, i - (n - 1 - margin)) for i, n in ((y, height), (x, width))]
+    distance = np.hypot(*(np.maximum(a, 0) for a in away))
+    return outside & (_by_pixel(film, blurs.shape) | (reach >= distance))
+
+
+def _spread(reach: np.ndarray) -> np.ndarray:
+    """By tile, whether a tile is so near that it reaches this one: reach in pixels, 0 for none."""
+    steps = np.ceil(reach / TILE).astype(int)
+    found = np.zeros(steps.shape, dtype=bool)
+    for step in range(int(steps.max()), 0, -1):
+        found = _around(found | (steps >= step), np.maximum)
+    return found
+
+
+def least_blur_around(blurs: np.ndarray, sky: float) -> np.ndarray:
+    """By pixel, the least blur (that of the farthest thing) at an edge which is so near that the
+    lens may see that thing behind the pixel; infinity where there is no such edge. Decided for
+    tiles of pixels together.
+
+    Parameters:
+        blurs: Signed radii in pixels, [y, x].
+        sky: That of infinity.
+    """
+    edge = np.full_like(blurs, np.inf)
+    for axis in range(2):
+        a = np.moveaxis(blurs, axis, 0)
+        e = np.moveaxis(edge, axis, 0)
+        jump = np.abs(a[1:] - a[:-1]) > _EDGE
+        least = np.where(jump, np.minimum(a[1:], a[:-1]), np.inf)
+        e[1:] = np.minimum(e[1:], least)
+        e[:-1] = np.minimum(e[:-1], least)
+    least, most = _by_tile(edge, np.inf, np.min), _by_tile(blurs, -np.inf, np.max)
+    # A ray through the edge of the lens is so far away from where the middle sees it
+    reach = np.ceil((most - sky) / TILE)
+    found = np.full_like(least, np.inf)
+    for radius in range(int(reach.max()) + 1):
+        found = np.where(reach >= radius, least, found)
+        least = _around(least, np.minimum)
+    found[most <= found + 1] = np.inf
+    return _by_pixel(found, blurs.shape)
+
+
+def _by_tile(image: np.ndarray, fill: float, reduce) -> np.ndarray:
+    height, width = image.shape
+    tiles = -(-height // TILE), -(-width // TILE)
+    pad = ((0, tiles[0] * TILE - height), (0, tiles[1] * TILE - width))
+    padded = np.pad(image, pad, constant_values=fill)
+    return reduce(padded.reshape(tiles[0], TILE, tiles[1], TILE), axis=(1, 3))
+
+
+def _by_pixel(tiles: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    return np.repeat(np.repeat(tiles, TILE, 0), TILE, 1)[: shape[0], : shape[1]]
+
+
+def _around(tiles: np.ndarray, reduce: np.ufunc) -> np.ndarray:
+    """Of each tile and the eight around it."""
+    padded = np.pad(tiles, 1, mode="edge")
+    height, width = tiles.shape
+    return reduce.reduce([
+        padded[y : y + height, x : x + width] for y in range(3) for x in range(3)
+    ])  # fmt: skip
