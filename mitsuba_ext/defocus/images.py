@@ -60,17 +60,12 @@ class Pyramid:
         for level in sizes:
             starts.append(starts[-1] + level.count)
         self.level_count = len(sizes)
-        self._data = dr.empty(mi.Float, 4 * starts[-1])
-        index, _ = size.pixels()
-        dr.scatter(self._data, dr.gather(mi.Vector4f, data, index), index)
-        dr.eval(self._data)
-        for level in range(1, len(sizes)):
-            mean = halved(
-                mi.Vector4f, self._data, sizes[level - 1], dr.opaque(mi.UInt32, starts[level - 1])
-            )
-            start = dr.opaque(mi.UInt32, starts[level])
-            dr.scatter(self._data, mean, start + dr.arange(mi.UInt32, sizes[level].count))
-            dr.eval(self._data)
+        # Each copy is an array of its own first: an array that is read is copied to be written
+        copies = [data]
+        for level in sizes[:-1]:
+            copies.append(dr.ravel(halved(mi.Vector4f, copies[-1], level)))
+            dr.eval(copies[-1])
+        self._data = dr.concat(copies)
         self._starts = mi.UInt32(starts[:-1])
         self._widths = mi.Int32([level.width for level in sizes])
         self._heights = mi.Int32([level.height for level in sizes])
