@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .highlights import Visibility, spread, without_highlights
 from .images import LevelView, Pyramid, Size, rgb
 from .layers import Layer
 from .lens_points import RINGS, LensPoints, ring_points
@@ -20,6 +22,9 @@ _TURNS = (0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5)
 #: Up to these radii of all that a pixel sees, in pixels, so few points of the lens are enough: the
 #: rings of the last ones are those of the others. A circle that does not leave the pixel needs one.
 _FEW_POINTS = ((0.5, (1,)), (2.0, (4, 8)))
+
+#: A layer in which blurs differ by no more, in pixels, has one everywhere.
+_FLAT = 0.5
 
 #: A layer of this coverage shows nothing of what is behind it.
 _OPAQUE = 0.9999
@@ -51,8 +56,15 @@ class _LensFilter:
         self._size, self._layers = size, layers
         self._lens = LensPoints(ring_points())
         self._few = [_Points(rings) for _radius, rings in _FEW_POINTS] + [_Points(RINGS)]
-        self._pyramids = [Pyramid(dr.ravel(layer.color), size) for layer in layers]
+        self._pyramids = [Pyramid(layer.color, size) for layer in layers]
+        around, self._highlights = reduce(Pyramid.plus, self._pyramids), []
+        for k, layer in enumerate(layers):
+            color, highlights = without_highlights(layer, around, size)
+            if color is not layer.color:
+                self._pyramids[k] = Pyramid(color, size)
+            self._highlights.append(highlights)
         dr.eval([layer.blur for layer in layers])
+        self._is_flat = [_range(layer.blur) <= _FLAT for layer in layers]
 
     def picture(self) -> mi.Color3f:
         """Computes the pixels that see the same layers through as many points together."""
@@ -74,7 +86,21 @@ class _LensFilter:
             )
             dr.scatter(picture, color / dr.maximum(covered, 1e-6), chosen)
             dr.eval(picture)
+        for k, highlights in enumerate(self._highlights):
+            if highlights is not None:
+                spread(picture, highlights, self._size, self._before(k))
         return dr.gather(mi.Color3f, picture, index)
+
+    def _before(self, count: int) -> Visibility:
+        """How much the first layers let through."""
+
+        def visibility(
+            pixel: mi.UInt32, place: mi.Point2f, point: mi.Point2f, active: mi.Bool
+        ) -> mi.Float:
+            seen = [self._view(k, pixel) for k in range(count)]
+            return 1 - _through(place, point, self._size, seen)[1] if seen else mi.Float(1)
+
+        return visibility
 
     def _group(self, place: mi.Point2f) -> mi.UInt32:
         """Which layers each pixel may see, one bit for each; and above these, the number of the
@@ -100,15 +126,17 @@ class _LensFilter:
     def _view(self, k: int, index: mi.UInt32) -> _LayerView:
         layer = self._layers[k]
         blur = dr.gather(mi.Float, layer.blur, index)
-        return _LayerView(blur, layer.blur, self._lens.view(self._pyramids[k], blur))
+        blurs = None if self._is_flat[k] else layer.blur
+        return _LayerView(blur, blurs, self._lens.view(self._pyramids[k], blur))
 
 
 @dataclass
 class _LayerView:
-    """A layer as a pixel sees it: the pixel's own blur, the blurs of all, the colours."""
+    """A layer as a pixel sees it: the pixel's own blur, the blurs of all (``None`` if these are the
+    same), the colours."""
 
     blur: mi.Float
-    blurs: mi.Float
+    blurs: mi.Float | None
     view: LevelView
 
 
@@ -150,9 +178,16 @@ def _through(
     """Colour and opacity of all layers, seen from a point of the lens."""
     through, color = mi.Float(1), mi.Color3f(0)
     for layer in seen:
-        about = mi.Vector2i(dr.floor(place + layer.blur * point))
-        blur = dr.gather(mi.Float, layer.blurs, size.index(about))
-        found = layer.view.at(place + blur * point)
+        at = place + layer.blur * point
+        if layer.blurs is not None:
+            about = size.index(mi.Vector2i(dr.floor(at)))
+            at = place + dr.gather(mi.Float, layer.blurs, about) * point
+        found = layer.view.at(at)
         color += through * rgb(found)
         through *= 1 - found.w
     return color, 1 - through
+
+
+def _range(values: mi.Float) -> float:
+    least, most = dr.min(values), dr.max(values)
+    return float(dr.slice(most - least))

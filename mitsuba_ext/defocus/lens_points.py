@@ -54,14 +54,6 @@ class LensPoints:
         return pyramid.view(mi.UInt32(dr.minimum(level, pyramid.level_count - 1)))
 
 
-def points_area(radius: np.ndarray) -> np.ndarray:
-    """Over how many pixels the mean of a disk is taken, about, by its radius in pixels: those of a
-    small one all, and those of a large one at which the points look."""
-    count = sum(RINGS)
-    step = 0.5 * math.sqrt(math.pi / count) * radius  # as in LensPoints.view()
-    return np.maximum(1, np.minimum(math.pi * radius**2, count * np.maximum(step, 1) ** 2))
-
-
 @dr.syntax
 def disk_mean(points: LensPoints, view: LevelView, middle: mi.Point2f, radius: mi.Float):
     """The mean of an image over a disk around each pixel.

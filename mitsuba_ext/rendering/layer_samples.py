@@ -1,49 +1,14 @@
-"""How many samples the pixels of a render in layers take, by how much the lens blurs them."""
+"""Which pixels of a render in layers take samples of what the film does not show."""
 
 from __future__ import annotations
 
 import numpy as np
-
-from ..defocus.lens_points import points_area
 
 #: Edge of the squares of pixels for which things are decided together.
 TILE = 8
 
 #: Where the blurs of neighbouring pixels differ by more, in pixels, one hides something behind it.
 _EDGE = 0.5
-
-#: Samples are distributed in proportion to this power of the area over which the lens averages
-#: them: that makes the mean absolute error of the picture least.
-_POWER = -1 / 3
-
-def relative_counts(blurs: np.ndarray, least: float) -> np.ndarray:
-    """Samples of each pixel, of which the mean is 1: few where the filter of the lens takes means
-    over many pixels, many in focus. The error of the mean over n samples of each of A pixels is in
-    proportion to 1 / √(n A); for a given sum of n, the mean of these errors is least where n is in
-    proportion to A^(-1/3).
-
-    Parameters:
-        blurs: Signed radii in pixels, [y, x].
-        least: Of a pixel, less than 1.
-    """
-    # Around edges, the sharper of the two
-    radius = np.pad(np.abs(blurs), 1, mode="edge")
-    height, width = blurs.shape
-    radius = np.min([radius[y : y + height, x : x + width] for y in range(3) for x in range(3)], 0)
-    share = points_area(radius) ** _POWER
-    # Those that get the least leave less for the others
-    scale = 1 / share.mean()
-    for _ in range(8):
-        scale *= 1 / np.maximum(share * scale, least).mean()
-    return np.maximum(share * scale, least)
-
-
-def whole_counts(counts: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Whole numbers that are right on average: the rest decides by chance, the same for all
-    renders."""
-    below = np.floor(counts)
-    chosen = np.random.default_rng(seed).random(counts.shape) < counts - below
-    return (below + chosen).astype(np.uint32)
 
 
 def outside_pixels(blurs: np.ndarray, margin: int) -> np.ndarray:
@@ -58,10 +23,17 @@ def outside_pixels(blurs: np.ndarray, margin: int) -> np.ndarray:
     outside[margin : height - margin, margin : width - margin] = False
     reach = np.abs(blurs) + 1
     film = _spread(_by_tile(np.where(outside, 0, reach), 0, np.max))
-    y, x = np.ogrid[:height, :width]
-    away = [np.maximum(margin - i, i - (n - 1 - margin)) for i, n in ((y, height), (x, width))]
-    distance = np.hypot(*(np.maximum(a, 0) for a in away))
+    distance = distance_from_film(blurs.shape, margin)
     return outside & (_by_pixel(film, blurs.shape) | (reach >= distance))
+
+
+def distance_from_film(shape: tuple[int, int], margin: int) -> np.ndarray:
+    """How far pixels are away from a film that has a margin: [y, x]."""
+    away = [
+        np.maximum(0, np.maximum(margin - i, i - (n - 1 - margin)))
+        for i, n in zip(np.ogrid[: shape[0], : shape[1]], shape)
+    ]
+    return np.hypot(*away)
 
 
 def _spread(reach: np.ndarray) -> np.ndarray:

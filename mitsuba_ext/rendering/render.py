@@ -278,15 +278,10 @@ class Job:
         sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
         if dr.grad_enabled(sample.L):
             raise self.integrator.no_gradients()
-        self._put_into_film(sampler, rays, sample, count)
-        return sample
-
-    def _put_into_film(
-        self, sampler: mi.Sampler, rays: CameraRays, sample: Sample, count: mi.Float | float
-    ) -> None:
         aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
         camera.put(self.film, self.block, rays, sample, aovs, count)
         self._count(sample)
+        return sample
 
     def _part_sampler(self, spp: int, part: int) -> mi.Sampler:
         if self.plan.structured:
