@@ -53,44 +53,65 @@ def without_highlights(
     Parameters:
         around: The sum of all layers.
     """
-    index, position = size.pixels()
-    color = dr.gather(mi.Vector4f, layer.color, index)
-    blur = layer.glow if layer.glow is not None else layer.blur
-    radius = dr.abs(blur)
-    level = mi.UInt32(dr.round(dr.log2(2 * dr.maximum(radius, 1))))
-    view = around.view(dr.minimum(level, around.level_count - 1))
-    middle, step = mi.Point2f(position) + 0.5, mi.Float(1 << level)
-    # What covers a part of a pixel only is not brighter than something else that does
-    mean = color.w * _relative(view.at(middle))
-    darkest = mean
-    for y in (-1, 0, 1):
-        for x in (-1, 0, 1):
-            near = color.w * _relative(view.at(middle + step * mi.Vector2f(x, y)))
-            darkest = dr.minimum(darkest, near)
-    bright = _brightness(color)
-    is_bright = (radius > _LEAST_RADIUS) & (bright > _BRIGHTER * mean)
-    is_bright &= bright > _BRIGHTER_THAN_DARKEST * darkest
-    if not dr.any(is_bright):
+    glow = layer.glow if layer.glow is not None else layer.blur
+    found = dr.compress(_Pixels(layer, glow, around, size, size.pixels()[0]).is_bright())
+    if len(found) == 0:
         return layer.color, None
+    pixels = _Pixels(layer, glow, around, size, found)
+    darkest = pixels.darkest()
+    is_bright = pixels.bright > _BRIGHTER_THAN_DARKEST * darkest
+    excess = rgb(pixels.color) * dr.select(is_bright, 1 - darkest / pixels.bright, 0)
     # What the layer before shows is not shown twice
-    is_shared = blur > dr.opaque(mi.Float, layer.shared)
-    found = dr.compress(is_bright & ~is_shared)
-    share = dr.select(is_bright, 1 - darkest / dr.select(is_bright, bright, 1), 0)
-    excess = rgb(color) * share
-    highlights, is_gone = None, dr.select(is_bright & is_shared, mi.Float(1), 0)
-    dr.eval(excess, blur, radius, is_gone)
-    if len(found) > 0:
-        found = _affordable(found, excess, radius, size)
-        dr.scatter(is_gone, mi.Float(1), found)
-        highlights = Highlights(
-            found, dr.gather(mi.Float, blur, found),
-            mi.Color3f(*(dr.gather(mi.Float, channel, found) for channel in excess)),
-        )  # fmt: skip
+    is_shared = pixels.blur > dr.opaque(mi.Float, layer.shared)
+    radius, blur = dr.select(is_bright & ~is_shared, pixels.radius, 0), pixels.blur
+    dr.eval(excess, radius, blur)
+    spread_ones = _affordable(excess, radius, size)
+    is_gone = dr.select(is_bright & is_shared, mi.Float(1), 0)
+    if len(spread_ones) > 0:
+        dr.scatter(is_gone, mi.Float(1), spread_ones)
     # A new array: the pyramid has the other one
-    rest = rgb(color) - excess * is_gone
-    rest = dr.ravel(mi.Vector4f(rest.x, rest.y, rest.z, color.w))
+    rest = dr.copy(layer.color)
+    for k, channel in enumerate(excess):
+        dr.scatter_add(rest, -channel * is_gone, 4 * found + k)
     dr.eval(rest)
-    return rest, highlights
+    if len(spread_ones) == 0:
+        return rest, None
+    return rest, Highlights(
+        dr.gather(mi.UInt32, found, spread_ones), dr.gather(mi.Float, blur, spread_ones),
+        mi.Color3f(*(dr.gather(mi.Float, channel, spread_ones) for channel in excess)),
+    )  # fmt: skip
+
+
+class _Pixels:
+    """Pixels of a layer, and how bright it is around them."""
+
+    def __init__(
+        self, layer: Layer, glow: mi.Float, around: Pyramid, size: Size, index: mi.UInt32
+    ) -> None:
+        self.color = dr.gather(mi.Vector4f, layer.color, index)
+        self.blur = dr.gather(mi.Float, glow, index)
+        self.radius, self.bright = dr.abs(self.blur), _brightness(self.color)
+        level = mi.UInt32(dr.round(dr.log2(2 * dr.maximum(self.radius, 1))))
+        level = dr.minimum(level, around.level_count - 1)
+        self._view, self._step = around.view(level), mi.Float(1 << level)
+        self._middle = mi.Point2f(size.position(index)) + 0.5
+
+    def is_bright(self) -> mi.Bool:
+        """Brighter than the square around it?"""
+        return (self.radius > _LEAST_RADIUS) & (self.bright > _BRIGHTER * self._square(0, 0))
+
+    def darkest(self) -> mi.Float:
+        """The brightness of the darkest of nine squares."""
+        darkest = self._square(0, 0)
+        for y in (-1, 0, 1):
+            for x in (-1, 0, 1):
+                darkest = dr.minimum(darkest, self._square(x, y))
+        return darkest
+
+    def _square(self, x: int, y: int) -> mi.Float:
+        color = self._view.at(self._middle + self._step * mi.Vector2f(x, y))
+        # What covers a part of a pixel only is not brighter than something else that does
+        return self.color.w * _brightness(color) / dr.maximum(color.w, 1e-6)
 
 
 def spread(picture: mi.Float, highlights: Highlights, size: Size, visibility: Visibility) -> None:
@@ -106,27 +127,20 @@ def spread(picture: mi.Float, highlights: Highlights, size: Size, visibility: Vi
     dr.eval(picture)
 
 
-def _affordable(
-    found: mi.UInt32, excess: mi.Color3f, radius: mi.Float, size: Size
-) -> mi.UInt32:
-    """As many of the highlights as may be spread: those that are brightest for the pixels that they
-    cover."""
-    covered = math.pi * dr.square(dr.gather(mi.Float, radius, found)).numpy()
-    if covered.sum() <= _MOST_COVERED * size.count:
-        return found
-    bright = dr.gather(mi.Float, dr.sum(excess), found).numpy()
-    order = np.argsort(-bright / covered, kind="stable")
-    chosen = order[np.cumsum(covered[order]) <= _MOST_COVERED * size.count]
-    return mi.UInt32(found.numpy()[np.sort(chosen)])
+def _affordable(excess: mi.Color3f, radius: mi.Float, size: Size) -> mi.UInt32:
+    """The numbers of the highlights that may be spread: those that are brightest for the pixels
+    that they cover, of those of a radius."""
+    covered = math.pi * np.square(radius.numpy())
+    order = np.flatnonzero(covered)
+    if covered.sum() > _MOST_COVERED * size.count:
+        bright = dr.sum(excess).numpy()
+        order = order[np.argsort(-bright[order] / covered[order], kind="stable")]
+        order = order[np.cumsum(covered[order]) <= _MOST_COVERED * size.count]
+    return mi.UInt32(np.sort(order).astype(np.uint32))
 
 
 def _brightness(color: mi.Vector4f) -> mi.Float:
     return color.x + color.y + color.z
-
-
-def _relative(color: mi.Vector4f) -> mi.Float:
-    """Brightness of what is there."""
-    return _brightness(color) / dr.maximum(color.w, 1e-6)
 
 
 @dr.syntax
