@@ -13,7 +13,7 @@ _EDGE = 0.5
 
 def outside_pixels(blurs: np.ndarray, margin: int) -> np.ndarray:
     """The pixels of a margin around the film that are blurred into it, or into which pixels of the
-    film are blurred: these by tiles.
+    film are blurred, about: these by tiles.
 
     Parameters:
         blurs: With the margin, [y, x].
@@ -24,7 +24,7 @@ def outside_pixels(blurs: np.ndarray, margin: int) -> np.ndarray:
     reach = np.abs(blurs) + 1
     film = _spread(_by_tile(np.where(outside, 0, reach), 0, np.max))
     distance = distance_from_film(blurs.shape, margin)
-    return outside & (_by_pixel(film, blurs.shape) | (reach >= distance))
+    return outside & (np.maximum(_by_pixel(film, blurs.shape), reach) >= distance)
 
 
 def distance_from_film(shape: tuple[int, int], margin: int) -> np.ndarray:
@@ -37,11 +37,11 @@ def distance_from_film(shape: tuple[int, int], margin: int) -> np.ndarray:
 
 
 def _spread(reach: np.ndarray) -> np.ndarray:
-    """By tile, whether a tile is so near that it reaches this one: reach in pixels, 0 for none."""
-    steps = np.ceil(reach / TILE).astype(int)
-    found = np.zeros(steps.shape, dtype=bool)
+    """By tile, the largest reach in pixels of the tiles that reach it; 0 for none."""
+    steps = np.ceil(reach / TILE)
+    found = np.zeros_like(reach)
     for step in range(int(steps.max()), 0, -1):
-        found = _around(found | (steps >= step), np.maximum)
+        found = _around(np.maximum(found, np.where(steps >= step, reach, 0)), np.maximum)
     return found
 
 
