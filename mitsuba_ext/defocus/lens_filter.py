@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .highlights import Visibility, spread, without_highlights
+from .highlights import Highlights, Visibility, spread, without_highlights
 from .images import LevelView, Pyramid, Size, rgb
 from .layers import Layer
 from .lens_points import RINGS, LensPoints, ring_points
@@ -22,6 +22,9 @@ _TURNS = (0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5)
 #: Up to these radii of all that a pixel sees, in pixels, so few points of the lens are enough: the
 #: rings of the last ones are those of the others. A circle that does not leave the pixel needs one.
 _FEW_POINTS = ((0.5, (1,)), (2.0, (4, 8)))
+
+#: How often highlights are looked for.
+_ROUNDS = 2
 
 #: A layer in which blurs differ by no more, in pixels, has one everywhere.
 _FLAT = 0.5
@@ -53,18 +56,29 @@ def lens_filter(layers: list[Layer], size: Size) -> mi.Color3f:
 
 class _LensFilter:
     def __init__(self, layers: list[Layer], size: Size) -> None:
-        self._size, self._layers = size, layers
+        self._size, self._layers = size, list(layers)
         self._lens = LensPoints(ring_points())
         self._few = [_Points(rings) for _radius, rings in _FEW_POINTS] + [_Points(RINGS)]
         self._pyramids = [Pyramid(layer.color, size) for layer in layers]
-        around, self._highlights = reduce(Pyramid.plus, self._pyramids), []
-        for k, layer in enumerate(layers):
-            color, highlights = without_highlights(layer, around, size)
-            if color is not layer.color:
-                self._pyramids[k] = Pyramid(color, size)
-            self._highlights.append(highlights)
+        self._highlights: list[tuple[int, Highlights]] = []
+        self._take_highlights()
         dr.eval([layer.blur for layer in layers])
         self._is_flat = [_range(layer.blur) <= _FLAT for layer in layers]
+
+    def _take_highlights(self) -> None:
+        """Takes them out of the layers. Without the brightest of them, their edges stand out."""
+        layers = self._layers
+        for _ in range(_ROUNDS):
+            around, before = reduce(Pyramid.plus, self._pyramids), len(self._highlights)
+            for k, layer in enumerate(layers):
+                color, highlights = without_highlights(layer, around, self._size)
+                if color is not layer.color:
+                    layers[k] = replace(layer, color=color)
+                    self._pyramids[k] = Pyramid(color, self._size)
+                if highlights is not None:
+                    self._highlights.append((k, highlights))
+            if len(self._highlights) == before:
+                return
 
     def picture(self) -> mi.Color3f:
         """Computes the pixels that see the same layers through as many points together."""
@@ -86,9 +100,8 @@ class _LensFilter:
             )
             dr.scatter(picture, color / dr.maximum(covered, 1e-6), chosen)
             dr.eval(picture)
-        for k, highlights in enumerate(self._highlights):
-            if highlights is not None:
-                spread(picture, highlights, self._size, self._before(k))
+        for k, highlights in self._highlights:
+            spread(picture, highlights, self._size, self._before(k))
         return dr.gather(mi.Color3f, picture, index)
 
     def _before(self, count: int) -> Visibility:
