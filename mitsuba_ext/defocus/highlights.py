@@ -15,8 +15,8 @@ from .images import Pyramid, Size, rgb
 from .layers import Layer
 
 #: A highlight is so many times as bright as the square around it that its circle fills, whatever
-#: layers that shows; and as the darkest of the nine squares there, which has nothing of it.
-_BRIGHTER, _BRIGHTER_THAN_DARKEST = 2.0, 4.0
+#: layers that shows: more than the bright half of a pattern.
+_BRIGHTER = 3.0
 
 #: Circles of a smaller radius, in pixels, are found by the points of the lens.
 _LEAST_RADIUS = 2.0
@@ -58,15 +58,14 @@ def without_highlights(
     if len(found) == 0:
         return layer.color, None
     pixels = _Pixels(layer, glow, around, size, found)
-    darkest = pixels.darkest()
-    is_bright = pixels.bright > _BRIGHTER_THAN_DARKEST * darkest
-    excess = rgb(pixels.color) * dr.select(is_bright, 1 - darkest / pixels.bright, 0)
+    # The darkest square around has nothing of it
+    excess = rgb(pixels.color) * (1 - pixels.darkest() / pixels.bright)
     # What the layer before shows is not shown twice
     is_shared = pixels.blur > dr.opaque(mi.Float, layer.shared)
-    radius, blur = dr.select(is_bright & ~is_shared, pixels.radius, 0), pixels.blur
+    radius, blur = dr.select(is_shared, 0, pixels.radius), pixels.blur
     dr.eval(excess, radius, blur)
     spread_ones = _affordable(excess, radius, size)
-    is_gone = dr.select(is_bright & is_shared, mi.Float(1), 0)
+    is_gone = dr.select(is_shared, mi.Float(1), 0)
     if len(spread_ones) > 0:
         dr.scatter(is_gone, mi.Float(1), spread_ones)
     # A new array: the pyramid has the other one
@@ -98,7 +97,8 @@ class _Pixels:
 
     def is_bright(self) -> mi.Bool:
         """Brighter than the square around it?"""
-        return (self.radius > _LEAST_RADIUS) & (self.bright > _BRIGHTER * self._square(0, 0))
+        limit = dr.maximum(_BRIGHTER * self._square(0, 0), 0)
+        return (self.radius > _LEAST_RADIUS) & (self.bright > limit)
 
     def darkest(self) -> mi.Float:
         """The brightness of the darkest of nine squares."""
@@ -106,7 +106,8 @@ class _Pixels:
         for y in (-1, 0, 1):
             for x in (-1, 0, 1):
                 darkest = dr.minimum(darkest, self._square(x, y))
-        return darkest
+        # Film filters can have negative lobes
+        return dr.maximum(darkest, 0)
 
     def _square(self, x: int, y: int) -> mi.Float:
         color = self._view.at(self._middle + self._step * mi.Vector2f(x, y))
