@@ -33,6 +33,12 @@ PICTURES = {
     "colour_wheel": 512,
     "spotlights": 128,
     "panes": 256,
+    "peppers_ghost": 128,
+    "bounce_card": 128,
+    "burning_glass": 256,
+    "showroom": 256,
+    "discharge_lamps": 512,
+    "paperweight": 512,
     "flint": 1024,
     "caustic": 256,
     "glass_lamp": 96,
@@ -49,16 +55,39 @@ PICTURES = {
 #: Scenes rendered by light paths or chains, or in which nothing is learned of visibility; all
 #: others have "neepp".
 INTEGRATORS = {
-    **dict.fromkeys(["caustic", "glass_lamp", "corridor", "ring", "shaded_lamp"], "bdpt"),
+    **dict.fromkeys(
+        [
+            "caustic",
+            "glass_lamp",
+            "corridor",
+            "ring",
+            "shaded_lamp",
+            "burning_glass",
+            "bounce_card",
+        ],
+        "bdpt",
+    ),
     **dict.fromkeys(["pool", "keyhole"], "erpt"),
-    **dict.fromkeys(["six_balls", "colour_wheel", "spotlights", "panes"], "swarm_path"),
+    **dict.fromkeys(
+        [
+            "six_balls",
+            "colour_wheel",
+            "spotlights",
+            "panes",
+            "peppers_ghost",
+            "showroom",
+            "discharge_lamps",
+            "paperweight",
+        ],
+        "swarm_path",
+    ),
 }
 
 #: Scenes that are not 16 : 9.
 WIDTHS = {"cornell_box": 216, "caustic": 240, "glass_lamp": 240, "ring": 240, "shaded_lamp": 240}
 
 #: Scenes that need a spectral variant.
-SPECTRAL = {"flint"}
+SPECTRAL = {"flint", "discharge_lamps"}
 
 
 @click.command()

@@ -119,6 +119,9 @@ class AdaptiveSampling(WrappingIntegrator):
             }
     """
 
+    #: The weights of its passes add up to one in the film, and do not count samples.
+    film_counts_samples = False
+
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.threshold = self.parameter(props, "threshold", 0.0, minimum=0.0)

@@ -111,6 +111,9 @@ class Variance(mi.AdjointIntegrator):
     #: Each render asks the nested integrator whether it does.
     sees_motion = True
 
+    #: Each pixel of its film has the weight one, and not the number of samples.
+    film_counts_samples = False
+
     def __init__(self, props: mi.Properties) -> None:
         # Without properties, because those of the base class would have no effect here
         super().__init__(mi.Properties(props.plugin_name()))

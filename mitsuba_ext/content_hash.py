@@ -21,17 +21,27 @@ _PACKAGE = Path(__file__).parent
 _COMPILED = ("builtins", "mitsuba", "drjit.detail")
 
 
-def hash_files(files: Iterable[Path], parameters: Mapping[str, str], source: object = None) -> str:
+def hash_each(files: Iterable[Path]) -> dict[Path, str]:
+    """SHA-256 of each file, by the file that links lead to."""
+    return {
+        file: hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in sorted({file.resolve() for file in files})
+    }
+
+
+def hash_files(
+    hashes: Mapping[Path, str], parameters: Mapping[str, str], source: object = None
+) -> str:
     """SHA-256 over a scene's files, and its parameters.
 
     Args:
-        files: From :func:`~mitsuba_ext.scene_files.files_of`.
+        hashes: Of the files, from :func:`hash_each`.
         parameters: Values of the ``$name`` placeholders.
         source: The dict that the scene was made from, if it was not a file.
     """
     digest = hashlib.sha256(repr(sorted(parameters.items())).encode())
-    for file in sorted({file.resolve() for file in files}):
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    for file in hashes:
+        digest.update(bytes.fromhex(hashes[file]))
     if source is not None:
         _feed(digest, source)
     return digest.hexdigest()

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import os
+import platform
+import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 from .errors import InputError
+
+#: Processes have numbers on their own machine only, and folders may be those of several.
+_HOST = re.sub(r"\W", "_", platform.node())
 
 
 def check_folder(folder: Path) -> None:
@@ -42,13 +47,33 @@ def check_target(path: Path) -> None:
     check_folder(path.parent)
 
 
+def _is_alive(process: int) -> bool:
+    if os.name != "posix":  # there, signal 0 ends a process
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # it is another user's; or it is no number of a process
+        pass
+    return True
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yields a temporary path to write to; the finished file then replaces ``path`` in one step.
 
-    After an exception, ``path`` is unchanged.
+    After an exception, ``path`` is unchanged. What processes of this machine have left that were
+    killed while they wrote to it is removed.
     """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    before, after = f".{path.stem}.{_HOST}-", path.suffix
+    temporary = path.with_name(f"{before}{os.getpid()}{after}")
+    for name in os.listdir(path.parent):
+        if name.startswith(before) and name.endswith(after):
+            process = name[len(before) : len(name) - len(after)]
+            if process.isdecimal() and not _is_alive(int(process)):
+                with contextlib.suppress(OSError):
+                    path.with_name(name).unlink()
     try:
         yield temporary
         os.replace(temporary, path)

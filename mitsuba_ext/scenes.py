@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .content_hash import hash_files
+from .content_hash import hash_each, hash_files
 from .errors import InputError
 from .rendering.aovs import check_nodes
 from .scene_files import files_of, named_in
@@ -92,6 +92,7 @@ class LoadedScene:
         path: The XML file; ``None`` for a scene made from a dict.
         parameters: The ``$name`` parameters that were passed to it.
         files: The XML file, and all files that it names, by their absolute paths.
+        file_hashes: SHA-256 of each of them, by the file that links lead to.
         content_hash: SHA-256 over the XML or dict, its parameters, and all these files.
         settings: ``max_depth`` and ``rr_depth`` of the scene's own integrator, as far as it has
             them, and ``hide_emitters`` where it is set.
@@ -103,6 +104,7 @@ class LoadedScene:
     path: Path | None
     parameters: dict[str, str]
     files: list[Path]
+    file_hashes: dict[Path, str]
     content_hash: str
     settings: dict[str, int | bool]
     integrator_name: str
@@ -176,7 +178,8 @@ def load_scene(
                 for (node, key), name in list(named_in(state)):
                     node.props[key] = moved(name)
             files = files_of(state, strings)
-            content_hash = hash_files(files, strings, source if is_dict else None)
+            file_hashes = hash_each(files)
+            content_hash = hash_files(file_hashes, strings, source if is_dict else None)
             integrator = _integrator_node(state)
             # Before transform_all(): afterwards, a node may be freed memory
             integrator_name = integrator.props.plugin_name() if integrator else ""
@@ -205,6 +208,7 @@ def load_scene(
         path=path,
         parameters=strings,
         files=files,
+        file_hashes=file_hashes,
         content_hash=content_hash,
         settings=settings,
         integrator_name=integrator_name,

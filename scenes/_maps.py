@@ -93,6 +93,22 @@ def clear_sky() -> Floats:
     return sky(colours, 33, 0.625, sun, (4, 3.4, 2.6), 60)
 
 
+def hall() -> Floats:
+    """The hall around showroom.xml, 512 x 256, latitude-longitude: dark, with 60 lamps of one to
+    four texels, in four colours, that hang all around."""
+    draw = np.random.Generator(np.random.PCG64(21))
+    image = np.full((256, 512, 3), 0.02)
+    tints = np.array([(1.0, 0.75, 0.45), (0.6, 0.8, 1.0), (1.0, 0.95, 0.85), (1.0, 0.5, 0.35)])
+    for row, count in ((36, 8), (56, 14), (76, 18), (96, 20)):
+        for number in range(count):
+            column = int((number + 0.6 * draw.random()) * 512 / count)
+            height, width = draw.integers(1, 3, 2)
+            colour = tints[draw.integers(len(tints))] * (0.5 + draw.random())
+            place = slice(row, row + height), np.arange(column, column + width) % 512
+            image[place] = colour * 1000 / (height * width)
+    return image
+
+
 def write_exr(path: Path, image: Floats) -> None:
     """Writes linear half floats, rounded to a thousandth: repeatable, and smaller files."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}

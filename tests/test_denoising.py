@@ -184,10 +184,11 @@ def test_a_film_without_rgb_is_refused_before_the_render(variant):
 @pytest.mark.slow
 def test_denoising_removes_noise(run, scenes, tmp_path):
     pytest.importorskip("mitsuba_oidn")
-    command = ("render", scenes / "cornell_box.xml", "--size", "64x64")
+    # With the gaussian filter of the scene, neighbours share their noise, which passes for detail
+    command = ("render", scenes / "cornell_box.xml", "--size", "64x64", "-D", "rfilter=box")
     assert run(*command, "-o", tmp_path / "truth.exr", "--spp", 256, "--seed", 9)[0] == 0
     assert run(*command, "-o", tmp_path / "a.exr", "--spp", 4, "--denoise")[0] == 0
     truth, noisy, ours = (
         np.stack([read_exr(tmp_path / f"{name}.exr")[0][c] for c in "RGB"], axis=2)
         for name in ("truth", "a.noisy", "a"))  # fmt: skip
-    assert relative_mse(ours, truth) < 0.5 * relative_mse(noisy, truth)
+    assert relative_mse(ours, truth) < 0.2 * relative_mse(noisy, truth)  # 0.10 +- 0.01 over seeds

@@ -147,7 +147,8 @@ def test_extreme_seeds_give_images_of_their_own(name: str) -> None:
     images = batches(scene, integrator, 16, seeds)
     assert_images_are_sound(images)
     for image, other in zip(images, images[[2, 2, 0]]):
-        assert abs(image.mean() / other.mean() - 1) < 0.2
+        # Four standard deviations of the ratio: the mean of such an image of `path` has 9 %
+        assert abs(image.mean() / other.mean() - 1) < 0.5
         assert np.abs(image - other).mean() > 0.01 * image.mean()
     for seed, image in zip(seeds[:2], images):
         array = np.array(mi.render(scene, integrator=integrator, seed=mi.UInt32(seed), spp=16))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,7 +18,8 @@ import numpy as np
 import pytest
 from conftest import PATH, in_subprocess
 
-from mitsuba_ext.compare import load_reference, read_exr
+from mitsuba_ext.compare import images, load_reference, read_exr
+from mitsuba_ext.errors import InputError
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.intervals import Interval
@@ -62,6 +65,26 @@ def test_more_samples_later_and_merged(run, make_scene, tmp_path):
     assert run("render", scene, "-o", tmp_path / "3.exr", *other)[0] == 0
     assert '"scene files" differs' in run(
         "merge", tmp_path / "1", tmp_path / "3", "-o", tmp_path / "c")[2]  # fmt: skip
+
+
+def test_a_merged_folder_is_whole_or_not_there(run, make_scene, tmp_path, monkeypatch):
+    scene, kept = make_scene(), [tmp_path / "a", tmp_path / "b"]
+    for seed, folder in enumerate(kept):
+        assert run("render", scene, "-o", tmp_path / "a.exr", "--checkpoint", folder,
+                   "--seed", seed)[0] == 0  # fmt: skip
+
+    def full(self, state):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = sorted(tmp_path.iterdir())
+    with monkeypatch.context() as patch:
+        patch.setattr(CheckpointFolder, "save", full)
+        code, _, err = run("merge", *kept, "-o", tmp_path / "c")
+    assert code == 2 and "c: cannot be written (No space left on device)" in err
+    assert sorted(tmp_path.iterdir()) == before
+    assert run("merge", *kept, "-o", tmp_path / "new" / "c")[0] == 0
+    assert sorted(f.name for f in (tmp_path / "new").rglob("*")) == [
+        "c", "render.json", "state.npz"]  # fmt: skip
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
@@ -111,6 +134,50 @@ def test_a_full_disk_costs_an_interval_at_most(run, make_scene, tmp_path, monkey
     assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64
 
 
+def test_a_folder_that_is_deleted_costs_the_folder_only(run, make_scene, tmp_path, monkeypatch):
+    render, kept = BatchRenderer.render, tmp_path / "kept"
+
+    def deleted(self, batch, learned):
+        if batch.index == 2:
+            shutil.rmtree(kept)
+        return render(self, batch, learned)
+
+    monkeypatch.setattr(BatchRenderer, "render", deleted)
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
+                       "--checkpoint", kept, "--every", "16spp")  # fmt: skip
+    assert code == 0 and "the render could not be kept: [Errno 2] No such file" in err
+    assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64 and not kept.exists()
+
+
+@pytest.mark.parametrize("is_kept", [True, False])
+def test_a_failure_keeps_the_image_so_far(run, make_scene, tmp_path, monkeypatch, is_kept):
+    """As when a scheduler is gone, or three workers have died of the same batch."""
+    render, kept = BatchRenderer.render, tmp_path / "kept"
+
+    def fails(self, batch, learned):
+        if batch.index == 2:
+            raise InputError("the cluster is gone")
+        return render(self, batch, learned)
+
+    monkeypatch.setattr(BatchRenderer, "render", fails)
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64, "--preview",
+               tmp_path / "b.png", *(("--checkpoint", kept) if is_kept else ()))  # fmt: skip
+    code, _, err = run(*command)
+    assert code == 2 and "interrupted after 32 of 64 spp" in err
+    assert err.endswith("mitsuba-ext: the cluster is gone\n")
+    assert read_exr(tmp_path / "a.exr")[1]["spp"] == 32
+    assert not is_kept or CheckpointFolder(kept).load().spp == 32
+
+
+@pytest.mark.parametrize("specification", ["neepp:timeout=9", "variance:in=[neepp:timeout=9]"])
+def test_a_time_limit_of_batches_is_refused(run, make_scene, tmp_path, specification):
+    """Their numbers of samples would be wrong."""
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", specification)
+    code, _, err = run(*command, "--until", "1")
+    assert code == 2 and '"timeout" would cut short each of the batches' in err
+    assert "limit the whole render by --time" in err and not (tmp_path / "a.exr").exists()
+
+
 def test_variants_without_batches_are_named(run, make_scene, tmp_path):
     code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--until", 0.1,
                        "--variant", "scalar_rgb")  # fmt: skip
@@ -128,6 +195,19 @@ def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkey
                          read_exr(tmp_path / "a.exr")[1]["spp"]))  # fmt: skip
         return render(self, batch, learned)
 
+    # It may come at any time, and would end the process by default
+    describe, write = CheckpointFolder.describe, images.write_film
+
+    def before(*arguments):
+        os.kill(os.getpid(), signal.SIGUSR1)
+        describe(*arguments)
+
+    def after(*arguments, **options):
+        os.kill(os.getpid(), signal.SIGUSR1)
+        write(*arguments, **options)
+
+    monkeypatch.setattr(CheckpointFolder, "describe", before)
+    monkeypatch.setattr(images, "write_film", after)
     monkeypatch.setattr(BatchRenderer, "render", signalled)
     code, out, _ = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
                        "--checkpoint", tmp_path / "kept")  # fmt: skip
@@ -195,10 +275,51 @@ def test_another_render_is_refused(run, make_scene, tmp_path):
         code, _, err = run(*command, *change)
         assert code == 2 and words in err, err
     make_scene(integrator=PATH.replace("3", "4"))
-    assert '"scene files" differs (its files or code have changed)' in run(*command)[2]
+    assert '"scene files" differs (scene.xml has changed)' in run(*command)[2]
     # The same file by another name
     make_scene()
     assert run("render", os.path.relpath(scene), *command[2:])[0] == 0
+
+
+def test_a_changed_file_is_named(run, make_scene, tmp_path):
+    """Of a scene with an included file, a mesh and a texture."""
+    (tmp_path / "parts.xml").write_text(
+        '<scene version="3.0.0"><shape type="ply"><string name="filename" value="mesh.ply"/>'
+        '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">'
+        '<string name="filename" value="wood.png"/></texture></bsdf></shape></scene>'
+    )
+    rectangle = mi.load_dict({"type": "rectangle"})
+    mesh = mi.Mesh("", 4, 2, has_vertex_texcoords=True)
+    values = mi.traverse(mesh)
+    values["vertex_positions"] = [-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0]
+    values["vertex_texcoords"] = [0, 0, 1, 0, 1, 1, 0, 1]
+    values["faces"] = [0, 1, 2, 2, 3, 0]
+    values.update()
+    assert rectangle.bbox() == mesh.bbox()
+    mesh.write_ply(str(tmp_path / "mesh.ply"))
+    mi.Bitmap(np.full((2, 2, 3), 100, np.uint8)).write(str(tmp_path / "wood.png"))
+    body = '<default name="file" value="parts.xml"/><include filename="$file"/>'
+    command = ("render", make_scene(body=body), "-o", tmp_path / "a.exr", "--spp", 1,
+               "--checkpoint", tmp_path / "kept")  # fmt: skip
+    assert run(*command)[0] == 0
+
+    def refused(name: str, content: bytes) -> None:
+        whole = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(content)
+        code, _, err = run(*command)
+        assert code == 2 and f'"scene files" differs ({name} has changed)' in err, err
+        (tmp_path / name).write_bytes(whole)
+
+    refused("parts.xml", (tmp_path / "parts.xml").read_bytes() + b" ")
+    values["vertex_positions"] = [-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 2, 0]
+    values.update()
+    mesh.write_ply(str(tmp_path / "other.ply"))
+    refused("mesh.ply", (tmp_path / "other.ply").read_bytes())
+    mi.Bitmap(np.full((2, 2, 3), 101, np.uint8)).write(str(tmp_path / "other.png"))
+    refused("wood.png", (tmp_path / "other.png").read_bytes())
+    err = run(*command, "-D", "file=./parts.xml")[2]
+    assert '"scene parameters" differs (file: None there, ./parts.xml here)' in err
+    assert run(*command)[0] == 0
 
 
 # ---- Processes ----

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from concurrent.futures import Executor, Future
 from pathlib import Path
 
@@ -104,6 +106,22 @@ def test_the_image_is_that_of_all_samples(request_of):
     assert not np.allclose(expected, state.images.mean, rtol=1e-4), "the weights do not matter"
 
 
+@pytest.mark.parametrize("specification", [
+    "path", "ptracer", "light_tracer", "bdpt", "adaptive:in=[path]",
+    "variance:nested=[path],batches=2",
+    "pssmlt:chains=64,luminance_samples=1000,bidirectional=false",
+])  # fmt: skip
+def test_batches_count_by_their_samples_in_the_image_too(specification, request_of):
+    """Also where the weights in the film are not numbers of samples."""
+    request = request_of(specification)
+    state = rendered(request, spp=34)
+    assert [batch.spp for batch in state.done] == [16, 16, 2]
+    film = BatchRenderer(request).sensor.film()
+    state.fill(film)
+    ours = np.array(film.develop())[..., :3]
+    np.testing.assert_allclose(ours, state.images.mean[..., :3], rtol=1e-4)
+
+
 def test_who_renders_does_not_matter(request_of):
     """Batches that come back late, or fail twice."""
     request = request_of("path")
@@ -154,6 +172,16 @@ def test_it_ends_when_the_error_is_small_enough(request_of):
     assert render.run(Goal(spp=render.state.spp, error=1e-9))
 
 
+def test_a_black_image_has_no_error_to_reach(run, make_scene, tmp_path):
+    scene = make_scene()
+    scene.write_text(re.sub("<emitter.*?/>", "", scene.read_text()))
+    command = ("render", scene, "-o", tmp_path / "a.exr", "--until", "0.01")
+    code, _, err = run(*command)
+    assert code == 2 and "is black, or not finite, after 128 samples per pixel" in err
+    assert run(*command, "--spp", 256)[0] == 0
+    assert run(*command, "--spp", 1 << 20, "--time", 0.2)[0] == 0
+
+
 def test_the_first_batches_tell_how_many_fit_into_the_time(request_of, monkeypatch):
     class Clock:
         now = 0.0
@@ -196,6 +224,48 @@ def test_a_damaged_state_is_replaced_by_the_one_before(request_of, tmp_path):
     (tmp_path / "kept" / "state.before.npz").write_bytes(b"?")
     with pytest.raises(InputError, match="is damaged: delete"):
         folder.load()
+
+
+def test_the_state_before_a_damaged_one_is_kept_until_there_is_a_newer(
+    run, make_scene, tmp_path, monkeypatch
+):
+    kept = tmp_path / "kept"
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--checkpoint", kept, "--spp")
+    assert run(*command, 16)[0] == run(*command, 32)[0] == 0
+    (kept / "state.npz").write_bytes(b"?")
+    replace, names = os.replace, []
+
+    def dies(source, target):
+        names.append(Path(target).name)
+        raise KeyboardInterrupt  # killed
+
+    folder = CheckpointFolder(kept)
+    state = folder.load()
+    assert state.spp == 16 and folder.damaged == kept / "state.npz"
+    monkeypatch.setattr(os, "replace", dies)
+    with pytest.raises(KeyboardInterrupt):
+        folder.save(state)
+    monkeypatch.setattr(os, "replace", replace)
+    assert names == ["state.npz"] and CheckpointFolder(kept).load().spp == 16
+    code, _, err = run("merge", kept, kept, "-o", tmp_path / "all")
+    assert code == 2 and err.count("state.npz: is damaged: the state before it is merged") == 2
+    code, _, err = run(*command, 48)
+    assert code == 0 and "state.npz: is damaged: going on from the state before it" in err
+    assert folder.load().spp == 48 and folder.damaged is None
+    (kept / "state.npz").unlink()
+    assert folder.load().spp == 16
+
+
+def test_a_folder_that_does_not_say_what_it_holds_is_refused(run, make_scene, tmp_path):
+    kept = tmp_path / "kept"
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--checkpoint", kept, "--spp")
+    assert run(*command, 16)[0] == run(*command, 32)[0] == 0
+    (kept / "render.json").unlink()
+    for name in ("state.npz", "state.before.npz"):
+        code, _, err = run(*command, 32)
+        assert code == 2 and "render.json: is missing: the folder cannot be used any more" in err
+        (kept / name).unlink()
+    assert run(*command, 32)[0] == 0
 
 
 def test_two_processes_cannot_use_a_folder(request_of, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import drjit as dr
+import mitsuba as mi
 import pytest
 
 from mitsuba_ext.cli import long_job, reports, statistics
@@ -43,8 +44,34 @@ def test_a_script_reads_events(run, make_scene, tmp_path, every_event, options):
     found = [step["spp"] for step in steps]
     assert found == sorted(set(found)) and found[-1] == 1 << 16
     assert steps[-2]["seconds_left"] > 0 == steps[-1]["seconds_left"]
+    assert steps[-1]["samples_per_second"] > 0
     if options:
-        assert steps[-1]["samples_per_second"] > 0 and steps[-1]["goal_spp"] == 1 << 16
+        assert steps[-1]["goal_spp"] == 1 << 16 and steps[-1]["batches"] == len(steps)
+
+
+@pytest.mark.usefixtures("batches_of_sixteen_samples")
+def test_the_error_is_told_without_being_asked_for(run, make_scene, tmp_path, every_event):
+    out = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 160, "--json",
+              "--checkpoint", tmp_path / "kept")[1]  # fmt: skip
+    *steps, _ = (json.loads(line) for line in out.splitlines())
+    assert [step["batches"] for step in steps] == list(range(1, 11))
+    assert "relmse" not in steps[6] and 0 < steps[9]["relmse"] < 1
+
+
+def test_nothing_else_gets_among_the_events(run, make_scene, tmp_path):
+    """Mitsuba prints its warnings to stdout, and so may a module of the user."""
+    module = tmp_path / "loud.py"
+    module.write_text(
+        "import mitsuba as mi\nprint('printed')\nmi.Log(mi.LogLevel.Warn, 'a thing')\n"
+        "mi.Log(mi.LogLevel.Info, 'another')\n"
+    )
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--plugin", module)
+    code, out, err = run(*command, "--json")
+    warning, *_, end = (json.loads(line) for line in out.splitlines())
+    assert code == 0 and err == "printed\n" and end["event"] == "end"
+    assert warning["event"] == "warning" and warning["text"].endswith("a thing")
+    before = mi.logger().appender(0)
+    assert run(*command)[1].startswith("printed") and mi.logger().appender(0) is before
 
 
 @pytest.mark.parametrize(("integrator", "options"), [

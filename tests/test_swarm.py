@@ -15,9 +15,10 @@ from mitsuba_ext.composition.swarm import doubling_pilots, stage_weights
 from mitsuba_ext.decisions.swarm import map_learner
 from mitsuba_ext.decisions.swarm.bounce_records import BounceRecords
 from mitsuba_ext.decisions.swarm.cells import CellDensities, Cells
-from mitsuba_ext.decisions.swarm.estimate import Form, density, estimate
+from mitsuba_ext.decisions.swarm.estimate import Form, Grid, Shares, estimate
 from mitsuba_ext.decisions.swarm.light_maps import light_cells
 from mitsuba_ext.decisions.swarm.lobe_maps import path_density
+from mitsuba_ext.rendering.dither import dithered_parts
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -44,12 +45,16 @@ def _table(kind: str, cells: Cells) -> np.ndarray:
     return np.stack([np.full(cells.count, 1 / cells.count), mass / mass.sum()])
 
 
+def _maps(cells: Cells, mass: np.ndarray) -> CellDensities:
+    return CellDensities(cells, mi.Float(mass.astype(np.float32).ravel()))
+
+
 @pytest.mark.parametrize("kind", ["random", "one_hot", "half_empty", "uniform"])
 @pytest.mark.parametrize("name", CELLS)
 def test_samples_have_their_density(name: str, kind: str) -> None:
     cells = CELLS[name]()
     mass = _table(kind, cells)
-    maps, count = CellDensities(cells, mass), 1 << 18
+    maps, count = _maps(cells, mass), 1 << 18
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(3, count)
     u = [sampler.next_1d() for _ in range(cells.dimension)]
@@ -71,7 +76,7 @@ def test_samples_have_their_density(name: str, kind: str) -> None:
 
 
 def test_inactive_lanes_keep_their_numbers() -> None:
-    maps = CellDensities(Cells.line(3), _table("one_hot", Cells.line(3)))
+    maps = _maps(Cells.line(3), _table("one_hot", Cells.line(3)))
     u = mi.Float([0.1, 0.9])
     (drawn,), pdf, _ = maps.sample(mi.UInt32([1, 1]), [u], mi.Bool([False, True]))
     assert drawn.numpy()[0] == u.numpy()[0] and pdf.numpy()[0] == 1
@@ -80,25 +85,70 @@ def test_inactive_lanes_keep_their_numbers() -> None:
 # ---- Estimates ----
 
 
-def _estimated(counts: np.ndarray, widths: np.ndarray | None = None) -> np.ndarray:
-    """Of samples that count one each."""
+def _estimated(
+    counts: np.ndarray, widths: np.ndarray | None = None, squares: np.ndarray | None = None
+) -> np.ndarray:
+    """Of counts by row, column, map and cell; the samples count one each by default."""
     widths = np.full(counts.shape[-1], 1 / counts.shape[-1]) if widths is None else widths
-    return estimate(counts, counts.sum(-1), widths)
+    squares = counts.sum(-1) if squares is None else squares
+    arrays = (mi.Float(x.astype(np.float32).ravel()) for x in (counts, squares))
+    shares = estimate(*arrays, Grid(*counts.shape[:3]), mi.Float(widths.astype(np.float32)))
+    return shares.numpy().reshape(counts.shape)
 
 
 def test_without_samples_maps_are_uniform() -> None:
     widths = np.array([0.5, 0.25, 0.25, 0])
     shares = _estimated(np.zeros((3, 5, 2, 4)), widths)
     np.testing.assert_allclose(shares, np.broadcast_to(widths, shares.shape), atol=1e-6)
+    tables = Shares(mi.Float(shares.ravel()), mi.Float(widths.astype(np.float32)))
     for form in (Form(True, 0.2), Form(False, 0.05)):
-        np.testing.assert_allclose(density(shares, widths, form).sum(-1), 1, rtol=1e-5)
+        mass = tables.mass(form).numpy().reshape(shares.shape)
+        np.testing.assert_allclose(mass, shares, atol=1e-6)
+        np.testing.assert_allclose(tables.expected_ratio(form).numpy(), 1, rtol=1e-5)
 
 
 def test_one_sample_is_not_believed() -> None:
     counts = np.zeros((4, 4, 1, 16))
     counts[1, 2, 0, 5] = 1e9
-    shares = estimate(counts, np.square(counts.sum(-1)), np.full(16, 1 / 16))
+    shares = _estimated(counts, squares=np.square(counts.sum(-1)))
     np.testing.assert_allclose(shares, 1 / 16, rtol=1e-4)
+    # Nor one in each tile, in different places
+    tiles = np.arange(16)
+    counts.reshape(16, 16)[tiles, (5 * tiles) % 16] = 1e9
+    shares = _estimated(counts, squares=np.square(counts.sum(-1)))
+    assert shares.max() < 3 / 16 and shares.min() > 0.5 / 16
+
+
+def _believed(h, p, n, variance, tables):
+    """The beta-binomial estimate and its variance at one node, with the ρ of these tables."""
+    excess, weight = (n * (h - p) ** 2 / (p * (1 - p)) - 1).sum(), tables * (n - 1)
+    chance = np.sqrt(2 * tables)
+    rho = np.clip((excess - chance) / weight, 0, 0.5)
+    most = np.clip((max(excess, 0) + chance) / weight, 0, 0.5)
+    believed = n * rho / (n * rho + 1 - rho)
+    left = p + believed * (h - p)
+    return left, (1 - believed) ** 2 * variance + left * (1 - left) * most / (n * most + 1)
+
+
+def test_few_samples_of_a_tile_are_believed_a_little() -> None:
+    counts = np.zeros((1, 2, 1, 2))
+    counts[0, 0, 0], counts[0, 1, 0] = (12, 0), (4, 8)
+    film, variance = _believed(np.array([2 / 3]), 1 / 2, 24, 0, 1)
+    left, variance = _believed(np.array([1, 1 / 3]), film, 12, variance, 2)
+    a, b = np.sqrt(left**2 + variance), np.sqrt((1 - left) ** 2 + variance)
+    np.testing.assert_allclose(_estimated(counts)[0, :, 0, 0], a / (a + b), rtol=1e-4)
+    assert (np.abs(a / (a + b) - [1, 1 / 3]) > 0.03).all()
+
+
+def test_tiles_that_are_joined_have_the_map_of_all_their_samples() -> None:
+    counts = np.random.default_rng(4).multinomial(9, [0.7, 0.1, 0.1, 0.1], size=(3, 5, 2))
+    joined = np.zeros((2, 3, 2, 4))
+    for row, column in np.ndindex(3, 5):
+        joined[row // 2, column // 2] += counts[row, column]
+    flat, squares = (mi.Float(x.astype(np.float32).ravel()) for x in (counts, counts.sum(-1)))
+    widths = mi.Float([0.25] * 4)
+    shares = estimate(flat, squares, Grid(3, 5, 2), widths, halvings=1)
+    np.testing.assert_allclose(shares.numpy(), _estimated(joined).ravel(), rtol=1e-4)
 
 
 def test_noise_stays_nearly_uniform() -> None:
@@ -130,14 +180,38 @@ def test_pilots_double(samples: int) -> None:
     assert all(n >= sum(pilots[:i]) for i, n in enumerate(pilots))
 
 
+@pytest.mark.parametrize("parts", [1, 2, 4])
 @pytest.mark.parametrize("spp", [4, 6, 8, 16, 64, 1024])
-def test_weights_of_stages_cost_little(spp: int) -> None:
+def test_weights_of_stages_cost_little(spp: int, parts: int) -> None:
     pilots = doubling_pilots(max(1, min(spp // 4, 64)))
     stages = [*pilots, spp - sum(pilots)]
-    n, w = np.array(stages), np.array(stage_weights(stages))
-    assert w[-1] == 1 and (w > 0).all() and (np.diff(w) >= 0).all()
-    assert n.sum() * (n * w**2).sum() / (n * w).sum() ** 2 < 1.0151
+    weights = np.array(stage_weights(stages, parts))
+    assert len(weights) == len(stages) + parts - 1
+    assert weights[-1] == 1 and (weights > 0).all() and (np.diff(weights) >= 0).all()
+    # In each part of the pixels, the first stage has another weight
+    sizes = [2.0 ** -(parts - max(1, part)) if parts > 1 else 1 for part in range(parts)]
+    loss = 0.0
+    for part, size in enumerate(sizes):
+        w = np.array([weights[part], *weights[parts:]])
+        loss += size * (np.sum(stages) * (stages * w**2).sum() / (stages * w).sum() ** 2 - 1)
+    assert sum(sizes) == 1 and loss < 0.0151
     assert stage_weights([5]) == [1]
+
+
+@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (64, 48)])
+def test_parts_of_a_film_are_all_of_it(size: tuple[int, int], count: int) -> None:
+    parts = dithered_parts(*size, count)
+    pixels = np.sort(np.concatenate(parts))
+    np.testing.assert_array_equal(pixels, np.arange(size[0] * size[1]))
+    if size == (64, 48):
+        assert [len(part) * 2**count for part in parts] == [
+            2 * pixels.size * 2 ** max(0, part - 1) for part in range(count)
+        ]
+        # Spread evenly: each 8 x 8 block has as many of each part
+        for part in parts:
+            blocks = part // 64 // 8 * 8 + part % 64 // 8
+            assert len(set(np.bincount(blocks))) == 1
 
 
 # ---- Renders ----
@@ -222,14 +296,16 @@ def test_maps_lower_the_noise_where_they_promise_to() -> None:
 def test_wrong_maps_only_make_noise(monkeypatch, adversary: str, kind: str) -> None:
     """All mass in one cell, or anywhere: the share of uniform numbers keeps the mean right."""
 
-    def wrong(counts, squares, widths):
-        rng = np.random.default_rng(len(counts))
+    def wrong(counts, squares, grid, widths, halvings):
+        size = len(estimate(counts, squares, grid, widths, halvings))
+        shape = (size // len(widths), len(widths))
+        rng = np.random.default_rng(shape[0])
         if adversary == "random":
-            mass = rng.random(counts.shape) ** 4 * (widths > 0)
+            mass = rng.random(shape) ** 4 * (widths.numpy() > 0)
         else:
-            mass = np.zeros(counts.shape)
-            mass[..., counts.shape[-1] // 5] = 1
-        return mass / mass.sum(-1, keepdims=True)
+            mass = np.zeros(shape)
+            mass[:, shape[1] // 5] = 1
+        return mi.Float((mass / mass.sum(-1, keepdims=True)).astype(np.float32).ravel())
 
     monkeypatch.setattr(map_learner, "estimate", wrong)
     scene, depth = (_streaks(12, 10), 2) if kind == "streaks" else (_glass_and_spots(), 5)

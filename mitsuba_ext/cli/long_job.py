@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
@@ -21,9 +20,11 @@ from ..long_renders.intervals import Interval, LastKept
 from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
 from ..long_renders.workers import Workers, threads_of_each
+from ..rendering import interrupts
 from ..rendering.interrupts import deferred_interrupt
 from ..rendering.totals import RenderTotals
-from .reports import Report, Speed, time_left
+from .long_progress import LongProgress
+from .reports import Report
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ class LongJob:
         integrator, name, parameters: The integrator, its name and its parameters.
         scene, sensor: What it renders.
         film: The film that holds the image.
-        is_interrupted: Did a signal end the render before its goal was reached?
+        is_interrupted: Did a signal or a failure end the render before its goal was reached?
+        failure: What went wrong after there was an image; ``None`` if nothing did.
         seconds: Wall clock of the render.
     """
 
@@ -83,6 +85,7 @@ class LongJob:
         self.scene, self.sensor = self._renderer.chosen.scene, self._renderer.sensor
         self.film = self.sensor.film()
         self.is_interrupted, self.seconds = False, 0.0
+        self.failure: InputError | None = None
         self._state, self._render = RenderState(), None
 
     def remarks(self, is_sensor_chosen: bool) -> list[str]:
@@ -110,6 +113,8 @@ class LongJob:
                 if self._folder:
                     self._folder.describe(self._renderer.description())
                     self._state = self._folder.load()
+                    if damaged := self._folder.damaged:
+                        report.warn(f"{damaged}: is damaged: going on from the state before it")
                 self._run(spp, seconds, write, report)
             finally:
                 self.seconds = time.perf_counter() - begin
@@ -133,29 +138,13 @@ class LongJob:
             self.seconds = time.perf_counter() - last.begin
             write(is_asked)
 
-        speed, pixel_count = Speed(), math.prod(self.film.crop_size())
-
         with report.bars() as bars, _asked_to_keep() as asked:
-            bar = bars.add_task(self.name, total=None, left="")
+            show = LongProgress(
+                report, bars, self.name, math.prod(self.film.crop_size()), bool(options.until)
+            )
 
             def progress(render: LongRender) -> None:
-                text, left = f"{self.name}, {state.spp} spp", None
-                if (per_second := speed(state.spp)) is not None:
-                    text += f", {per_second * pixel_count / 1e6:.3g} million samples/s"
-                    left = render.spp_left and render.spp_left / per_second
-                # It takes as long as a small batch
-                error = render.error if options.until else None
-                if error is not None:
-                    text += f", relMSE about {error:.2g}"
-                bars.update(
-                    bar, description=text, completed=state.spp, total=render.goal_spp or None,
-                    left=time_left(left),
-                )  # fmt: skip
-                report.progress(
-                    spp=state.spp, goal_spp=render.goal_spp or None, relmse=error,
-                    samples_per_second=per_second and per_second * pixel_count,
-                    seconds=time.perf_counter() - last.begin, seconds_left=left,
-                )  # fmt: skip
+                show(render)
                 is_asked, is_due = asked(), is_due_at_once
                 if self._folder or options.has_preview:
                     is_due |= last.is_due(options.every, state.spp)
@@ -178,10 +167,10 @@ class LongJob:
                     is_reached = self._render.run(goal, is_stopped, executor, n)
                 if not state.done:  # stopped before others had finished a batch
                     raise KeyboardInterrupt
-            except InputError:  # the scheduler or too many workers are gone
-                if self._folder and state.done:
-                    self._folder.save(state)
-                raise
+            except InputError as error:  # the scheduler or too many workers are gone
+                if not state.done:
+                    raise
+                self.failure = error
             except KeyboardInterrupt:
                 if not state.done:
                     raise
@@ -260,21 +249,10 @@ def _asked_to_keep() -> Iterator[Callable[[], bool]]:
     """While active, SIGUSR1 asks to keep the render after the running batch, and to go on. Yields a
     function that says whether that was asked since the last time."""
     asked: list[int] = []
-    number = getattr(signal, "SIGUSR1", None)
-    if number is None:
-        yield lambda: False
-        return
-    try:
-        before = signal.signal(number, lambda *_: asked.append(1))
-    except ValueError:  # not the main thread
-        yield lambda: False
-        return
 
     def take() -> bool:
         was, asked[:] = bool(asked), []
         return was
 
-    try:
+    with interrupts.requests_to_keep(lambda *_: asked.append(1)):
         yield take
-    finally:
-        signal.signal(number, before)

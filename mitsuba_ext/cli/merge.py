@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from . import candidates
 from .common import FilledPath, say
+
+if TYPE_CHECKING:
+    from ..long_renders.folder import CheckpointFolder
+    from ..long_renders.state import RenderState
 
 
 @click.command(short_help="Merge renders that --checkpoint has kept.")
@@ -24,6 +31,7 @@ def merge(folders: Sequence[Path], output: Path) -> int:
     """Merge the samples of renders that ``render --checkpoint DIR`` has kept: of the same scene, by
     the same integrator, with different seeds. Each counts by its samples."""
     from ..errors import InputError
+    from ..files import make_folder
     from ..long_renders.folder import CheckpointFolder, check_same
 
     if len(folders) < 2:
@@ -31,16 +39,30 @@ def merge(folders: Sequence[Path], output: Path) -> int:
     if output.exists():
         raise InputError(f"{output}: exists already")
     first, *others = (CheckpointFolder(folder) for folder in folders)
-    description, state = first.description(), first.load()
+    description, state = first.description(), _loaded(first)
     for other in others:
         check_same(description, other.description(), first.path, free=["seed"])
         try:
-            state = state.plus(other.load())
+            state = state.plus(_loaded(other))
         except InputError as error:
             raise InputError(f"{first.path} and {other.path}: {error}") from None
-    target = CheckpointFolder(output)
-    with target.in_use():
-        target.describe(description)
-        target.save(state)
+    # Made beside it: a folder that is half made would pass for the beginning of a render
+    make_folder(output.parent)
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as made:
+            target = CheckpointFolder(Path(made) / output.name)
+            with target.in_use():
+                target.describe(description)
+                target.save(state)
+            os.rename(target.path, output)
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written ({error.strerror})") from error
     say(f"{output}: {state.spp} spp in {len(state.done)} batches", err=False)
     return 0
+
+
+def _loaded(folder: CheckpointFolder) -> RenderState:
+    state = folder.load()
+    if folder.damaged:
+        say(f"mitsuba-ext: warning: {folder.damaged}: is damaged: the state before it is merged")
+    return state

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import click
 from ..long_renders.intervals import Interval
 from ..names import check_integrator
 from ..parameters import MOST_SPP
+from ..rendering.interrupts import requests_to_keep
 from ..variants import select_variant
 from . import candidates
 from .common import (
@@ -164,8 +167,6 @@ def render(
     from .reports import Report
 
     report = Report(quiet, as_json)
-    if spp is not None and seconds is not None and until is None:
-        raise click.UsageError("--spp and --time exclude each other")
     if add is not None and checkpoint is None:
         raise click.UsageError("--add needs --checkpoint: the folder with the samples so far")
     if add is not None and spp is not None:
@@ -175,6 +176,8 @@ def render(
     if preview is not None and preview.absolute() == output.absolute():
         raise click.UsageError("--preview must be another file than --output")
     is_long = checkpoint or until or workers or dask or preview
+    if spp is not None and seconds is not None and not is_long:
+        raise click.UsageError("--spp and --time exclude each other, but in a render in batches")
     order = Order(
         scene, specification, spp, seconds, size, variant, tuple(plugins), denoise, threads,
         LongOptions(
@@ -187,26 +190,29 @@ def render(
         raise click.UsageError("--add is for one image: give --spp, the number that all shall have")
     if parameters is not None and frames is None:
         raise click.UsageError("--parameters needs --frames")
-    function = None
-    if parameters is not None:
-        from .frame_parameters import load_function
+    # Before the first batch and after the last one, there is nothing to keep
+    ignored = requests_to_keep(signal.SIG_IGN) if is_long else contextlib.nullcontext()
+    with report.only_events(), ignored:
+        function = None
+        if parameters is not None:
+            from .frame_parameters import load_function
 
-        select_variant(variant, plugins)  # the function may use types of Mitsuba
-        plugins = ()  # they are registered
-        function = load_function(parameters)
-    if sensors == ():
-        sensors = _all_sensors(scene, definitions, variant, plugins, frames, function)
-        plugins = ()
-    result, scenes = 0, LastScene()
-    for picture in list(pictures(output, definitions, sensors or [None], seed, frames)):
-        if order.is_one_of_many and is_finished(order, picture):
-            report.note(f"{picture.output}: exists already")
-            continue
-        code = render_image(order, picture, plugins, report, scenes, function)
-        plugins = ()
-        if code > 1:
-            return code
-        result = max(result, code)
+            select_variant(variant, plugins)  # the function may use types of Mitsuba
+            plugins = ()  # they are registered
+            function = load_function(parameters)
+        if sensors == ():
+            sensors = _all_sensors(scene, definitions, variant, plugins, frames, function)
+            plugins = ()
+        result, scenes = 0, LastScene()
+        for picture in list(pictures(output, definitions, sensors or [None], seed, frames)):
+            if order.is_one_of_many and is_finished(order, picture):
+                report.note(f"{picture.output}: exists already")
+                continue
+            code = render_image(order, picture, plugins, report, scenes, function)
+            plugins = ()
+            if code > 1:
+                return code
+            result = max(result, code)
     return result
 
 

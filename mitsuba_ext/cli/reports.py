@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import datetime
 import json
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import click
 from rich.progress import Progress, TextColumn
 
 from ..progress import progress_bars
@@ -29,6 +31,7 @@ class Report:
     def __init__(self, is_quiet: bool = False, as_json: bool = False) -> None:
         self._is_quiet, self._as_json = is_quiet, as_json
         self._last = -_PERIOD
+        self._events = sys.stdout
 
     def note(self, text: str) -> None:
         """Says something that needs no attention, on stderr."""
@@ -63,9 +66,46 @@ class Report:
         with progress_bars(column, is_shown=not self._is_quiet and not self._as_json) as bars:
             yield bars
 
+    @contextlib.contextmanager
+    def only_events(self) -> Iterator[None]:
+        """A context in which nothing else gets among the events on stdout: Mitsuba's warnings are
+        events, and what modules of the user print goes to stderr. Without events, it does
+        nothing."""
+        if not self._as_json:
+            yield
+            return
+        import mitsuba as mi
+
+        report = self
+
+        class Warnings(mi.Appender):
+            def append(self, level: mi.LogLevel, text: str) -> None:
+                if level.value >= mi.LogLevel.Warn.value:
+                    report.warn(text)
+
+            def log_progress(self, *_arguments: Any) -> None:
+                pass
+
+        logger, formatter = mi.logger(), mi.DefaultFormatter()
+        formatter.set_has_date(False)
+        formatter.set_has_log_level(False)
+        before = logger.formatter(), [logger.appender(n) for n in range(logger.appender_count())]
+        logger.clear_appenders()
+        logger.add_appender(Warnings())
+        logger.set_formatter(formatter)
+        try:
+            with contextlib.redirect_stdout(sys.stderr):
+                yield
+        finally:
+            logger.clear_appenders()
+            for appender in before[1]:
+                logger.add_appender(appender)
+            logger.set_formatter(before[0])
+
     def _event(self, event: str, **figures: Any) -> None:
         known = {key: value for key, value in figures.items() if value is not None}
-        say(json.dumps({"event": event, **known}), err=False)
+        with contextlib.suppress(OSError):  # as say() does
+            click.echo(json.dumps({"event": event, **known}), file=self._events)
 
 
 def time_left(seconds: float | None) -> str:

@@ -80,6 +80,9 @@ class ChainIntegrator(WalkIntegrator):
 
     sees_media = False
 
+    #: The weights in the film count its camera samples, and not its mutations.
+    film_counts_samples = False
+
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.direct_samples = self.parameter(

@@ -18,7 +18,7 @@ from ..transport.walk import Walk
 from .camera_numbers import WeightedNumbers
 from .decision_parameters import DecisionParameters, Setting
 from .learned_file import States
-from .swarm import Swarm, doubling_pilots, stage_weights
+from .swarm import Swarm, doubling_pilots, first_parts, stage_weights
 
 #: Where pilots double, from so many samples on they may have half of all: they cost little then.
 _MANY_SAMPLES = 8
@@ -99,10 +99,10 @@ class Schedule:
         learned: Callable[[States], None] | None = None,
     ) -> None:
         self._setting, self._pilot_count, self._estimator = setting, len(stages) - 1, estimator
+        self._stages = list(stages)
+        self._has_maps = any(isinstance(parameters, Swarm) for parameters in slots.values())
         #: How many samples of the last stage a sample of each stage counts for
-        self._weights = [1.0] * len(stages)
-        if any(isinstance(parameters, Swarm) for parameters in slots.values()):
-            self._weights = stage_weights(stages)
+        self._weights = stage_weights(stages) if self._has_maps else [1.0] * len(stages)
         self.decisions: dict[str, Any] = {"query": query}
         self.learners: dict[str, Learner] = {}
         self._camera = CameraSamples()
@@ -120,6 +120,16 @@ class Schedule:
         self._restored, self._learned = restored, learned
         self._scout: Scout | None = None
         self._finished_stages = -1
+
+    def divide_first_stage(self, pixel_count: int) -> int:
+        """See :class:`mitsuba_ext.rendering.stages.Schedule`."""
+        learns = self._pilot_count > 0 and self.learners and self._stages[0] == 1
+        if not self._has_maps or not learns:
+            return 1
+        parts = first_parts(pixel_count, sum(self._stages))
+        self._pilot_count += parts - 1
+        self._weights = stage_weights(self._stages, parts)
+        return parts
 
     def next_stage(self) -> Stage:
         """See :class:`mitsuba_ext.rendering.stages.Schedule`."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from ..decisions.learner import Learner
 from ..decisions.swarm.camera_maps import CameraMapLearner, MappedNumbers
@@ -19,8 +21,15 @@ from .decision_parameters import DecisionParameters, ParameterReader, Setting, S
 #: By how much unequal weights of samples may raise the variance of images in which no map helps.
 _MOST_LOSS = 0.015
 
-#: Weights of the first stages where that is no matter: their samples are drawn from poor maps.
-_FIRST_WEIGHTS = (0.1, 0.5, 0.75, 0.9)
+#: Where maps help, a sample that is drawn from a map of n samples per pixel is worth about
+#: (n + _UNIFORM) / (n + _HALF) of one that is drawn from a perfect map.
+_UNIFORM, _HALF = 0.1, 1.5
+
+
+#: The first sample of all pixels is divided into stages until the first of them takes no more than
+#: this share of all samples, as these are drawn from uniform numbers. It takes so many at least: to
+#: trace a stage takes as long.
+_FIRST_SHARE, _LEAST_PIXELS = 1 / 32, 1 << 13
 
 
 class Swarm(DecisionParameters):
@@ -59,6 +68,10 @@ class Swarm(DecisionParameters):
         """Who learns, for a film of this size."""
         raise NotImplementedError
 
+    def _how(self, setting: Setting) -> dict[str, Any]:
+        """What all learners ask."""
+        return {"samples": setting.pilot_spp, "always": self._always}
+
 
 class TimeMaps(Swarm):
     """Maps of the time in the shutter interval."""
@@ -70,7 +83,7 @@ class TimeMaps(Swarm):
 
     def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
         numbers = MappedNumbers(Cells.line(6))
-        return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
+        return CameraMapLearner(self.summary, numbers, width, height, **self._how(setting))
 
 
 class LensMaps(Swarm):
@@ -83,7 +96,7 @@ class LensMaps(Swarm):
 
     def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
         numbers = MappedNumbers(Cells.square(5))
-        return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
+        return CameraMapLearner(self.summary, numbers, width, height, **self._how(setting))
 
 
 class WavelengthMaps(Swarm):
@@ -100,7 +113,7 @@ class WavelengthMaps(Swarm):
 
     def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
         numbers = MappedNumbers(Cells.line(6), periods=4)
-        return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
+        return CameraMapLearner(self.summary, numbers, width, height, **self._how(setting))
 
 
 class LightMapsChoice(Swarm):
@@ -126,7 +139,7 @@ class LightMapsChoice(Swarm):
         lights = self._lights.decision(setting) if self._lights else None
         dimension = lights.choice_dimension if lights else 0
         maps = LightMaps(light_cells(setting.scene, dimension))
-        return LightMapLearner(self.summary, maps, width, height, always=self._always)
+        return LightMapLearner(self.summary, maps, width, height, **self._how(setting))
 
 
 class LobeMaps(Swarm):
@@ -138,7 +151,7 @@ class LobeMaps(Swarm):
         return spp > 0 and divides(scene.shapes())
 
     def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
-        return LobeMapLearner(self.summary, MappedLobes(), width, height, always=self._always)
+        return LobeMapLearner(self.summary, MappedLobes(), width, height, **self._how(setting))
 
 
 class DirectionMaps(Swarm):
@@ -151,7 +164,7 @@ class DirectionMaps(Swarm):
 
     def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
         maps = MappedScattering()
-        return DirectionMapLearner(self.summary, maps, width, height, always=self._always)
+        return DirectionMapLearner(self.summary, maps, width, height, **self._how(setting))
 
 
 class DistanceMaps(Swarm):
@@ -164,7 +177,7 @@ class DistanceMaps(Swarm):
 
     def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
         numbers = MappedNumbers(Cells.line(7))
-        return CameraMapLearner(self.summary, numbers, width, height, always=self._always)
+        return CameraMapLearner(self.summary, numbers, width, height, **self._how(setting))
 
 
 #: By slot, the maps that it can hold.
@@ -196,23 +209,41 @@ def doubling_pilots(samples: int) -> list[int]:
     return pilots
 
 
-def stage_weights(stages: Sequence[int]) -> list[float]:
+def first_parts(pixel_count: int, spp: int) -> int:
+    """Into how many stages the first sample of all pixels is divided, of ``spp`` ones."""
+    parts = 1
+    while 0.5 ** (parts - 1) > _FIRST_SHARE * spp and pixel_count >> parts >= _LEAST_PIXELS:
+        parts += 1
+    return parts
+
+
+def stage_weights(stages: Sequence[int], parts: int = 1) -> list[float]:
     """How many samples of the last stage a sample of each stage counts for. Where maps help much,
     samples of the first stages would make most of the noise; where they do not help, the loss is
     1.5 % at most, which decides how unequal the weights are.
 
     Parameters:
         stages: Samples per pixel of each stage.
+        parts: Into how many stages the first one is divided.
     """
-    wanted = [*_FIRST_WEIGHTS, *[1.0] * len(stages)][: len(stages) - 1] + [1.0]
+    count = len(stages) + parts - 1
+    # By part of the first stage, the share of its pixels
+    shares = [0.5 ** (parts - max(part, 1)) for part in range(parts)] if parts > 1 else [1.0]
+    known = np.cumsum([0.0, *(stages[0] * share for share in shares), *stages[1:]])[:count]
+    wanted = (known + _UNIFORM) / (known + _HALF)
+    wanted = list(wanted / wanted[-1])
 
     def weights(share: float) -> list[float]:
         return [1 - share * (1 - weight) for weight in wanted]
 
-    def loss(share: float) -> float:
-        pairs = list(zip(stages, weights(share)))
+    def loss_of_pixel(first: float, others: Sequence[float]) -> float:
+        pairs = [(stages[0], first), *zip(stages[1:], others)]
         mean = sum(n * w for n, w in pairs)
         return sum(stages) * sum(n * w * w for n, w in pairs) / mean**2 - 1
+
+    def loss(share: float) -> float:
+        every = weights(share)
+        return sum(s * loss_of_pixel(every[k], every[parts:]) for k, s in enumerate(shares))
 
     low, high = 0.0, 1.0
     if loss(high) <= _MOST_LOSS:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -78,11 +79,16 @@ class BatchRenderer(IntegratorBatches):
             )  # fmt: skip
         self.chosen.loaded.path = Path(request.scene)
         integrator = self.chosen.named.integrator
+        its_parameter = f'{self.chosen.loaded.source}: "{self.chosen.named.name}": its parameter'
         if any(getattr(each, "checkpoint", "") for each in with_nested(integrator)):
             raise InputError(
-                f'{self.chosen.loaded.source}: "{self.chosen.named.name}": its parameter '
-                f'"checkpoint" keeps the render already: leave it out, or the options of the '
-                f"command"
+                f'{its_parameter} "checkpoint" keeps the render already: leave it out, or the '
+                f"options of the command"
+            )
+        if any(getattr(each, "timeout", 0) > 0 for each in with_nested(integrator)):
+            raise InputError(
+                f'{its_parameter} "timeout" would cut short each of the batches in which this '
+                f"render is divided: leave it out, and limit the whole render by --time"
             )
         super().__init__(integrator, self.chosen.scene, self.chosen.sensor, request.seed)
 
@@ -90,9 +96,14 @@ class BatchRenderer(IntegratorBatches):
         """What the image depends on, but for the number of samples."""
         request, film = self.request, self.sensor.film()
         loaded, named = self.chosen.loaded, self.chosen.named
+        folder = loaded.path.resolve().parent
         return {
             "scene": loaded.source,
+            "scene parameters": loaded.parameters,
             "scene files hash": loaded.content_hash,
+            "scene files": {
+                os.path.relpath(file, folder): found for file, found in loaded.file_hashes.items()
+            },
             **({"values of the scene": request.values} if request.values else {}),
             "size": "x".join(map(str, film.crop_size())),
             "integrator": named.name,

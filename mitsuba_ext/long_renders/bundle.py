@@ -12,7 +12,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..content_hash import hash_files
+from ..content_hash import hash_each
 from ..errors import InputError
 from ..scene_files import named_by_absolute_path
 from ..scenes import LoadedScene
@@ -53,7 +53,7 @@ class Bundle:
             files = {
                 os.path.abspath(file): Path(file).read_bytes() for file in [*loaded.files, *others]
             }
-            is_same = hash_files(loaded.files, loaded.parameters) == loaded.content_hash
+            is_same = hash_each(loaded.files) == loaded.file_hashes
         except OSError as error:
             raise InputError(f"{loaded.source}: cannot be sent to the workers: {error}") from None
         if not is_same:

@@ -18,6 +18,10 @@ from .state import RenderState
 #: What is rendered; the state; the one before it.
 _DESCRIPTION, _STATE, _BEFORE = "render.json", "state.npz", "state.before.npz"
 
+#: The key of a description under which it has the hashes of the scene's files by their names. They
+#: only tell which file has changed: the names differ from place to place.
+_FILES = "scene files"
+
 #: Number of the format of these files.
 _FORMAT = 2
 
@@ -30,10 +34,15 @@ class CheckpointFolder:
 
     Parameters:
         path: The folder, which is made if it is missing.
+
+    Attributes:
+        damaged: The file of the newest state, if :meth:`load` found that one damaged and returned
+            the one before.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.damaged: Path | None = None
 
     def in_use(self):
         """A context in which no other process can use the folder."""
@@ -48,7 +57,7 @@ class CheckpointFolder:
         """
         file = self.path / _DESCRIPTION
         if not file.exists():
-            if (self.path / _STATE).exists():
+            if any((self.path / name).exists() for name in (_STATE, _BEFORE)):
                 raise InputError(f"{file}: is missing: the folder cannot be used any more")
             with replacing(file) as temporary:
                 temporary.write_text(json.dumps(description, indent=1, default=str))
@@ -81,6 +90,7 @@ class CheckpointFolder:
         for file in found:
             arrays = _read(file)
             if arrays is not None:
+                self.damaged = None if file == found[0] else found[0]
                 return RenderState.from_arrays(arrays)
         if found:
             raise InputError(f"{found[0]}: is damaged: delete {self.path}, and begin again")
@@ -99,9 +109,11 @@ class CheckpointFolder:
                 np.savez(stream, format=np.array(_FORMAT), **state.arrays())
                 stream.flush()
                 os.fsync(stream.fileno())
-            if file.exists():
+            # A damaged state must not replace the one before, which is whole
+            if file.exists() and self.damaged is None:
                 os.replace(file, self.path / _BEFORE)
             os.replace(temporary, file)
+            self.damaged = None
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -127,13 +139,28 @@ def check_same(
 def difference(before: Mapping[str, Any], now: Mapping[str, Any], free: Sequence[str] = ()) -> str:
     """Says in which key two descriptions of renders differ; empty if they are the same."""
     for key in dict.fromkeys([*before, *now]):
-        if key not in ("scene", *free) and before.get(key) != now.get(key):
-            change = f"{before.get(key)} there, {now.get(key)} here"
-            # Hashes tell nobody anything
-            if key.endswith("hash"):
-                key, change = key.removesuffix("hash").strip(), "its files or code have changed"
-            return f'"{key}" differs ({change})'
+        if key in ("scene", _FILES, *free) or before.get(key) == now.get(key):
+            continue
+        there, here = before.get(key), now.get(key)
+        change = f"{there} there, {here} here"
+        if key == f"{_FILES} hash":
+            key, change = _FILES, _changed_files(before.get(_FILES, {}), now.get(_FILES, {}))
+        elif key.endswith("hash"):  # which tells nobody anything
+            key = key.removesuffix("hash").strip()
+            change = "its code has changed" if key == "integrator" else "it has changed"
+        elif isinstance(there, Mapping) and isinstance(here, Mapping):
+            inner = next(k for k in [*there, *here] if there.get(k) != here.get(k))
+            change = f"{inner}: {there.get(inner)} there, {here.get(inner)} here"
+        return f'"{key}" differs ({change})'
     return ""
+
+
+def _changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """Names the files, of which hashes are given, that are not the same."""
+    names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    are = "has" if len(names) == 1 else "have"
+    return f"{', '.join(names[:3])}{more} {are} changed" if names else "their order has changed"
 
 
 def _read(file: Path) -> dict[str, np.ndarray] | None:

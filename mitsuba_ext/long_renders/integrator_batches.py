@@ -109,7 +109,7 @@ class IntegratorBatches:
         images = next(each_batch(integrator, self._scene, self.sensor, batch.spp, [seed]))
         totals = RenderTotals.of(integrator, film, images.spp, time.perf_counter() - begin)
         sums = FilmSums()
-        sums.add(film, images.spp)
+        sums.add(film, images.spp, getattr(integrator, "film_counts_samples", True))
         return BatchResult(
             batch._replace(spp=images.spp), sums.contents.astype(np.float32), sums.has_weights,
             images.mean.astype(np.float32), images.channels, images.image_channel_count,

@@ -65,6 +65,10 @@ class KeptRender:
         with self._folder.in_use():
             self._folder.describe(self._description(scene, sensor, seed))
             state = self._folder.load()
+            if damaged := self._folder.damaged:
+                mi.Log(
+                    mi.LogLevel.Warn, f"{damaged}: is damaged: going on from the state before it"
+                )
             last = LastKept(state.spp)
 
             def after_batch(render: LongRender) -> None:

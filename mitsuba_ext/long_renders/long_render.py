@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-from ..compare import images, metrics
+from ..compare import images
+from ..errors import InputError
+from .announced_error import announced_error
 from .dispatch import QUEUE, Dispatch
 from .integrator_batches import IntegratorBatches
 from .state import Batch, BatchResult, RenderState
@@ -55,6 +57,8 @@ class LongRender:
     ) -> None:
         self._renderer, self._progress = renderer, progress
         self.state, self.goal_spp = state, 0
+        # After how many batches it was computed last, which takes a while for large images
+        self._error: tuple[int, float | None] = (0, None)
 
     def run(
         self,
@@ -101,13 +105,15 @@ class LongRender:
 
     @property
     def error(self) -> float | None:
-        """The relative error that the batches announce, as relMSE; ``None`` before there are enough
-        of them."""
+        """The relative error that the batches announce; ``None`` before there are enough of them,
+        and for a black image."""
         batches = self.state.images
         if batches is None or batches.count < _FEWEST:
             return None
-        rgb = [images.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance)]
-        return metrics.reference_noise(*rgb)
+        if self._error[0] != batches.count:
+            rgb = [images.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance)]
+            self._error = batches.count, announced_error(*rgb)
+        return self._error[1]
 
     @property
     def spp_left(self) -> int | None:
@@ -123,8 +129,15 @@ class LongRender:
     def _is_reached(self) -> bool:
         if self.goal_spp and self.state.spp >= self.goal_spp:
             return True
-        limit = self._goal.error
-        return limit is not None and (error := self.error) is not None and error <= limit
+        if (limit := self._goal.error) is None:
+            return False
+        error, is_endless = self.error, self._goal.spp is None and self._goal.seconds is None
+        if error is None and is_endless and len(self.state.done) >= _FEWEST:
+            raise InputError(
+                f"the image is black, or not finite, after {self.state.spp} samples per pixel, and "
+                f"has no relative error that could be reached: limit the samples or the time too"
+            )
+        return error is not None and error <= limit
 
     def _plan(self, left: float, seconds: float) -> None:
         """Says how many samples fit into the time that is left, by the seconds of one."""

@@ -95,9 +95,9 @@ class Workers(Executor):
 
 def _start(parent: int) -> None:
     """Leaves signals to the parent, and ends with it."""
-    for number in interrupts.SIGNALS:
-        if number != signal.SIGTERM:  # by which the pool ends its processes
-            signal.signal(number, signal.SIG_IGN)
+    # Batch systems send signals to all processes. By SIGTERM, the pool ends them
+    for number in {*interrupts.SIGNALS, interrupts.KEEP} - {signal.SIGTERM, None}:
+        signal.signal(number, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it has ended meanwhile

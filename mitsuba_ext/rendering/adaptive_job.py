@@ -32,6 +32,8 @@ class AdaptiveJob(Job):
     pixel, and all others as many as :class:`SampleAllocation` says.
     """
 
+    divides_stages = False  # moments are those of whole passes
+
     def __init__(self, integrator, scene, sensor, seed, spp) -> None:
         super().__init__(integrator, scene, sensor, seed, spp)
         spp, pilot_spp = self.plan.spp, sum(self.plan.stages[:-1])

@@ -11,7 +11,9 @@ import numpy as np
 class FilmSums:
     """A film holds, for each pixel, the weighted sum of its samples and the sum of their weights.
     These sums are added over renders, which gives the film of a single render of all samples, for
-    every reconstruction filter.
+    every reconstruction filter. Of renders whose weights do not count the samples of the image
+    (chains, whose film has some samples of the camera besides), it is the images that are added,
+    each times its samples per pixel.
 
     Attributes:
         contents: The sums, [height, width, channel], in double precision; 0.0 before the first.
@@ -24,10 +26,17 @@ class FilmSums:
         self.contents: np.ndarray | float = 0.0
         self.has_weights, self.spp = True, 0
 
-    def add(self, film: mi.Film, spp: int) -> None:
-        """Adds what a render of so many samples per pixel has left in the film."""
+    def add(self, film: mi.Film, spp: int, counts_samples: bool = True) -> None:
+        """Adds what a render of so many samples per pixel has left in the film.
+
+        Args:
+            counts_samples: Do its weights count the samples of the image?
+        """
         contents = np.array(film.develop(raw=True), dtype=np.float64)
-        self.has_weights = bool(contents[..., _weight_channel(film)].any())
+        weights = contents[..., _weight_channel(film), None]
+        self.has_weights = bool(weights.any())
+        if self.has_weights and not counts_samples:
+            contents = contents * (spp / np.where(weights == 0, 1, weights))
         self.contents = self.contents + (contents if self.has_weights else contents * spp)
         self.spp += spp
 

@@ -17,6 +17,9 @@ SIGNALS = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 ]
 
+#: Asks a long render to keep what it has; ``None`` on systems that do not have it.
+KEEP: int | None = getattr(signal, "SIGUSR1", None)
+
 #: Signals within so many seconds of the first one count as one. A terminal that is closed may send
 #: several, and some launchers forward a Ctrl-C that the terminal also sends to this process.
 TOGETHER = 0.5
@@ -49,6 +52,21 @@ class InterruptHandler:
         import mitsuba as mi
 
         mi.Log(mi.LogLevel.Warn, "Interrupted: finishing the running pass.")
+
+
+@contextlib.contextmanager
+def requests_to_keep(
+    handler: Callable[[int, FrameType | None], None] | signal.Handlers,
+) -> Iterator[None]:
+    """A context in which :data:`KEEP` has a handler: else it would end the process."""
+    if KEEP is None or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(KEEP, handler)
+    try:
+        yield
+    finally:
+        signal.signal(KEEP, before)
 
 
 @contextlib.contextmanager

@@ -17,14 +17,16 @@ from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..transport import heroes
 from ..transport.estimator import CameraRays, Sample
 from . import camera
+from .dither import dithered_parts
 from .filter_weights import put_splats
 from .interrupts import deferred_interrupt
 from .plan import Planned, plan_render
-from .stages import Schedule, Stage
+from .stages import DivisibleSchedule, Schedule, Stage
 from .time_budget import TimeBudget
 
 
@@ -126,6 +128,9 @@ def render(
 class Job:
     """One call of :func:`render`."""
 
+    #: Can a stage take samples of a part of the pixels?
+    divides_stages = True
+
     def __init__(self, integrator, scene, sensor, seed, spp) -> None:
         self.start = time.perf_counter()
         dr.detail.malloc_clear_statistics()
@@ -163,16 +168,18 @@ class Job:
         # One kernel for all passes: coalescing is decided once
         self.block.set_coalesce(self.block.coalesce() and self.plan.longest_pass >= 4)
 
-    def _lanes(self, spp: int, pixels: range | None = None) -> int:
+    def _lanes(self, spp: int, pixels: range | np.ndarray | None = None) -> int:
         return (self.plan.pixel_count if pixels is None else len(pixels)) * spp
 
-    def _seed(self, sampler: mi.Sampler, index: int, spp: int, pixels: range | None) -> None:
+    def _seed(
+        self, sampler: mi.Sampler, index: int, spp: int, pixels: range | np.ndarray | None
+    ) -> None:
         """Seeds a sampler for part ``index``, those of earlier passes counted. The first one is
         seeded as Mitsuba's own integrators do: it draws the same numbers."""
         seed = self.plan.seed
         if index > 0:
             seed = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(index))[0][0]
-        camera.tell_film(sampler, self.film, 0 if pixels is None else pixels.start)
+        camera.tell_film(sampler, self.film, getattr(pixels, "start", 0))
         sampler.seed(dr.opaque(mi.UInt32, seed), self._lanes(spp, pixels))
 
     def run(self, interrupt: threading.Event) -> None:
@@ -184,9 +191,14 @@ class Job:
         )
         self.statistics.interrupted = True  # until the last stage has all its samples
         schedule = self.integrator.schedule(self.scene, self.sensor, plan.stages, plan.seed)
+        parts = self._first_parts(schedule)
         for index, samples in enumerate(plan.stages):
-            while (stage := schedule.next_stage()).is_scout:
-                self._run_scout(stage)
+            if index == 0 and parts:
+                self._run_divided(schedule, parts)
+                if self._stopped(interrupt):
+                    return
+                continue
+            stage = self._next_stage(schedule)
             is_last = index == len(plan.stages) - 1
             self.statistics.learned = stage.learned
             if is_last:
@@ -218,6 +230,35 @@ class Job:
                 total = before + wanted if is_known else self.plan.spp
                 self.integrator.progress((before + done) / total)
         self.statistics.interrupted = not is_last
+
+    def _next_stage(self, schedule: Schedule) -> Stage:
+        while (stage := schedule.next_stage()).is_scout:
+            self._run_scout(stage)
+        return stage
+
+    def _first_parts(self, schedule: Schedule) -> list[np.ndarray]:
+        """The pixels of the stages into which the schedule divides the first one; none if it is not
+        divided."""
+        if not (self.divides_stages and isinstance(schedule, DivisibleSchedule)):
+            return []
+        if self.plan.structured or self.plan.parts > 1:
+            return []
+        count = schedule.divide_first_stage(self.plan.pixel_count)
+        return dithered_parts(*camera.film_extent(self.film), count) if count > 1 else []
+
+    def _run_divided(self, schedule: Schedule, parts: list[np.ndarray]) -> None:
+        """Takes one sample of each pixel, in a stage for each part of them."""
+        for pixels in parts:
+            stage, begin = self._next_stage(schedule), time.perf_counter()
+            sampler = self.sampler.clone()
+            self._seed(sampler, self.statistics.passes, 1, pixels)
+            lanes = camera.lanes_at(self.film, mi.UInt32(pixels), dr.opaque(mi.UInt32, 0))
+            self._take(stage, sampler, lanes)
+            self.statistics.compile_seconds += time.perf_counter() - begin
+            dr.sync_thread()
+            self.statistics.passes += 1
+            self.statistics.rays["camera"] += len(pixels)
+        self.statistics.spp += 1
 
     def _stopped(self, interrupt: threading.Event) -> bool:
         return interrupt.is_set() or self.integrator.is_cancelled
@@ -256,9 +297,14 @@ class Job:
 
     def _run_part(self, stage: Stage, spp: int, part: int) -> None:
         sampler, pixels = self._part_sampler(spp, part), self.parts[part]
-        rays = camera.sample_rays(
-            self.sensor, sampler, spp, self.plan.spp, stage.camera, self.statistics.spp, pixels
+        self._take(
+            stage, sampler, camera.lanes_of(self.film, spp, self.statistics.spp, pixels)
         )
+
+    def _take(self, stage: Stage, sampler: mi.Sampler, lanes: camera.Lanes) -> None:
+        """Puts the samples of these lanes into the block."""
+        numbers = camera.draw_numbers(self.sensor, sampler, lanes, stage.camera)
+        rays = camera.camera_rays(self.sensor, lanes, numbers, self.plan.spp)
         count = stage.weight if stage.weight == 1 else dr.opaque(mi.Float, stage.weight)
         sample = self._sample(stage, sampler, rays, count)
         for splats in sample.splats:

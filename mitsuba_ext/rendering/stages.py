@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from ..transport.estimator import Estimator
 from .camera_samples import CameraSamples
@@ -35,6 +35,16 @@ class Schedule(Protocol):
     def next_stage(self) -> Stage:
         """The next stage. All samples of the one before have been taken: what they teach is learned
         now. Scouts come besides the stages of the plan."""
+
+
+@runtime_checkable
+class DivisibleSchedule(Schedule, Protocol):
+    """One whose first stage can be divided."""
+
+    def divide_first_stage(self, pixel_count: int) -> int:
+        """Into how many stages the first one is divided, each of which takes one sample for a part
+        of the pixels: the second is as large as the first, and each later one as large as all
+        before it. Called before the first stage, if the render can do so."""
 
 
 class OneStage:

@@ -70,9 +70,7 @@ class CameraMapLearner(MapLearner):
     """Learns maps of :class:`MappedNumbers`, which is its ``decision``."""
 
     def __init__(self, name: str, decision: MappedNumbers, width: int, height: int, **how) -> None:
-        edge = 4 if decision.cells.dimension == 1 else 8
-        super().__init__(name, decision, width, height, decision.cells, edge, **how)
-        decision.tiles = self.tiles
+        super().__init__(name, decision, width, height, decision.cells, **how)
 
     def choices(self, radiance: mi.Float) -> Choices:
         cell, density = self.decision.drawn

@@ -5,7 +5,8 @@ The cells of a map are the leaves of a complete binary tree. Each of its levels 
 along one axis, so that a one-dimensional map of 64 cells has six levels, and one of 32 x 32 cells
 has ten, which take turns. To draw, a number descends along its axis: it goes left where it is below
 the probability of the left half, and is stretched to [0, 1) again. Numbers that are stratified stay
-so, and the same cells serve counting, estimating and drawing.
+so, and the same cells serve counting, estimating and drawing. The cells of a node follow each
+other: its probability is the difference of two entries of a cumulative table.
 """
 
 from __future__ import annotations
@@ -17,6 +18,10 @@ import mitsuba as mi
 import numpy as np
 
 from ...discrete_sampling import ONE_MINUS_EPSILON
+from .nodes import sums_before
+
+#: Fixed point of probabilities: their sum, with what rounding adds, stays below 2^32.
+_ONE = 2.0**31
 
 
 class Cells:
@@ -95,23 +100,24 @@ class CellDensities:
 
     Parameters:
         cells: The cells.
-        mass: The probability of each cell, [table, cell]. A cell of no width has none.
+        mass: The probability of each cell, by table and cell. A cell of no width has none.
 
     Attributes:
         cells: The cells.
-        splits: The probability of the left half at each node of each tree: node 1 is the root, and
-            2 n and 2 n + 1 are the halves of n. Entry 0 of a table is not used.
+        cumulative: By table and cell, the probability of all cells up to this one, in fixed point:
+            equal seeds draw equal numbers.
     """
 
-    def __init__(self, cells: Cells, mass: np.ndarray) -> None:
+    def __init__(self, cells: Cells, mass: mi.Float) -> None:
         self.cells = cells
-        self.splits = mi.Float(splits_of(mass).ravel())
+        self.cumulative = sums_before(mi.UInt32(dr.fma(mass, _ONE, 0.5)), cells.count)
+        dr.eval(self.cumulative)
         self._widths = mi.Float(cells.widths.astype(np.float32))
 
     @property
     def bytes(self) -> int:
         """Memory of the tables."""
-        return 4 * len(self.splits)
+        return 4 * len(self.cumulative)
 
     def sample(
         self, table: mi.UInt32, u: Sequence[mi.Float], active: mi.Bool | bool = True
@@ -123,46 +129,42 @@ class CellDensities:
             the numbers are those that were given, of density 1.
         """
         cells, active = self.cells, mi.Bool(active)
-        first, node, mass = table * cells.count, mi.UInt32(1), mi.Float(1)
+        first, half = table * cells.count, cells.count
+        total = dr.gather(mi.UInt32, self.cumulative, first + (cells.count - 1), active)
+        cell, below, above = mi.UInt32(0), mi.UInt32(0), mi.UInt32(total)
         fraction, index = list(u), [mi.UInt32(0) for _ in range(cells.dimension)]
         for axis in cells.axes:
-            p = dr.gather(mi.Float, self.splits, first + node, active)
+            half >>= 1
+            middle = dr.gather(mi.UInt32, self.cumulative, first + cell + (half - 1), active)
+            p = mi.Float(middle - below) / mi.Float(dr.maximum(above - below, 1))
             x = fraction[axis]
             is_left = x < p
             share = dr.select(is_left, p, 1 - p)
             # A half of no probability is not entered: x < 1, and not x < 0
             x = dr.select(is_left, x, x - p) / dr.maximum(share, 1e-20)
             fraction[axis] = dr.clip(x, 0, ONE_MINUS_EPSILON)
-            mass *= share
             bit = dr.select(is_left, mi.UInt32(0), 1)
-            node, index[axis] = (node << 1) | bit, (index[axis] << 1) | bit
-        cell = node - cells.count
+            index[axis] = (index[axis] << 1) | bit
+            cell += dr.select(is_left, mi.UInt32(0), half)
+            below, above = dr.select(is_left, below, middle), dr.select(is_left, middle, above)
         drawn = [
             dr.select(active, cells.place(axis, index[axis], fraction[axis]), u[axis])
             for axis in range(cells.dimension)
         ]
-        density = mass / dr.gather(mi.Float, self._widths, cell, active)
+        density = self._relative(above - below, total, cell, active)
         return drawn, dr.select(active, density, 1), cell
 
     def density(
         self, table: mi.UInt32, cell: mi.UInt32, active: mi.Bool | bool = True
     ) -> mi.Float:
         """The density of the numbers of a cell, relative to uniform ones."""
-        cells, mass = self.cells, mi.Float(1)
-        first, leaf, depth = table * cells.count, cell + cells.count, len(cells.axes)
-        for level in range(depth):
-            p = dr.gather(mi.Float, self.splits, first + (leaf >> (depth - level)), active)
-            is_right = ((leaf >> (depth - 1 - level)) & 1) == 1
-            mass *= dr.select(is_right, 1 - p, p)
-        return mass / dr.gather(mi.Float, self._widths, cell, active)
+        first, active = table * self.cells.count, mi.Bool(active)
+        total = dr.gather(mi.UInt32, self.cumulative, first + (self.cells.count - 1), active)
+        above = dr.gather(mi.UInt32, self.cumulative, first + cell, active)
+        below = dr.gather(mi.UInt32, self.cumulative, first + cell - 1, active & (cell > 0))
+        return dr.select(active, self._relative(above - below, total, cell, active), 1)
 
-
-def splits_of(mass: np.ndarray) -> np.ndarray:
-    """``CellDensities.splits`` of probabilities, [table, cell]."""
-    splits = np.ones(mass.shape, np.float32)
-    while mass.shape[1] > 1:
-        left = mass[:, 0::2]
-        mass = left + mass[:, 1::2]
-        # What is never reached may be anything
-        splits[:, mass.shape[1] : 2 * mass.shape[1]] = left / np.maximum(mass, 1e-30)
-    return splits
+    def _relative(self, mass, total, cell, active) -> mi.Float:
+        width = dr.gather(mi.Float, self._widths, cell, active)
+        # Cells without width have no mass
+        return mi.Float(mass) / dr.maximum(mi.Float(total) * width, 1e-20)

@@ -142,8 +142,8 @@ class DirectionMapLearner(MapLearner):
     def __init__(
         self, name: str, decision: MappedScattering, width: int, height: int, **how
     ) -> None:
-        super().__init__(name, decision, width, height, decision.cells, 8, **how)
-        decision.tiles, decision.is_recorded = self.tiles, True
+        super().__init__(name, decision, width, height, decision.cells, **how)
+        decision.is_recorded = True
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         super().begin(lanes, pixel)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-#: Cells of all tiles of one map, at most: 32 MiB of counters, and as much for the table.
+#: Cells of all tiles of one map, at most: 32 MiB of counters, and as much for each of two tables.
 _MOST_CELLS = 1 << 23
 
 
@@ -14,25 +14,33 @@ class FilmTiles:
 
     Parameters:
         width, height: Of the film in pixels, with its border where that is sampled.
-        edge: Of a tile in pixels, where memory suffices.
-        cells: Cells that each tile has; where the film is large and these are many, tiles are
-            larger.
+        edge: Of a tile in pixels.
 
     Attributes:
-        edge: Of a tile in pixels.
+        edge: See above.
         rows, columns, count: How many tiles there are.
     """
 
-    def __init__(self, width: int, height: int, edge: int, cells: int) -> None:
-        self.edge = edge
-        while -(-width // self.edge) * -(-height // self.edge) * cells > _MOST_CELLS:
-            self.edge *= 2
-        self.rows, self.columns = -(-height // self.edge), -(-width // self.edge)
+    def __init__(self, width: int, height: int, edge: int) -> None:
+        self.width, self.height, self.edge = width, height, edge
+        self.rows, self.columns = -(-height // edge), -(-width // edge)
         self.count = self.rows * self.columns
         # Opaque: films of all sizes share the kernels
         self._width, self._edge, self._across = (
-            dr.opaque(mi.UInt32, x) for x in (width, self.edge, self.columns)
+            dr.opaque(mi.UInt32, x) for x in (width, edge, self.columns)
         )
+
+    @classmethod
+    def of_cells(cls, width: int, height: int, edge: int, cells: int) -> FilmTiles:
+        """Tiles of this edge, or larger ones where the film is large and tiles have many cells."""
+        tiles = cls(width, height, edge)
+        while tiles.count * cells > _MOST_CELLS:
+            tiles = tiles.joined(1)
+        return tiles
+
+    def joined(self, halvings: int) -> FilmTiles:
+        """Larger tiles: 2 x 2 of them are joined so often."""
+        return FilmTiles(self.width, self.height, self.edge << halvings)
 
     def tile(self, pixel: mi.UInt32) -> mi.UInt32:
         """The tile of a pixel, both counted row by row."""

@@ -141,8 +141,7 @@ class LightMapLearner(MapLearner):
     """Learns :class:`LightMaps`, which are its ``decision``."""
 
     def __init__(self, name: str, decision: LightMaps, width: int, height: int, **how) -> None:
-        super().__init__(name, decision, width, height, decision.cells, 8, **how)
-        decision.tiles = self.tiles
+        super().__init__(name, decision, width, height, decision.cells, **how)
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         super().begin(lanes, pixel)

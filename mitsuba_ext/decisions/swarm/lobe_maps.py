@@ -145,10 +145,13 @@ class LobeMapLearner(MapLearner):
     #: What the maps of single bounces promise does not add up
     needs_measurement = True
 
+    #: Maps of each bounce: by the number of reflections before it
+    reflections = _REFLECTIONS
+
     def __init__(self, name: str, decision: MappedLobes, width: int, height: int, **how) -> None:
         maps = _BOUNCES * _REFLECTIONS
-        super().__init__(name, decision, width, height, decision.cells, 8, maps, **how)
-        decision.tiles, decision.is_recorded = self.tiles, True
+        super().__init__(name, decision, width, height, decision.cells, maps=maps, **how)
+        decision.is_recorded = True
 
     def direction(self, vertex, sample, weight, L, active) -> None:
         if self.is_learning:

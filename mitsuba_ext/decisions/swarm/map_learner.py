@@ -13,9 +13,9 @@ from ...transport.estimator import CameraRays
 from ..learner import Learner
 from ..pixel_estimates import brightness
 from .cells import CellDensities, Cells
-from .estimate import Form, density, estimate, expected_ratio
+from .estimate import Form, Grid, Shares, estimate
 from .film_tiles import FilmTiles
-from .tile_counts import Choices, TileCounts
+from .tile_counts import Candidate, Choices, TileCounts
 
 #: How densities may follow from what was found; and how they do as long as nothing is known of
 #: what that brings.
@@ -24,6 +24,29 @@ _FIRST_FORM = Form(False, 0.2)
 
 #: By how much a map is to lower the variance of the image, relatively, to be used.
 _LEAST_GAIN = 0.03
+
+#: Maps that do not pay after so many samples per pixel, and in so many stages, are given up.
+_ENOUGH_SAMPLES, _VAIN_STAGES = 4, 2
+
+#: Samples of all pilots that a tile has, at least, and one for each cell of its maps, which takes
+#: time. Tiles are as small as that allows. Before all are taken, there are maps of larger tiles,
+#: which have at least a part of these.
+_LEAST_SAMPLES, _EARLY_PART = 64, 0.25
+
+
+def tile_edge(samples: float, cells: int, share: float = 1.0) -> int:
+    """The edge of a tile in pixels.
+
+    Parameters:
+        samples: Samples per pixel.
+        cells: Of all maps of a tile.
+        share: Of the samples that tiles are to have.
+    """
+    wanted = share * max(_LEAST_SAMPLES, cells)
+    edge = 1
+    while edge * edge * samples < wanted:
+        edge *= 2
+    return edge
 
 
 class MapLearner(Learner):
@@ -41,7 +64,7 @@ class MapLearner(Learner):
             numbers are to be uniform.
         width, height: Of the film, with its border where that is sampled.
         cells: Of a map.
-        edge: Of a tile in pixels, where memory suffices.
+        samples: Samples per pixel of all pilots.
         maps: Maps of a tile.
         always: Use them also where they do not pay?
 
@@ -61,13 +84,16 @@ class MapLearner(Learner):
         width: int,
         height: int,
         cells: Cells,
-        edge: int,
+        samples: int,
         maps: int = 1,
         always: bool = False,
     ) -> None:
         self.name, self.decision, self.cells, self.maps = name, decision, cells, maps
-        self.tiles = FilmTiles(width, height, edge, maps * cells.count)
-        self.gain, self._always, self._memory = 0.0, always, 0
+        edge = tile_edge(samples, maps * cells.count)
+        self.tiles = FilmTiles.of_cells(width, height, edge, maps * cells.count)
+        decision.tiles = self.tiles
+        self._widths = mi.Float(cells.widths.astype(np.float32))
+        self.gain, self._always, self._memory, self._vain_stages = 0.0, always, 0, 0
         self._counts: TileCounts | None = TileCounts(self.tiles, maps, cells.count)
         self._pixel: mi.UInt32 | None = None
         self._radiance: mi.Float | None = None
@@ -124,44 +150,76 @@ class MapLearner(Learner):
             best = int(np.argmax(gains))
             self.gain, form = float(gains[best]), _FORMS[best]
             if self.gain < _LEAST_GAIN and self.decision.maps is not None and not self._always:
-                self.decision.maps = None
-                self.stop()
+                self._give_up()
                 return None
-        array, squares = counts.arrays()
-        widths = self.cells.widths
-        shares = estimate(array, squares, widths)
-        mass = density(shares, widths, form)
+        samples = counts.samples / (self.tiles.width * self.tiles.height)
+        halvings = self._halvings(samples)
+        shares = self._shares(halvings)
         if self.needs_measurement:
             expected = np.inf if len(gains) > 0 else 0.0
         else:
-            expected = counts.expected_gain(expected_ratio(mass, widths))
+            expected = counts.expected_gain(shares.expected_ratio(form).numpy(), halvings)
         if len(gains) == 0:
             self.gain = expected
         self.decision.maps = None
         if self._always or min(self.gain, expected) >= _LEAST_GAIN:
-            self.decision.maps = CellDensities(self.cells, mass.reshape(-1, self.cells.count))
+            self.decision.maps = CellDensities(self.cells, shares.mass(form))
+            self.decision.tiles = self.tiles.joined(halvings)
+        elif samples >= _ENOUGH_SAMPLES:
+            self._vain_stages += 1
+            if self._vain_stages >= _VAIN_STAGES:
+                self._give_up()
+                return None
         if not is_last:
-            counts.begin_stage([self._relative(density(shares, widths, f)) for f in _FORMS])
-        self._memory = counts.bytes
+            counts.begin_stage([self._candidate(shares, form, halvings) for form in _FORMS])
+        self._memory = counts.bytes + shares.bytes
         if self.decision.maps is not None:
             self._memory += self.decision.maps.bytes
         return None
 
-    def _relative(self, mass: np.ndarray) -> mi.Float:
-        """Densities relative to uniform numbers."""
-        widths = self.cells.widths
-        # Nothing is drawn from a cell without width
-        inverse = (1 / np.where(widths > 0, widths, 1)).astype(np.float32)
-        return mi.Float((mass * inverse).ravel())
+    def _give_up(self) -> None:
+        self.decision.maps = None
+        self.stop()
+
+    def _halvings(self, samples: float) -> int:
+        """How often tiles are joined where each pixel has so many samples."""
+        wanted, halvings = tile_edge(samples, self.maps * self.cells.count, _EARLY_PART), 0
+        most = max(self.tiles.rows, self.tiles.columns)
+        while self.tiles.edge << halvings < wanted and 1 << halvings < most:
+            halvings += 1
+        return halvings
+
+    def _shares(self, halvings: int) -> Shares:
+        """What cells bring, for tiles that are joined so often."""
+        grid = Grid(self.tiles.rows, self.tiles.columns, self.maps)
+        shares = estimate(*self._counts.sums(), grid, self._widths, halvings)
+        return Shares(shares, self._widths)
+
+    def _candidate(self, shares: Shares, form: Form, halvings: int) -> Candidate:
+        """A density that is tried; it is asked for tables of tiles that are not joined."""
+        grid = Grid(self.tiles.rows, self.tiles.columns, self.maps)
+        joined = self.tiles.joined(halvings)
+        columns, shift = dr.opaque(mi.UInt32, joined.columns), dr.opaque(mi.UInt32, halvings)
+
+        def density(table: mi.UInt32, cell: mi.UInt32) -> mi.Float:
+            row, column, which = grid.places(table)
+            table = ((row >> shift) * columns + (column >> shift)) * self.maps + which
+            return shares.relative(form, table * self.cells.count + cell)
+
+        return density
 
     def state(self) -> dict[str, np.ndarray]:
         maps = self.decision.maps
-        return {} if maps is None else {"splits": maps.splits.numpy()}
+        if maps is None:
+            return {}
+        edge = np.array(self.decision.tiles.edge)
+        return {"cumulative": maps.cumulative.numpy(), "edge": edge}
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> Any:
-        maps = CellDensities(self.cells, self.cells.widths[None])
-        maps.splits = mi.Float(state["splits"])
+        maps = CellDensities(self.cells, self._widths)
+        maps.cumulative = mi.UInt32(state["cumulative"])
         self.decision.maps = maps
+        self.decision.tiles = FilmTiles(self.tiles.width, self.tiles.height, int(state["edge"]))
         return self.decision
 
     def finish(self) -> None:
@@ -181,7 +239,8 @@ class MapLearner(Learner):
     def __str__(self) -> str:
         if self.decision.maps is None:
             return f"{self.name}: uniform"
+        tiles = self.decision.tiles
         return (
-            f"{self.name}: {self.tiles.count} tiles of {self.tiles.edge} pixels, "
+            f"{self.name}: {tiles.count} tiles of {tiles.edge} pixels, "
             f"{self._memory / 2**20:.1f} MiB, about {self.gain:.0%} less variance"
         )

@@ -3,8 +3,9 @@ equally."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,6 +25,9 @@ _BRIGHTEST = 1024.0
 
 #: Squared radiance of a dark tile, in units of the squared mean of the film.
 _FLOOR = 1e-2
+
+#: The density of a cell of a table, relative to uniform numbers: of table and cell.
+Candidate = Callable[[Any, Any], Any]
 
 
 @dataclass
@@ -69,15 +73,16 @@ class TileCounts:
         cells: Cells of a map.
 
     Attributes:
-        candidates: Densities relative to uniform ones, one for each [table, cell], that are tried
-            on the samples of the running stage.
+        candidates: Densities that are tried on the samples of the running stage.
+        samples: Samples that were counted.
     """
 
     def __init__(self, tiles: FilmTiles, maps: int, cells: int) -> None:
         self._tiles, self._maps, self._cells = tiles, maps, cells
         self._counts = dr.zeros(mi.UInt32, tiles.count * maps * cells)
         self._squares = dr.zeros(mi.UInt64, tiles.count * maps)
-        self.candidates: list[mi.Float] = []
+        self.candidates: list[Candidate] = []
+        self.samples = 0
         #: Second moments under uniform numbers, by table, and variances of all pixels, of all
         #: samples and of those of the stage
         self._second, self._variance = np.zeros(tiles.count * maps), 0.0
@@ -85,11 +90,10 @@ class TileCounts:
 
     @property
     def bytes(self) -> int:
-        """Memory of the counters and of the candidates."""
-        tried = sum(4 * len(table) for table in self.candidates)
-        return 4 * len(self._counts) + 8 * len(self._squares) + tried
+        """Memory of the counters."""
+        return 4 * len(self._counts) + 8 * len(self._squares)
 
-    def begin_stage(self, candidates: Sequence[mi.Float]) -> None:
+    def begin_stage(self, candidates: Sequence[Candidate]) -> None:
         """Tries ``candidates`` from now on."""
         self.candidates = list(candidates)
         #: Squares as they were drawn, under uniform numbers, and under each candidate
@@ -102,20 +106,22 @@ class TileCounts:
         variance = self._stage_variance + uniform - drawn
         return (uniform - np.array(tried)) / variance if variance > 0 else np.zeros(len(tried))
 
-    def expected_gain(self, ratios: np.ndarray) -> float:
+    def expected_gain(self, ratios: np.ndarray, halvings: int) -> float:
         """The same for maps whose second moments, relative to uniform numbers, are ``ratios``, by
-        table; as all samples tell."""
+        table of tiles that were joined so often; as all samples tell."""
+        tiles, joined = self._tiles, self._tiles.joined(halvings)
+        places = np.ix_(np.arange(tiles.rows) >> halvings, np.arange(tiles.columns) >> halvings)
+        ratios = ratios.reshape(joined.rows, joined.columns, self._maps)[places]
         saved = (self._second * (1 - ratios.ravel())).sum()
         return float(saved) / self._variance if self._variance > 0 else 0.0
 
-    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Counts, [row, column, map, cell], and sums of squares, [row, column, map]."""
-        shape = (self._tiles.rows, self._tiles.columns, self._maps)
-        counts = self._counts.numpy().reshape(*shape, self._cells)
-        return counts, self._squares.numpy().reshape(shape).astype(np.float64) * _ONE
+    def sums(self) -> tuple[mi.Float, mi.Float]:
+        """Counts, by table and cell, and sums of squares, by table."""
+        return mi.Float(self._counts), mi.Float(self._squares) * _ONE
 
     def add(self, pixel: mi.UInt32, radiance: mi.Float, choices: Choices) -> None:
         """Adds the samples of a pass; ``radiance`` is what each brought to its pixel."""
+        self.samples += len(pixel)
         tile, count = self._tiles.tile(pixel), self._tiles.count
         radiance = dr.select(dr.isfinite(radiance), radiance, 0)
         mean = float(dr.mean(radiance)[0])
@@ -163,7 +169,7 @@ class TileCounts:
         # Mean over uniform numbers: what was drawn with a density stands for fewer of them
         uniform = square * choices.density
         tried = [
-            uniform / dr.select(choices.active, choices.under(dr.gather(mi.Float, q, cell)), 1)
+            uniform / dr.select(choices.active, choices.under(q(table, choices.cell)), 1)
             for q in self.candidates
         ]
         sums = _sums(len(weight), table, [square, uniform, *tried], choices.active)
