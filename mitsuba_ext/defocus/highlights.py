@@ -24,7 +24,8 @@ _LEAST_RADIUS = 2.0
 #: All highlights together cover so many pixels, at most, for each pixel of the picture.
 _MOST_COVERED = 8
 
-#: What lets light through: called with pixels, and the points of the lens that are looked through.
+#: How much light gets through: called with the indices of pixels, their middles, and points of the
+#: lens.
 Visibility = Callable[..., "mi.Float"]
 
 
@@ -163,7 +164,7 @@ def _spread(picture, position, blur, excess, size, visibility):
         index = size.index(at)
         # From there, the highlight is seen through this point
         point = -mi.Point2f(offset) / blur
-        light = excess * (weight / total * visibility(index, mi.Point2f(at) + 0.5, point, active))
+        light = excess * (weight / total * visibility(index, mi.Point2f(at) + 0.5, point))
         for c in range(3):
             dr.scatter_add(picture, light[c], 3 * index + c, active)
         i += 1

@@ -107,9 +107,7 @@ class _LensFilter:
     def _before(self, count: int) -> Visibility:
         """How much the first layers let through."""
 
-        def visibility(
-            pixel: mi.UInt32, place: mi.Point2f, point: mi.Point2f, active: mi.Bool
-        ) -> mi.Float:
+        def visibility(pixel: mi.UInt32, place: mi.Point2f, point: mi.Point2f) -> mi.Float:
             seen = [self._view(k, pixel) for k in range(count)]
             return 1 - _through(place, point, self._size, seen)[1] if seen else mi.Float(1)
 
