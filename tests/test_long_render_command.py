@@ -134,6 +134,30 @@ def test_a_full_disk_costs_an_interval_at_most(run, make_scene, tmp_path, monkey
     assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64
 
 
+def test_a_full_file_system_keeps_the_state_before(run, make_scene, tmp_path):
+    """One that holds a state, but not a second one beside it."""
+    full = tmp_path / "full"
+    full.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(full)]
+    try:
+        if subprocess.run(mount, capture_output=True).returncode:
+            pytest.skip("no file system can be made here")
+    except FileNotFoundError:
+        pytest.skip("there is no mount")
+    try:
+        kept = CheckpointFolder(full / "kept")
+        command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--size", "64x48",
+                   "--checkpoint", kept.path, "--spp")  # fmt: skip
+        assert run(*command, 16)[0] == 0 and kept.load().spp == 16
+        code, _, err = run(*command, 32)
+        assert code == 0 and "could not be kept: [Errno 28] No space left on device" in err
+        assert read_exr(tmp_path / "a.exr")[1]["spp"] == 32 and kept.load().spp == 16
+        subprocess.run(["mount", "-o", "remount,size=5m", str(full)], check=True)
+        assert run(*command, 32)[0] == 0 and kept.load().spp == 32
+    finally:
+        subprocess.run(["umount", str(full)], check=True)
+
+
 def test_a_folder_that_is_deleted_costs_the_folder_only(run, make_scene, tmp_path, monkeypatch):
     render, kept = BatchRenderer.render, tmp_path / "kept"
 

@@ -139,9 +139,7 @@ class LongJob:
             write(is_asked)
 
         with report.bars() as bars, _asked_to_keep() as asked:
-            show = LongProgress(
-                report, bars, self.name, math.prod(self.film.crop_size()), bool(options.until)
-            )
+            show = LongProgress(report, bars, self.name, math.prod(self.film.crop_size()))
 
             def progress(render: LongRender) -> None:
                 show(render)

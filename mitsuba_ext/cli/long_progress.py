@@ -9,10 +9,6 @@ from rich.progress import Progress
 from ..long_renders.long_render import LongRender
 from .reports import Report, Speed, time_left
 
-#: If no error ends the render, it is computed again after so many times the time that this took: as
-#: long as a small batch.
-_ERROR_PERIOD = 200
-
 
 class LongProgress:
     """Samples, their speed, the error that the batches announce, and the time left.
@@ -22,21 +18,17 @@ class LongProgress:
         bars: Show it on a terminal.
         name: Of the integrator.
         pixel_count: Of the image.
-        needs_error: Does an error end the render? It is then known after each batch.
     """
 
-    def __init__(
-        self, report: Report, bars: Progress, name: str, pixel_count: int, needs_error: bool
-    ) -> None:
+    def __init__(self, report: Report, bars: Progress, name: str, pixel_count: int) -> None:
         self._report, self._bars, self._name = report, bars, name
-        self._pixel_count, self._needs_error = pixel_count, needs_error
+        self._pixel_count = pixel_count
         self._bar = bars.add_task(name, total=None, left="")
         self._begin, self._speed = time.perf_counter(), Speed()
-        self._error, self._error_due = None, 0.0
 
     def __call__(self, render: LongRender) -> None:
         """To be called after each batch."""
-        spp, error = render.state.spp, self._error_of(render)
+        spp, error = render.state.spp, render.error
         text, samples, left = f"{self._name}, {spp} spp", None, None
         if (per_second := self._speed(spp)) is not None:
             samples = per_second * self._pixel_count
@@ -53,11 +45,3 @@ class LongProgress:
             samples_per_second=samples, seconds=time.perf_counter() - self._begin,
             seconds_left=left,
         )  # fmt: skip
-
-    def _error_of(self, render: LongRender) -> float | None:
-        begin = time.perf_counter()
-        if self._needs_error or begin >= self._error_due:
-            self._error = render.error
-            now = time.perf_counter()
-            self._error_due = now + _ERROR_PERIOD * (now - begin)
-        return self._error
