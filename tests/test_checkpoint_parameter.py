@@ -78,6 +78,18 @@ def test_another_render_is_refused(scene, make_scene, tmp_path):
     mi.render(scene(), integrator=integrator(checkpoint=folder, timeout=60.0), spp=16)
 
 
+def test_choices_that_are_no_parameters_are_seen(make_scene, tmp_path):
+    def metal(distribution: str) -> mi.Scene:
+        bsdf = f'<bsdf type="roughconductor"><string name="distribution" value="{distribution}"/>'
+        return mi.load_file(str(make_scene(body=f'<shape type="sphere">{bsdf}</bsdf></shape>')))
+
+    kept = integrator(checkpoint=str(tmp_path / "kept"))
+    kept.render(metal("ggx"), spp=1)
+    with pytest.raises(ValueError, match='holds another render: "scene" differs'):
+        kept.render(metal("beckmann"), spp=2)
+    kept.render(metal("ggx"), spp=2)
+
+
 def test_it_can_be_cancelled_and_interrupted(scene, tmp_path):
     kept = integrator(checkpoint=str(tmp_path / "kept"))
     seen = []

@@ -19,6 +19,7 @@ import pytest
 from conftest import PATH, in_subprocess
 
 from mitsuba_ext.compare import images, load_reference, read_exr
+from mitsuba_ext.errors import InputError
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.intervals import Interval
@@ -133,6 +134,30 @@ def test_a_full_disk_costs_an_interval_at_most(run, make_scene, tmp_path, monkey
     assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64
 
 
+def test_a_full_file_system_keeps_the_state_before(run, make_scene, tmp_path):
+    """One that holds a state, but not a second one beside it."""
+    full = tmp_path / "full"
+    full.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(full)]
+    try:
+        if subprocess.run(mount, capture_output=True).returncode:
+            pytest.skip("no file system can be made here")
+    except FileNotFoundError:
+        pytest.skip("there is no mount")
+    try:
+        kept = CheckpointFolder(full / "kept")
+        command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--size", "64x48",
+                   "--checkpoint", kept.path, "--spp")  # fmt: skip
+        assert run(*command, 16)[0] == 0 and kept.load().spp == 16
+        code, _, err = run(*command, 32)
+        assert code == 0 and "could not be kept: [Errno 28] No space left on device" in err
+        assert read_exr(tmp_path / "a.exr")[1]["spp"] == 32 and kept.load().spp == 16
+        subprocess.run(["mount", "-o", "remount,size=5m", str(full)], check=True)
+        assert run(*command, 32)[0] == 0 and kept.load().spp == 32
+    finally:
+        subprocess.run(["umount", str(full)], check=True)
+
+
 def test_a_folder_that_is_deleted_costs_the_folder_only(run, make_scene, tmp_path, monkeypatch):
     render, kept = BatchRenderer.render, tmp_path / "kept"
 
@@ -146,6 +171,35 @@ def test_a_folder_that_is_deleted_costs_the_folder_only(run, make_scene, tmp_pat
                        "--checkpoint", kept, "--every", "16spp")  # fmt: skip
     assert code == 0 and "the render could not be kept: [Errno 2] No such file" in err
     assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64 and not kept.exists()
+
+
+@pytest.mark.parametrize("is_kept", [True, False])
+def test_a_failure_keeps_the_image_so_far(run, make_scene, tmp_path, monkeypatch, is_kept):
+    """As when a scheduler is gone, or three workers have died of the same batch."""
+    render, kept = BatchRenderer.render, tmp_path / "kept"
+
+    def fails(self, batch, learned):
+        if batch.index == 2:
+            raise InputError("the cluster is gone")
+        return render(self, batch, learned)
+
+    monkeypatch.setattr(BatchRenderer, "render", fails)
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64, "--preview",
+               tmp_path / "b.png", *(("--checkpoint", kept) if is_kept else ()))  # fmt: skip
+    code, _, err = run(*command)
+    assert code == 2 and "interrupted after 32 of 64 spp" in err
+    assert err.endswith("mitsuba-ext: the cluster is gone\n")
+    assert read_exr(tmp_path / "a.exr")[1]["spp"] == 32
+    assert not is_kept or CheckpointFolder(kept).load().spp == 32
+
+
+@pytest.mark.parametrize("specification", ["neepp:timeout=9", "variance:in=[neepp:timeout=9]"])
+def test_a_time_limit_of_batches_is_refused(run, make_scene, tmp_path, specification):
+    """Their numbers of samples would be wrong."""
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", specification)
+    code, _, err = run(*command, "--until", "1")
+    assert code == 2 and '"timeout" would cut short each of the batches' in err
+    assert "limit the whole render by --time" in err and not (tmp_path / "a.exr").exists()
 
 
 def test_variants_without_batches_are_named(run, make_scene, tmp_path):

@@ -44,8 +44,18 @@ def test_a_script_reads_events(run, make_scene, tmp_path, every_event, options):
     found = [step["spp"] for step in steps]
     assert found == sorted(set(found)) and found[-1] == 1 << 16
     assert steps[-2]["seconds_left"] > 0 == steps[-1]["seconds_left"]
+    assert steps[-1]["samples_per_second"] > 0
     if options:
-        assert steps[-1]["samples_per_second"] > 0 and steps[-1]["goal_spp"] == 1 << 16
+        assert steps[-1]["goal_spp"] == 1 << 16 and steps[-1]["batches"] == len(steps)
+
+
+@pytest.mark.usefixtures("batches_of_sixteen_samples")
+def test_the_error_is_told_without_being_asked_for(run, make_scene, tmp_path, every_event):
+    out = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 160, "--json",
+              "--checkpoint", tmp_path / "kept")[1]  # fmt: skip
+    *steps, _ = (json.loads(line) for line in out.splitlines())
+    assert [step["batches"] for step in steps] == list(range(1, 11))
+    assert "relmse" not in steps[6] and 0 < steps[9]["relmse"] < 1
 
 
 def test_nothing_else_gets_among_the_events(run, make_scene, tmp_path):

@@ -70,7 +70,8 @@ def render_image(
         function: Of the number of the frame: what it changes in the scene.
 
     Raises:
-        InputError: Something cannot be read, used or written.
+        InputError: Something cannot be read, used or written. If that happened when there were
+            samples, the image of these is written.
     """
     output, definitions, sensor_index, seed = picture[:4]
     values, long = None, order.long
@@ -194,6 +195,8 @@ def render_image(
             older = older if output.exists() else ""
             said = f"interrupted {job.how_far()}: {target}{older}"
             report.end(said, costs, is_interrupted=True, **figures)
+            if job.failure:
+                raise job.failure
             return stop.exit_code
     is_slow = kernels_compiled() > compiled and not is_new  # else it was printed above
     remark = " (compiled kernels: the next such render starts faster)" if is_slow else ""

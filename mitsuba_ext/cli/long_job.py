@@ -23,10 +23,8 @@ from ..long_renders.workers import Workers, threads_of_each
 from ..rendering import interrupts
 from ..rendering.interrupts import deferred_interrupt
 from ..rendering.totals import RenderTotals
-from .reports import Report, Speed, time_left
-
-#: Without --until, the error is computed again after so many times the time that this took.
-_ERROR_PERIOD = 200
+from .long_progress import LongProgress
+from .reports import Report
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,8 @@ class LongJob:
         integrator, name, parameters: The integrator, its name and its parameters.
         scene, sensor: What it renders.
         film: The film that holds the image.
-        is_interrupted: Did a signal end the render before its goal was reached?
+        is_interrupted: Did a signal or a failure end the render before its goal was reached?
+        failure: What went wrong after there was an image; ``None`` if nothing did.
         seconds: Wall clock of the render.
     """
 
@@ -86,6 +85,7 @@ class LongJob:
         self.scene, self.sensor = self._renderer.chosen.scene, self._renderer.sensor
         self.film = self.sensor.film()
         self.is_interrupted, self.seconds = False, 0.0
+        self.failure: InputError | None = None
         self._state, self._render = RenderState(), None
 
     def remarks(self, is_sensor_chosen: bool) -> list[str]:
@@ -138,36 +138,11 @@ class LongJob:
             self.seconds = time.perf_counter() - last.begin
             write(is_asked)
 
-        speed, pixel_count = Speed(), math.prod(self.film.crop_size())
-        error, error_due = None, 0.0
-
         with report.bars() as bars, _asked_to_keep() as asked:
-            bar = bars.add_task(self.name, total=None, left="")
+            show = LongProgress(report, bars, self.name, math.prod(self.film.crop_size()))
 
             def progress(render: LongRender) -> None:
-                nonlocal error, error_due
-                text, left = f"{self.name}, {state.spp} spp", None
-                if (per_second := speed(state.spp)) is not None:
-                    text += f", {per_second * pixel_count / 1e6:.3g} million samples/s"
-                    left = render.spp_left and render.spp_left / per_second
-                # To compute it takes as long as a small batch
-                if options.until or (begin := time.perf_counter()) >= error_due:
-                    error = render.error
-                    if not options.until:
-                        now = time.perf_counter()
-                        error_due = now + _ERROR_PERIOD * (now - begin)
-                if error is not None:
-                    text += f", relMSE about {error:.2g}"
-                bars.update(
-                    bar, description=text, completed=state.spp, total=render.goal_spp or None,
-                    left=time_left(left),
-                )  # fmt: skip
-                report.progress(
-                    spp=state.spp, goal_spp=render.goal_spp or None, batches=len(state.done),
-                    relmse=error,
-                    samples_per_second=per_second and per_second * pixel_count,
-                    seconds=time.perf_counter() - last.begin, seconds_left=left,
-                )  # fmt: skip
+                show(render)
                 is_asked, is_due = asked(), is_due_at_once
                 if self._folder or options.has_preview:
                     is_due |= last.is_due(options.every, state.spp)
@@ -190,10 +165,10 @@ class LongJob:
                     is_reached = self._render.run(goal, is_stopped, executor, n)
                 if not state.done:  # stopped before others had finished a batch
                     raise KeyboardInterrupt
-            except InputError:  # the scheduler or too many workers are gone
-                if self._folder and state.done:
-                    self._folder.save(state)
-                raise
+            except InputError as error:  # the scheduler or too many workers are gone
+                if not state.done:
+                    raise
+                self.failure = error
             except KeyboardInterrupt:
                 if not state.done:
                     raise

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -28,6 +29,7 @@ class RenderJob:
         scene, sensor: What it renders.
         film: The film that holds the image.
         is_interrupted: Did a signal end the render before all samples were taken?
+        failure: Always ``None``: after a failure, there is no image.
         seconds: Wall clock of the render.
     """
 
@@ -37,7 +39,7 @@ class RenderJob:
             named.integrator, named.name, named.parameters
         )  # fmt: skip
         self.scene, self.sensor, self.film = chosen.scene, chosen.sensor, chosen.sensor.film()
-        self.is_interrupted, self.seconds = False, 0.0
+        self.is_interrupted, self.seconds, self.failure = False, 0.0, None
         self._chosen, self._seed = chosen, seed
         self._wanted: int | None = None  # samples per pixel, where it is known
         self._is_measuring = False
@@ -101,16 +103,22 @@ class RenderJob:
         def progress(done: float) -> None:
             per_second = speed(done)
             left = (1 - done) / per_second if per_second else None
-            bars.update(bar, total=1.0, completed=done, left=time_left(left))
+            text, samples = self.name, None
+            if per_second and self._wanted:
+                samples = per_second * self._wanted * math.prod(self.film.crop_size())
+                text += f", {samples / 1e6:.3g} million samples/s"
+            bars.update(
+                bar, description=text, total=1.0, completed=done, left=time_left(left)
+            )
             report.progress(
                 done=done, spp=self._passes.spp if self._passes else None,
-                seconds=time.perf_counter() - begin, seconds_left=left,
+                samples_per_second=samples, seconds=time.perf_counter() - begin, seconds_left=left,
             )  # fmt: skip
 
         self._wanted = spp
+        if seconds is None:
+            self._wanted = sample_count(self.sensor, spp or 0)
         if self._passes is not None:
-            if seconds is None:
-                self._wanted = sample_count(self.sensor, spp or 0)
             self._passes.run(self._wanted or 0, seconds, progress)
             self.is_interrupted = self._passes.interrupted
             return

@@ -79,11 +79,16 @@ class BatchRenderer(IntegratorBatches):
             )  # fmt: skip
         self.chosen.loaded.path = Path(request.scene)
         integrator = self.chosen.named.integrator
+        its_parameter = f'{self.chosen.loaded.source}: "{self.chosen.named.name}": its parameter'
         if any(getattr(each, "checkpoint", "") for each in with_nested(integrator)):
             raise InputError(
-                f'{self.chosen.loaded.source}: "{self.chosen.named.name}": its parameter '
-                f'"checkpoint" keeps the render already: leave it out, or the options of the '
-                f"command"
+                f'{its_parameter} "checkpoint" keeps the render already: leave it out, or the '
+                f"options of the command"
+            )
+        if any(getattr(each, "timeout", 0) > 0 for each in with_nested(integrator)):
+            raise InputError(
+                f'{its_parameter} "timeout" would cut short each of the batches in which this '
+                f"render is divided: leave it out, and limit the whole render by --time"
             )
         super().__init__(integrator, self.chosen.scene, self.chosen.sensor, request.seed)
 

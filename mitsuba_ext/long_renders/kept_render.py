@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -110,7 +111,7 @@ class KeptRender:
         """What the image depends on, but for the number of samples."""
         integrator, film = self._integrator, sensor.film()
         return {
-            "scene hash": fingerprint(scene),
+            "scene hash": fingerprint(scene) + _digest_of_text(scene),
             "size": "x".join(map(str, film.crop_size())),
             "integrator": integrator.name,
             "parameters": self._parameters,
@@ -133,6 +134,14 @@ class _Batches(IntegratorBatches):
         if self._integrator.is_cancelled:
             raise _CancelledError
         return result
+
+
+def _digest_of_text(scene: mi.Scene) -> str:
+    """What shapes and lights say of themselves: choices such as the distribution of a microfacet
+    BSDF are no parameters that the fingerprint could see."""
+    parts = [*scene.shapes(), *scene.emitters()]
+    text = sorted(re.sub("0x[0-9a-f]+", "", str(part)) for part in parts)  # without addresses
+    return hashlib.sha256("".join(text).encode()).hexdigest()
 
 
 def _digest(sensor: mi.Sensor) -> str:

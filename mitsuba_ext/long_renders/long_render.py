@@ -18,6 +18,10 @@ from .state import Batch, BatchResult, RenderState
 #: Batches, at least, that tell the error of an image.
 _FEWEST = 8
 
+#: The error is computed again after so many times the batches: for large images, this takes as long
+#: as some of their samples.
+_LATER = 1.05
+
 
 @dataclass(frozen=True)
 class Goal:
@@ -57,7 +61,7 @@ class LongRender:
     ) -> None:
         self._renderer, self._progress = renderer, progress
         self.state, self.goal_spp = state, 0
-        # After how many batches it was computed last, which takes a while for large images
+        # After how many batches it was computed last
         self._error: tuple[int, float | None] = (0, None)
 
     def run(
@@ -105,12 +109,12 @@ class LongRender:
 
     @property
     def error(self) -> float | None:
-        """The relative error that the batches announce; ``None`` before there are enough of them,
-        and for a black image."""
+        """The relative error that the batches announce, or announced not long ago; ``None`` before
+        there are enough of them, and for a black image."""
         batches = self.state.images
         if batches is None or batches.count < _FEWEST:
             return None
-        if self._error[0] != batches.count:
+        if batches.count >= _LATER * self._error[0]:
             rgb = [images.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance)]
             self._error = batches.count, announced_error(*rgb)
         return self._error[1]
