@@ -10,7 +10,7 @@ import pytest
 from hard_cases import area, diffuse, film, rectangle, sensor, stage
 from statistical import batches
 
-from mitsuba_ext.rendering.layered_job import least_blur_around
+from mitsuba_ext.rendering.layer_samples import least_blur_around
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -192,6 +192,20 @@ def test_a_sensor_without_a_lens_is_refused(plugin, parameters, message):
     scene = mi.load_dict(stage(camera=sensor(plugin)))
     with pytest.raises((ValueError, NotImplementedError), match=message):
         ecoc(**parameters).render(scene, spp=1)
+
+
+def test_a_focus_at_infinity_is_refused_and_one_far_away_is_not():
+    """Mitsuba's rays are not numbers at infinity."""
+    scene = mi.load_dict(stage(camera=sensor("thinlens", aperture_radius=0.1,
+                                             focus_distance=np.inf)))  # fmt: skip
+    with pytest.raises(ValueError, match="give a finite one"):
+        ecoc().render(scene, spp=1)
+    far = sensor("thinlens", aperture_radius=1e-3, focus_distance=1e6, film=film(12, 9))
+    near = sensor("thinlens", aperture_radius=1e-3, focus_distance=4.0, film=film(12, 9))
+    scenes = [mi.load_dict(stage(camera=camera)) for camera in (far, near)]
+    images = [rendered(scene, ecoc(PATH), 64) for scene in scenes]
+    assert np.isfinite(images[0]).all()
+    assert images[0].mean() == pytest.approx(images[1].mean(), rel=0.05)
 
 
 @pytest.mark.parametrize("nested, message", [
