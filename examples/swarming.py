@@ -186,15 +186,17 @@ def plot(results: dict[str, dict[str, dict[str, Any]]], path: Path) -> None:
     bar = 0.84 / len(kinds)
     for k, ((label, value), colour) in enumerate(zip(kinds.items(), colours)):
         x = np.arange(len(names)) + (k - (len(kinds) - 1) / 2) * bar
-        axes.bar(x, [value(n, results[n]) for n in names], bar, label=label, color=colour)
+        heights = [value(n, results[n]) - 1 for n in names]
+        axes.bar(x, heights, bar, bottom=1, label=label, color=colour)
     axes.axhline(1, color="black", linewidth=0.8)
     axes.set_yscale("log")
-    axes.set_yticks([0.25, 0.5, 1, 2, 4, 8], ["1/4", "1/2", "1", "2", "4", "8"])
+    axes.set_ylim(0.4, 10)
+    axes.set_yticks([0.5, 1, 2, 4, 8], ["1/2", "1", "2", "4", "8"])
     axes.set_yticks([], minor=True)
     labels = [f"{n}\n{CASES[n].scene}, {CASES[n].spp}" for n in names]
     axes.set_xticks(range(len(names)), labels, fontsize=7)
     axes.set_ylabel("σ/μ of path over that of the method")
-    axes.legend(fontsize=7, ncols=2)
+    figure.legend(fontsize=7, ncols=4, loc="outside upper center")
     figure.savefig(path)
 
 
