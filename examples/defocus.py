@@ -6,10 +6,10 @@ Writes a row of Markdown for each scene and filter, and a picture of a part of e
 reference, and the filters in the order of the table. FLIP and SSIM are those against ``path`` with
 the ``thinlens`` at many samples, whose noise both contain. The last columns are for the filter of
 lens points: how many samples ``path`` takes to reach the same FLIP, and how much longer these take
-(the smaller of two times of each, in turns, all samples of what is hidden and the filter included).
+(the smaller of two CPU times of each, in turns, with all samples of what is hidden and the filter).
 
-``hairball`` is a scene of this file. The real scenes are looked for in ../shared/scenes; they get a
-thin lens.
+``hairball`` and ``lamps`` are scenes of this file. The real scenes are looked for in
+../shared/scenes; they get a thin lens.
 """
 
 from __future__ import annotations
@@ -96,6 +96,37 @@ def hairball(size: tuple[int, int]) -> mi.Scene:
     }, optimize=False)  # fmt: skip
 
 
+def lamps(size: tuple[int, int]) -> mi.Scene:
+    """A ball in focus on a street at night, and a hundred small lamps far behind it."""
+    to, random = mi.ScalarTransform4f, np.random.default_rng(3)
+    film = {"type": "hdrfilm", "width": size[0], "height": size[1], "pixel_format": "rgb",
+            "rfilter": {"type": "gaussian"}}  # fmt: skip
+
+    def grey(value: float) -> dict:
+        return {"type": "diffuse", "reflectance": {"type": "rgb", "value": value}}
+
+    scene = {
+        "type": "scene",
+        "sensor": {"type": "thinlens", "film": film, "fov": 40.0, "aperture_radius": 0.12,
+                   "focus_distance": 2.5,
+                   "to_world": to().look_at([0, -2.5, 0.8], [0, 0, 0.7], [0, 0, 1])},
+        "ball": {"type": "sphere", "center": [0.2, 0, 0.5], "radius": 0.3, "bsdf": grey(0.6)},
+        # Half of the connections: what is in focus is not to be the noise here
+        "key": {"type": "rectangle",
+                "emitter": {"type": "area", "radiance": 12.0, "sampling_weight": 100.0},
+                "to_world": to().look_at([-2, -2, 3], [0, 0, 0.5], [0, 0, 1]).scale(0.3)},
+        "street": {"type": "rectangle", "to_world": to().translate([0, 20, 0]).scale([20, 24, 1]),
+                   "bsdf": grey(0.2)},
+    }  # fmt: skip
+    for i in range(100):
+        place = [random.uniform(-9, 9), random.uniform(8, 30), random.uniform(0.3, 6)]
+        color = np.array([1.0, 0.6, 0.2]) if i % 3 else np.array([0.2, 0.6, 1.0])
+        light = {"type": "rgb", "value": (40 * color).tolist()}
+        scene[f"lamp_{i}"] = {"type": "sphere", "center": place, "radius": 0.05,
+                              "emitter": {"type": "area", "radiance": light}}  # fmt: skip
+    return mi.load_dict(scene, optimize=False)
+
+
 def with_lens(name: str, size: tuple[int, int]) -> mi.Scene:
     """A real scene whose sensor gets a lens."""
     file = REAL / name / "scene.xml"
@@ -109,8 +140,8 @@ def with_lens(name: str, size: tuple[int, int]) -> mi.Scene:
 
 
 def scene_of(name: str, size: tuple[int, int]) -> mi.Scene:
-    if name == "hairball":
-        return hairball(size)
+    if name in ("hairball", "lamps"):
+        return {"hairball": hairball, "lamps": lamps}[name](size)
     return with_lens(name, size) if name in LENSES else load(name, size)
 
 
@@ -130,9 +161,9 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def timed(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int):
-    begin = time.perf_counter()
+    begin = time.process_time()
     image = mi.render(scene, integrator=integrator, spp=spp, seed=seed).numpy()
-    return image.astype(np.float64), time.perf_counter() - begin
+    return image.astype(np.float64), time.process_time() - begin
 
 
 def reference_of(scene: mi.Scene, path: mi.Integrator, spp: int) -> np.ndarray:
@@ -176,7 +207,7 @@ def write(file: Path, image: np.ndarray) -> None:
 @click.option("--pictures", default="out/defocus", help="Folder for pictures.")
 @click.argument("names", nargs=-1, required=True)
 def main(names, size, spp, reference_spp, max_depth, pictures) -> None:
-    """Compares on the scenes NAMES: hairball, kitchen, sponza, or ours."""
+    """Compares on the scenes NAMES: hairball, lamps, kitchen, sponza, or ours."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     print_header(COLUMNS)

@@ -1,12 +1,12 @@
 """How fast depth of field comes near a traced thin lens, with and without a denoiser:
 
-    .venv/bin/python examples/defocus_convergence.py kitchen defocus hairball
+    .venv/bin/python examples/defocus_convergence.py kitchen defocus hairball sponza
 
 Writes a row of Markdown for each scene, technique and number of samples (FLIP, SSIM, seconds), and
 a plot of FLIP over time. ``path`` traces the ``thinlens``; *denoised* means that Open Image Denoise
 has been run, on the image of ``path`` with guides of 32 samples per pixel (whose time counts), and
 in ``ecoc_dof`` on the layers. FLIP and SSIM are those against ``path`` at many samples, whose noise
-they contain. Times are the smaller of two, in turns, kernels compiled before.
+they contain. Times are CPU seconds, the smaller of two, in turns, kernels compiled before.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FIGURES = Path(__file__).parent / "figures"
 
 def denoised_path(scene: mi.Scene, path: mi.Integrator, spp: int, seed: int):
     image, seconds = timed(scene, path, spp, seed)
-    begin = time.perf_counter()
+    begin = time.process_time()
     guides = render_guides(scene, scene.sensors()[0], seed)
     albedo, normal = (
         np.stack([guides[f"{name}.{c}"] for c in letters], axis=2).astype(np.float32)
@@ -39,7 +39,7 @@ def denoised_path(scene: mi.Scene, path: mi.Integrator, spp: int, seed: int):
     )
     color = np.ascontiguousarray(image, dtype=np.float32)
     result = denoiser().denoise(color, albedo=albedo, normal=normal, hdr=True)
-    return np.array(result, np.float64), seconds + time.perf_counter() - begin
+    return np.array(result, np.float64), seconds + time.process_time() - begin
 
 
 def techniques(max_depth: int) -> dict:
@@ -69,7 +69,7 @@ def main(names, size, spp, reference_spp, max_depth) -> None:
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     counts = [int(n) for n in spp.split(",")]
-    print_header(["scene", "technique", "samples", "FLIP", "SSIM", "seconds"])
+    print_header(["scene", "technique", "samples", "FLIP", "SSIM", "CPU seconds"])
     figure, axes = plt.subplots(1, len(names), figsize=(3.6 * len(names), 3), squeeze=False)
     for axis, name in zip(axes[0], names):
         scene = scene_of(name, size)
@@ -89,7 +89,7 @@ def main(names, size, spp, reference_spp, max_depth) -> None:
                            f"{seconds:.2f}"])  # fmt: skip
         for label, points in curves.items():
             axis.loglog(*np.transpose(points), "o-", label=label, markersize=4)
-        axis.set(title=name, xlabel="seconds", ylabel="FLIP")
+        axis.set(title=name, xlabel="CPU seconds", ylabel="FLIP")
         dr.flush_malloc_cache()
     axes[0][0].legend(fontsize=7)
     figure.tight_layout()

@@ -9,7 +9,11 @@ from mitsuba_ext.composition.decision_parameters import ParameterReader
 from mitsuba_ext.composition.directions import Guided
 from mitsuba_ext.composition.next_event import LearnedLights
 from mitsuba_ext.composition.roulette import GuidedRoulette
+from mitsuba_ext.composition.swarm import MAPS
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+
+#: The numbers of a camera ray that can have maps.
+_CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
 
 
 @registry.plugin
@@ -20,8 +24,9 @@ class AutoPath(WalkIntegrator):
     Self-configuring path tracer (:monosp:`auto_path`)
     --------------------------------------------------
 
-    A path tracer that tries in its first samples whether guiding directions and learning lights
-    pay in this scene, and keeps what does. There is nothing to choose.
+    A path tracer that tries in its first samples whether guiding directions, learning lights, and
+    learning which times, points of the lens, wavelengths and distances in fog find light pay in
+    this scene, and keeps what does. There is nothing to choose.
 
     .. pluginparameters::
 
@@ -43,18 +48,22 @@ class AutoPath(WalkIntegrator):
     more. **Not when** an image has fewer samples (there is nothing to learn from), or when light
     comes through glass from small lamps (no path from the camera finds it).
 
-    It is a :monosp:`composed_path` with :monosp:`directions=guided` and
-    :monosp:`next_event=contribution`; :monosp:`guided_directions` and :monosp:`learned_lights` tell
-    what is learned, and how. The first two pilots are short: together they predict by how much each
-    of the two lowers the variance of the image. What costs more time than it saves ends there.
+    It is a :monosp:`composed_path` with :monosp:`directions=guided`,
+    :monosp:`next_event=contribution`, and the word :monosp:`swarm` in the slots :monosp:`time`,
+    :monosp:`aperture`, :monosp:`wavelength` and :monosp:`distance`; :monosp:`guided_directions`,
+    :monosp:`learned_lights` and :monosp:`swarm_path` tell what is learned, and how. Maps are for
+    scenes with an open shutter, a lens, fog, or in spectral variants, and cost nothing elsewhere.
+    The first two pilots are short: together they predict by how much each of these lowers the
+    variance of the image. What costs more time than it saves ends there. Maps of reflections and of
+    directions are not tried: guided directions have their place.
     :monosp:`integrator.statistics.learned` says what was kept, and why.
 
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
     pilot.
 
-    Sources: those of :monosp:`guided_directions` and :monosp:`learned_lights`. The predictions are
-    ours.
+    Sources: those of :monosp:`guided_directions`, :monosp:`learned_lights` and
+    :monosp:`swarm_path`. The predictions are ours.
 
     .. tabs::
         .. code-tab:: xml
@@ -77,4 +86,6 @@ class AutoPath(WalkIntegrator):
             directions=Guided(read),
             next_event=LearnedLights(read),
             roulette=GuidedRoulette(),
+            # They do not ask for longer pilots
+            **{slot: MAPS[slot](read, pilot_spp=Guided.pilot_spp) for slot in _CAMERA_NUMBERS},
         )

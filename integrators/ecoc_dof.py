@@ -81,16 +81,18 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
 
     **The filter** :monosp:`lens` looks, for each pixel and 48 points of the lens, into each layer
     at the place where that point sees it; what is nearer covers what is behind it. It uses copies
-    of lower resolution where the blur is large. Its time does not depend on the samples. With
-    :monosp:`effective` there are three layers. The near one is blurred with one radius, the median
-    of those of its surfaces.
+    of lower resolution where the blur is large, and fewer points where all circles are small. What
+    is small and bright, such as a lamp at night, is spread over its circle instead, where nearer
+    layers let it through. The time does not depend on the samples. With :monosp:`effective` there
+    are three layers. The near one is blurred with one radius, the median of those of its surfaces.
 
     **Where it errs.** What is seen in mirrors and through glass is blurred as the mirror and the
     glass are. Surfaces that let most light through (:monosp:`mask`, :monosp:`thindielectric`) are
     not there for the layers. Of what is hidden, the first surface only is known. Highlights depend
     on the direction, and the lens sees them from its middle only. Layers are cut where blurs have a
     gap; in a hedge there is none. Samples outside of the film reach an eighth of its longer edge.
-    Noise of the nested integrator in what is in focus stays as it is.
+    Noise of the nested integrator in what is in focus stays as it is. A denoiser changes the
+    brightness of lamps of a few pixels: :monosp:`denoise` is not for these.
 
     The sensor must be a :monosp:`thinlens`, or a :monosp:`perspective` with both parameters given.
     The film is any but a :monosp:`specfilm`, with any filter and crop window. Output variables

@@ -175,6 +175,13 @@ TECHNIQUES: dict[str, Technique] = {
             ["cornell_box", "sunny_gloss"], ["llvm_ad_spectral"], FURNACES, [2, -1], _LEARNERS
         ),
     ),
+    "swarm_all_maps": Technique(
+        "swarm_path", {"always_use": True, "direction_map": True},
+        thorough=Checks(
+            ["mirrors_and_glass"], furnaces=FURNACES, depths=[-1],
+            cases=("materials", "film_of_odd_size", "cropped_film", "three_samples", "thin_lens"),
+        ),
+    ),
     "auto_path": Technique(
         "auto_path", is_plugin=True,
         checks=Checks(

@@ -254,17 +254,17 @@ def test_holes_are_filled_from_around_and_what_is_known_stays():
     random = np.random.default_rng(1)
     known = (random.random(size.count) < 0.2).astype(np.float32)
     values = (1 + random.random(size.count)).astype(np.float32)
-    found = filled(mi.Float(values * known), mi.Float(known), size).numpy()
+    found = filled(mi.Float, mi.Float(values * known), mi.Float(known), size).numpy()
     assert np.allclose(found[known == 1], values[known == 1], atol=1e-5)
     assert found.min() >= 1 - 1e-5 and found.max() <= 2 + 1e-5
-    assert not filled(mi.Float(0 * known), mi.Float(0 * known), size).numpy().any()
+    assert not filled(mi.Float, mi.Float(0 * known), mi.Float(0 * known), size).numpy().any()
 
 
 def test_near_filter_points_at_the_objects():
     height, width = 48, 64
     coverage = np.zeros((height, width), dtype=np.float32)
     coverage[:, 40:] = 1
-    color = mi.Vector4f(0, 0, 0, mi.Float(coverage.ravel()))
+    color = dr.ravel(mi.Vector4f(0, 0, 0, mi.Float(coverage.ravel())))
     for radius in (6.0, 30.0):
         found = near_field(layers.Layer(color, dr.full(mi.Float, radius, width * height)),
                            Size(width, height), radius)  # fmt: skip

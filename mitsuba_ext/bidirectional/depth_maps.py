@@ -5,7 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..movers import point_at_rest, sensor_at_rest, viewing_axis
+from ..movers import sensor_at_rest
+from ..transport.lens_view import LensView
 from ..transport.numbers import hashed
 from ..transport.path_decisions import SceneQuery
 
@@ -44,12 +45,11 @@ class DepthMaps:
         self, scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery, pieces: int, most_pixels: int
     ) -> None:
         self._sensor, self.pieces = sensor_at_rest(sensor), pieces
+        self._view = LensView(scene, sensor, query)
         size = [int(n) for n in sensor.film().crop_size()]
         shrink = min(1.0, most_pixels / max(size))
         self.shape = (max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink)))
-        self._axis = viewing_axis(self._sensor, mi.Float(0))
-        dr.make_opaque(self._axis)
-        self._maps = self._trace(scene, sensor, query)
+        self._maps = self._trace(sensor)
         self.nearest = self.farthest = self.parallax = 0.0
         self.margins = (0.0, 0.0)
         if dr.width(self.places) > 0:
@@ -60,13 +60,20 @@ class DepthMaps:
 
     def place(self, p: mi.Point3f) -> mi.Point3f:
         """The place of a point; 0 where it is behind the lens."""
+        return self._place(p, self._view.inverse_depth(p, mi.Bool(True)))
+
+    def _place(self, p: mi.Point3f, inverse_depth: mi.Float) -> mi.Point3f:
+        position = self._film_position(p, mi.Point2f(_MIDDLE))
+        place = mi.Point3f(position.x, position.y, inverse_depth)
+        return dr.select(inverse_depth > 0, place, 0)
+
+    def _film_position(self, p: mi.Point3f, numbers: mi.Point2f) -> mi.Point2f:
+        """Where on the film, in units of its size, a point is seen through a point of the
+        aperture."""
         it = dr.zeros(mi.Interaction3f, dr.width(p))
         it.p = p
-        ds, _ = self._sensor.sample_direction(it, mi.Point2f(_MIDDLE))
-        depth = dr.dot(p - ds.p, self._axis)
-        position = ds.uv / mi.ScalarVector2f(self._sensor.film().crop_size())
-        place = mi.Point3f(position.x, position.y, dr.rcp(depth))
-        return dr.select(depth > 0, place, 0)
+        ds, _ = self._sensor.sample_direction(it, numbers)
+        return ds.uv / mi.ScalarVector2f(self._sensor.film().crop_size())
 
     def lens_numbers(self, piece: mi.UInt32, numbers: mi.Point2f) -> mi.Point2f:
         """The numbers that choose the point of a piece at relative coordinates in [0, 1)²."""
@@ -92,17 +99,15 @@ class DepthMaps:
         return active & (dr.gather(mi.Float, self._maps, index, active) <= nearest)
 
     def _seen_from(self, place: mi.Point3f, numbers: mi.Point2f) -> mi.Point2f:
-        """Where on the film a point is seen through a point of the aperture."""
+        """Where on the film the point of a place is seen through a point of the aperture."""
         ray, _ = self._sensor.sample_ray(
             0, _MIDDLE, mi.Point2f(place.x, place.y), mi.Point2f(_MIDDLE)
         )
         distance = dr.rcp(place.z) - self._sensor.near_clip()
-        it = dr.zeros(mi.Interaction3f, dr.width(place))
-        it.p = ray.o + ray.d * (distance / dr.dot(ray.d, self._axis))
-        ds, _ = self._sensor.sample_direction(it, numbers)
-        return ds.uv / mi.ScalarVector2f(self._sensor.film().crop_size())
+        p = ray.o + ray.d * (distance / dr.dot(ray.d, self._view.axis))
+        return self._film_position(p, numbers)
 
-    def _trace(self, scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery) -> mi.Float:
+    def _trace(self, sensor: mi.Sensor) -> mi.Float:
         """The maps, one after the other, row by row; 0 where nothing is seen."""
         width, height = self.shape
         lane = dr.arange(mi.UInt32, width * height * self.pieces**2)
@@ -111,12 +116,7 @@ class DepthMaps:
         position = mi.Point2f(x + numbers[0], y + numbers[1]) / mi.Vector2f(width, height)
         time = sensor.shutter_open() + numbers[4] * sensor.shutter_open_time()
         lens = self.lens_numbers(piece, mi.Point2f(numbers[2], numbers[3]))
-        ray, _ = sensor.sample_ray(time, _MIDDLE, position, lens)
-        pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
-        is_hit = pi.is_valid()
-        hit = ray(dr.select(is_hit, pi.t, 0))
-        place = self.place(point_at_rest(sensor, hit, ray.time))
-        place.z = dr.select(is_hit, place.z, 0)
+        place = self._place(*self._view.meet(self._view.ray(position, lens, time)))
         dr.eval(place)
         self.places = dr.gather(mi.Point3f, place, dr.compress(place.z > 0))
         return place.z

@@ -23,6 +23,10 @@ from .swarm import Swarm, doubling_pilots, first_parts, stage_weights
 #: Where pilots double, from so many samples on they may have half of all: they cost little then.
 _MANY_SAMPLES = 8
 
+#: Samples of a pass from which maps are learned, at most: the learners of all maps together record
+#: about 150 bytes of each.
+_MAP_LANES = 1 << 22
+
 #: Paths of each of the first two pilots, about: they show what learning is worth.
 _TRIAL_PATHS = 1 << 17
 
@@ -100,9 +104,6 @@ class Schedule:
     ) -> None:
         self._setting, self._pilot_count, self._estimator = setting, len(stages) - 1, estimator
         self._stages = list(stages)
-        self._has_maps = any(isinstance(parameters, Swarm) for parameters in slots.values())
-        #: How many samples of the last stage a sample of each stage counts for
-        self._weights = stage_weights(stages) if self._has_maps else [1.0] * len(stages)
         self.decisions: dict[str, Any] = {"query": query}
         self.learners: dict[str, Learner] = {}
         self._camera = CameraSamples()
@@ -117,6 +118,10 @@ class Schedule:
                 learner = parameters.learner(setting, self.learners)
                 if learner is not None:
                     self.learners[slot] = learner
+        learns_maps = [isinstance(slots[slot], Swarm) for slot in self.learners]
+        self._learns_maps, self._learns_only_maps = any(learns_maps), all(learns_maps)
+        #: How many samples of the last stage a sample of each stage counts for
+        self._weights = stage_weights(stages) if self._learns_maps else [1.0] * len(stages)
         self._restored, self._learned = restored, learned
         self._scout: Scout | None = None
         self._finished_stages = -1
@@ -124,7 +129,7 @@ class Schedule:
     def divide_first_stage(self, pixel_count: int) -> int:
         """See :class:`mitsuba_ext.rendering.stages.Schedule`."""
         learns = self._pilot_count > 0 and self.learners and self._stages[0] == 1
-        if not self._has_maps or not learns:
+        if not self._learns_only_maps or not learns:
             return 1
         parts = first_parts(pixel_count, sum(self._stages))
         self._pilot_count += parts - 1
@@ -154,6 +159,7 @@ class Schedule:
             self._estimator(observer=observer, **self.decisions),
             camera=self._camera,
             weight=self._weights[self._finished_stages],
+            most_lanes=_MAP_LANES if self._learns_maps else 0,
         )
 
     def _restored_stage(self, states: States) -> Stage:

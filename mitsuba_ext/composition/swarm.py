@@ -37,17 +37,23 @@ class Swarm(DecisionParameters):
 
     Parameters:
         always: Use the maps also where pilots show that they do not pay? For tests.
+        pilot_spp: Samples per pixel from which is learned.
 
     Attributes:
         summary: What the log calls the maps.
     """
 
     name = "swarm"
-    pilot_spp, doubles = 64, True
+    doubles = True
     summary = ""
 
-    def __init__(self, read: ParameterReader, always: bool = False) -> None:
-        self._always = always
+    def __init__(self, read: ParameterReader, always: bool = False, pilot_spp: int = 64) -> None:
+        self._always, self._pilot_spp = always, pilot_spp
+
+    @property
+    def pilot_spp(self) -> int:
+        """See :class:`DecisionParameters`."""
+        return self._pilot_spp
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
         return spp > 0 and any(map(self.is_asked, scene.sensors()))

@@ -34,11 +34,9 @@ def denoised(sums: LayerSums, size: Size) -> LayerSums:
     weight = dr.select(is_known, mi.Float(1), 0)
 
     def picture(values: list[mi.Float]) -> np.ndarray:
-        packed = mi.Vector4f(*(value * scale for value in values), 0)
-        dr.eval(packed, weight)
-        whole = filled(packed, weight, size)
-        flat = np.array(mi.Vector4f(whole)).T[:, :3]
-        return np.ascontiguousarray(flat.reshape(size.height, size.width, 3), dtype=np.float32)
+        packed = dr.ravel(mi.Vector4f(*(value * scale for value in values), 0))
+        whole = filled(mi.Vector4f, packed, weight, size).numpy()
+        return np.ascontiguousarray(whole.reshape(size.height, size.width, 4)[..., :3])
 
     color = picture(list(sums.color))
     result = np.array(denoiser().denoise(

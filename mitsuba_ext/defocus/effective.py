@@ -50,7 +50,7 @@ def effective_filter(
         # A place on the lens: what is behind the focus is seen on the other side. Eq. 5.5 (Guo)
         middle = mi.Point2f(position) + 0.5 - radius * hidden * direction
         radius = dr.abs(radius) * (1 - hidden)  # Eq. 5.4
-        view = lens.view(Pyramid(dr.ravel(layer.color), size), radius)
+        view = lens.view(Pyramid(layer.color, size), radius)
         found = disk_mean(lens, view, middle, radius)
         color += through * rgb(found)
         through *= 1 - found.w

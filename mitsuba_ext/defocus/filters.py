@@ -85,7 +85,8 @@ class _OfPicture:
 
     def picture(self, capture: Capture) -> mi.Color3f:
         (only,) = layers_from_sums(capture.sums, capture.size)
-        return self._function(rgb(only.color), capture.blur, capture.size)
+        color = dr.gather(mi.Vector4f, only.color, dr.arange(mi.UInt32, capture.size.count))
+        return self._function(rgb(color), capture.blur, capture.size)
 
 
 _MAKERS: dict[str, Callable[[], Filter]] = {

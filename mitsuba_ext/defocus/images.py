@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -22,6 +23,10 @@ class Size:
         self.count = self.width * self.height
         self._width = dr.opaque(mi.UInt32, self.width)
         self._last = dr.opaque(mi.Vector2i, [self.width - 1, self.height - 1])
+
+    def contains(self, position: mi.Vector2i) -> mi.Bool:
+        """Is there a pixel at a position?"""
+        return dr.all((position >= 0) & (position <= self._last))
 
     def pixels(self) -> tuple[mi.UInt32, mi.Vector2i]:
         """The index and the position of each pixel."""
@@ -60,21 +65,23 @@ class Pyramid:
         for level in sizes:
             starts.append(starts[-1] + level.count)
         self.level_count = len(sizes)
-        self._data = dr.empty(mi.Float, 4 * starts[-1])
-        index, _ = size.pixels()
-        dr.scatter(self._data, dr.gather(mi.Vector4f, data, index), index)
-        dr.eval(self._data)
-        for level in range(1, len(sizes)):
-            mean = halved(
-                mi.Vector4f, self._data, sizes[level - 1], dr.opaque(mi.UInt32, starts[level - 1])
-            )
-            start = dr.opaque(mi.UInt32, starts[level])
-            dr.scatter(self._data, mean, start + dr.arange(mi.UInt32, sizes[level].count))
-            dr.eval(self._data)
+        # Each copy is an array of its own first: an array that is read is copied to be written
+        copies = [data]
+        for level in sizes[:-1]:
+            copies.append(dr.ravel(halved(mi.Vector4f, copies[-1], level)))
+            dr.eval(copies[-1])
+        self._data = dr.concat(copies)
         self._starts = mi.UInt32(starts[:-1])
         self._widths = mi.Int32([level.width for level in sizes])
         self._heights = mi.Int32([level.height for level in sizes])
         dr.make_opaque(self._starts, self._widths, self._heights)
+
+    def plus(self, other: Pyramid) -> Pyramid:
+        """The sum of two images of the same size."""
+        result = copy(self)
+        result._data = self._data + other._data
+        dr.eval(result._data)
+        return result
 
     def view(self, level: mi.UInt32) -> LevelView:
         """The copy number ``level`` in each lane."""
@@ -128,24 +135,23 @@ def bilinear(kind: type[T], flat: mi.Float, size: Size, place: mi.Point2f) -> T:
     return total
 
 
-def filled(values: T, weight: mi.Float, size: Size) -> T:
+def filled(kind: type, values: mi.Float, weight: mi.Float, size: Size) -> mi.Float:
     """Fills the holes of an image: where ``weight`` is below 1, means of what is around take the
     rest (Gortler et al., *The Lumigraph*, SIGGRAPH 1996: pull and push).
 
     Parameters:
-        values: One number or four for each pixel, each already multiplied by its ``weight``.
+        kind: ``mi.Float`` or ``mi.Vector4f``: what each pixel has.
+        values: The numbers of each pixel, row by row, already multiplied by its ``weight``.
         weight: How much is known of each pixel, in [0, 1].
         size: Of the image.
 
     Returns:
         The values; 0 where nothing is known anywhere.
     """
-    kind = type(values)
+    dr.eval(values, weight)
     levels = [(values, weight, size)]
     while levels[-1][2].count > 1:
-        values, weight, size = levels[-1]
-        flat = dr.ravel(values)
-        dr.eval(flat, weight)
+        flat, weight, size = levels[-1]
         _index, position = size.half().pixels()
         total, known = kind(0), mi.Float(0)
         for at in _four(size, 2 * position):
@@ -154,17 +160,18 @@ def filled(values: T, weight: mi.Float, size: Size) -> T:
             known += dr.gather(mi.Float, weight, at)
         # Where more than one of the four is known, these count as one
         scale = dr.rcp(dr.maximum(known, 1))
-        total, known = total * scale, known * scale
+        total, known = dr.ravel(total * scale), known * scale
         dr.eval(total, known)
         levels.append((total, known, size.half()))
     total, known, _size = levels.pop()
     found = dr.select(known > 0, total / dr.maximum(known, 1e-20), 0)
+    dr.eval(found)
     while levels:
-        values, weight, size = levels.pop()
-        flat = dr.ravel(found)
-        _index, position = size.pixels()
+        flat, weight, size = levels.pop()
+        index, position = size.pixels()
         place = (mi.Point2f(position) + 0.5) * 0.5
-        found = values + (1 - weight) * bilinear(kind, flat, size.half(), place)
+        around = bilinear(kind, found, size.half(), place)
+        found = dr.ravel(dr.gather(kind, flat, index) + (1 - weight) * around)
         dr.eval(found)
     return found
 

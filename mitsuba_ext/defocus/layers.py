@@ -3,6 +3,7 @@ part of the lens only."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -29,14 +30,19 @@ class Layer:
     """One layer.
 
     Attributes:
-        color: RGB times coverage, and coverage (the share of the pixel's area that the layer
-            fills).
+        color: Four numbers for each pixel: RGB times coverage, and coverage (the share of the
+            pixel's area that the layer fills).
         blur: Signed radius of the circle of confusion in pixels (:meth:`ThinLens.blur`). Beyond the
             layer's edges, that of the nearest pixels.
+        glow: That of the light of a pixel: its samples weighted by their brightness. ``None`` if
+            that is not known.
+        shared: What is blurred by more is in the layer before as well.
     """
 
-    color: mi.Vector4f
+    color: mi.Float
     blur: mi.Float
+    glow: mi.Float | None = None
+    shared: float = math.inf
 
 
 @dataclass
@@ -62,6 +68,10 @@ class Limits:
         if layer < len(self.blurs):
             inside &= blur > self.blurs[layer]
         return inside
+
+    def shared(self, layer: int) -> float:
+        """The layer before the one of this number has what is blurred by more as well."""
+        return self.blurs[layer - 1] if layer > 0 else math.inf
 
     def is_before(self, layer: int, blur: mi.Float) -> mi.Bool:
         """Is the layer before a surface of this blur, or does it hold it? Then a ray that got there
@@ -124,6 +134,8 @@ class LayerSums:
             in it or behind it.
         guides: What guides a denoiser: sums of RGB of the albedo, and of the shading normal. Empty
             if there is no denoiser.
+        glow: The blurs times the brightness of the samples, and this brightness, if anybody asked.
+        shared: What is blurred by more is in the layer before as well.
     """
 
     color: mi.Color3f
@@ -131,6 +143,8 @@ class LayerSums:
     hits: mi.Float
     known: mi.Float
     guides: list[mi.Float] = field(default_factory=list)
+    glow: tuple[mi.Float, mi.Float] | None = None
+    shared: float = math.inf
 
     @property
     def is_there(self) -> bool:
@@ -158,12 +172,18 @@ def _layer(sums: LayerSums, size: Size, is_last: bool) -> Layer:
     # Where it overshoots, the colour keeps its brightness
     scale = dr.select(is_known, coverage / dr.select(is_known, sums.hits, 1), 0)
     color = sums.color * scale
-    values = mi.Vector4f(color.x, color.y, color.z, coverage)
+    values = dr.ravel(mi.Vector4f(color.x, color.y, color.z, coverage))
     # Nothing hides the last layer from itself
     weight = coverage if is_last else dr.select(sums.known > 1e-6, mi.Float(1), 0)
-    dr.eval(values, weight)
-    blur = filled(sums.blur * scale, coverage, size)
-    return Layer(filled(values, weight, size), blur)
+    blurs = sums.blur * scale
+    dr.eval(values, weight, blurs, coverage)
+    blur = filled(mi.Float, blurs, coverage, size)
+    glow = None
+    if sums.glow is not None:
+        product, bright = sums.glow
+        is_bright = bright > 1e-6
+        glow = dr.select(is_bright, product / dr.select(is_bright, bright, 1), blur)
+    return Layer(filled(mi.Vector4f, values, weight, size), blur, glow, sums.shared)
 
 
 def sums_of_picture(color: mi.Color3f, blur: mi.Float, limits: Limits) -> list[LayerSums]:
@@ -177,5 +197,5 @@ def sums_of_picture(color: mi.Color3f, blur: mi.Float, limits: Limits) -> list[L
     for k in range(limits.layer_count):
         hit = dr.select(limits.contains(k, blur), mi.Float(1), 0)
         known = dr.select(limits.is_before(k, blur), mi.Float(1), 0)
-        sums.append(LayerSums(color * hit, blur * hit, hit, known))
+        sums.append(LayerSums(color * hit, blur * hit, hit, known, shared=limits.shared(k)))
     return sums

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import reduce
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .highlights import Highlights, Visibility, spread, without_highlights
 from .images import LevelView, Pyramid, Size, rgb
 from .layers import Layer
 from .lens_points import RINGS, LensPoints, ring_points
@@ -16,6 +18,19 @@ from .lens_points import RINGS, LensPoints, ring_points
 #: Neighbouring pixels turn the points by different angles, of which these are the ranks in a square
 #: of 4 × 4 pixels (Bayer's matrix): what the 48 points leave out differs from pixel to pixel.
 _TURNS = (0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5)
+
+#: Up to these radii of all that a pixel sees, in pixels, so few points of the lens are enough: the
+#: rings of the last ones are those of the others. A circle that does not leave the pixel needs one.
+_FEW_POINTS = ((0.5, (1,)), (2.0, (4, 8)))
+
+#: How often highlights are looked for.
+_ROUNDS = 2
+
+#: A layer in which blurs differ by no more, in pixels, has one everywhere.
+_FLAT = 0.5
+
+#: A layer of this coverage shows nothing of what is behind it.
+_OPAQUE = 0.9999
 
 #: So many pixels around the circle of its own blur a pixel may see besides.
 _MARGIN = 2.0
@@ -41,37 +56,68 @@ def lens_filter(layers: list[Layer], size: Size) -> mi.Color3f:
 
 class _LensFilter:
     def __init__(self, layers: list[Layer], size: Size) -> None:
-        self._size, self._layers = size, layers
+        self._size, self._layers = size, list(layers)
         self._lens = LensPoints(ring_points())
-        self._pyramids = [Pyramid(dr.ravel(layer.color), size) for layer in layers]
+        self._few = [_Points(rings) for _radius, rings in _FEW_POINTS] + [_Points(RINGS)]
+        self._pyramids = [Pyramid(layer.color, size) for layer in layers]
+        self._highlights: list[tuple[int, Highlights]] = []
+        self._take_highlights()
         dr.eval([layer.blur for layer in layers])
+        self._is_flat = [_range(layer.blur) <= _FLAT for layer in layers]
+
+    def _take_highlights(self) -> None:
+        """Takes them out of the layers. Without the brightest of them, their edges stand out."""
+        layers = self._layers
+        for _ in range(_ROUNDS):
+            around, before = reduce(Pyramid.plus, self._pyramids), len(self._highlights)
+            for k, layer in enumerate(layers):
+                color, highlights = without_highlights(layer, around, self._size)
+                if color is not layer.color:
+                    layers[k] = replace(layer, color=color)
+                    self._pyramids[k] = Pyramid(color, self._size)
+                if highlights is not None:
+                    self._highlights.append((k, highlights))
+            if len(self._highlights) == before:
+                return
 
     def picture(self) -> mi.Color3f:
-        """Computes the pixels that see the same layers together."""
+        """Computes the pixels that see the same layers through as many points together."""
         index, position = self._size.pixels()
         place = mi.Point2f(position) + 0.5
-        present = self._present(place)
-        dr.eval(present)
-        counts = dr.zeros(mi.UInt32, 1 << len(self._layers))
-        dr.scatter_add(counts, mi.UInt32(1), present)
+        group = self._group(place)
+        dr.eval(group)
+        count = len(self._layers)
+        sizes = dr.zeros(mi.UInt32, len(self._few) << count)
+        dr.scatter_add(sizes, mi.UInt32(1), group)
         picture = dr.zeros(mi.Float, 3 * self._size.count)
-        for bits in np.flatnonzero(counts.numpy()):
-            chosen = dr.compress(present == dr.opaque(mi.UInt32, int(bits)))
+        for number in np.flatnonzero(sizes.numpy()):
+            chosen = dr.compress(group == dr.opaque(mi.UInt32, int(number)))
             where = self._size.position(chosen)
-            layers = [k for k in range(len(self._layers)) if bits >> k & 1]
-            seen = [self._view(k, chosen) for k in layers]
+            points = self._few[number >> count]
+            seen = [self._view(k, chosen) for k in range(count) if number >> k & 1]
             color, covered = _sum(
-                self._lens, mi.Point2f(where) + 0.5, _turn(where), self._size, seen
+                points.table, mi.Point2f(where) + 0.5, points.turn(where), self._size, seen
             )
             dr.scatter(picture, color / dr.maximum(covered, 1e-6), chosen)
             dr.eval(picture)
+        for k, highlights in self._highlights:
+            spread(picture, highlights, self._size, self._before(k))
         return dr.gather(mi.Color3f, picture, index)
 
-    def _present(self, place: mi.Point2f) -> mi.UInt32:
-        """Which layers each pixel may see, one bit for each. The last one is everywhere."""
-        last = len(self._layers) - 1
-        present = dr.full(mi.UInt32, 1 << last, self._size.count)
-        for k, (layer, pyramid) in enumerate(zip(self._layers[:last], self._pyramids)):
+    def _before(self, count: int) -> Visibility:
+        """How much the first layers let through."""
+
+        def visibility(pixel: mi.UInt32, place: mi.Point2f, point: mi.Point2f) -> mi.Float:
+            seen = [self._view(k, pixel) for k in range(count)]
+            return 1 - _through(place, point, self._size, seen)[1] if seen else mi.Float(1)
+
+        return visibility
+
+    def _group(self, place: mi.Point2f) -> mi.UInt32:
+        """Which layers each pixel may see, one bit for each; and above these, the number of the
+        points that are enough. The last layer is everywhere, but behind others that are opaque."""
+        bits, largest, is_open = mi.UInt32(0), mi.Float(0), mi.Bool(True)
+        for k, (layer, pyramid) in enumerate(zip(self._layers, self._pyramids)):
             # Four pixels of a copy that is so coarse that they cover the circle
             reach = dr.abs(layer.blur) + _MARGIN
             level = mi.UInt32(dr.ceil(dr.log2(2 * reach)))
@@ -80,31 +126,45 @@ class _LensFilter:
             for x in (-1, 1):
                 for y in (-1, 1):
                     coverage += view.at(place + reach * mi.Vector2f(x, y)).w
-            present |= dr.select(coverage > 0, mi.UInt32(1 << k), 0)
-        return present
+            is_seen = is_open & (coverage > 0) if k < len(self._layers) - 1 else is_open
+            bits |= dr.select(is_seen, mi.UInt32(1 << k), 0)
+            largest = dr.maximum(largest, dr.select(is_seen, dr.abs(layer.blur), 0))
+            is_open &= coverage < _OPAQUE * 4
+        for radius, _rings in _FEW_POINTS:
+            bits += dr.select(largest > radius, mi.UInt32(1 << len(self._layers)), 0)
+        return bits
 
     def _view(self, k: int, index: mi.UInt32) -> _LayerView:
         layer = self._layers[k]
         blur = dr.gather(mi.Float, layer.blur, index)
-        return _LayerView(blur, layer.blur, self._lens.view(self._pyramids[k], blur))
+        blurs = None if self._is_flat[k] else layer.blur
+        return _LayerView(blur, blurs, self._lens.view(self._pyramids[k], blur))
 
 
 @dataclass
 class _LayerView:
-    """A layer as a pixel sees it: the pixel's own blur, the blurs of all, the colours."""
+    """A layer as a pixel sees it: the pixel's own blur, the blurs of all (``None`` if these are the
+    same), the colours."""
 
     blur: mi.Float
-    blurs: mi.Float
+    blurs: mi.Float | None
     view: LevelView
 
 
-def _turn(position: mi.Vector2i) -> mi.Vector2f:
-    """Sine and cosine of the angle by which a pixel turns the points."""
-    ranks = mi.UInt32(np.array(_TURNS, dtype=np.uint32))
-    rank = dr.gather(mi.UInt32, ranks, mi.UInt32((position.y & 3) * 4 + (position.x & 3)))
-    # The rings repeat themselves after this angle
-    whole = 2 * math.pi / math.gcd(*RINGS)
-    return mi.Vector2f(*dr.sincos(mi.Float(rank) * (whole / len(_TURNS))))
+class _Points:
+    """Points of the lens, which pixels turn by different angles."""
+
+    def __init__(self, rings: tuple[int, ...]) -> None:
+        points = ring_points(rings) if sum(rings) > 1 else np.zeros((1, 2))
+        self.table = LensPoints(points)
+        # The rings repeat themselves after this angle
+        self._step = dr.opaque(mi.Float, 2 * math.pi / math.gcd(*rings) / len(_TURNS))
+
+    def turn(self, position: mi.Vector2i) -> mi.Vector2f:
+        """Sine and cosine of the angle by which a pixel turns the points."""
+        ranks = mi.UInt32(np.array(_TURNS, dtype=np.uint32))
+        rank = dr.gather(mi.UInt32, ranks, mi.UInt32((position.y & 3) * 4 + (position.x & 3)))
+        return mi.Vector2f(*dr.sincos(mi.Float(rank) * self._step))
 
 
 @dr.syntax
@@ -129,9 +189,16 @@ def _through(
     """Colour and opacity of all layers, seen from a point of the lens."""
     through, color = mi.Float(1), mi.Color3f(0)
     for layer in seen:
-        about = mi.Vector2i(dr.floor(place + layer.blur * point))
-        blur = dr.gather(mi.Float, layer.blurs, size.index(about))
-        found = layer.view.at(place + blur * point)
+        at = place + layer.blur * point
+        if layer.blurs is not None:
+            about = size.index(mi.Vector2i(dr.floor(at)))
+            at = place + dr.gather(mi.Float, layer.blurs, about) * point
+        found = layer.view.at(at)
         color += through * rgb(found)
         through *= 1 - found.w
     return color, 1 - through
+
+
+def _range(values: mi.Float) -> float:
+    least, most = dr.min(values), dr.max(values)
+    return float(dr.slice(most - least))

@@ -37,7 +37,7 @@ def near_field(layer: Layer, size: Size, radius: float) -> NearField:
     Source: J. J. Guo, PhD thesis, TU Delft, section 5.4.1.1, Listing 1 and Eq. 5.5. Wide windows
     are filtered in a copy of lower resolution.
     """
-    full, color, blur = size, dr.ravel(layer.color), layer.blur
+    full, color, blur = size, layer.color, layer.blur
     scale = 1
     while radius / scale > _MOST_TAPS and size.count > 1:
         dr.eval(color, blur)

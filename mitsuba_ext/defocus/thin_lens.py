@@ -59,6 +59,9 @@ class ThinLens:
             depth: Along the axis of the lens, positive; may be infinite.
         """
         # The reciprocal of infinity is not 0 in all backends
-        inverse = dr.select(dr.isfinite(depth), dr.rcp(depth), 0)
+        return self.blur_at(dr.select(dr.isfinite(depth), dr.rcp(depth), 0))
+
+    def blur_at(self, inverse_depth: mi.Float) -> mi.Float:
+        """:meth:`blur` at 1 / ``inverse_depth``; 0 is infinity."""
         # Eq. 5.3 (Guo), on the film instead of on the focal plane, which is focus_distance away
-        return self.pixels_per_disparity * inverse + self.blur_of_sky
+        return self.pixels_per_disparity * inverse_depth + self.blur_of_sky

@@ -9,8 +9,9 @@ from ..defocus.images import Size
 from ..defocus.layers import LayerSums, Limits
 from .pinhole import Surface
 
-#: Channels of each layer: RGB, alpha, blur, hits; and of the guides of a denoiser.
-_VALUES, _GUIDES = 6, 6
+#: Channels of each layer: RGB, alpha, blur, hits, blur times brightness; and of the guides of a
+#: denoiser.
+_VALUES, _GUIDES = 7, 6
 
 
 class LayerBlocks:
@@ -53,13 +54,18 @@ class LayerBlocks:
 
         Parameters:
             surface: What they met.
-            behind: Only to layers behind the one of a surface of this blur.
+            behind: Only to layers behind the one of a surface of this blur; infinite for all.
         """
         known, blur = [], surface.blur
         for k, block in enumerate(self._hits):
-            is_open = active if behind is None else active & ~self.limits.is_before(k, behind)
+            is_open = active
+            if behind is not None:
+                is_open = active & (dr.isinf(behind) | ~self.limits.is_before(k, behind))
             is_hit = is_open & self.limits.contains(k, blur)
-            values = [color.x, color.y, color.z, alpha, blur, mi.Float(1), *surface.guides]
+            values = [
+                color.x, color.y, color.z, alpha, blur, mi.Float(1), blur * dr.sum(color),
+                *surface.guides,
+            ]  # fmt: skip
             block.put(position, [weight * value for value in values], is_hit)
             known.append(dr.select(is_open & self.limits.is_before(k, blur), weight, 0))
         self._known.put(position, known, active)
@@ -78,7 +84,8 @@ class LayerBlocks:
             v = [dr.gather(mi.Float, values, channels * lane + i) for i in range(channels)]
             sums.append(LayerSums(
                 mi.Color3f(*v[:3]), v[4], v[5],
-                dr.gather(mi.Float, known.array, count * lane + k), v[_VALUES:]
+                dr.gather(mi.Float, known.array, count * lane + k), v[_VALUES:],
+                (v[6], v[0] + v[1] + v[2]), self.limits.shared(k),
             ))  # fmt: skip
             alphas.append(v[3])
         return sums, alphas

@@ -14,20 +14,19 @@ from ..defocus.images import Size
 from ..defocus.layers import LayerSums
 from ..transport.colour import to_rgb
 from ..transport.estimator import CameraRays, Sample
+from ..transport.lens_view import LensView
 from . import camera
 from .layer_blocks import LayerBlocks
+from .layer_samples import distance_from_film, least_blur_around, outside_pixels
 from .pinhole import PinholeView, Surface
 from .render import Job
-
-#: Edge of the squares of pixels for which it is decided together whether anything hidden is needed.
-_TILE = 8
-
-#: Where the blurs of neighbouring pixels differ by more, in pixels, one hides something behind it.
-_EDGE = 0.5
 
 #: What lies around the film is blurred into it. So far outside samples are taken at most: this
 #: share of the film's longer edge.
 _WIDEST_MARGIN = 1 / 8
+
+#: Marks pixels in a list of which hidden things are wanted.
+_HIDDEN = 0x80000000
 
 #: Samples of a pass over a list of pixels, at most.
 _MOST_LANES = 1 << 21
@@ -49,9 +48,8 @@ class LayeredJob(Job):
                 f'use an "hdrfilm".'
             )
         self.lens = integrator.thin_lens(sensor)
-        self.view = PinholeView(
-            scene, sensor, integrator.scene_query(scene), self.lens, integrator.denoise
-        )
+        self._lens_view = LensView(scene, sensor, integrator.scene_query(scene))
+        self.view = PinholeView(self._lens_view, scene, self.lens, integrator.denoise)
         self.filter = make_filter(integrator.filter)
         self._crop = [int(n) for n in self.film.crop_size()]
         # The film and a margin around it
@@ -74,13 +72,15 @@ class LayeredJob(Job):
         _index, pixel = self.size.pixels()
         position = (mi.Point2f(pixel) + 0.5 - self.margin) / mi.Vector2f(self._crop)
         time = self.sensor.shutter_open() + 0.5 * self.sensor.shutter_open_time()
-        ray, _ = self.sensor.sample_ray(time, 0.5, position, mi.Point2f(0.5))
+        ray = self._lens_view.ray(position, 0.5, time)
         return self.view.first(ray).blur.numpy().reshape(self.size.height, self.size.width)
 
     def _trim(self) -> None:
-        """Leaves as much of the margin as the largest blur reaches."""
+        """Leaves as much of the margin as is blurred into the film, or the film into it."""
         margin, film = self.margin, self.blurs[self._inside]
-        self.margin = min(margin, math.ceil(np.abs(film).max()) + 1)
+        distance = distance_from_film(self.blurs.shape, margin)
+        inwards = distance[np.abs(self.blurs) >= distance].max()
+        self.margin = min(margin, math.ceil(max(np.abs(film).max(), inwards)) + 1)
         cut = margin - self.margin
         height, width = self.blurs.shape
         self.blurs = np.ascontiguousarray(self.blurs[cut : height - cut, cut : width - cut])
@@ -94,8 +94,10 @@ class LayeredJob(Job):
         return slice(m, m + height), slice(m, m + width)
 
     def _sample(self, stage, sampler, rays: CameraRays, count=1.0) -> Sample:
-        sample = super()._sample(stage, sampler, rays, count)
+        # Before the samples are put into the block: null transmission of textures evaluates
+        # something while it is traced, and with it what waits for the block, in another kernel
         first = self.view.first(rays.ray)
+        sample = super()._sample(stage, sampler, rays, count)
         self._put(rays, sample, first, mi.Float(rays.weight * count), mi.Bool(True))
         self._last_stage = stage
         return sample
@@ -113,65 +115,72 @@ class LayeredJob(Job):
 
     def run(self, interrupt) -> None:
         super().run(interrupt)
-        if self._stopped(interrupt):
-            return
-        outside = np.ones_like(self.blurs, dtype=bool)
-        outside[self._inside] = False
-        self._run_pixels(outside, None, interrupt)
-        if self.filter.has_layers:
-            least = least_blur_around(self.blurs, self.lens.blur_of_sky)
-            self._run_pixels(np.isfinite(least), mi.Float(least.ravel()), interrupt)
+        if not self._stopped(interrupt):
+            self._run_besides(interrupt)
 
     # ---- What the film does not show ----
 
-    def _run_pixels(self, chosen: np.ndarray, least: mi.Float | None, interrupt) -> None:
-        """Takes samples of some pixels: of what is seen first, or where ``least`` is given, of what
-        is hidden by something whose blur is larger than that by more than 1."""
-        spp = self.integrator.hidden_samples(self.statistics.spp)
-        pixels = np.flatnonzero(chosen).astype(np.uint32)
+    def _run_besides(self, interrupt) -> None:
+        """Takes samples of what lies around the film; and of what is hidden by something whose blur
+        is larger by more than 1 than that of the farthest thing around."""
+        count = self.integrator.hidden_samples(self.statistics.spp)
+        self._weight = dr.opaque(mi.Float, self.statistics.spp / count)
+        pixels = np.flatnonzero(outside_pixels(self.blurs, self.margin)).astype(np.uint32)
+        if self.filter.has_layers:
+            least = least_blur_around(self.blurs, self.lens.blur_of_sky)
+            self._least = mi.Float(least.ravel())
+            hidden = np.flatnonzero(np.isfinite(least)).astype(np.uint32)
+            pixels = np.concatenate([pixels, hidden | _HIDDEN])
+        if len(pixels) == 0:
+            return
+        # Passes of about equal length, in which neighbouring lanes are alike
         most = min(_MOST_LANES // self.integrator.sample_cost, self.integrator.most_lanes)
-        per_pass = max(1, most // spp)
-        for start in range(0, len(pixels), per_pass):
+        passes = -(-len(pixels) // max(1, most // count))
+        for number, part in enumerate(np.array_split(pixels, passes)):
             if self._stopped(interrupt):
                 return
-            part = pixels[start : start + per_pass]
-            # Numbers that no other part of the render has
-            number = (2 if least is None else 3) * 0x40000000 + start
-            seed = mi.sample_tea_32(mi.UInt32(self.plan.seed), mi.UInt32(number & 0xFFFFFFFF))[0]
-            sampler = mi.load_dict({"type": "independent"})
-            sampler.seed(dr.opaque(mi.UInt32, seed[0]), len(part) * spp)
-            self._run_some_pixels(mi.UInt32(part), spp, sampler, least)
-            dr.eval(self.layers.tensors())
-            dr.sync_thread()
+            self._run_list(mi.UInt32(part), count, number)
 
-    def _run_some_pixels(self, pixels, spp, sampler, least) -> None:
+    def _run_list(self, pixels: mi.UInt32, count: int, number: int) -> None:
+        """Takes ``count`` samples of each of these."""
         stage = self._last_stage
-        lane = dr.arange(mi.UInt32, len(pixels) * spp)
-        place = lane // dr.opaque(mi.UInt32, spp)
-        pixel = dr.gather(mi.UInt32, pixels, place)
-        lanes = self._lanes_with_margin(pixel, lane - place * dr.opaque(mi.UInt32, spp))
+        lane = dr.arange(mi.UInt32, len(pixels) * count)
+        place = lane // dr.opaque(mi.UInt32, count)
+        sampler = mi.load_dict({"type": "independent"})
+        # Numbers that no other part of the render has
+        seed = mi.sample_tea_32(mi.UInt32(self.plan.seed), mi.UInt32(0x80000000 + number))[0]
+        sampler.seed(dr.opaque(mi.UInt32, seed[0]), len(lane))
+        chosen = dr.gather(mi.UInt32, pixels, place)
+        pixel, is_hidden = chosen & (_HIDDEN - 1), chosen >= _HIDDEN
+        lanes = self._lanes_with_margin(pixel, lane - place * dr.opaque(mi.UInt32, count))
         numbers = camera.draw_numbers(self.sensor, sampler, lanes, stage.camera)
         rays = camera.camera_rays(self.sensor, lanes, numbers, self.plan.spp)
+        surface, active, behind = self._surface(rays, pixel, is_hidden)
+        sample = stage.estimator(self.scene, sampler, rays, active)
+        self._put(rays, sample, surface, mi.Float(rays.weight) * self._weight, active, behind)
+        dr.eval(self.layers.tensors())
+        dr.sync_thread()
+
+    def _surface(
+        self, rays: CameraRays, pixel: mi.UInt32, is_hidden: mi.Bool
+    ) -> tuple[Surface, mi.Bool, mi.Float | None]:
+        """What a ray meets, or meets behind that where ``is_hidden``: from there on the ray goes.
+        And where there is something, and the blur of what hides it (infinite for nothing)."""
         first = self.view.first(rays.ray)
-        weight = mi.Float(rays.weight) * dr.opaque(mi.Float, self.statistics.spp / spp)
-        if least is None:
-            sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
-            self._put(rays, sample, first, weight, mi.Bool(True))
-            return
-        rest, hidden, active = self.view.beyond(rays.ray, first)
-        active &= first.blur > dr.gather(mi.Float, least, pixel) + 1
+        if not self.filter.has_layers:
+            return first, mi.Bool(True), None
+        rest, hidden, active = self.view.beyond(rays.ray, first, is_hidden)
+        active &= first.blur > dr.gather(mi.Float, self._least, pixel) + 1
         if not self._sees_sky:
             active &= hidden.is_hit
-        rays.ray.o = rest.o
-        sample = stage.estimator(self.scene, sampler, rays, active)
-        self._put(rays, sample, hidden, weight, active, first.blur)
+        rays.ray.o = dr.select(is_hidden, rest.o, rays.ray.o)
+        behind = dr.select(is_hidden, first.blur, dr.inf)
+        return dr.select(is_hidden, hidden, first), active | ~is_hidden, behind
 
     def _lanes_with_margin(self, pixel: mi.UInt32, index: mi.UInt32) -> camera.Lanes:
         """Lanes for pixels of the film and its margin. Tables of the nested integrator that have an
         entry for each pixel of the film know the nearest one."""
-        width = dr.opaque(mi.UInt32, self.size.width)
-        y = pixel // width
-        corner = mi.Vector2i(mi.Int32(pixel - y * width), mi.Int32(y)) - self.margin
+        corner = self.size.position(pixel) - self.margin
         border = self.film.rfilter().border_size() if self.film.sample_border() else 0
         extent = camera.film_extent(self.film)
         inside = dr.clip(corner + border, 0, mi.Vector2i(extent[0] - 1, extent[1] - 1))
@@ -207,42 +216,3 @@ class LayeredJob(Job):
         picture = self.filter.picture(capture)
         shape = (self.size.height, self.size.width, 3)
         return mi.TensorXf(dr.ravel(picture), shape=shape).numpy()[self._inside]
-
-
-def least_blur_around(blurs: np.ndarray, sky: float) -> np.ndarray:
-    """By pixel, the least blur (that of the farthest thing) at an edge which is so near that the
-    lens may see that thing behind the pixel; infinity where there is no such edge. Decided for
-    tiles of pixels together.
-
-    Parameters:
-        blurs: Signed radii in pixels, [y, x].
-        sky: That of infinity.
-    """
-    height, width = blurs.shape
-    edge = np.full_like(blurs, np.inf)
-    for axis in range(2):
-        a = np.moveaxis(blurs, axis, 0)
-        e = np.moveaxis(edge, axis, 0)
-        jump = np.abs(a[1:] - a[:-1]) > _EDGE
-        least = np.where(jump, np.minimum(a[1:], a[:-1]), np.inf)
-        e[1:] = np.minimum(e[1:], least)
-        e[:-1] = np.minimum(e[:-1], least)
-    tiles = -(-height // _TILE), -(-width // _TILE)
-    pad = ((0, tiles[0] * _TILE - height), (0, tiles[1] * _TILE - width))
-
-    def by_tile(image: np.ndarray, fill: float, reduce) -> np.ndarray:
-        padded = np.pad(image, pad, constant_values=fill)
-        return reduce(padded.reshape(tiles[0], _TILE, tiles[1], _TILE), axis=(1, 3))
-
-    least, most = by_tile(edge, np.inf, np.min), by_tile(blurs, -np.inf, np.max)
-    # A ray through the edge of the lens is so far away from where the middle sees it
-    reach = np.ceil((most - sky) / _TILE)
-    found = np.full_like(least, np.inf)
-    for radius in range(int(reach.max()) + 1):
-        found = np.where(reach >= radius, least, found)
-        padded = np.pad(least, 1, mode="edge")
-        least = np.minimum.reduce([
-            padded[y : y + tiles[0], x : x + tiles[1]] for y in range(3) for x in range(3)
-        ])  # fmt: skip
-    found[most <= found + 1] = np.inf
-    return np.repeat(np.repeat(found, _TILE, 0), _TILE, 1)[:height, :width]

@@ -8,13 +8,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..defocus.thin_lens import ThinLens
+from ..transport.lens_view import LensView, Passes
 from ..transport.numbers import Numbers
-from ..transport.path_decisions import SceneQuery
 from .guides import guides_of
-
-#: Surfaces that a ray may pass before it counts as having met one: those that let light through,
-#: and the back of what hides the rest.
-_MOST_PASSED = 16
 
 #: A surface that lets more of the light through than this is not there.
 _MOST_TRANSMITTED = 0.5
@@ -60,30 +56,27 @@ class PinholeView:
     """The scene from the middle of a lens.
 
     Parameters:
-        scene, sensor, query: The query says how a ray meets the scene.
-        lens: The lens, of which the sensor's camera rays begin in the middle.
+        view: The lens' rays and depths.
+        scene: The scene.
+        lens: By how much the lens blurs.
         has_guides: Does a denoiser want to know the surfaces' albedo and normal?
     """
 
     def __init__(
-        self, scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery, lens: ThinLens,
-        has_guides: bool = False,
-    ) -> None:  # fmt: skip
-        self.lens, self._scene, self._query, self._has_guides = lens, scene, query, has_guides
-        to_world = mi.Transform4f(sensor.world_transform())
-        self._axis = dr.normalize(to_world @ mi.Vector3f(0, 0, 1))
-        self._origin = to_world @ mi.Point3f(0)
-        dr.make_opaque(self._axis, self._origin)
+        self, view: LensView, scene: mi.Scene, lens: ThinLens, has_guides: bool = False
+    ) -> None:
+        self._view, self._lens, self._has_guides = view, lens, has_guides
         null = int(mi.BSDFFlags.Null)
         self._has_holes = any(s.bsdf() and int(s.bsdf().flags()) & null for s in scene.shapes())
 
     def first(self, ray: mi.Ray3f) -> Surface:
         """The first surface along a ray."""
-        nothing = Surface(mi.Float(0), mi.Bool(False), dr.zeros(mi.ShapePtr), mi.Float(0))
-        return self._meet(ray, nothing, mi.Bool(True), self._has_holes)
+        return self._meet(ray, self._lets_through if self._has_holes else None, mi.Bool(True))
 
-    def beyond(self, ray: mi.Ray3f, first: Surface) -> tuple[mi.Ray3f, Surface, mi.Bool]:
-        """What the ``first`` surface hides.
+    def beyond(
+        self, ray: mi.Ray3f, first: Surface, active: mi.Bool
+    ) -> tuple[mi.Ray3f, Surface, mi.Bool]:
+        """What the ``first`` surface hides, where ``active``.
 
         The ray is moved on, behind what belongs to the same object: where the blur is half as
         large. Behind the focus, that is half of the way to the blur of the sky.
@@ -92,67 +85,46 @@ class PinholeView:
             The rest of the ray, what it meets, and whether there can be anything: not behind the
             sky.
         """
-        sky, blur = self.lens.blur_of_sky, first.blur
+        sky, blur = self._lens.blur_of_sky, first.blur
         start = dr.select(blur > 0, _BEHIND * blur, blur - _BEHIND * (blur - sky))
         start = dr.minimum(start, blur - _LEAST_STEP)
-        active = first.is_hit & (start > sky)
+        active = active & first.is_hit & (start > sky)
         # The depth of which the blur is that of the start
-        scale = dr.opaque(mi.Float, self.lens.pixels_per_disparity)
+        scale = dr.opaque(mi.Float, self._lens.pixels_per_disparity)
         depth = scale / dr.select(active, start - sky, 1)
-        distance = (depth - self._depth(ray.o)) / dr.dot(ray.d, self._axis)
+        distance = (depth - self._view.depth(ray.o)) / dr.dot(ray.d, self._view.axis)
         active &= distance < ray.maxt
         rest = mi.Ray3f(ray)
         rest.o = ray(dr.select(active, distance, 0))
-        return rest, self._meet(rest, first, active, True), active
 
-    def _meet(self, ray: mi.Ray3f, hider: Surface, active: mi.Bool, can_pass: bool) -> Surface:
-        guides = []
-        if can_pass or self._has_guides:
-            if can_pass:
-                si, side = _walk(self, mi.Ray3f(ray), hider.shape, hider.side, active)
+        def passes(si: mi.SurfaceInteraction3f, side: mi.Float, active: mi.Bool) -> mi.Bool:
+            """Out of the object that hides the rest."""
+            out = (si.shape == first.shape) & (side != first.side)
+            return out | self._lets_through(si, side, active) if self._has_holes else out
+
+        return rest, self._meet(rest, passes, active), active
+
+    def _meet(self, ray: mi.Ray3f, passes: Passes | None, active: mi.Bool) -> Surface:
+        guides, side = [], mi.Float(1)
+        if passes or self._has_guides:
+            if passes:
+                si, side = self._view.surface_behind(ray, passes, active)
             else:
-                si, side = self._closest(ray, active), mi.Float(1)
+                si = self._view.surface(ray, active)
             p, hit, shape = si.p, si.is_valid(), si.shape
             if self._has_guides:
                 guides = guides_of(si, hit)
         else:
-            pi = self._query.closest(self._scene, ray, coherent=True, active=active)
-            hit, shape, side = pi.is_valid(), pi.shape, mi.Float(1)
+            pi = self._view.closest(ray, active)
+            hit, shape = pi.is_valid(), pi.shape
             p = ray(dr.select(hit, pi.t, 0))
-        depth = dr.select(hit, self._depth(p), dr.inf)
-        # Rounding at the lens itself
-        blur = self.lens.blur(dr.maximum(depth, 1e-6))
+        blur = self._lens.blur_at(self._view.inverse_depth(p, hit))
         return Surface(blur, hit, shape, side, guides)
 
-    def _depth(self, p: mi.Point3f) -> mi.Float:
-        return dr.dot(p - self._origin, self._axis)
-
-    def _closest(self, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-        pi = self._query.closest(self._scene, ray, coherent=True, active=active)
-        return self._query.interaction(pi, ray)
-
-    def _passes(
-        self, si: mi.SurfaceInteraction3f, side: mi.Float, hider: mi.ShapePtr,
-        hider_side: mi.Float, active: mi.Bool,
-    ) -> mi.Bool:  # fmt: skip
-        """Does a ray go on: through a surface that lets light through, or out of the object that
-        hides the rest?"""
-        passes = (si.shape == hider) & (side != hider_side)
-        if self._has_holes:
-            through = si.bsdf().eval_null_transmission(si, active & si.is_valid())
-            passes |= dr.mean(mi.unpolarized_spectrum(through)) > _MOST_TRANSMITTED
-        return passes
-
-
-@dr.syntax
-def _walk(view, ray, hider, hider_side, active):
-    si, side = dr.zeros(mi.SurfaceInteraction3f), mi.Float(0)
-    steps, going = mi.UInt32(0), mi.Bool(active)
-    while going:
-        si = view._closest(ray, going)
-        side = dr.sign(dr.dot(si.n, ray.d))
-        passes = view._passes(si, side, hider, hider_side, going)
-        going &= si.is_valid() & passes & (steps < _MOST_PASSED)
-        steps += 1
-        ray = dr.select(going, si.spawn_ray(ray.d), ray)
-    return si, side
+    @staticmethod
+    def _lets_through(
+        si: mi.SurfaceInteraction3f, side: mi.Float, active: mi.Bool
+    ) -> mi.Bool:
+        """Through a surface that lets light through."""
+        through = si.bsdf().eval_null_transmission(si, active & si.is_valid())
+        return dr.mean(mi.unpolarized_spectrum(through)) > _MOST_TRANSMITTED

@@ -81,11 +81,15 @@ class RenderPlan:
     set_size: int
     parts: int = 1
 
-    def pass_length(self, samples: int) -> int:
-        """Samples per pixel of passes of about equal length that take ``samples`` samples."""
+    def pass_length(self, samples: int, most_lanes: int = 0) -> int:
+        """Samples per pixel of passes of about equal length that take ``samples`` samples;
+        ``most_lanes`` as :class:`~mitsuba_ext.rendering.stages.Stage` says."""
         if self.structured:
             return self.limit
-        pass_count = -(-samples // self.limit)
+        limit = self.limit
+        if most_lanes:
+            limit = max(1, min(limit, most_lanes // self.pixel_count))
+        pass_count = -(-samples // limit)
         return max(1, -(-samples // max(1, pass_count)))
 
     @property

@@ -214,7 +214,7 @@ class Job:
         """Runs the passes of a stage: all of them, or as many as the timeout allows."""
         before = self.statistics.spp
         budget = self.budget.stage(samples, before, is_last)
-        length, done = self.plan.pass_length(samples), 0
+        length, done = self.plan.pass_length(samples, stage.most_lanes), 0
         while done < (wanted := self.plan.whole(before, budget.samples, samples)):
             if self._stopped(interrupt):
                 return

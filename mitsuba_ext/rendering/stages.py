@@ -20,6 +20,8 @@ class Stage:
         camera: What chooses points of the aperture, times and wavelengths.
         weight: How many samples of the last stage each of its samples counts for. It must not
             depend on any sample.
+        most_lanes: Samples of a pass, at most, where passes can be cut anywhere and hold one sample
+            of each pixel: what is recorded of each takes memory. 0 for no limit.
     """
 
     estimator: Estimator
@@ -27,6 +29,7 @@ class Stage:
     is_scout: bool = False
     camera: CameraSamples = field(default_factory=CameraSamples)
     weight: float = 1.0
+    most_lanes: int = 0
 
 
 class Schedule(Protocol):
