@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import drjit as dr
@@ -182,7 +183,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
         """The lens of a sensor.
 
         Raises:
-            ValueError: It has none, and none is given.
+            ValueError: It has none, and none is given; or it focuses at infinity.
             NotImplementedError: Its rays do not begin in a point, or it moves.
         """
         if is_moving_camera(sensor):
@@ -204,6 +205,12 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
                     f'"thinlens", or give the parameter here'
                 )
             own[key] = value or float(dr.slice(parameters[key]))
+        if not math.isfinite(own["focus_distance"]):
+            # Mitsuba's sensor makes rays of NaN of it
+            raise ValueError(
+                f'"{self.name}": the sensor "{sensor.class_name()}" has the "focus_distance" '
+                f'{own["focus_distance"]}: give a finite one, as large as you like'
+            )
         angle = float(dr.slice(parameters["x_fov"]))
         return ThinLens(**own, fov=angle, film_width=int(sensor.film().size()[0]))
 

@@ -194,6 +194,20 @@ def test_a_sensor_without_a_lens_is_refused(plugin, parameters, message):
         ecoc(**parameters).render(scene, spp=1)
 
 
+def test_a_focus_at_infinity_is_refused_and_one_far_away_is_not():
+    """Mitsuba's rays are not numbers at infinity."""
+    scene = mi.load_dict(stage(camera=sensor("thinlens", aperture_radius=0.1,
+                                             focus_distance=np.inf)))  # fmt: skip
+    with pytest.raises(ValueError, match="give a finite one"):
+        ecoc().render(scene, spp=1)
+    far = sensor("thinlens", aperture_radius=1e-3, focus_distance=1e6, film=film(12, 9))
+    near = sensor("thinlens", aperture_radius=1e-3, focus_distance=4.0, film=film(12, 9))
+    scenes = [mi.load_dict(stage(camera=camera)) for camera in (far, near)]
+    images = [rendered(scene, ecoc(PATH), 64) for scene in scenes]
+    assert np.isfinite(images[0]).all()
+    assert images[0].mean() == pytest.approx(images[1].mean(), rel=0.05)
+
+
 @pytest.mark.parametrize("nested, message", [
     ({"type": "bdpt"}, '"bdpt" cannot be .* set "light_image" to false'),
     ({"type": "light_tracer"}, "its light paths"),
