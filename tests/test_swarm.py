@@ -16,8 +16,10 @@ from mitsuba_ext.decisions.swarm import map_learner
 from mitsuba_ext.decisions.swarm.bounce_records import BounceRecords
 from mitsuba_ext.decisions.swarm.cells import CellDensities, Cells
 from mitsuba_ext.decisions.swarm.estimate import Form, Grid, Shares, estimate
+from mitsuba_ext.decisions.swarm.film_tiles import FilmTiles
 from mitsuba_ext.decisions.swarm.light_maps import light_cells
 from mitsuba_ext.decisions.swarm.lobe_maps import path_density
+from mitsuba_ext.decisions.swarm.tile_counts import Choices, TileCounts
 from mitsuba_ext.rendering.dither import dithered_parts
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -140,15 +142,28 @@ def test_few_samples_of_a_tile_are_believed_a_little() -> None:
     assert (np.abs(a / (a + b) - [1, 1 / 3]) > 0.03).all()
 
 
-def test_tiles_that_are_joined_have_the_map_of_all_their_samples() -> None:
-    counts = np.random.default_rng(4).multinomial(9, [0.7, 0.1, 0.1, 0.1], size=(3, 5, 2))
-    joined = np.zeros((2, 3, 2, 4))
-    for row, column in np.ndindex(3, 5):
-        joined[row // 2, column // 2] += counts[row, column]
-    flat, squares = (mi.Float(x.astype(np.float32).ravel()) for x in (counts, counts.sum(-1)))
-    widths = mi.Float([0.25] * 4)
-    shares = estimate(flat, squares, Grid(3, 5, 2), widths, halvings=1)
-    np.testing.assert_allclose(shares.numpy(), _estimated(joined).ravel(), rtol=1e-4)
+def test_smaller_tiles_go_on_with_what_larger_ones_have_counted() -> None:
+    tiles, smaller = FilmTiles(7, 5, 4), FilmTiles(7, 5, 2)
+    counts, pixel = TileCounts(tiles, 2, 4), dr.arange(mi.UInt32, 35)
+    radiance = mi.Float(pixel % 3)
+
+    def add(cell: int) -> None:
+        one = (mi.UInt32(x) for x in (1, cell))
+        counts.add(pixel, radiance, Choices(*one, mi.Float(1), radiance, mi.Bool(True)))
+
+    add(1)
+    add(3)
+    (before, squares), gain = counts.sums(), counts.expected_gain(np.full(8, 0.5))
+    before = before.numpy().reshape(2, 2, 2, 4)
+    counts.divide(smaller)
+    after, squares_after = counts.sums()
+    after = after.numpy().reshape(3, 4, 2, 4)
+    for row, column in np.ndindex(3, 4):
+        np.testing.assert_allclose(after[row, column], before[row // 2, column // 2] / 4, atol=1)
+    np.testing.assert_allclose(squares_after.numpy()[1], squares.numpy()[1] / 4, rtol=1e-3)
+    assert counts.samples == 70 and after[0, 0, 0].sum() == 0 and gain > 0
+    add(3)
+    assert counts.sums()[0].numpy().sum() > after.sum()
 
 
 def test_noise_stays_nearly_uniform() -> None:
@@ -296,9 +311,8 @@ def test_maps_lower_the_noise_where_they_promise_to() -> None:
 def test_wrong_maps_only_make_noise(monkeypatch, adversary: str, kind: str) -> None:
     """All mass in one cell, or anywhere: the share of uniform numbers keeps the mean right."""
 
-    def wrong(counts, squares, grid, widths, halvings):
-        size = len(estimate(counts, squares, grid, widths, halvings))
-        shape = (size // len(widths), len(widths))
+    def wrong(counts, squares, grid, widths):
+        shape = (grid.count, len(widths))
         rng = np.random.default_rng(shape[0])
         if adversary == "random":
             mass = rng.random(shape) ** 4 * (widths.numpy() > 0)

@@ -72,6 +72,9 @@ class CameraMapLearner(MapLearner):
     def __init__(self, name: str, decision: MappedNumbers, width: int, height: int, **how) -> None:
         super().__init__(name, decision, width, height, decision.cells, **how)
 
+    def drawn(self) -> tuple[mi.UInt32, mi.Float]:
+        return self.decision.drawn
+
     def choices(self, radiance: mi.Float) -> Choices:
         cell, density = self.decision.drawn
         return Choices(mi.UInt32(0), cell, density, radiance, mi.Bool(True))

@@ -119,9 +119,7 @@ class Grid:
         )
 
 
-def estimate(
-    counts: mi.Float, squares: mi.Float, grid: Grid, widths: mi.Float, halvings: int = 0
-) -> mi.Float:
+def estimate(counts: mi.Float, squares: mi.Float, grid: Grid, widths: mi.Float) -> mi.Float:
     """The share of each cell in what each tile brings.
 
     Parameters:
@@ -130,16 +128,14 @@ def estimate(
             are worth.
         grid: The tables.
         widths: The share of each cell where nothing is known.
-        halvings: How often tiles are joined, 2 x 2 at a time, before they get tables.
 
     Returns:
         Shares, in the order of ``counts``; those of a table add up to one.
     """
     cells = len(widths)
     levels = [(grid, counts, squares)]
-    while len(levels) < halvings + _LEVELS and levels[-1][0].tiles > 1:
+    while len(levels) < _LEVELS and levels[-1][0].tiles > 1:
         levels.append(_halved(*levels[-1], cells))
-    levels = levels[min(halvings, len(levels) - 1) :]
     above, shares = levels[-1][0], widths
     if above.count > 1:
         shares = dr.tile(widths, above.count)

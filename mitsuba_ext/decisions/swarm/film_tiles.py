@@ -35,12 +35,8 @@ class FilmTiles:
         """Tiles of this edge, or larger ones where the film is large and tiles have many cells."""
         tiles = cls(width, height, edge)
         while tiles.count * cells > _MOST_CELLS:
-            tiles = tiles.joined(1)
+            tiles = cls(width, height, 2 * tiles.edge)
         return tiles
-
-    def joined(self, halvings: int) -> FilmTiles:
-        """Larger tiles: 2 x 2 of them are joined so often."""
-        return FilmTiles(self.width, self.height, self.edge << halvings)
 
     def tile(self, pixel: mi.UInt32) -> mi.UInt32:
         """The tile of a pixel, both counted row by row."""

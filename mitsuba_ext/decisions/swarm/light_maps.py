@@ -110,16 +110,19 @@ class LightMaps:
 
     Attributes:
         cells, maps, tiles: See :class:`~mitsuba_ext.decisions.swarm.camera_maps.MappedNumbers`.
+        is_recorded: Does somebody learn?
     """
 
     def __init__(self, cells: Cells) -> None:
         self.cells = cells
         self.maps: CellDensities | None = None
         self.tiles: Any = None
+        self.is_recorded = False
 
-    def around(self, inner: EmitterSampling) -> MappedLights:
-        """A decision with warped numbers."""
-        return MappedLights(inner, self)
+    def around(self, inner: EmitterSampling) -> EmitterSampling:
+        """A decision with warped numbers, where there is something to warp or to learn."""
+        is_needed = self.maps is not None or self.is_recorded
+        return MappedLights(inner, self) if is_needed else inner
 
     def warp(
         self, tile: mi.UInt32, numbers: LightNumbers, active: mi.Bool
@@ -142,6 +145,7 @@ class LightMapLearner(MapLearner):
 
     def __init__(self, name: str, decision: LightMaps, width: int, height: int, **how) -> None:
         super().__init__(name, decision, width, height, decision.cells, **how)
+        decision.is_recorded = True
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         super().begin(lanes, pixel)
@@ -166,4 +170,5 @@ class LightMapLearner(MapLearner):
 
     def stop(self) -> None:
         super().stop()
+        self.decision.is_recorded = False
         self._lane = self._cell = self._density = self._value = None

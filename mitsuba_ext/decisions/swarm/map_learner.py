@@ -22,16 +22,20 @@ from .tile_counts import Candidate, Choices, TileCounts
 _FORMS = (Form(True, 0.2), Form(False, 0.05))
 _FIRST_FORM = Form(False, 0.2)
 
-#: By how much a map is to lower the variance of the image, relatively, to be used.
-_LEAST_GAIN = 0.03
+#: By how much a map is to lower the variance of the image, relatively, to be used: samples that are
+#: drawn from maps take about 5 % longer, and learning takes time.
+_LEAST_GAIN = 0.1
 
 #: Maps that do not pay after so many samples per pixel, and in so many stages, are given up.
-_ENOUGH_SAMPLES, _VAIN_STAGES = 4, 2
+_ENOUGH_SAMPLES, _VAIN_STAGES = 2, 2
 
 #: Samples of all pilots that a tile has, at least, and one for each cell of its maps, which takes
 #: time. Tiles are as small as that allows. Before all are taken, there are maps of larger tiles,
 #: which have at least a part of these.
 _LEAST_SAMPLES, _EARLY_PART = 64, 0.25
+
+#: Samples per pixel of the first stage, about.
+_FIRST_SAMPLES = 0.25
 
 
 def tile_edge(samples: float, cells: int, share: float = 1.0) -> int:
@@ -89,15 +93,13 @@ class MapLearner(Learner):
         always: bool = False,
     ) -> None:
         self.name, self.decision, self.cells, self.maps = name, decision, cells, maps
-        edge = tile_edge(samples, maps * cells.count)
-        self.tiles = FilmTiles.of_cells(width, height, edge, maps * cells.count)
-        decision.tiles = self.tiles
+        self._extent, self._least_edge = (width, height), tile_edge(samples, maps * cells.count)
+        self.tiles = decision.tiles = self._tiles(_FIRST_SAMPLES)
         self._widths = mi.Float(cells.widths.astype(np.float32))
         self.gain, self._always, self._memory, self._vain_stages = 0.0, always, 0, 0
         self._counts: TileCounts | None = TileCounts(self.tiles, maps, cells.count)
         self._pixel: mi.UInt32 | None = None
         self._radiance: mi.Float | None = None
-        self._choices: Choices | None = None
 
     # ---- What a subclass says ----
 
@@ -106,9 +108,14 @@ class MapLearner(Learner):
     needs_measurement = False
 
     def choices(self, radiance: mi.Float) -> Choices:
-        """What the decision chose in each lane of the pass that ends; ``radiance`` is what each
-        lane brought to its pixel."""
+        """What the decision chose in each lane of the last pass; ``radiance`` is what each lane
+        brought to its pixel."""
         raise NotImplementedError
+
+    def drawn(self) -> Any:
+        """Variables of the running pass that :meth:`choices` needs, but for those into which it
+        scatters."""
+        return None
 
     @property
     def is_learning(self) -> bool:
@@ -132,8 +139,9 @@ class MapLearner(Learner):
         self._radiance = dr.sqrt(dr.squared_norm(mi.Color3f(rgb)) / 3)
         self.total = brightness(L)
         self.importance = dr.select(self.total > 0, self._radiance / self.total, 0)
-        self._choices = self.choices(self._radiance)
-        dr.schedule(self._radiance, self._pixel, self._choices)
+        # Choices are asked for once the pass is over: to read what it has scattered would start it,
+        # and what is not stored yet would be traced a second time
+        dr.schedule(self._radiance, self.total, self.importance, self._pixel, self.drawn())
 
     # ---- Between the stages ----
 
@@ -152,58 +160,55 @@ class MapLearner(Learner):
             if self.gain < _LEAST_GAIN and self.decision.maps is not None and not self._always:
                 self._give_up()
                 return None
-        samples = counts.samples / (self.tiles.width * self.tiles.height)
-        halvings = self._halvings(samples)
-        shares = self._shares(halvings)
+        samples = counts.samples / np.prod(self._extent)
+        grid = Grid(self.tiles.rows, self.tiles.columns, self.maps)
+        shares = Shares(estimate(*counts.sums(), grid, self._widths), self._widths)
         if self.needs_measurement:
             expected = np.inf if len(gains) > 0 else 0.0
         else:
-            expected = counts.expected_gain(shares.expected_ratio(form).numpy(), halvings)
+            expected = counts.expected_gain(shares.expected_ratio(form).numpy())
         if len(gains) == 0:
             self.gain = expected
         self.decision.maps = None
         if self._always or min(self.gain, expected) >= _LEAST_GAIN:
             self.decision.maps = CellDensities(self.cells, shares.mass(form))
-            self.decision.tiles = self.tiles.joined(halvings)
+            self.decision.tiles = self.tiles
         elif samples >= _ENOUGH_SAMPLES:
             self._vain_stages += 1
             if self._vain_stages >= _VAIN_STAGES:
                 self._give_up()
                 return None
-        if not is_last:
-            counts.begin_stage([self._candidate(shares, form, halvings) for form in _FORMS])
         self._memory = counts.bytes + shares.bytes
         if self.decision.maps is not None:
             self._memory += self.decision.maps.bytes
+        if not is_last:
+            # The next stage has as many samples as all until now
+            tiles = self._tiles(2 * samples)
+            counts.begin_stage([self._candidate(shares, form, tiles) for form in _FORMS])
+            if tiles.edge < self.tiles.edge:
+                counts.divide(tiles)
+                self.tiles = tiles
         return None
 
     def _give_up(self) -> None:
         self.decision.maps = None
         self.stop()
 
-    def _halvings(self, samples: float) -> int:
-        """How often tiles are joined where each pixel has so many samples."""
-        wanted, halvings = tile_edge(samples, self.maps * self.cells.count, _EARLY_PART), 0
-        most = max(self.tiles.rows, self.tiles.columns)
-        while self.tiles.edge << halvings < wanted and 1 << halvings < most:
-            halvings += 1
-        return halvings
+    def _tiles(self, samples: float) -> FilmTiles:
+        """The tiles that have maps once each pixel has so many samples."""
+        cells = self.maps * self.cells.count
+        edge = max(self._least_edge, tile_edge(samples, cells, _EARLY_PART))
+        return FilmTiles.of_cells(*self._extent, edge, cells)
 
-    def _shares(self, halvings: int) -> Shares:
-        """What cells bring, for tiles that are joined so often."""
-        grid = Grid(self.tiles.rows, self.tiles.columns, self.maps)
-        shares = estimate(*self._counts.sums(), grid, self._widths, halvings)
-        return Shares(shares, self._widths)
-
-    def _candidate(self, shares: Shares, form: Form, halvings: int) -> Candidate:
-        """A density that is tried; it is asked for tables of tiles that are not joined."""
-        grid = Grid(self.tiles.rows, self.tiles.columns, self.maps)
-        joined = self.tiles.joined(halvings)
-        columns, shift = dr.opaque(mi.UInt32, joined.columns), dr.opaque(mi.UInt32, halvings)
+    def _candidate(self, shares: Shares, form: Form, tiles: FilmTiles) -> Candidate:
+        """A density that is tried; it is asked for tables of these tiles, which may be smaller than
+        its own."""
+        own, grid = self.tiles, Grid(tiles.rows, tiles.columns, self.maps)
+        columns, step = (dr.opaque(mi.UInt32, n) for n in (own.columns, own.edge // tiles.edge))
 
         def density(table: mi.UInt32, cell: mi.UInt32) -> mi.Float:
             row, column, which = grid.places(table)
-            table = ((row >> shift) * columns + (column >> shift)) * self.maps + which
+            table = (row // step * columns + column // step) * self.maps + which
             return shares.relative(form, table * self.cells.count + cell)
 
         return density
@@ -219,7 +224,7 @@ class MapLearner(Learner):
         maps = CellDensities(self.cells, self._widths)
         maps.cumulative = mi.UInt32(state["cumulative"])
         self.decision.maps = maps
-        self.decision.tiles = FilmTiles(self.tiles.width, self.tiles.height, int(state["edge"]))
+        self.decision.tiles = FilmTiles(*self._extent, int(state["edge"]))
         return self.decision
 
     def finish(self) -> None:
@@ -227,14 +232,14 @@ class MapLearner(Learner):
 
     def stop(self) -> None:
         """Learns nothing more."""
-        self._counts = self._rays = self._pixel = self._choices = None
+        self._counts = self._rays = self._pixel = self._radiance = None
         self.total = self.importance = None
 
     def _collect(self) -> None:
         """Counts the last pass."""
         if self._counts is not None and self._radiance is not None:
-            self._counts.add(self._pixel, self._radiance, self._choices)
-        self._radiance = self._choices = None
+            self._counts.add(self._pixel, self._radiance, self.choices(self._radiance))
+        self._radiance = None
 
     def __str__(self) -> str:
         if self.decision.maps is None:

@@ -106,14 +106,31 @@ class TileCounts:
         variance = self._stage_variance + uniform - drawn
         return (uniform - np.array(tried)) / variance if variance > 0 else np.zeros(len(tried))
 
-    def expected_gain(self, ratios: np.ndarray, halvings: int) -> float:
+    def expected_gain(self, ratios: np.ndarray) -> float:
         """The same for maps whose second moments, relative to uniform numbers, are ``ratios``, by
-        table of tiles that were joined so often; as all samples tell."""
-        tiles, joined = self._tiles, self._tiles.joined(halvings)
-        places = np.ix_(np.arange(tiles.rows) >> halvings, np.arange(tiles.columns) >> halvings)
-        ratios = ratios.reshape(joined.rows, joined.columns, self._maps)[places]
-        saved = (self._second * (1 - ratios.ravel())).sum()
+        table; as all samples tell."""
+        saved = (self._second * (1 - ratios)).sum()
         return float(saved) / self._variance if self._variance > 0 else 0.0
+
+    def divide(self, tiles: FilmTiles) -> None:
+        """Goes on with smaller tiles, among which it divides evenly what it has counted."""
+        parts = (self._tiles.edge // tiles.edge) ** 2
+        source = self._larger(tiles)
+        self._second = self._second[source.numpy()] / parts
+        self._squares = dr.gather(mi.UInt64, self._squares, source) // parts
+        lane = dr.arange(mi.UInt32, len(source) * self._cells)
+        table = lane // self._cells
+        cell = dr.gather(mi.UInt32, source, table) * self._cells + (lane - table * self._cells)
+        self._counts = dr.gather(mi.UInt32, self._counts, cell) // parts
+        dr.eval(self._counts, self._squares)
+        self._tiles = tiles
+
+    def _larger(self, tiles: FilmTiles) -> mi.UInt32:
+        """By table of smaller tiles, that of the tile which they are a part of."""
+        step, which = self._tiles.edge // tiles.edge, np.arange(self._maps)
+        rows, columns = np.arange(tiles.rows) // step, np.arange(tiles.columns) // step
+        tile = rows[:, None] * self._tiles.columns + columns
+        return mi.UInt32((tile[..., None] * self._maps + which).ravel().astype(np.uint32))
 
     def sums(self) -> tuple[mi.Float, mi.Float]:
         """Counts, by table and cell, and sums of squares, by table."""
