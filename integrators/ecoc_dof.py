@@ -58,7 +58,8 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
      * - denoise
        - |bool|
        - Denoises the layers before they are filtered (Open Image Denoise, from the package
-         :monosp:`mitsuba-oidn`). They are collected with a box filter then. (Default: false)
+         :monosp:`mitsuba-oidn`), but for pixels that show a light. They are collected with a box
+         filter then. (Default: false)
      * - (Common parameters)
        - |float|
        - Those of :class:`StagedIntegrator`: timeout, checkpoint.
@@ -92,8 +93,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
     not there for the layers. Of what is hidden, the first surface only is known. Highlights depend
     on the direction, and the lens sees them from its middle only. Layers are cut where blurs have a
     gap; in a hedge there is none. Samples outside of the film reach an eighth of its longer edge.
-    Noise of the nested integrator in what is in focus stays as it is. A denoiser changes the
-    brightness of lamps of a few pixels: :monosp:`denoise` is not for these.
+    Noise of the nested integrator in what is in focus stays as it is.
 
     The sensor must be a :monosp:`thinlens`, or a :monosp:`perspective` with both parameters given.
     The film is any but a :monosp:`specfilm`, with any filter and crop window. Output variables

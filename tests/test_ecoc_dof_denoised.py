@@ -45,6 +45,15 @@ def test_holes_of_a_layer_are_no_edges_for_the_denoiser(calls):
     assert np.allclose(near, 0.1, rtol=1e-3), "the panel's radiance everywhere"
 
 
+def test_lights_stay_as_they_are(monkeypatch):
+    """All that is seen are lights; the denoiser makes everything brighter."""
+    brighter = SimpleNamespace(denoise=lambda color, albedo, normal, *, hdr: 2 * color)
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", brighter)
+    scene = signs(rfilter={"type": "box"})
+    plain, image = (rendered(scene, ecoc(denoise=d), 4) for d in (False, True))
+    assert np.allclose(image, plain, rtol=1e-4, atol=1e-6)
+
+
 def test_a_missing_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
     with pytest.raises(RuntimeError, match="denoising needs the package mitsuba-oidn"):

@@ -18,7 +18,7 @@ def denoised(sums: LayerSums, size: Size) -> LayerSums:
 
     A denoiser knows little of a picture that a lens has blurred: its guides are blurred and noisy
     too. Before the filter, they are sharp. Holes of the layer are filled in first, so that they
-    are no edges.
+    are no edges. Pixels that show a light stay as they are.
 
     Parameters:
         sums: With guides.
@@ -40,7 +40,9 @@ def denoised(sums: LayerSums, size: Size) -> LayerSums:
 
     color = picture(list(sums.color))
     result = np.array(denoiser().denoise(
-        color, albedo=picture(sums.guides[:3]), normal=picture(sums.guides[3:]), hdr=True
+        color, albedo=picture(sums.guides[:3]), normal=picture(sums.guides[3:6]), hdr=True
     ))  # fmt: skip
     found = mi.Color3f(np.ascontiguousarray(result.reshape(-1, 3).T))
-    return replace(sums, color=found * dr.select(is_known, sums.hits, 0))
+    found *= dr.select(is_known, sums.hits, 0)
+    # Lights have no noise, and a denoiser makes small ones brighter
+    return replace(sums, color=dr.select(sums.guides[6] > 0, sums.color, found))

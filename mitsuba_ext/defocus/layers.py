@@ -132,8 +132,8 @@ class LayerSums:
         hits: Their number.
         known: The number of samples that tell whether the layer is there: those that met something
             in it or behind it.
-        guides: What guides a denoiser: sums of RGB of the albedo, and of the shading normal. Empty
-            if there is no denoiser.
+        guides: What guides a denoiser: sums of RGB of the albedo, and of the shading normal; and
+            how many of the hits were lights. Empty if there is no denoiser.
         glow: The blurs times the brightness of the samples, and this brightness, if anybody asked.
         shared: What is blurred by more is in the layer before as well.
     """

@@ -11,7 +11,7 @@ from .pinhole import Surface
 
 #: Channels of each layer: RGB, alpha, blur, hits, blur times brightness; and of the guides of a
 #: denoiser.
-_VALUES, _GUIDES = 7, 6
+_VALUES, _GUIDES = 7, 7
 
 
 class LayerBlocks:

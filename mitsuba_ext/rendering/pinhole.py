@@ -41,8 +41,8 @@ class Surface:
         is_hit: Does the ray meet a surface?
         shape: Which one.
         side: On which side of the surface the ray arrives: 1 or -1.
-        guides: What guides a denoiser: RGB of the albedo, and the shading normal. Empty if nobody
-            asked for them.
+        guides: What guides a denoiser: RGB of the albedo, the shading normal, and whether it is a
+            light. Empty if nobody asked for them.
     """
 
     blur: mi.Float
@@ -113,7 +113,8 @@ class PinholeView:
                 si = self._view.surface(ray, active)
             p, hit, shape = si.p, si.is_valid(), si.shape
             if self._has_guides:
-                guides = guides_of(si, hit)
+                shines = hit & si.shape.is_emitter()
+                guides = [*guides_of(si, hit), dr.select(shines, mi.Float(1), 0)]
         else:
             pi = self._view.closest(ray, active)
             hit, shape = pi.is_valid(), pi.shape
