@@ -88,8 +88,6 @@ REGRESSIONS = {
         Regression("swarm_path", "bounce_card", {"always_use": True, "direction_map": True},
                    max_depth=4, spp=512, is_slow=True),
         Regression("swarm_path", "showroom", {"always_use": True}, max_depth=3),
-        Regression("swarm_path", "burning_glass", {"direction_map": True}, max_depth=5, spp=512,
-                   is_slow=True),
         Regression("swarm_path", "paperweight", {"always_use": True}, spp=256, is_slow=True),
         Regression("swarm_path", "discharge_lamps", {"always_use": True}, max_depth=4, spp=2048,
                    variant="llvm_ad_spectral", is_slow=True),
