@@ -84,21 +84,25 @@ class SwarmPath(WalkIntegrator):
     that shine on different places, reflections in panes of glass. **Not when** the noise is that of
     many bounces (use :monosp:`pss_guided`), or when an image has fewer than 8 samples per pixel.
 
-    The first pilot has one sample per pixel, and each pilot as many as all before it. Its samples
-    are drawn from the maps of the earlier ones, and count with a weight that is fixed before the
-    render: less in the first pilots, whose maps are poor, as long as that costs no more than 1.5 %
-    where no map helps.
+    The first pilot has one sample per pixel, and each pilot as many as all before it. Where samples
+    are few, the first pilot is divided: a part of the pixels takes its sample, then as many others,
+    and so on, each from the maps of all before. All samples count with weights that are fixed
+    before the render: less in the first pilots, whose maps are poor, as long as that costs no
+    more than 1.5 % where no map helps. Pilots are not divided with a structured sampler.
 
-    A tile has 4 pixels along each edge in maps of one dimension (64 cells, 128 for distances) and 8
-    in those of two (32 x 32 cells), and more where the film is large: a map has 8 million cells at
-    most, which take 160 MiB while it is learned, and 32 MiB afterwards. Lights and points on them
-    have one joint map, of 2048 cells at most; the choice of a lobe has maps of 32 cells for each
-    bounce and for no, one, and more reflections before; directions are mixed with those of the BSDF
-    (multiple importance sampling), by height and angle around the z axis. What a tile has found is
-    drawn to what larger tiles around it have found, as far as the differences are no more than
-    chance. From the samples of each pilot follows which density would have been best (in proportion
-    to the mean of what a cell brings, with 5 % of uniform numbers, or to its root, with 20 %), and
-    by how much the variance is lower: below 3 %, a map is given up. After a render,
+    The edge of a tile is the power of two with which it has at least 64 samples of all pilots, and
+    one for each cell of its maps: 4 pixels for a map of 64 times and 8 for one of 32 x 32 points of
+    the aperture, at 16 and 32 samples per pixel. Before all pilots are taken, tiles are up to twice
+    as large. Distances have maps of 128 cells. A map has 8 million cells at most, which take
+    96 MiB; while it is estimated, some hundreds more. Lights and points on them have one joint
+    map, of 2048 cells at most; the choice of a lobe has maps of 32 cells for each bounce and for
+    no, one, and more reflections before; directions are mixed with those of the BSDF (multiple
+    importance sampling), by height and angle around the z axis. What a tile has found is drawn to
+    what larger tiles around it have found, as far as the differences are no more than chance; where
+    little is known, the density is wider. From the samples of each pilot follows which density
+    would have been best (in proportion to the mean of what a cell brings, with 5 % of uniform
+    numbers, or to its root, with 20 %), and by how much the variance is lower: below 10 %, a map is
+    not used, and after 4 samples per pixel it is given up. After a render,
     :monosp:`integrator.statistics.learned` tells what was found, and
     :monosp:`mitsuba_ext.composition.pixel_maps` has the maps of a pixel as arrays (see
     examples/swarm_maps.py).
