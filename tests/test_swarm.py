@@ -11,6 +11,7 @@ import pytest
 from hard_cases import area, diffuse, film, lookat, rectangle, sensor, stage
 from statistical import assert_exact, assert_same_pixels_on_average, batches, load, one_thread
 
+from mitsuba_ext.composition import swarm as swarm_parameters
 from mitsuba_ext.composition.swarm import doubling_pilots, stage_weights
 from mitsuba_ext.decisions.swarm import map_learner
 from mitsuba_ext.decisions.swarm.bounce_records import BounceRecords
@@ -343,6 +344,33 @@ def test_few_samples_cost_nothing(spp: int) -> None:
     integrator = swarm()
     mi.render(_streaks(5, 3), integrator=integrator, spp=spp)
     assert (integrator.statistics.learned == "") == (spp < 4)
+
+
+_CROPPED = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 7, "crop_height": 5}
+
+
+def test_each_pixel_has_its_sample_where_the_first_one_is_divided(monkeypatch) -> None:
+    monkeypatch.setattr(swarm_parameters, "_LEAST_PIXELS", 1)
+    scene = mi.load_dict({
+        "type": "scene", "sky": {"type": "constant", "radiance": 0.5},
+        "sensor": {**sensor(), "film": {**film(13, 11), **_CROPPED}},
+    })  # fmt: skip
+    integrator = swarm(always_use=True)
+    image = np.array(mi.render(scene, integrator=integrator, spp=8))
+    assert image.shape[:2] == (5, 7) and integrator.statistics.passes == 6
+    assert integrator.statistics.spp == 8 and integrator.statistics.rays["camera"] == 8 * 35
+    np.testing.assert_allclose(image, 0.5, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_mean_where_the_first_sample_is_divided(monkeypatch) -> None:
+    monkeypatch.setattr(swarm_parameters, "_LEAST_PIXELS", 1)
+    scene = _streaks(13, 11)
+    plain = mi.load_dict({"type": "composed_path", "max_depth": 4})
+    expected = batches(scene, plain, 512, [1001, 1002])
+    images = batches(scene, swarm(always_use=True), 6, range(64))
+    error = images.mean(axis=(1, 2, 3)).std(ddof=1) / 8 + expected.mean() * 0.003
+    assert abs(images.mean() - expected.mean()) < 4 * error
 
 
 def test_what_is_learned_can_be_saved(tmp_path) -> None:
