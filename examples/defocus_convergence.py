@@ -19,6 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from defocus import reference_of, scene_of, ssim, timed
 from equal_samples import print_header, print_row
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from mitsuba_ext.compare.flip import mean_flip
 from mitsuba_ext.denoising import denoiser, render_guides
@@ -87,13 +88,22 @@ def main(names, size, spp, reference_spp, max_depth) -> None:
                 curves[label].append((seconds, flip))
                 print_row([name, label, str(count), f"{flip:.4f}", f"{ssim(image, reference):.4f}",
                            f"{seconds:.2f}"])  # fmt: skip
-        for label, points in curves.items():
-            axis.loglog(*np.transpose(points), "o-", label=label, markersize=4)
-        axis.set(title=name, xlabel="CPU seconds", ylabel="FLIP")
+        plot(axis, name, curves)
         dr.flush_malloc_cache()
     axes[0][0].legend(fontsize=7)
     figure.tight_layout()
     figure.savefig(FIGURES / "defocus_convergence.svg", metadata={"Date": None})
+
+
+def plot(axis: plt.Axes, name: str, curves: dict[str, list[tuple[float, float]]]) -> None:
+    """FLIP over CPU seconds, of each technique."""
+    for label, points in curves.items():
+        axis.loglog(*np.transpose(points), "o-", label=label, markersize=4)
+    axis.set(title=name, xlabel="CPU seconds", ylabel="FLIP")
+    for side in (axis.xaxis, axis.yaxis):
+        side.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        side.set_major_formatter("{x:g}")
+        side.set_minor_formatter(NullFormatter())
 
 
 if __name__ == "__main__":
