@@ -23,8 +23,11 @@ import mitsuba as mi  # isort: skip
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
-# Background jobs of a shell ignore SIGINT, and so would the processes that the tests interrupt
+# Background jobs of a shell ignore SIGINT, those of ``nohup`` SIGHUP, and so would the processes
+# that the tests interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP"):
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session", autouse=True)
