@@ -197,8 +197,9 @@ class Trial:
     def _sampler(self) -> str:
         """The sampler of the scene."""
         scene = self._kind.make(self.number, self._folder, None)
-        sensors = [v for v in scene.values() if isinstance(v, dict) and "sampler" in v]
-        return sensors[0]["sampler"]["type"]
+        sensor = scene["sensor"]
+        # One that moves is around a still one
+        return sensor.get("still", sensor)["sampler"]["type"]
 
     def _rng(self, name: str, times: int) -> np.random.Generator:
         """The seeds, which are the same for one technique as for several."""
