@@ -1,7 +1,8 @@
 # Needs: Debian or Ubuntu, make, apt, Python >= 3.9 with venv. (On other systems, install an LLVM
 # library by hand: mitsuba_ext/llvm.py says which ones work.)
 #
-#   make demo    compares our integrator with `path` on two of our scenes, in three to seven minutes
+#   make demo    compares two of our integrators with `path` on three of our scenes, in two to four
+#                minutes
 #   make test    runs the default tests, on all cores
 #   make test-slow  runs the long statistical tests, and other slow tests
 #   make bench   runs the benchmarks on our scenes, and on ../shared/scenes if it exists; writes a
@@ -16,8 +17,9 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 
 DEMO_OUT := out/demo
-DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml scenes/rooms.xml path neepp \
-        --sweep 4,16,64 --seeds 3 --reference-spp 1024 --out $(DEMO_OUT)
+DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml scenes/rooms.xml scenes/glass_lamp.xml \
+        path auto_path bdpt --size 160x90 --spp 64 --seeds 3 \
+        --reference-integrator bdpt --reference-spp 512 --out $(DEMO_OUT)
 
 # One process per core (1 GiB of memory each), each with one thread of Dr.Jit. A process that is done
 # takes over tests that others have not begun.

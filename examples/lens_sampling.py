@@ -100,7 +100,7 @@ def unblocked(scene: mi.Scene, share: np.ndarray, max_depth: int) -> dict[str, l
     paths = walk.begin(scene, numbers, mi.Float(0), mi.Ray3f().wavelengths, mi.Bool(True))
     vertices, _ = walk.advance(scene, numbers, paths, STRIDE)
     index = dr.arange(mi.UInt32, vertices.count)
-    si = vertices.gather(index, mi.Bool(True)).si
+    si = vertices.at(vertices.slot, mi.Bool(True)).si
     u = hashed_2d(index, mi.UInt32(0))
     found: dict[str, list[float]] = {region: [] for region in REGIONS}
     for kind in LENS_SAMPLING:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -49,14 +50,31 @@ _BASES = (
 
 _registered: set[str] = set()
 
+#: The kinds of plugins whose methods kernels call, and those plugins that are in memory.
+_CALLED = ("emitters", "bsdfs", "shapes", "sensors")
+_alive: weakref.WeakSet[mi.Object] = weakref.WeakSet()
+
 
 def plugin(cls: type) -> type:
     """Class decorator: makes ``cls`` the plugin that its file is named after."""
     import mitsuba as mi
 
     _, kind, name = cls.__module__.rsplit(".", 2)
-    getattr(mi, _KINDS[kind])(name, lambda props: cls(props))
+
+    def made(props: mi.Properties) -> mi.Object:
+        instance = cls(props)
+        if kind in _CALLED:
+            _alive.add(instance)
+        return instance
+
+    getattr(mi, _KINDS[kind])(name, made)
     return cls
+
+
+def is_any_called() -> bool:
+    """Is there a plugin of ours in memory whose methods kernels call? Dr.Jit traces the methods of
+    all objects of a kind, also of those in scenes that nobody renders."""
+    return len(_alive) > 0
 
 
 def plugin_names() -> dict[str, list[str]]:

@@ -17,6 +17,7 @@ import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before dr
 from mitsuba_ext import cli
 from mitsuba_ext.cli import image_render
 from mitsuba_ext.compare import timing
+from mitsuba_ext.transport.frozen import forget_recordings
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -70,6 +71,8 @@ def clean_up_after_module() -> Iterator[None]:
 def _clean_up() -> None:
     gc.collect()
     dr.sync_thread()
+    # Recordings hold kernels
+    forget_recordings()
     dr.flush_kernel_cache()
     dr.flush_malloc_cache()
 

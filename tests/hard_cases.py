@@ -152,6 +152,11 @@ def _materials() -> Scene:
     for i, (name, bsdf) in enumerate(bsdfs.items()):
         place = _translated(0.5 * (i % 4) - 0.75, 0, 0.35 + 0.6 * (i // 4)).scale(0.2)
         things[name] = {"type": "sphere", "to_world": place, "bsdf": bsdf}
+    # Seen from behind, where Mitsuba's samples of rough metal are not finite
+    metal = {"type": "roughconductor", "alpha": 0.3}
+    rust = {"type": "blendbsdf", "weight": 0.7, "metal": metal, "rust": diffuse()}
+    place = _translated(0, -0.4, 0.7).rotate([1, 0, 0], -60).scale([0.2, 0.3, 1])
+    things["rust"] = {"type": "disk", "to_world": place, "bsdf": rust}
     return stage(block=None, **things)
 
 

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from lights import ball
 from motions import Pose, keyed, uniform
-from random_scenes import Maker, Scene
+from random_scenes import Maker, NestedMaker, Scene
 from scipy.spatial.transform import Rotation
 
 from mitsuba_ext.materials.glass import GLASSES
@@ -45,6 +45,10 @@ class Kind:
 
 def _plain(seed: int, folder: Path, time: float | None) -> Scene:
     return Maker(seed, folder).scene()
+
+
+def _nested(seed: int, folder: Path, time: float | None) -> Scene:
+    return NestedMaker(seed, folder, stream=31).scene()
 
 
 # ---- Moving shapes, cameras and lights ----
@@ -227,6 +231,7 @@ def _medium(maker: Maker, is_grid: bool | None = None) -> Scene:
 
 KINDS = {
     "plain": Kind(_plain),
+    "nested": Kind(_nested),
     "media": Kind(_media, reference="volpath"),
     "moving": Kind(_moving, strata=16),
     "moving_camera": Kind(_moving_camera, strata=16),

@@ -127,6 +127,14 @@ class Maker:
                      "clearcoat": self.number(0, 1), "sheen": self.number(0, 1)},
         )()  # fmt: skip
 
+    def glass(self) -> Scene:
+        return {"type": "principled", "base_color": self.colour(), "spec_trans": 0.7,
+                "roughness": self.number(0.4, 1)}  # fmt: skip
+
+    def film_of_glass(self) -> Scene:
+        return {"type": "principledthin", "base_color": self.colour(), "spec_trans": 0.3,
+                "diff_trans": self.number(0, 2), "roughness": self.number(0.4, 1)}  # fmt: skip
+
     def bsdf(self) -> Scene:
         alpha = self.number(0.15, 0.5)
         return self.choice(
@@ -137,10 +145,8 @@ class Maker:
             lambda: {"type": "thindielectric"},
             lambda: {"type": "roughdielectric", "alpha": alpha,
                      "distribution": self.choice("ggx", "beckmann")},
-            lambda: {"type": "principled", "base_color": self.colour(), "spec_trans": 0.7,
-                     "roughness": self.number(0.4, 1)},
-            lambda: {"type": "principledthin", "base_color": self.colour(), "spec_trans": 0.3,
-                     "diff_trans": self.number(0, 2), "roughness": self.number(0.4, 1)},
+            self.glass,
+            self.film_of_glass,
             lambda: {"type": "mask", "opacity": self.choice(self.number(0.2, 0.8), self.weights()),
                      "bsdf": self.opaque()},
             # Not with mirrors: Mitsuba adds probabilities and densities there
@@ -288,3 +294,70 @@ class Maker:
         if self.chance(0.2):
             film |= {"crop_width": 5, "crop_height": 4, "crop_offset_x": 1, "crop_offset_y": 1}
         return film | {"sample_border": self.chance(0.2)}
+
+
+class NestedMaker(Maker):
+    """BSDFs that hold others, each of them rough, on shapes that are sheared and mirrored as well.
+
+    Mirrored spheres and cylinders are left out: Mitsuba keeps their normals as they were.
+    """
+
+    def place(self, uniform: bool = False, size: tuple[float, float] | None = None) -> Any:
+        T = super().place(uniform, size)
+        if uniform:
+            return T
+        shear = np.eye(4)
+        shear[:3, :3] += self.rng.uniform(-0.6, 0.6, (3, 3)) * (1 - np.eye(3))
+        mirror = [float(x) for x in self.rng.choice([-1, 1], 3)]
+        return T @ mi.ScalarTransform4f(shear).scale(mirror)
+
+    def rough(self) -> Scene:
+        """Rough, and black from behind."""
+        alpha, distribution = self.number(0.05, 0.5), self.choice("ggx", "beckmann")
+        return self.choice(
+            lambda: {"type": "roughconductor", "alpha": alpha, "distribution": distribution,
+                     "sample_visible": self.chance(0.8)},
+            lambda: {"type": "roughconductor", "alpha_u": alpha, "alpha_v": self.number(0.1, 0.5)},
+            lambda: {"type": "roughplastic", "alpha": alpha, "distribution": distribution,
+                     "diffuse_reflectance": self.reflectance()},
+            lambda: {"type": "principled", "base_color": self.reflectance(), "roughness": alpha,
+                     "metallic": self.number(0, 1), "clearcoat": self.number(0, 1)},
+            lambda: {"type": "diffuse", "reflectance": self.reflectance()},
+        )()  # fmt: skip
+
+    def transparent(self) -> Scene:
+        """Rough, and seen from both sides."""
+        alpha = self.number(0.15, 0.5)
+        return self.choice(
+            lambda: {"type": "twosided", "bsdf": self.rough()},
+            lambda: {"type": "roughdielectric", "alpha": alpha,
+                     "distribution": self.choice("ggx", "beckmann")},
+            self.glass,
+            self.film_of_glass,
+        )()  # fmt: skip
+
+    def opaque(self) -> Scene:
+        return self.blend(self.rough)
+
+    def bsdf(self) -> Scene:
+        """Not a blend of both kinds: from behind, Mitsuba samples it with a wrong density."""
+        return self.nested(self.choice(self.rough, self.rough, self.transparent))
+
+    def nested(self, inner: Callable[[], Scene]) -> Scene:
+        return self.choice(
+            lambda: self.blend(inner),
+            lambda: self.blend(inner),
+            lambda: {"type": "mask", "opacity": self.choice(self.number(0.2, 0.8), self.weights()),
+                     "bsdf": self.blend(inner)},
+            lambda: {"type": "bumpmap", "texture": {**self.bitmap(0, 1), "raw": True},
+                     "scale": self.number(0.05, 0.5), "bsdf": inner()},
+            lambda: {"type": "normalmap", "bsdf": inner(),
+                     "normalmap": {**self.bitmap(0.2, 0.9), "raw": True}},
+            lambda: {"type": "blendbsdf", "weight": self.number(0, 1), "second": inner(),
+                     "first": {"type": "bumpmap", "texture": {**self.bitmap(0, 1), "raw": True},
+                               "scale": 0.1, "bsdf": inner()}},
+        )()  # fmt: skip
+
+    def blend(self, inner: Callable[[], Scene]) -> Scene:
+        weight = self.choice(self.number(0, 1), self.weights())
+        return {"type": "blendbsdf", "weight": weight, "first": inner(), "second": inner()}

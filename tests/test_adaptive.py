@@ -183,6 +183,11 @@ def test_stratified_samplers_come_in_whole_sets(sampler):
     assert (np.round(image[..., 3]) % 4 == 0).all() and image[..., 3].max() > image[..., 3].min()
 
 
+def test_a_sampler_whose_small_sets_are_biased_is_refused():
+    with pytest.raises(NotImplementedError, match='"stratified" depend on each other'):
+        adaptive().render(small(sampler="stratified"), spp=16)
+
+
 def test_passes_of_any_length_share_a_kernel():
     scene, integrator = small(8, 8), adaptive()
     mi.render(scene, integrator=integrator, seed=1, spp=32).numpy()

@@ -80,6 +80,20 @@ def test_a_room_imports_nothing_that_stands_above_it(room: str) -> None:
     assert not upward, "\n".join(upward)
 
 
+def test_bsdfs_are_called_in_one_place() -> None:
+    """Mitsuba's return numbers that are not finite: ``transport/bsdfs.py`` removes them."""
+    calls = {"eval_pdf", "eval", "pdf", "sample", "eval_pdf_sample"}
+    found = []
+    for folder in (PACKAGE, *(ROOT / plugins for plugins in PLUGINS)):
+        for file in sorted(folder.rglob("*.py")):
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                is_call = isinstance(node, ast.Attribute) and node.attr in calls
+                if is_call and "bsdf" in ast.unparse(node.value).lower():
+                    found.append(f"{file.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node)}")
+    assert all(line.startswith("mitsuba_ext/transport/bsdfs.py") for line in found), found
+    assert found, "the calls have other names"
+
+
 def test_pointsets_need_neither_mitsuba_nor_drjit() -> None:
     for file, _package in _files(PACKAGE / "pointsets"):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):

@@ -176,7 +176,7 @@ def test_later_directions_are_not_guided() -> None:
     _pilot(learner, 1)
     learner.learn(None, is_last=True)
     guide = GuidedDirections(learner.guide.trees, learner.guide.regions, bounces=1)
-    state, active = guide.begin(None, None, _pixels()), mi.Bool(True)
+    state, active = guide.begin(None, None, _pixels()), dr.full(mi.Bool, True, LANES)
     state = guide.draw(state, _Numbers(2), vertex_at(0), active)[3]
     _, sample, weight, after = guide.draw(state, _Numbers(3), vertex_at(1), active)
     assert (sample == _Numbers(3).next_2d()).numpy().all() and (weight == 1).numpy().all()

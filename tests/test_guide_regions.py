@@ -115,8 +115,10 @@ def test_records_of_a_walk_are_the_radiance_of_longer_paths() -> None:
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(5, lanes)
         ray, _ = mi.load_dict(sensor()).sample_ray(0, 0, sampler.next_2d(), mi.Point2f(0.5))
-        walk = Walk(max_depth, rr_depth=100, observer=observer or Observer())
-        sample = walk(scene, sampler, CameraRays(ray, dr.arange(mi.UInt32, lanes)), mi.Bool(True))
+        observer, pixel = observer or Observer(), dr.arange(mi.UInt32, lanes)
+        observer.begin(lanes, pixel)
+        walk = Walk(max_depth, rr_depth=100, observer=observer)
+        sample = walk(scene, sampler, CameraRays(ray, pixel), mi.Bool(True))
         dr.eval(sample.L)
         return sample.L.numpy().mean(axis=0)
 

@@ -9,6 +9,7 @@ import pytest
 from lights import ball
 from maps import connect, floor, lamp, learner_of, map_of, observe, row_of, surface, vertex_at
 
+from mitsuba_ext.decisions.benefit import TABLE
 from mitsuba_ext.decisions.next_event.light_map_learner import LightMapLearner
 from mitsuba_ext.decisions.next_event.light_table import Choice, LightTable, OneRow
 from mitsuba_ext.decisions.shadow_test.light_map_roulette import LightMapRouletteLearner
@@ -183,6 +184,14 @@ def test_learning_that_does_not_pay_ends_with_the_choice_of_path_unless_needed(
     decision = learner.learn(scene, is_last=False)
     assert (type(decision) is EmitterSampling) == ends
     assert ("as path" in str(learner)) == ends and (learner.map is None) == ends
+
+
+def test_cost_of_a_choice_is_that_of_its_rays_and_of_the_table():
+    records = learner_of(floor(a=lamp(-0.1, 0, 50), b=lamp(0.1, 0, 50)))._records
+    # Of 10 paths: connections, shadow rays, and shadow rays with Mitsuba's choice
+    records._paths, records._rays = 10, np.array([40.0, 30.0, 20.0])
+    assert records.cost == pytest.approx((10 + 40 + 30 + TABLE * 40) / (10 + 40 + 20))
+    assert records.least_cost == pytest.approx((10 + 40 + 20 + TABLE * 40) / (10 + 40 + 20))
 
 
 def test_learning_goes_on_where_lights_were_chosen_better_than_by_path():

@@ -44,6 +44,7 @@ def _scout(scene: mi.Scene, lanes: int = 4096) -> Scout:
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, lanes)
     ray = scene.sensors()[0].sample_ray(0, 0.5, sampler.next_2d(), sampler.next_2d())[0]
+    scout.begin(lanes)
     walk = integrator.walk(observer=scout)
     dr.eval(walk(scene, sampler, CameraRays(ray), mi.Bool(True)).L)
     return scout

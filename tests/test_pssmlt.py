@@ -29,6 +29,7 @@ from techniques import REFERENCE, TECHNIQUES
 from test_light_tracer import T, below_the_lamp
 from test_rendering import _Clock
 
+from mitsuba_ext.chains import visits
 from mitsuba_ext.chains.looped import LoopedChains
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -284,7 +285,9 @@ def test_statistics_count_rays_and_acceptance() -> None:
     assert 0 < statistics.rays["shadow"] <= statistics.connections
     accepted = [float(x) for x in re.findall(r"([\d.]+)% of", statistics.learned)]
     assert len(accepted) == 2 and 0 < accepted[0] < accepted[1] < 100
-    assert re.search(r"; brightness known to 0\.\d%$", statistics.learned)
+    *_, brightness, stay = statistics.learned.split("; ")
+    assert re.fullmatch(r"brightness known to 0\.\d%", brightness)
+    assert re.fullmatch(r"a chain stayed at one path for \d+ of \d+ mutations", stay)
 
 
 def test_a_warning_tells_that_the_brightness_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -297,6 +300,20 @@ def test_a_warning_tells_that_the_brightness_is_not_known(monkeypatch: pytest.Mo
         integrator = pssmlt(**ALONE, chains=16, luminance_samples=samples)
         batches(scene, integrator, 1, [1])
         assert len(said) == 1 and '"luminance_samples"' in said[0], said
+
+
+def test_a_warning_tells_that_a_chain_stayed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its visits, in units of those of a pixel."""
+    told: list[str] = []
+    monkeypatch.setattr(mi, "Log", lambda level, text: told.append(text))
+    monkeypatch.setattr(visits, "_LONG", 1)
+    monkeypatch.setattr(visits, "_STAY", 0.01)
+    batches(mi.load_dict(stage()), pssmlt(**_FOUR_PER_PIXEL, p_large=0.5), 64, [1])
+    assert any("stayed at one path" in text for text in told)
+    told.clear()
+    monkeypatch.setattr(visits, "_STAY", 1e6)
+    batches(mi.load_dict(stage()), pssmlt(**_FOUR_PER_PIXEL, p_large=0.5), 64, [1])
+    assert not any("stayed at one path" in text for text in told)
 
 
 # ---- Errors ----

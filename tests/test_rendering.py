@@ -49,8 +49,8 @@ def small_passes(monkeypatch: pytest.MonkeyPatch) -> None:
 class _Constant:
     """An estimator whose every sample is worth the same."""
 
-    def __init__(self, value: float) -> None:
-        self.value = value
+    def __init__(self, value: float, can_be_frozen: bool = False) -> None:
+        self.value, self.can_be_frozen = value, can_be_frozen
 
     def __call__(self, scene, sampler, rays, active):
         zero = dr.zeros(mi.UInt32, dr.width(rays.ray))
@@ -92,6 +92,19 @@ class _TwoStages:
 
     def render(self, scene, spp, **rest):
         return rendering.render(self, scene, 0, 0, spp, True, True).numpy()
+
+
+@pytest.mark.parametrize("can_be_frozen", [False, True])
+def test_samples_of_a_stage_count_in_the_film_as_its_weight_says(scene, can_be_frozen):
+    class Weighted(_TwoStages):
+        def schedule(self, scene, sensor, samples, seed):
+            first, second = (_Constant(value, can_be_frozen) for value in (1.0, 3.0))
+            return _Schedule(Stage(first, weight=0.25), Stage(second))
+
+    for _ in range(2):
+        image = Weighted(pilot_spp=8).render(scene, spp=12)
+        # 8 samples that count a quarter, and 4 that count as one
+        np.testing.assert_allclose(image, (8 * 0.25 * 1 + 4 * 3) / (8 * 0.25 + 4), rtol=1e-5)
 
 
 def _path(name: str = "composed_path", **parameters) -> mi.Integrator:

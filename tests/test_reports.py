@@ -131,3 +131,13 @@ def test_the_first_part_does_not_count_for_the_speed(monkeypatch):
     speed = reports.Speed()
     assert [speed(done) for done in (5, 9, 13)] == [None, 2, 2]
     assert reports.time_left(None) == "" and reports.time_left(61.2) == "about 0:01:01 left"
+
+
+def test_progress_of_frames_names_their_images(run, make_scene, tmp_path, every_event):
+    out = run("render", make_scene(), "-o", tmp_path / "a.##.exr", "--spp", 16, "--json",
+              "--frames", "3:5")[1]  # fmt: skip
+    steps = [json.loads(line) for line in out.splitlines()]
+    steps = [step for step in steps if step["event"] == "progress"]
+    named = {(step["frame"], step["file"]) for step in steps}
+    assert named == {(n, str(tmp_path / f"a.0{n}.exr")) for n in {n for n, _ in named}}
+    assert {3, 4} <= {n for n, _ in named}

@@ -166,7 +166,7 @@ def _table_and_vertices(adversarial: bool) -> tuple[RegionTable, VertexCache]:
 
     some_vertices = vertices(None)
     active = dr.full(mi.Bool, True, some_vertices.count)
-    vertex = some_vertices.gather(dr.arange(mi.UInt32, some_vertices.count), active)
+    vertex = some_vertices.at(dr.arange(mi.UInt32, some_vertices.count), active)
     si = vertex.si
     regions = NestedRegions(si.p, lit_normal(si), most=12)
     rng = np.random.default_rng(2)

@@ -33,7 +33,7 @@ def _rounds(scene: mi.Scene, stride: int) -> list[LightVertices]:
 
 
 def _words(cache: VertexCache) -> list[np.ndarray]:
-    vertex = cache.gather(dr.arange(mi.UInt32, cache.count), mi.Bool(True))
+    vertex = cache.at(dr.arange(mi.UInt32, cache.count), mi.Bool(True))
     columns = [vertex.si.p, vertex.si.wi, vertex.si.uv, vertex.β, vertex.sums.dVCM, vertex.sums.dVC,
                vertex.depth, vertex.lane]  # fmt: skip
     return [column.numpy() for column in columns]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.bsdfs import bsdf_density, eval_bsdf
 from ..transport.heroes import Heroes
 from ..transport.observer import Observer
 from ..transport.path_decisions import SceneQuery, Subpaths
@@ -142,7 +143,7 @@ class LightSubpaths(Subpaths):
         wo, back = si.to_local(d), far.to_local(-d)
 
         # ----- What both ends let through -----
-        value, pdf = vertex.bsdf.eval_pdf(self._ctx, si, wo, active)
+        value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, active)
         value = si.to_world_mueller(value, -wo, si.wi)
         far_bsdf = far.bsdf()
         far_value, far_reverse = adjoint_value(self._ctx, far_bsdf, far, back, active)
@@ -154,7 +155,7 @@ class LightSubpaths(Subpaths):
 
         # ----- How else this path could have been found -----
         reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
-        far_pdf = far_bsdf.pdf(self._ctx, far, back, active)
+        far_pdf = bsdf_density(far_bsdf, self._ctx, far, back, active)
         near_end = End(si, wo, pdf, reverse, vertex.path.sums)
         far_end = End(far, back, far_pdf, far_reverse, other.sums)
         mis = joining_weight(

@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..arrays import joined
 from ..transport.estimator import CameraRays, Splats
+from ..transport.frozen import frozen
 from ..transport.heroes import Heroes
 from ..transport.numbers import Numbers, hashed_2d
 from ..transport.path_decisions import SceneQuery
@@ -68,10 +69,19 @@ class LightImage:
         self._found: list[Splats] = []
         self.shadow_count = mi.UInt32(0)
 
+    def kernel_state(self) -> tuple:
+        """What kernels depend on."""
+        return (
+            self._least_depth, self._scene, self._sensor, self._importance, self._sums,
+            self._query, self._hides_emitters, self._seed,
+        )  # fmt: skip
+
     def add(self, vertices: LightVertices) -> None:
         """Connects these vertices, of which there is at least one. It evaluates the result, so that
         nothing needs them any more."""
-        found, tested = self._connect(vertices)
+        # Observers rebind attributes when they are told something
+        connect = self._connect_frozen if self._observer is None else self._connect
+        found, tested = connect(vertices, *vertices.lanes())
         dr.eval(found, tested)
         self._found.append(found)
         self.shadow_count += dr.sum(tested)
@@ -83,12 +93,11 @@ class LightImage:
             return self._found
         return [joined(self._found)]
 
-    def _connect(self, vertices: LightVertices) -> tuple[Splats, mi.UInt32]:
+    def _connect(
+        self, vertices: LightVertices, slot: mi.UInt32, active: mi.Bool
+    ) -> tuple[Splats, mi.UInt32]:
         """The splats, and the shadow rays of each vertex."""
-        # Some lanes at least: very few would need other kernels
-        index = dr.arange(mi.UInt32, max(16, vertices.count))
-        active = index < dr.opaque(mi.UInt32, vertices.count)
-        vertex = vertices.gather(index, active)
+        vertex = vertices.at(slot, active)
         si = vertex.si
         sample = mi.Point2f(0.5)
         if self._seed is not None:
@@ -136,3 +145,5 @@ class LightImage:
         return Splats(
             value, connection.position, vertices.wavelengths(vertex, active), finite, vertex.lane
         ), tested
+
+    _connect_frozen = frozen(_connect)

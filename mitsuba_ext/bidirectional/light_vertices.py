@@ -140,11 +140,23 @@ class LightVertices:
         self.stride, self._lane = store.stride, None
         self.slot = dr.compress(store.is_taken)
         self.count = len(self.slot)
+        self.room = room_for(self.count)
         self.bytes = store.bytes + 4 * self.count
 
-    def gather(self, index: mi.UInt32, active: mi.Bool) -> LightVertex:
-        """The vertices of these numbers, 0 to ``count`` − 1."""
-        return self.at(dr.gather(mi.UInt32, self.slot, index, active), active)
+    def kernel_state(self) -> tuple:
+        """What kernels depend on."""
+        return (
+            self._layout, self._words, self._time, self._wavelengths, self._disperses, self._lane,
+            self.stride,
+        )  # fmt: skip
+
+    def lanes(self) -> tuple[mi.UInt32, mi.Bool]:
+        """The place in the store of each vertex, in ``room`` lanes, and which of these have one."""
+        index = dr.arange(mi.UInt32, self.room)
+        active = index < dr.opaque(mi.UInt32, self.count)
+        slot = dr.gather(mi.UInt32, self.slot, index, active)
+        dr.eval(slot, active)
+        return slot, active
 
     def at(self, slot: mi.UInt32, active: mi.Bool) -> LightVertex:
         """The vertices at these places of the store, which must be taken."""
@@ -194,14 +206,15 @@ class PackedVertices(LightVertices):
 
     def __init__(self, vertices: LightVertices) -> None:
         self._share_paths_of(vertices)
-        self.count, words = vertices.count, self._layout.words
+        self.count, self.room, words = vertices.count, vertices.room, self._layout.words
         self._lane = vertices._lane_of(vertices.slot, mi.Bool(True))
         packet = dr.gather(
             mi.ArrayXf, vertices._words, vertices.slot, shape=(words, self.count)
         )
-        self._words = dr.empty(mi.Float, self.count * words)
+        self._words = dr.empty(mi.Float, self.room * words)
         dr.scatter(self._words, packet, dr.arange(mi.UInt32, self.count))
         dr.eval(self._words, self._lane)
+        self._lane = _widened(self._lane, self.room)
         vertices._words = vertices._lane = None
         self.bytes = self.count * (4 * words + 4)
 
@@ -227,9 +240,9 @@ class VertexCache(PackedVertices):
 
     def __init__(self, rounds: list[LightVertices], lanes: int) -> None:
         if len(rounds) == 1:
-            super().__init__(rounds[0])
-            self.number = _numbers(self._lane, lanes)
+            self.number = _numbers(rounds[0]._lane_of(rounds[0].slot, mi.Bool(True)), lanes)
             self.first = dr.cumsum(self.number) - self.number
+            super().__init__(rounds[0])
             return
         self._share_paths_of(rounds[-1])
         owners = [v._lane_of(v.slot, mi.Bool(True)) for v in rounds]
@@ -237,8 +250,9 @@ class VertexCache(PackedVertices):
         self.number = sum(numbers[1:], numbers[0])
         self.first = dr.cumsum(self.number) - self.number
         self.count, words = sum(vertices.count for vertices in rounds), self._layout.words
-        self._words = dr.empty(mi.Float, self.count * words)
-        self._lane = dr.empty(mi.UInt32, self.count)
+        self.room = room_for(self.count)
+        self._words = dr.empty(mi.Float, self.room * words)
+        self._lane = dr.empty(mi.UInt32, self.room)
         before = mi.UInt32(self.first)
         for vertices, lane, number in zip(rounds, owners, numbers):
             # The first of this path in this round
@@ -255,6 +269,9 @@ class VertexCache(PackedVertices):
             vertices._words = vertices._lane = None
         self.bytes = self.count * (4 * words + 4) + 8 * lanes
 
+    def kernel_state(self) -> tuple:
+        return super().kernel_state(), self.first, self.number
+
     @property
     def region(self) -> mi.UInt32:
         """The region in which each vertex lies, where the layout has it."""
@@ -262,6 +279,21 @@ class VertexCache(PackedVertices):
         index = dr.arange(mi.UInt32, self.count) * layout.words + layout.mark
         mark = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, index))
         return _depth_and_region(mark)[1]
+
+
+def room_for(count: int) -> int:
+    """A number of lanes or places for so many vertices, and a few more: many passes have the same,
+    and so the same kernels. 16 at least, since very few would need others."""
+    step = max(16, 1 << max(0, count.bit_length() - 4))
+    return -(-count // step) * step
+
+
+def _widened(values: mi.UInt32, width: int) -> mi.UInt32:
+    """With zeros behind."""
+    index = dr.arange(mi.UInt32, width)
+    result = dr.gather(mi.UInt32, values, index, index < dr.opaque(mi.UInt32, len(values)))
+    dr.eval(result)
+    return result
 
 
 def _numbers(lane: mi.UInt32, lanes: int) -> mi.UInt32:

@@ -10,8 +10,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..garbage import garbage_left_alone
+from ..transport.bsdfs import sample_bsdf
+from ..transport.frozen import frozen
 from ..transport.heroes import Heroes
-from ..transport.numbers import Numbers, schedule_state
+from ..transport.numbers import Numbers, copied, go_to, reached, schedule_state
 from ..transport.path_decisions import Roulette, SceneQuery
 from ..transport.vertex import Arrival, PathState, Vertex
 from .emission import LightEmission
@@ -107,6 +109,13 @@ class LightWalk:
             time, wavelengths: Of each path; those of the camera path in the same lane.
             active: Which lanes emit.
         """
+        paths, place = self._begin(scene, numbers, time, wavelengths, active)
+        go_to(numbers, place)
+        return paths
+
+    @frozen
+    def _begin(self, scene, numbers, time, wavelengths, active) -> tuple[LightPaths, Any]:
+        numbers = copied(numbers)
         with garbage_left_alone():
             active = mi.Bool(active) & (self.max_depth > 1)
             emitted = self.emission.sample(numbers, time, wavelengths, active)
@@ -125,7 +134,7 @@ class LightWalk:
             )  # fmt: skip
             if not isinstance(paths.hero_is_alone, tuple):
                 paths.hero_is_alone = dr.zeros(mi.Bool, width)
-            return paths
+            return paths, reached(numbers)
 
     def advance(
         self, scene: mi.Scene, numbers: Numbers, paths: LightPaths, stride: int
@@ -142,8 +151,8 @@ class LightWalk:
         dr.eval(paths)
         store = VertexStore(self.layout, dr.width(paths.active), stride)
         time, wavelengths = paths.ray.time, paths.ray.wavelengths
-        with garbage_left_alone():
-            numbers, paths = self._trace(scene, numbers, paths, store)
+        paths, place = self._go_on(scene, numbers, paths, store)
+        go_to(numbers, place)
         # With the rest: the walk would be traced again for where the sampler has got to
         schedule_state(numbers)
         dr.eval(paths, store.words, store.is_taken)
@@ -178,6 +187,12 @@ class LightWalk:
                 break
         return paths.scatter_count
 
+    @frozen
+    def _go_on(self, scene, numbers, paths, store) -> tuple[LightPaths, Any]:
+        with garbage_left_alone():
+            numbers, paths = self._trace(scene, copied(numbers), paths, store)
+        return paths, reached(numbers)
+
     @dr.syntax
     def _trace(self, scene, numbers, paths, store) -> tuple[Numbers, LightPaths]:
         heroes = Heroes(scene)
@@ -207,7 +222,7 @@ class LightWalk:
             # ----- Choose where to scatter -----
             active_next = active & (paths.depth < last_depth)
             sample_1, sample_2 = numbers.next_1d(), numbers.next_2d()
-            bs, weight = bsdf.sample(ctx, si, sample_1, sample_2, active_next)
+            bs, weight = sample_bsdf(bsdf, ctx, si, sample_1, sample_2, active_next)
             weight, sums, hero_count, hero_is_alone = self._scatter(
                 heroes, paths, bsdf, si, bs, weight, sums, active_next
             )
@@ -215,13 +230,13 @@ class LightWalk:
             sampling_weight = paths.sampling_weight * hero_count
 
             # ----- Russian roulette -----
-            is_black = dr.max(β) == 0
+            carries = dr.max(β) != 0  # Dr.Jit says no to NaN
             depth = paths.depth + 1
             rr_active = depth >= rr_depth
             survival = self._survival(paths, si, bsdf, β, sampling_weight, depth, hero_is_alone,
-                                      active_next & rr_active & ~is_black)
+                                      active_next & rr_active & carries)
             rr_continue = numbers.next_1d() < survival
-            active_next &= (~rr_active | rr_continue) & ~is_black
+            active_next &= (~rr_active | rr_continue) & carries
             β[rr_active] *= dr.rcp(survival)
 
             # ----- Move on to the next vertex -----

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..movers import movers
 from ..transport.estimator import CameraRays, Sample
-from ..transport.numbers import BothEnds, Numbers
+from ..transport.frozen import frozen
+from ..transport.numbers import BothEnds, Numbers, copied, go_to, reached
 from ..transport.observer import Observers
 from ..transport.path_decisions import SubpathSelection
 from ..transport.walk import Walk
@@ -116,7 +118,9 @@ class BidirectionalPathTracer:
             )  # fmt: skip
         if isinstance(sampler, BothEnds):
             sampler = sampler.camera
-        sample = replace(walk, mis=weights, subpaths=subpaths)(scene, sampler, rays, active)
+        sample = self._camera_paths(
+            replace(walk, mis=weights, subpaths=subpaths), scene, sampler, rays, active
+        )
         shadow_count = sample.shadow_count
         if image is not None:
             # Counted as if the first lane had traced them
@@ -129,3 +133,16 @@ class BidirectionalPathTracer:
         if observer is not None:
             observer.traced(sample, whole)
         return whole
+
+    def _camera_paths(self, walk, scene, sampler, rays, active) -> Sample:
+        if self.observer is not None or not walk.observer.can_be_frozen:
+            return walk(scene, sampler, rays, active)
+        sample, place = _walked(walk, scene, sampler, rays, mi.Bool(active))
+        go_to(sampler, place)
+        return sample
+
+
+@frozen
+def _walked(walk: Walk, scene, sampler, rays, active) -> tuple[Sample, Any]:
+    numbers = copied(sampler)
+    return walk(scene, numbers, rays, active), reached(numbers)

@@ -13,6 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.bsdfs import bsdf_density, eval_bsdf
 from ..transport.heroes import Heroes
 
 
@@ -45,7 +46,7 @@ def adjoint_value(
     """The same for all wavelengths."""
     reversed_si = mi.SurfaceInteraction3f(si)
     reversed_si.wi = to_camera
-    value, pdf = bsdf.eval_pdf(ctx, reversed_si, si.wi, active)
+    value, pdf = eval_bsdf(bsdf, ctx, reversed_si, si.wi, active)
     arrives, leaves = geometric_cosine(si, si.wi), geometric_cosine(si, to_camera)
     # The value holds the shading cosine of arrival
     return value * dr.select(arrives > 0, leaves / arrives, 0), pdf
@@ -82,4 +83,4 @@ def reverse_density(
     """The density with which a path that arrives from ``wo`` goes on towards ``si.wi``."""
     reversed_si = mi.SurfaceInteraction3f(si)
     reversed_si.wi = wo
-    return bsdf.pdf(ctx, reversed_si, si.wi, active)
+    return bsdf_density(bsdf, ctx, reversed_si, si.wi, active)

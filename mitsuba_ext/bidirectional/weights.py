@@ -40,6 +40,10 @@ class BidirectionalWeights(Weights):
         self.sums, self._emission, self._sensor = sums, emission, sensor
         self._origin = mi.Point3f(0)
 
+    def kernel_state(self) -> tuple:
+        """What kernels depend on."""
+        return self.sums, self._emission, self._sensor
+
     def begin(self, ray: mi.Ray3f) -> Sums:
         if self._sensor is None:
             return self.sums.begin(mi.Float(0), mi.Float(0))

@@ -20,6 +20,10 @@ from .target import ImageTarget
 #: step in them.
 MOST_NUMBERS, MOST_LIGHT_NUMBERS = 128, 96
 
+#: Mutations of all chains, about, between two looks at the clock (a second or two on two CPU cores:
+#: states are read and written in between); and of each, at least.
+_LAUNCH, _LEAST_LAUNCH = 1 << 21, 16
+
 #: Streams of random numbers, which differ from those of the bootstrap.
 CAMERA, LIGHT = 3, 4
 
@@ -33,6 +37,7 @@ class Counts:
         large_target: The sum of the target function over all proposals of large steps.
         scatter, shadow, connections: See :class:`~mitsuba_ext.transport.estimator.Sample`.
         black: Proposals that add nothing to the image.
+        longest: Visits of one state, at most, that were added to the image at once.
     """
 
     large: mi.UInt32
@@ -43,14 +48,15 @@ class Counts:
     shadow: mi.UInt32
     connections: mi.UInt32
     black: mi.UInt32
+    longest: mi.Float
 
     @classmethod
     def none(cls, lanes: int) -> Counts:
-        kinds = [mi.UInt32] * 3 + [mi.Float] + [mi.UInt32] * 4
+        kinds = [mi.UInt32] * 3 + [mi.Float] + [mi.UInt32] * 4 + [mi.Float]
         return cls(*(dr.zeros(kind, lanes) for kind in kinds))
 
-    def plus(self, is_large, is_accepted, target, sample) -> Counts:
-        """With one more proposal."""
+    def plus(self, is_large, is_accepted, target, sample, visits) -> Counts:
+        """With one more proposal, in a state that had so many ``visits``."""
         return Counts(
             self.large + dr.select(is_large, 1, 0),
             self.accepted_large + dr.select(is_large & is_accepted, 1, 0),
@@ -60,6 +66,7 @@ class Counts:
             self.shadow + sample.shadow_count,
             self.connections + sample.connection_count,
             self.black + dr.select(target > 0, 0, 1),
+            dr.maximum(self.longest, visits),
         )
 
 
@@ -110,9 +117,6 @@ class Chains:
         done: Mutations of each.
     """
 
-    #: Mutations of each chain between two looks at the clock, and for Ctrl-C.
-    launch = 16
-
     #: What makes a state of all chains.
     _parts_of_state: tuple[str, ...]
 
@@ -146,6 +150,11 @@ class Chains:
         self.done = int(stored["done"])
         for name in self._parts_of_state:
             setattr(self, name, value_of(stored, name))
+
+    @property
+    def launch(self) -> int:
+        """Mutations of each chain between two looks at the clock, and for Ctrl-C."""
+        return max(_LEAST_LAUNCH, _LAUNCH // self.count)
 
     def stored(self) -> Arrays:
         """The chains as they are, between two launches."""

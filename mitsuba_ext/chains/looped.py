@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.frozen import frozen
 from .chains import MOST_NUMBERS, Chains, Counts, acceptance
 from .numbers import LocalNumbers, ProposedNumbers, RecordedNumbers
 from .target import Contribution
@@ -28,27 +31,47 @@ class LoopedChains(Chains):
         # Evaluated now, the first launch has the kernel of the others
         dr.eval(self._state, self._known, self._values, self._rngs)
 
-    def advance(self, steps):
-        counts = self._advance(dr.opaque(mi.UInt32, steps))
-        dr.eval(
-            self._state, self._known, self._weight, self._earlier, self._rngs, self._values,
-            counts, self._image.tensors(),
+    def kernel_state(self) -> tuple:
+        """What kernels depend on, but for the states."""
+        return (
+            self._target, self._image, self.rules.steps, self.count, self._large_step,
+            self._uses_uniform, self._uniform_weight, self._energy,
         )  # fmt: skip
+
+    def advance(self, steps):
+        before = self._rngs[0], self._state, self._known, self._weight, self._earlier, self._values
+        rng, *after, counts = self._launched(dr.opaque(mi.UInt32, steps), *before)
+        dr.eval(rng, after, self._values, counts, self._image.tensors())
+        self._rngs, (self._state, self._known, self._weight, self._earlier) = [rng], after
         self.done += steps
         return counts
 
+    @frozen
+    def _launched(self, *arguments: Any) -> tuple:
+        return self._mutated(*arguments)
+
     @dr.syntax
-    def _advance(self, steps: mi.UInt32) -> Counts:
+    def _mutated(
+        self,
+        steps: mi.UInt32,
+        rng: mi.PCG32,
+        state: Contribution,
+        known: mi.UInt32,
+        weight: mi.Float,
+        earlier: mi.Float,
+        values: mi.Float,
+    ) -> tuple[mi.PCG32, Contribution, mi.UInt32, mi.Float, mi.Float, Counts]:
+        """Makes ``steps`` mutations of each chain; the numbers of the states, ``values``, are
+        replaced."""
         count, none = dr.opaque(mi.UInt32, self.count), dr.zeros(mi.UInt32, self.count)
         lane = dr.arange(mi.UInt32, self.count)
-        rng, state = mi.PCG32(self._rngs[0]), self._state
-        known, weight = mi.UInt32(self._known), mi.Float(self._weight)
-        earlier = mi.Float(self._earlier)
+        rng, known = mi.PCG32(rng), mi.UInt32(known)
+        weight, earlier = mi.Float(weight), mi.Float(earlier)
         counts = Counts.none(self.count)
         vector = dr.alloc_local(mi.Float, MOST_NUMBERS, value=dr.zeros(mi.Float))
         index = mi.UInt32(none)
         while index < known:
-            vector[index] = dr.gather(mi.Float, self._values, index * count + lane)
+            vector[index] = dr.gather(mi.Float, values, index * count + lane)
             index += 1
 
         step = mi.UInt32(none)
@@ -66,7 +89,7 @@ class LoopedChains(Chains):
             # ----- Accept or reject -----
             a = acceptance(state.target, proposal.target)
             is_accepted = threshold < a
-            counts = counts.plus(is_large, is_accepted, proposal.target, sample)
+            counts = counts.plus(is_large, is_accepted, proposal.target, sample, weight)
 
             # ----- Add what is left behind to the image -----
             left = dr.select(is_accepted, state, proposal)
@@ -91,11 +114,9 @@ class LoopedChains(Chains):
 
         index = mi.UInt32(none)
         while index < known:
-            dr.scatter(self._values, vector[index], index * count + lane)
+            dr.scatter(values, vector[index], index * count + lane)
             index += 1
-        self._rngs, self._state, self._known, self._weight = [rng], state, known, weight
-        self._earlier = earlier
-        return counts
+        return rng, state, known, weight, earlier, counts
 
     def _added(
         self, state: Contribution, proposal: Contribution, is_accepted: mi.Bool,

@@ -79,6 +79,9 @@ class FilteredChains(LoopedChains):
         self._most = dr.opaque(mi.Float, filters.most_consecutive or dr.largest(mi.Float))
         super().__init__(*chains)
 
+    def kernel_state(self):
+        return super().kernel_state(), self._most
+
     def _added(self, state, proposal, is_accepted, weight, a, earlier):
         self._image.propose(proposal)
         visits = dr.select(is_accepted, weight, a)

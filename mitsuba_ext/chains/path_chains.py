@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
 from ..path_space.memory import Head, Logs, PathMemory, Place, stride
 from ..path_space.mutations import NEW_PATH
+from ..transport.frozen import frozen
+from ..transport.numbers import Numbers, copied
 from .chains import Chains, Counts
 from .numbers import ProposedNumbers, StateNumbers, stream
 from .path_target import PathState
@@ -22,36 +26,62 @@ class PathChains(Chains):
     _parts_of_state = ("_rngs", "_state", "_places", "_logs", "_weight")
 
     def _begin(self, bootstrap, winners):
-        numbers = bootstrap.numbers(winners)
+        self._state, self._places, self._logs = self._first(bootstrap.numbers(winners))
+        dr.eval(self._state, self._places, self._logs)
+
+    @frozen
+    def _first(self, numbers: Numbers) -> tuple[PathState, Place, Logs]:
+        """New paths, and their vertices."""
         memory, at = PathMemory.of(self._target.most), dr.zeros(mi.UInt32, self.count)
         memory, _numbers, proposal = self._target.mutations.new_path(
-            memory, at, numbers, mi.Bool(True)
+            memory, at, copied(numbers), mi.Bool(True)
         )
-        self._state = self._as_state(proposal)
-        self._store(memory, self._state.head)
+        state = self._as_state(proposal)
+        return state, *self._stored(memory, state.head)
+
+    def kernel_state(self) -> tuple:
+        """What kernels depend on, but for the states."""
+        return (
+            self._target, self._image, self.rules.large_step > 0, self.rules.steps, self.count,
+            self._large_step, self._uses_uniform, self._uniform_weight, self._energy,
+        )  # fmt: skip
 
     def _as_state(self, proposal) -> PathState:
         return PathState(proposal.head, self._target.contribution(proposal), proposal.log_density)
 
     def advance(self, steps):
         seeds = [dr.opaque(mi.UInt32, stream(self._seed, n)) for n in (_KIND, _FILM)]
-        counts = self._advance(
-            dr.opaque(mi.UInt32, steps), dr.opaque(mi.UInt32, self.done), seeds
+        before = self._rngs[0], self._state, self._weight, self._places, self._logs
+        rng, *after, counts = self._launched(
+            dr.opaque(mi.UInt32, steps), dr.opaque(mi.UInt32, self.done), seeds, *before
         )
-        dr.eval(
-            self._state, self._weight, self._rngs, self._places, self._logs, counts,
-            self._image.tensors(),
-        )  # fmt: skip
+        dr.eval(rng, after, counts, self._image.tensors())
+        self._rngs, (self._state, self._weight, self._places, self._logs) = [rng], after
         self.done += steps
         return counts
 
+    @frozen
+    def _launched(self, *arguments: Any) -> tuple:
+        return self._mutated(*arguments)
+
     @dr.syntax
-    def _advance(self, steps: mi.UInt32, done: mi.UInt32, seeds: list[mi.UInt32]) -> Counts:
+    def _mutated(
+        self,
+        steps: mi.UInt32,
+        done: mi.UInt32,
+        seeds: list[mi.UInt32],
+        rng: mi.PCG32,
+        state: PathState,
+        weight: mi.Float,
+        places: Place,
+        logs: Logs,
+    ) -> tuple[mi.PCG32, PathState, mi.Float, Place, Logs, Counts]:
+        """Makes ``steps`` mutations of each chain, after ``done`` earlier ones."""
         mutations = self._target.mutations
         none, lane = dr.zeros(mi.UInt32, self.count), dr.arange(mi.UInt32, self.count)
-        rng, state, weight = mi.PCG32(self._rngs[0]), self._state, mi.Float(self._weight)
+        rng, weight = mi.PCG32(rng), mi.Float(weight)
         counts = Counts.none(self.count)
-        memory = self._load(state.head)
+        memory = self._loaded(state.head, places, logs)
         unused = StateNumbers(self.rules.steps)
         step = mi.UInt32(none)
         while step < steps:
@@ -77,7 +107,7 @@ class PathChains(Chains):
             is_accepted = threshold < a
             is_large = kind == NEW_PATH
             counts = counts.plus(
-                is_large, is_accepted, new.found.target, self._target.sample(proposal)
+                is_large, is_accepted, new.found.target, self._target.sample(proposal), weight
             )
 
             # ----- Add what is left behind to the image -----
@@ -92,26 +122,25 @@ class PathChains(Chains):
             state = dr.select(is_accepted, new, state)
             step += 1
 
-        self._store(memory, state.head)
-        self._rngs, self._state, self._weight = [rng], state, weight
-        return counts
+        places, logs = self._stored(memory, state.head)
+        return rng, state, weight, places, logs, counts
 
     # ---- Vertices between launches ----
 
     @dr.syntax
-    def _load(self, head: Head) -> PathMemory:
+    def _loaded(self, head: Head, places: Place, logs: Logs) -> PathMemory:
         memory = PathMemory.of(self._target.most)
         lane, count = dr.arange(mi.UInt32, self.count), dr.opaque(mi.UInt32, self.count)
         index = dr.zeros(mi.UInt32, self.count)
         while index <= head.length:
             where = index * count + lane
-            memory.places[head.at + index] = dr.gather(type(self._places), self._places, where)
-            memory.logs[head.at + index] = dr.gather(type(self._logs), self._logs, where)
+            memory.places[head.at + index] = dr.gather(Place, places, where)
+            memory.logs[head.at + index] = dr.gather(Logs, logs, where)
             index += 1
         return memory
 
     @dr.syntax
-    def _store(self, memory: PathMemory, head: Head) -> None:
+    def _stored(self, memory: PathMemory, head: Head) -> tuple[Place, Logs]:
         size = self.count * stride(self._target.most)
         places, logs = dr.zeros(Place, size), dr.zeros(Logs, size)
         lane, count = dr.arange(mi.UInt32, self.count), dr.opaque(mi.UInt32, self.count)
@@ -121,8 +150,7 @@ class PathChains(Chains):
             dr.scatter(places, memory.places[head.at + index], where)
             dr.scatter(logs, memory.logs[head.at + index], where)
             index += 1
-        self._places, self._logs = places, logs
-        dr.eval(self._state, places, logs)
+        return places, logs
 
     def end(self):
         self._image.add(self._state.found, self._weight * self._share(self._state.found.target))

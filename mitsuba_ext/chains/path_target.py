@@ -10,7 +10,8 @@ import mitsuba as mi
 from ..path_space.memory import Head, PathMemory
 from ..path_space.mutations import Mutations, Proposal
 from ..transport.estimator import Sample
-from ..transport.numbers import Numbers
+from ..transport.frozen import frozen
+from ..transport.numbers import Numbers, copied, go_to, reached
 from .numbers import ProposedNumbers, StateNumbers, generator, stream
 from .small_steps import SmallSteps
 from .target import Contribution, Found, PlaceWeights, beyond_bound
@@ -66,12 +67,22 @@ class PathTarget:
 
     def evaluate(self, numbers: Numbers, active: mi.Bool | bool = True) -> Found:
         """What a new path brings; also the place that ``numbers`` have reached, evaluated."""
-        proposal, numbers = self._evaluate(numbers, mi.Bool(active))
-        brought, sample = self._brought(proposal), self.sample(proposal)
-        target = beyond_bound(brought.target, self.bound)
+        brought, target, sample, place = self._evaluated(numbers, mi.Bool(active))
+        go_to(numbers, place)
         lane = dr.arange(mi.UInt32, dr.width(target))
         dr.eval(brought, target, lane, sample, numbers)
         return Found(target, [brought], [lane], sample)
+
+    @frozen
+    def _evaluated(
+        self, numbers: Numbers, active: mi.Bool
+    ) -> tuple[Contribution, mi.Float, Sample, Numbers]:
+        """What a new path brings, with its luminance; the target function; the place that the
+        numbers have reached."""
+        proposal, numbers = self._new_path(copied(numbers), active)
+        brought = self._brought(proposal)
+        target = beyond_bound(brought.target, self.bound)
+        return brought, target, self.sample(proposal), reached(numbers)
 
     def learn(self, seed: int) -> None:
         """Learns from paths of its own how new paths should be made."""
@@ -80,12 +91,17 @@ class PathTarget:
             lane = dr.arange(mi.UInt32, _PATHS)
             rng, none = generator(stream(seed, round), lane), dr.zeros(mi.UInt32, _PATHS)
             numbers = ProposedNumbers(rng, mi.UInt32(none), none, unused)
-            proposal, _numbers = self._evaluate(numbers, mi.Bool(True))
-            target = self.contribution(proposal).target
-            dr.eval(target, proposal.technique)
-            self.mutations.techniques.learn(proposal.technique.numpy(), target.numpy())
+            technique, target = self._tried(numbers)
+            dr.eval(target, technique)
+            self.mutations.techniques.learn(technique.numpy(), target.numpy())
 
-    def _evaluate(self, numbers: Numbers, active: mi.Bool) -> tuple[Proposal, Numbers]:
+    @frozen
+    def _tried(self, numbers: Numbers) -> tuple[mi.UInt32, mi.Float]:
+        """How new paths were made, and the target function."""
+        proposal, _numbers = self._new_path(copied(numbers), mi.Bool(True))
+        return proposal.technique, self.contribution(proposal).target
+
+    def _new_path(self, numbers: Numbers, active: mi.Bool) -> tuple[Proposal, Numbers]:
         memory, at = PathMemory.of(self.most), mi.UInt32(0)
         _memory, numbers, proposal = self.mutations.new_path(memory, at, numbers, active)
         return proposal, numbers

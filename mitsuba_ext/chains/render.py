@@ -100,8 +100,11 @@ class ChainRender:
         return True
 
     def _count(self, counts: Counts, mutations: int) -> None:
+        longest = float(dr.max(counts.longest)[0])
+        self._counts["longest"] = max(self._counts["longest"], longest)
         for name in self._counts:
-            self._counts[name] += float(dr.sum(mi.Float64(getattr(counts, name)))[0])
+            if name != "longest":
+                self._counts[name] += float(dr.sum(mi.Float64(getattr(counts, name)))[0])
         self._mutations += mutations
 
     def _report(self, samples: int) -> None:

@@ -63,7 +63,7 @@ class SteppedChains(Chains):
         # ----- Accept or reject -----
         a = acceptance(self._state, found.target)
         is_accepted = threshold < a
-        counts = counts.plus(is_large, is_accepted, found.target, found.sample)
+        counts = counts.plus(is_large, is_accepted, found.target, found.sample, self._weight)
 
         # ----- Add what is left behind to the image -----
         visits = self._weight + (1 - a)

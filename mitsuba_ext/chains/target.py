@@ -12,7 +12,8 @@ from ..rendering.camera import Lanes, camera_rays, draw_numbers, film_extent
 from ..rendering.camera_samples import CameraSamples
 from ..transport.colour import to_rgb
 from ..transport.estimator import CameraRays, Estimator, Sample
-from ..transport.numbers import Numbers
+from ..transport.frozen import frozen
+from ..transport.numbers import Numbers, copied, go_to, reached
 
 
 @dataclass
@@ -85,7 +86,7 @@ class ImageTarget:
 
     def evaluate(self, numbers: Numbers, active: mi.Bool | bool = True) -> Found:
         """Everything, evaluated; also the place that ``numbers`` have reached."""
-        camera, sample = self._camera(numbers, mi.Bool(active))
+        camera, sample = self._found(numbers, mi.Bool(active))
         lane = dr.arange(mi.UInt32, dr.width(camera.target))
         parts, lanes = [camera], [lane]
         for splats in sample.splats:
@@ -101,6 +102,18 @@ class ImageTarget:
         target = beyond_bound(target, self.bound)
         dr.eval(target)
         return Found(target, parts, lanes, sample)
+
+    def _found(self, numbers: Numbers, active: mi.Bool) -> tuple[Contribution, Sample]:
+        if not getattr(self.estimator, "can_be_frozen", False):
+            return self._camera(numbers, active)
+        *found, place = self._recorded(numbers, active)
+        go_to(numbers, place)
+        return tuple(found)
+
+    @frozen
+    def _recorded(self, numbers: Numbers, active: mi.Bool) -> tuple:
+        numbers = copied(numbers)
+        return *self._camera(numbers, active), reached(numbers)
 
     def _camera(self, numbers: Numbers, active: mi.Bool) -> tuple[Contribution, Sample]:
         rays = self._rays(numbers)

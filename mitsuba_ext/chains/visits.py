@@ -33,6 +33,10 @@ _BOOTSTRAP_SHARE, _MOST_BOOTSTRAP = 0.25, 1 << 24
 #: The largest standard error of the brightness without a warning.
 _UNSURE = 0.05
 
+#: Visits of one state in a row that are worth a warning: at least so many, and this share of those
+#: of an average pixel.
+_LONG, _STAY = 64, 0.5
+
 #: Samples that find the scale of MIS weights.
 _SCALE_SAMPLES = 1 << 14
 
@@ -207,7 +211,17 @@ class MetropolisRender(ChainRender):
         uniform_factor = chains.rules.uniform_weight * camera_samples / uniform
         image.write(visit_factor, uniform_factor, self._camera_spp)
         self._report(round(mutations / self._pixel_count))
-        self._statistics.learned = f"{self._rates()}; brightness known to {start.error:.1%}"
+        longest = self._counts["longest"]
+        self._statistics.learned = (
+            f"{self._rates()}; brightness known to {start.error:.1%}; a chain stayed at one path "
+            f"for {longest:.0f} of {chains.done} mutations"
+        )
+        if longest > max(_LONG, _STAY * mutations / self._pixel_count):
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"A chain stayed at one path for {longest:.0f} of {chains.done} mutations: some "
+                f'pixels may be far too bright. "erpt" bounds what one path brings.',
+            )
         if start.error > _UNSURE:
             mi.Log(
                 mi.LogLevel.Warn,

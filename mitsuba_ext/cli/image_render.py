@@ -117,6 +117,9 @@ def render_image(
         if order.preview:
             images.write_film(order.preview, job.film, metadata())
 
+    report.image = {}
+    if picture.name:
+        report.image = {"file": str(output), "frame": picture.frame, "sensor": picture.sensor}
     with stopping() as stop:
         job = None
         try:

@@ -32,6 +32,8 @@ class Report:
         self._is_quiet, self._as_json = is_quiet, as_json
         self._last = -_PERIOD
         self._events = sys.stdout
+        #: Of which image progress is reported; empty if there is only one.
+        self.image: dict[str, Any] = {}
 
     def note(self, text: str) -> None:
         """Says something that needs no attention, on stderr."""
@@ -48,7 +50,7 @@ class Report:
         """An event of progress; figures that are ``None`` are left out."""
         if self._as_json and not self._is_quiet and time.monotonic() - self._last >= _PERIOD:
             self._last = time.monotonic()
-            self._event("progress", **figures)
+            self._event("progress", **self.image, **figures)
 
     def end(
         self, text: str, details: Sequence[str] = (), is_interrupted: bool = False, **figures: Any

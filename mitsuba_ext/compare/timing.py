@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..movers import check_motion_is_seen
 from ..rendering.batches import sample_count
+from ..rendering.camera import forget_state
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -71,6 +72,7 @@ def timed_render(
         dr.sync_thread()
         seconds = time.perf_counter() - start
         kernels = dr.kernel_history([dr.KernelType.JIT])
+    forget_state(scene.sensors()[sensor])
     compiled = [kernel for kernel in kernels if not kernel["cache_hit"]]
     milliseconds = sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in compiled)
     memory = dr.detail.malloc_watermark(dr.backend_v(mi.Float))

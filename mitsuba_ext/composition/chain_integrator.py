@@ -23,6 +23,7 @@ from ..rendering.camera import develop as develop_film
 from ..rendering.interrupts import deferred_interrupt
 from ..rendering.stages import OneStage
 from ..transport.estimator import CameraRays, Estimator, Sample
+from ..transport.frozen import with_recordings
 from ..transport.walk import Walk
 from .chain_file import ChainFile
 from .decision_parameters import Setting
@@ -41,6 +42,8 @@ class _OnlyAlpha:
     """Camera samples without radiance."""
 
     estimator: Estimator
+
+    can_be_frozen = True
 
     def __call__(self, scene, sampler, rays: CameraRays, active) -> Sample:
         sample = self.estimator(scene, sampler, rays, active)
@@ -168,21 +171,29 @@ class ChainIntegrator(WalkIntegrator):
             raise NotImplementedError(f'"{self.name}": {error}') from None
         spp = self._check_spp(spp, sensor)
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else int(seed)
-        setting = Setting(scene, sensor, seed, self.max_depth, self.rr_depth, spp)
-        target = self.target(setting)
-        self._render_camera_samples(scene, sensor, seed, spp, target is not None)
-        statistics, camera_spp = self.statistics, self.statistics.spp
-        is_interrupted = False
-        if target is not None and not self.is_cancelled:
-            chains = self.chain_render(target, seed, spp, camera_spp, statistics, start)
-            with deferred_interrupt() as interrupt:
-                chains.run(interrupt)
-            is_interrupted = interrupt.is_set()
-        statistics.seconds = time.perf_counter() - start
+
+        def attempt() -> bool:
+            return self._render_all(scene, sensor, seed, spp, start)
+
+        is_interrupted = with_recordings(scene, sensor, attempt)
+        self.statistics.seconds = time.perf_counter() - start
         image = develop_film(sensor.film(), develop, evaluate)
         if is_interrupted:
             raise KeyboardInterrupt
         return image
+
+    def _render_all(self, scene, sensor, seed: int, spp: int, start: float) -> bool:
+        """Leaves the image in the film. Was the render interrupted?"""
+        setting = Setting(scene, sensor, seed, self.max_depth, self.rr_depth, spp)
+        target = self.target(setting)
+        self._render_camera_samples(scene, sensor, seed, spp, target is not None)
+        statistics, camera_spp = self.statistics, self.statistics.spp
+        if target is None or self.is_cancelled:
+            return False
+        chains = self.chain_render(target, seed, spp, camera_spp, statistics, start)
+        with deferred_interrupt() as interrupt:
+            chains.run(interrupt)
+        return interrupt.is_set()
 
     def _check_spp(self, spp: int, sensor: mi.Sensor) -> int:
         if not 0 <= spp <= MOST_SPP:

@@ -160,6 +160,7 @@ class Schedule:
             camera=self._camera,
             weight=self._weights[self._finished_stages],
             most_lanes=_MAP_LANES if self._learns_maps else 0,
+            observer=observer,
         )
 
     def _restored_stage(self, states: States) -> Stage:
@@ -180,7 +181,7 @@ class Schedule:
             depth, depth, next_event=NoConnections(), query=self.decisions["query"],
             observer=self._scout,
         )  # fmt: skip
-        return Stage(walk, is_scout=True)
+        return Stage(walk, is_scout=True, observer=self._scout)
 
     def _learn(self, is_last: bool) -> None:
         for slot, learner in self.learners.items():

@@ -66,7 +66,7 @@ def _light_vertices(setting: Setting) -> LightVertexSample:
         return LightVertexSample(mi.Point3f(), mi.Normal3f(), mi.Float(), _PATHS)
     vertices = VertexCache(rounds, _PATHS)
     active = dr.full(mi.Bool, True, vertices.count)
-    vertex = vertices.gather(dr.arange(mi.UInt32, vertices.count), active)
+    vertex = vertices.at(dr.arange(mi.UInt32, vertices.count), active)
     si = vertex.si
     n, β = lit_normal(from_both_ends(si)), brightness(vertex.β)
     finite = dr.compress(dr.all(dr.isfinite(si.p) & dr.isfinite(n)) & dr.isfinite(β))

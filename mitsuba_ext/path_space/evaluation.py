@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..bidirectional.scattering import geometric_cosine, reverse_density
+from ..transport.bsdfs import eval_bsdf, sample_bsdf
 from ..transport.colour import to_rgb
 from ..transport.hidden_emitters import behind_emitters
 from ..transport.numbers import Numbers
@@ -138,10 +139,12 @@ def trace_from_camera(
         walks = grows & ~plan.perturbs
         number, sample = numbers.next_1d(), numbers.next_2d()
         lobe = dr.select(walks, number, place.lobe)
-        bs, weight = bsdf.sample(ctx, si, lobe, sample, goes_on)
-        is_sampled_discrete = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         joins = (index == plan.grown) | (index == plan.grown + 1)
         was_discrete = (place.is_discrete == 1) & ~joins
+        # Other directions are known
+        is_sampled = goes_on & (walks | was_discrete)
+        bs, weight = sample_bsdf(bsdf, ctx, si, lobe, sample, is_sampled)
+        is_sampled_discrete = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         is_discrete = dr.select(walks, is_sampled_discrete, was_discrete)
         next_d = towards(si.p, target, given)
         is_given = mi.Bool(False)
@@ -170,7 +173,7 @@ def trace_from_camera(
         wo = si.to_local(next_d)
 
         # ----- What does the vertex let through? -----
-        smooth, pdf = bsdf.eval_pdf(ctx, si, wo, goes_on & ~is_discrete)
+        smooth, pdf = eval_bsdf(bsdf, ctx, si, wo, goes_on & ~is_discrete)
         reverse = reverse_density(ctx, bsdf, si, wo, goes_on & ~is_discrete)
         agrees = is_sampled_discrete & (dr.squared_norm(bs.wo - wo) < _MISS)
         goes_on &= ~is_discrete | agrees

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.bsdfs import sample_bsdf
 from ..transport.numbers import Numbers
 from .memory import Head, PathMemory, Place
 from .plan import Plan
@@ -64,7 +65,7 @@ def grow_from_light(
         # ----- Where does the path go on? -----
         lobe, sample = numbers.next_1d(), numbers.next_2d()
         lobe = dr.select(plan.perturbs, place.lobe, lobe)
-        bs, weight = bsdf.sample(ctx, si, lobe, sample, active & ~is_last)
+        bs, weight = sample_bsdf(bsdf, ctx, si, lobe, sample, active & ~is_last)
         is_discrete = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         d = si.to_world(bs.wo)
         scatters = (bs.pdf > 0) & (dr.max(dr.abs(weight)) > 0)

@@ -46,6 +46,13 @@ class Techniques:
         self._logs = mi.Float(np.log(np.maximum(chance, 1e-30)).astype(np.float32))
         dr.eval(self._sums, self._logs)
 
+    def kernel_state(self) -> tuple:
+        """What kernels depend on."""
+        return (
+            self._least, self._most, len(self._first), self._sums, self._logs, self._tables,
+            self._starts,
+        )  # fmt: skip
+
     def learn(self, index: np.ndarray, target: np.ndarray) -> None:
         """Makes the second moment of the light that is found smaller. It is least where those parts
         of it that the techniques would find, each divided by its probability, are equal.

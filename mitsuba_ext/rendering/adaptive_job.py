@@ -35,6 +35,12 @@ class AdaptiveJob(Job):
     divides_stages = False  # moments are those of whole passes
 
     def __init__(self, integrator, scene, sensor, seed, spp) -> None:
+        if sensor.sampler().class_name() == "StratifiedSampler":
+            raise NotImplementedError(
+                f'"{integrator.name}": in sets of a few samples, the numbers of the sampler '
+                f'"stratified" depend on each other, and the image would be biased: use '
+                f'"multijitter" or "independent".'
+            )
         super().__init__(integrator, scene, sensor, seed, spp)
         spp, pilot_spp = self.plan.spp, sum(self.plan.stages[:-1])
         self._pass_spp = min(integrator.pass_spp or -(-spp // _PASS_SHARE), spp)

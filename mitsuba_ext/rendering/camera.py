@@ -44,6 +44,23 @@ def tell_film(sampler: mi.Sampler, film: mi.Film, first: int = 0) -> None:
         sampler.set_film(film_extent(film)[0], first)
 
 
+def forget_state(sensor: mi.Sensor) -> None:
+    """Lets the sensor's sampler forget how far a render has got, as ``mi.render`` does afterwards.
+    That waits to be evaluated, which recorded kernels would do: the whole render, a second time."""
+    sensor.sampler().seed(0, 1)
+
+
+def own_sampler(sensor: mi.Sensor) -> mi.Sampler:
+    """A copy of the sensor's sampler, or the sampler itself where it cannot be copied (samplers
+    written in Python need not have ``clone``)."""
+    try:
+        sampler = sensor.sampler().clone()
+    except RuntimeError:
+        return sensor.sampler()
+    forget_state(sensor)
+    return sampler
+
+
 @contextmanager
 def film_told(sensor: mi.Sensor) -> Iterator[None]:
     """The same for integrators of Mitsuba, which tell samplers nothing."""
@@ -54,6 +71,7 @@ def film_told(sensor: mi.Sensor) -> Iterator[None]:
     finally:
         if hasattr(sampler, "set_film"):
             sampler.set_film(None)
+        forget_state(sensor)
 
 
 @dataclass
@@ -76,15 +94,43 @@ def lanes_of(
 ) -> Lanes:
     """The lanes of a pass of ``spp_per_pass`` samples for each of the ``pixels`` (all of them), row
     by row in the film's extent, after ``first`` ones of earlier passes."""
-    width, height = film_extent(film)
-    count = width * height if pixels is None else len(pixels)
-    # The divisor is opaque, so that passes of different length share a kernel
-    lane = dr.arange(mi.UInt32, count * spp_per_pass)
-    pixel = lane // dr.opaque(mi.UInt32, spp_per_pass)
-    index = lane - pixel * dr.opaque(mi.UInt32, spp_per_pass) + dr.opaque(mi.UInt32, first)
-    if pixels is not None:
-        pixel += dr.opaque(mi.UInt32, pixels.start)
-    return lanes_at(film, pixel, index)
+    return PassLanes.of(film, spp_per_pass, first, pixels).lanes(film)
+
+
+@dataclass
+class PassLanes:
+    """The lanes of a pass, before it begins: what differs from pass to pass are arrays.
+
+    Attributes:
+        count: Samples of all pixels.
+        spp: Samples of each pixel.
+        first: Samples of each pixel in earlier passes.
+        start: The first pixel; ``None`` where it is that of the film.
+    """
+
+    count: int
+    spp: mi.UInt32
+    first: mi.UInt32
+    start: mi.UInt32 | None
+
+    @classmethod
+    def of(cls, film: mi.Film, spp: int, first: int, pixels: range | None) -> PassLanes:
+        """Those of :func:`lanes_of`."""
+        width, height = film_extent(film)
+        pixel_count = width * height if pixels is None else len(pixels)
+        # Opaque, so that passes share a kernel
+        numbers = (dr.opaque(mi.UInt32, n) for n in (spp, first))
+        start = None if pixels is None else dr.opaque(mi.UInt32, pixels.start)
+        return cls(pixel_count * spp, *numbers, start)
+
+    def lanes(self, film: mi.Film) -> Lanes:
+        """The lanes."""
+        lane = dr.arange(mi.UInt32, self.count)
+        pixel = lane // self.spp
+        index = lane - pixel * self.spp + self.first
+        if self.start is not None:
+            pixel += self.start
+        return lanes_at(film, pixel, index)
 
 
 def lanes_at(film: mi.Film, pixel: mi.UInt32, index: mi.UInt32) -> Lanes:

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..transport.bsdfs import sample_bsdf
 from ..transport.estimator import Sample
 from ..transport.path_decisions import SceneQuery
 from . import camera
@@ -101,7 +102,8 @@ def _follow(scene, query, sampler, ray, going, throughput):
         pi = query.closest(scene, ray, coherent=True, active=going)
         si = query.interaction(pi, ray)
         bsdf = si.bsdf()
-        bs, weight = bsdf.sample(context, si, sampler.next_1d(going), sampler.next_2d(going), going)
+        numbers = sampler.next_1d(going), sampler.next_2d(going)
+        bs, weight = sample_bsdf(bsdf, context, si, *numbers, going)
         # Is there anything but mirror images here?
         is_specular = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         is_specular |= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)

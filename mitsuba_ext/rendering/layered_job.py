@@ -40,6 +40,9 @@ class LayeredJob(Job):
     where the lens sees a part of it, and of what lies around the film. A filter makes the picture.
     """
 
+    #: The samples go into layers too
+    freezes_passes = False
+
     def __init__(self, integrator, scene, sensor, seed, spp) -> None:
         super().__init__(integrator, scene, sensor, seed, spp)
         if mi.has_flag(self.film.flags(), mi.FilmFlags.Special):

@@ -21,10 +21,12 @@ import numpy as np
 
 from ..transport import heroes
 from ..transport.estimator import CameraRays, Sample
+from ..transport.frozen import with_recordings
 from . import camera
 from .dither import dithered_parts
 from .filter_weights import put_splats
 from .interrupts import deferred_interrupt
+from .pass_samples import GradientsError, count_rays, put_samples
 from .plan import Planned, plan_render
 from .stages import DivisibleSchedule, Schedule, Stage
 from .time_budget import TimeBudget
@@ -111,15 +113,20 @@ def render(
         KeyboardInterrupt: Ctrl-C; the film then holds the image of the finished passes.
     """
     sensor = camera.find_sensor(scene, sensor)
-    job = (job or Job)(integrator, scene, sensor, seed, spp)
-    try:
-        with deferred_interrupt() as interrupt:
-            job.run(interrupt)
-    finally:
-        # Also after an exception, the film holds the passes that were finished
-        job.fill_film()
+
+    def attempt() -> tuple[Job, threading.Event]:
+        made = (job or Job)(integrator, scene, sensor, seed, spp)
+        try:
+            with deferred_interrupt() as interrupt:
+                made.run(interrupt)
+        finally:
+            # Also after an exception, the film holds the passes that were finished
+            made.fill_film()
+        return made, interrupt
+
+    made, interrupt = with_recordings(scene, sensor, attempt)
     image = camera.develop(sensor.film(), develop, evaluate)
-    job.finish()
+    made.finish()
     if interrupt.is_set():
         raise KeyboardInterrupt
     return image
@@ -131,6 +138,9 @@ class Job:
     #: Can a stage take samples of a part of the pixels?
     divides_stages = True
 
+    #: May a pass be recorded as a whole? Not where a subclass wants to see its samples.
+    freezes_passes = True
+
     def __init__(self, integrator, scene, sensor, seed, spp) -> None:
         self.start = time.perf_counter()
         dr.detail.malloc_clear_statistics()
@@ -138,7 +148,7 @@ class Job:
             integrator, scene, sensor, sensor.film(),
         )
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
-        self.sampler = _own_sampler(sensor)
+        self.sampler = camera.own_sampler(sensor)
         self.plan = plan_render(
             integrator, scene, self.film, self.sampler, seed & 0xFFFFFFFF, spp
         )
@@ -278,6 +288,7 @@ class Job:
         rays = camera.sample_rays(
             self.sensor, sampler, 1, self.plan.spp, stage.camera, pixels=pixels
         )
+        stage.observer.begin(dr.width(rays.ray), rays.pixel)
         sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
         dr.eval(sample.L)
 
@@ -297,9 +308,33 @@ class Job:
 
     def _run_part(self, stage: Stage, spp: int, part: int) -> None:
         sampler, pixels = self._part_sampler(spp, part), self.parts[part]
-        self._take(
-            stage, sampler, camera.lanes_of(self.film, spp, self.statistics.spp, pixels)
-        )
+        lanes = camera.PassLanes.of(self.film, spp, self.statistics.spp, pixels)
+        if not self._is_frozen(stage):
+            self._take(stage, sampler, lanes.lanes(self.film))
+            return
+        if stage.observer is not None:
+            pixel = lanes.lanes(self.film).pixel
+            dr.eval(pixel)
+            stage.observer.begin(lanes.count, pixel)
+        weight = 1.0 if stage.weight == 1 else dr.opaque(mi.Float, stage.weight)
+        try:
+            put_samples(
+                stage.estimator, stage.camera, self.scene, self.sensor, sampler, lanes,
+                self.plan.spp, weight, self.block, self.tally,
+            )  # fmt: skip
+        except GradientsError:
+            raise self.integrator.no_gradients() from None
+        self._finish_take(sampler)
+
+    def _is_frozen(self, stage: Stage) -> bool:
+        """Are the passes of this stage recorded?"""
+        if not self.freezes_passes or self.integrator.aov_names():
+            return False
+        if stage.observer is not None and not stage.observer.can_be_frozen:
+            return False
+        # Special films prepare samples as they like
+        is_special = mi.has_flag(self.film.flags(), mi.FilmFlags.Special)
+        return not is_special and getattr(stage.estimator, "can_be_frozen", False)
 
     def _take(self, stage: Stage, sampler: mi.Sampler, lanes: camera.Lanes) -> None:
         """Puts the samples of these lanes into the block."""
@@ -312,6 +347,9 @@ class Job:
                 self.splats = self.film.create_block()
                 self.splats.set_coalesce(False)
             camera.put_splats(self.film, self.splats, splats)
+        self._finish_take(sampler)
+
+    def _finish_take(self, sampler: mi.Sampler) -> None:
         if self.plan.structured:
             sampler.advance()
             sampler.schedule_state()
@@ -321,12 +359,14 @@ class Job:
         self, stage: Stage, sampler: mi.Sampler, rays: CameraRays, count: mi.Float | float = 1.0
     ) -> Sample:
         """Puts the samples of these rays into the block, but for their splats."""
+        if stage.observer is not None:
+            stage.observer.begin(dr.width(rays.ray), rays.pixel)
         sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
         if dr.grad_enabled(sample.L):
             raise self.integrator.no_gradients()
         aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
         camera.put(self.film, self.block, rays, sample, aovs, count)
-        self._count(sample)
+        count_rays(self.tally, sample)
         return sample
 
     def _part_sampler(self, spp: int, part: int) -> mi.Sampler:
@@ -336,16 +376,6 @@ class Job:
         index = self.statistics.passes * len(self.parts) + part
         self._seed(sampler, index, spp, self.parts[part])
         return sampler
-
-    def _count(self, sample) -> None:
-        counts = (
-            sample.scatter_count,
-            sample.shadow_count,
-            sample.connection_count,
-            dr.select(dr.max(dr.abs(sample.L)) == 0, 1, 0),
-        )
-        for index, count in enumerate(counts):
-            dr.scatter_add(self.tally, mi.UInt64(count), mi.UInt32(index))
 
     def fill_film(self) -> None:
         """Hands the samples of the finished passes to the film."""
@@ -368,15 +398,6 @@ class Job:
             f"(took {statistics.seconds:.2f}s, {statistics.passes} pass(es), "
             f"{statistics.spp} of {self.plan.spp} samples)",
         )
-
-
-def _own_sampler(sensor: mi.Sensor) -> mi.Sampler:
-    """A copy of the sensor's sampler, or the sampler itself where it cannot be copied (samplers
-    written in Python need not have ``clone``)."""
-    try:
-        return sensor.sampler().clone()
-    except RuntimeError:
-        return sensor.sampler()
 
 
 def kernel_cache_misses() -> int:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from ..transport.estimator import Estimator
+from ..transport.observer import Observer
 from .camera_samples import CameraSamples
 
 
@@ -22,6 +23,7 @@ class Stage:
             depend on any sample.
         most_lanes: Samples of a pass, at most, where passes can be cut anywhere and hold one sample
             of each pixel: what is recorded of each takes memory. 0 for no limit.
+        observer: Is told when a pass begins; the estimator tells it the rest.
     """
 
     estimator: Estimator
@@ -30,6 +32,7 @@ class Stage:
     camera: CameraSamples = field(default_factory=CameraSamples)
     weight: float = 1.0
     most_lanes: int = 0
+    observer: Observer | None = None
 
 
 class Schedule(Protocol):

@@ -83,7 +83,12 @@ class Sample:
 
 
 class Estimator(Protocol):
-    """Estimates the radiance along camera rays."""
+    """Estimates the radiance along camera rays.
+
+    Attributes:
+        can_be_frozen: May a call be recorded as a whole (``frozen.py``)? It then reads no array on
+            the host, and makes no splats. If it is not there, no.
+    """
 
     def __call__(
         self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool

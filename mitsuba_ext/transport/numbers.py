@@ -6,8 +6,9 @@ Dr.Jit's loops then see the place that it has reached, and change it.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -73,6 +74,33 @@ def schedule_state(numbers: Numbers) -> None:
         numbers.schedule_state()
     else:
         dr.schedule(numbers)
+
+
+def copied(numbers: Numbers) -> Numbers:
+    """Numbers to draw from instead of these, which are left alone, unless they are a sampler."""
+    if isinstance(numbers, mi.Sampler):
+        return numbers
+    if isinstance(numbers, BothEnds):
+        return BothEnds(copied(numbers.camera), copied(numbers.light))
+    result = copy.copy(numbers)
+    for key, value in vars(numbers).items():
+        if dr.is_array_v(value) or hasattr(type(value), "DRJIT_STRUCT"):
+            setattr(result, key, type(value)(value))
+    return result
+
+
+def reached(numbers: Numbers) -> Any:
+    """The place that numbers have reached, as a frozen function returns it: a sampler keeps it."""
+    return () if isinstance(numbers, mi.Sampler) else numbers
+
+
+def go_to(numbers: Numbers, place: Any) -> None:
+    """Lets ``numbers`` go on where a frozen function has got to with copies of them."""
+    if isinstance(numbers, BothEnds):
+        go_to(numbers.camera, place.camera)
+        go_to(numbers.light, place.light)
+    elif not isinstance(numbers, mi.Sampler):
+        vars(numbers).update(vars(place))
 
 
 # Not a dataclass: loops only read it, and it has not the width of their state

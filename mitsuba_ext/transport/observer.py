@@ -18,11 +18,16 @@ class Observer:
     No observer is a dataclass: Dr.Jit would take one that a loop uses for a part of its state.
     """
 
+    #: May a pass that it observes be recorded (``frozen.py``)? Not if it rebinds attributes
+    #: while the pass is traced.
+    can_be_frozen = True
+
     def camera(self, rays: CameraRays) -> None:
         """The camera rays of the pass that begins."""
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
-        """A pass of so many paths begins, one in each lane, in ``pixel`` of the film."""
+        """A pass of so many paths begins, one in each lane, in ``pixel`` of the film. The render
+        says so, before the walk is traced: now is the time to make arrays."""
 
     def emission(
         self,
@@ -103,6 +108,10 @@ class Observers(Observer):
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         for observer in self._observers:
             observer.begin(lanes, pixel)
+
+    @property
+    def can_be_frozen(self) -> bool:
+        return all(observer.can_be_frozen for observer in self._observers)
 
     def emission(self, *arguments: Any) -> None:
         for observer in self._observers:

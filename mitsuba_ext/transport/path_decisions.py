@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .bsdfs import eval_and_sample_bsdf, eval_bsdf
 from .mis import Heuristic, power_heuristic
 from .scene_query import SceneQuery as SceneQuery  # one of the decisions
 from .vertex import PathState, Vertex
@@ -65,13 +66,13 @@ class Scattering:
             The BSDF's value (cosine included) and the density of this decision for ``wo``; the
             direction that was chosen, with its density; value / density there; the new state.
         """
-        return *vertex.bsdf.eval_pdf_sample(ctx, vertex.si, wo, sample_1, sample_2), state
+        return *eval_and_sample_bsdf(vertex.bsdf, ctx, vertex.si, wo, sample_1, sample_2), state
 
     def eval_pdf(
         self, state: Any, ctx: mi.BSDFContext, vertex: Vertex, wo: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Float]:
         """The first two results of :meth:`sample` alone; ``state`` is that before it."""
-        return vertex.bsdf.eval_pdf(ctx, vertex.si, wo, active)
+        return eval_bsdf(vertex.bsdf, ctx, vertex.si, wo, active)
 
 
 @dataclass

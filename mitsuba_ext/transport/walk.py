@@ -74,6 +74,9 @@ class Walk:
     subpaths: Subpaths | None = None
     observer: Observer = field(default_factory=Observer)
 
+    #: See :class:`~mitsuba_ext.transport.estimator.Estimator`.
+    can_be_frozen = True
+
     def __call__(
         self, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays, active: mi.Bool
     ) -> Sample:
@@ -121,7 +124,6 @@ class Walk:
         next_event_state = self.next_event.begin(sampler, ray, pixel)
         shadow_state = self.shadow_test.begin(sampler, ray)
         roulette_state = self.roulette.begin(sampler, ray, pixel)
-        self.observer.begin(dr.width(ray), pixel)
         self.observer.camera(rays)
 
         inside = media.begin(sampler, rays)
@@ -225,15 +227,15 @@ class Walk:
 
             # ----- Russian roulette -----
             rr_active = path.depth >= self.rr_depth
-            is_black = dr.max(path.β) == 0
+            carries = dr.max(path.β) != 0  # Dr.Jit says no to NaN
             survival, roulette_state = self.roulette.survival(
-                roulette_state, vertex, path, active_next & rr_active & ~is_black
+                roulette_state, vertex, path, active_next & rr_active & carries
             )
             rr_continue = sampler.next_1d() < survival
             self.observer.survival(
                 path, dr.select(rr_active, survival, 1), media.scattered(bs, active_next)
             )
-            active = active_next & (~rr_active | rr_continue) & ~is_black
+            active = active_next & (~rr_active | rr_continue) & carries
             path.β[rr_active] *= dr.rcp(survival)
 
             ray, inside = media.launch(inside, sampler, rays, ray, active)

@@ -11,6 +11,7 @@ import numpy as np
 
 from ...transport.observer import Observer
 from ...transport.path_decisions import DirectionSamples, Roulette
+from ..benefit import BATCHES, FIRST_GUIDED, GUIDED, gain_of, is_worth
 from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
 from ..roulette.adjoint_roulette import AdjointRoulette
@@ -26,12 +27,14 @@ _FIRST_SHARE, _SHARES = 0.6, (0.4, 0.6, 0.8)
 #: Share of all pilots' paths from which the number of bounces is chosen, at least.
 _LEAST_SHARE = 0.2
 
-#: What guiding the first direction of a path and each further one costs, in units of the time of a
-#: path (measured: 0 to 10 %, and 1 to 8 %); and the efficiency that it must reach.
-_COST, _COST_OF_BOUNCE, _LEAST_EFFICIENCY = 0.05, 0.05, 1.02
+#: The efficiency that guiding must reach. Trees of all pilots are better than those tested.
+_LEAST_EFFICIENCY = 1.0
+
+#: Rays of a path for each segment, about: shadow rays too.
+_RAYS = 1.5
 
 #: The efficiency of trees of few samples that lets learning go on: those of more are better.
-_TRIAL_EFFICIENCY = 0.97
+_TRIAL_EFFICIENCY = 0.95
 
 
 class Guidance(NamedTuple):
@@ -115,6 +118,10 @@ class GuideLearner(Learner):
 
     # ---- Observer ----
 
+    def kernel_state(self) -> list[Observer]:
+        """What kernels depend on."""
+        return self._observers()
+
     def begin(self, *arguments: Any) -> None:
         for observer in self._observers():
             observer.begin(*arguments)
@@ -156,12 +163,14 @@ class GuideLearner(Learner):
             least = _TRIAL_EFFICIENCY if is_trial else _LEAST_EFFICIENCY
             gains = self.gains(records)
             against_path = self._against_path(gains, least)
-            self.guidance = most_efficient(gains, self.always, *against_path)
+            rays = _RAYS * (1 + (records.count - records.first_new) / max(records.paths, 1))
+            self.guidance = most_efficient(gains, self.always, *against_path, rays)
+            error = 0.0 if is_trial else self._error(records)
             share, bounces, gain, efficiency = self.guidance
             if is_trial:
                 bounces = self.bounces
             effect = f"about {gain:.0%} less variance"
-            if efficiency < least and not self.always:
+            if not (self.always or is_worth(efficiency, error, least)):
                 self.guide, self._records, self.roulette = None, None, Roulette()
                 self._summary = f"no guide: with {self._regions}, {effect}"
                 return DirectionSamples()
@@ -237,11 +246,16 @@ class GuideLearner(Learner):
         square, drawn = dr.square(value) * importance, dr.rcp(weight)
         density = (drawn - (1 - self._share)) / self._share
 
-        def by_bounce(x: mi.Float) -> np.ndarray:
-            sums = dr.zeros(mi.Float64, records.bounces)
-            dr.scatter_add(sums, mi.Float64(x), bounce)
-            return sums.numpy()
+        place = bounce * BATCHES + dr.gather(mi.UInt32, records.batch, new)
 
+        def by_bounce(x: mi.Float) -> np.ndarray:
+            sums = dr.zeros(mi.Float64, records.bounces * BATCHES)
+            dr.scatter_add(sums, mi.Float64(x), place)
+            sums = sums.numpy().reshape(-1, BATCHES)
+            self._batches.append(sums)
+            return sums.sum(axis=1)
+
+        self._batches: list[np.ndarray] = []
         # The mean squares under uniform samples, of those that were drawn, and of other shares
         uniform, actual = by_bounce(square * drawn), by_bounce(square)
         variance = max(records.variance + (uniform - actual).sum(), 1e-30)
@@ -253,6 +267,16 @@ class GuideLearner(Learner):
         # Squares of large numbers overflow: that shows no gain
         return {share: np.nan_to_num(gain, nan=0.0) for share, gain in gains.items()}
 
+    def _error(self, records: PathRecords) -> float:
+        """The standard error of the logarithm of the variance that is left by what was chosen."""
+        if len(self._batches) != 2 + len(_SHARES):
+            return 0.0
+        uniform, actual, *others = self._batches
+        other = others[_SHARES.index(self.guidance.share)][: self.guidance.bounces].sum(axis=0)
+        before = records.variances + (uniform - actual).sum(axis=0)
+        more = uniform[: self.guidance.bounces].sum(axis=0) - other
+        return gain_of(np.stack([before - more, more]))[1]
+
     def __str__(self) -> str:
         return self._summary
 
@@ -262,12 +286,14 @@ def most_efficient(
     all_bounces: bool = False,
     variance: float = 1.0,
     segments: float = 1.0,
+    rays: float = 8.0,
 ) -> Guidance:
     """The most efficient way to guide.
 
     Parameters:
         gains: By how much, relatively, the variance is lower: for each share, by bounce.
         all_bounces: Choose among those that guide all bounces?
+        rays: Of a path of ``path``.
         variance, segments: Of uniform samples under the same roulette, in units of ``path``'s.
     """
     candidates = []
@@ -275,7 +301,7 @@ def most_efficient(
         for index, left in enumerate(variance * (1 - np.cumsum(by_bounce))):
             if all_bounces and index < len(by_bounce) - 1:
                 continue
-            cost = segments * (1 + _COST + _COST_OF_BOUNCE * index)
+            cost = segments + (FIRST_GUIDED + GUIDED * index) / rays
             efficiency = 1 / (max(left, 1e-3) * cost)
             candidates.append(Guidance(share, index + 1, float(1 - left), efficiency))
     return max(candidates, key=lambda guidance: (guidance.efficiency, guidance[:3]))

@@ -47,6 +47,12 @@ class GuidedDirections(DirectionSamples):
 
     def __init__(self, trees: SampleTrees, regions: Regions, bounces: int) -> None:
         self.trees, self.regions, self.bounces = trees, regions, bounces
+        # Opaque: however many there are, the kernel is the same
+        self._bounces = dr.opaque(mi.UInt32, bounces)
+
+    def kernel_state(self) -> tuple:
+        """What kernels depend on."""
+        return self.trees, self.regions, self._bounces
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
         return self.regions.begin(pixel)
@@ -56,7 +62,7 @@ class GuidedDirections(DirectionSamples):
         # A branch: later bounces are to cost nothing
         sample_2, weight, state = dr.if_stmt(
             (state, vertex.si, sample_2),
-            active & (vertex.depth < self.bounces),
+            active & (vertex.depth < self._bounces),
             self._guide,
             lambda state, si, sample: (sample, mi.Float(1), state),
         )

@@ -6,9 +6,11 @@ from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...arrays import joined
 from ...transport.observer import Observer
+from ..benefit import BATCHES
 from ..pixel_estimates import PixelEstimates, brightness
 from .tree_builder import DEPTH, cell_code
 
@@ -36,7 +38,9 @@ class PathRecords(Observer):
             its samples.
         weight (mi.Float): 1 / density of the sample.
         importance (mi.Float): By how much a squared error counts, at the place in the image.
-        variance (float): Sum over the paths of the squared errors that they make, weighted so.
+        batch (mi.UInt32): The batch of paths (``benefit.py``).
+        variances (numpy.ndarray): Sums over the paths of the squared errors that they make,
+            weighted so; shape [batches].
     """
 
     def __init__(
@@ -53,13 +57,25 @@ class PathRecords(Observer):
 
     def restart_counting(self) -> None:
         """Lets ``paths``, ``variance`` and ``first_new`` speak of what comes from now on."""
-        self.paths, self.variance = 0, 0.0
+        self.paths, self.variances = 0, np.zeros(BATCHES)
         self.first_new = self.count
+
+    @property
+    def variance(self) -> float:
+        """The sum of all ``variances``."""
+        return float(self.variances.sum())
 
     @property
     def count(self) -> int:
         """How many samples there are, after :meth:`finish`."""
         return len(self.code) if self._passes else 0
+
+    def kernel_state(self) -> tuple:
+        """What kernels depend on."""
+        return (
+            self._region, self.bounces, self._pixel, self._path, self._is_recorded, self._slots,
+            self._keys, self._weights, self._before, self._throughput, self._total,
+        )  # fmt: skip
 
     # ---- Observer of the walk ----
 
@@ -77,7 +93,10 @@ class PathRecords(Observer):
             dr.zeros(mi.Float, slots) for _ in range(3)
         )
         self._slots = dr.opaque(mi.UInt32, self._lanes)
-        dr.eval(self._keys, self._weights, self._before, self._throughput, self._total)
+        dr.eval(
+            self._path, self._is_recorded, self._keys, self._weights, self._before,
+            self._throughput, self._total,
+        )  # fmt: skip
 
     def direction(self, vertex, sample, weight, L, active) -> None:
         active = active & self._is_recorded & (vertex.depth < self.bounces)
@@ -104,7 +123,7 @@ class PathRecords(Observer):
             return
         columns = [joined(parts) for parts in zip(*self._passes)]
         self.region, self.code, self.history, self.bounce = columns[:4]
-        self.value, self.weight, self.importance, self.throughput = columns[4:]
+        self.value, self.weight, self.importance, self.throughput, self.batch = columns[4:]
         self._passes = [columns]
 
     def _collect(self) -> None:
@@ -116,7 +135,8 @@ class PathRecords(Observer):
         self._pixels.add(pixel, self._total)
         importance, error = self._pixels.importance(pixel, self._total)
         self.paths += self._lanes
-        self.variance += float(dr.sum(mi.Float64(error))[0])
+        batch = np.arange(self._lanes) % BATCHES
+        self.variances += np.bincount(batch, error.numpy(), BATCHES)
         slot = dr.compress(self._weights > 0)
         self._lanes = 0
         if len(slot) == 0:
@@ -138,6 +158,7 @@ class PathRecords(Observer):
         columns = [
             key >> DEPTH, key & ((1 << DEPTH) - 1), history, bounce, value, weight,
             dr.gather(mi.Float, importance, path), dr.gather(mi.Float, self._throughput, slot),
+            path % BATCHES,
         ]
         dr.eval(columns)
         self._passes.append(columns)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...transport.mis import power_heuristic
 from ...transport.observer import Observer
+from ..benefit import BATCHES, TABLE, gain_of, trimmed_batches
 from ..pixel_estimates import PixelEstimates, brightness
 from .light_table import Choice
 
@@ -33,8 +35,6 @@ class ConnectionRecords(Observer):
             [rows].
         variance (float): Sum of the squared errors of the paths, weighted so, if Mitsuba had
             chosen.
-        measured_gain (float): By how much, relatively, the choice of the last pilot has lowered
-            that variance.
     """
 
     def __init__(
@@ -47,8 +47,17 @@ class ConnectionRecords(Observer):
     def restart(self) -> None:
         """Forgets the last pilot."""
         self.row_squares = dr.zeros(mi.Float64, self._rows)
-        self.samples, self.variance, self.measured_gain = 0, 0.0, 0.0
+        self.samples, self.variance = 0, 0.0
         self._error = self._removed = 0.0
+        self._paths = 0
+        self._batches, self._rays = np.zeros((2, BATCHES)), np.zeros(3)
+
+    def kernel_state(self) -> tuple:
+        """What kernels depend on."""
+        return (
+            self._scene, self._as_path, self._path, self._is_recorded, self._slots, self._row,
+            self._square, self._more, self._total, self._counts,
+        )  # fmt: skip
 
     # ---- Observer of the walk ----
 
@@ -63,12 +72,15 @@ class ConnectionRecords(Observer):
         self._path = lane // stride
         self._is_recorded = self._path * stride == lane
         self._slots = dr.opaque(mi.UInt32, self._lanes)
+        dr.eval(self._path, self._is_recorded)
         slots = self._lanes * _VERTICES
         self._row, self._square = dr.zeros(mi.UInt32, slots), dr.zeros(mi.Float, slots)
         # By how much the sum of squares of a path would be larger if Mitsuba had chosen
         self._more = dr.zeros(mi.Float, self._lanes)
         self._total = dr.zeros(mi.Float, self._lanes)
-        dr.eval(self._row, self._square, self._more, self._total)
+        # Connections, shadow rays, and shadow rays if Mitsuba had chosen
+        self._counts = [dr.zeros(mi.Float, self._lanes) for _ in range(3)]
+        dr.eval(self._row, self._square, self._more, self._total, self._counts)
 
     def emission(self, path, ds, value, mis, pdf, active) -> None:
         # A number that is not finite would hide those of the others in the sum
@@ -82,8 +94,12 @@ class ConnectionRecords(Observer):
     def connection(
         self, choice: Choice, vertex, ds, contribution, value, pdf, visible, tested
     ) -> None:
+        is_traced = tested & self._is_recorded
+        as_path = dr.gather(mi.Float, self._as_path, choice.cell, is_traced)
+        dr.scatter_add(self._counts[1], mi.Float(1), self._path, is_traced)
+        dr.scatter_add(self._counts[2], as_path / choice.probability, self._path, is_traced)
         active = visible & self._is_recorded
-        ratio = choice.probability / dr.gather(mi.Float, self._as_path, choice.cell, active)
+        ratio = choice.probability / as_path
         change = power_heuristic(ds.pdf / ratio, pdf) / power_heuristic(ds.pdf, pdf)
         square = dr.square(brightness(value))
         as_path = square * ratio * dr.select(ds.delta, 1, dr.square(change))
@@ -94,6 +110,9 @@ class ConnectionRecords(Observer):
         dr.scatter(self._row, choice.row, slot, active)
         # A vertex may have several connections
         dr.scatter_add(self._square, as_path, slot, active)
+
+    def vertex(self, vertex, active) -> None:
+        dr.scatter_add(self._counts[0], mi.Float(1), self._path, active & self._is_recorded)
 
     def end(self, L: mi.Spectrum) -> None:
         dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
@@ -116,12 +135,38 @@ class ConnectionRecords(Observer):
         dr.scatter_add(self.row_squares, squares, self._row)
         more = self._more * weight
         more = dr.select(dr.isfinite(more), more, 0)
+        self._batches += trimmed_batches(error.numpy(), more.numpy())
+        self._rays += [float(dr.sum(mi.Float64(count))[0]) for count in self._counts]
+        self._paths += self._lanes
         self._error += float(dr.sum(mi.Float64(error))[0])
         self._removed += float(dr.sum(mi.Float64(more))[0])
         self.variance = self._error + self._removed
-        self.measured_gain = self._removed / max(self.variance, 1e-30)
         self._lanes = 0
-        self._row = self._square = self._more = self._total = self._pixel = None
+        self._row = self._square = self._more = self._total = self._pixel = self._counts = None
+
+    @property
+    def measured(self) -> tuple[float, float]:
+        """By how much, relatively, the choice of the last pilot has lowered the variance, and the
+        error of that (``benefit.py``)."""
+        return gain_of(self._batches)
+
+    @property
+    def cost(self) -> float:
+        """The time of a path with the choice of the last pilot, in units of that with Mitsuba's."""
+        return self._cost(self._rays[1])
+
+    @property
+    def least_cost(self) -> float:
+        """The same, if no more connections had to be tested than with Mitsuba's choice."""
+        return self._cost(self._rays[2])
+
+    def _cost(self, shadow: float) -> float:
+        connections, _, as_path = self._rays
+        if connections == 0:
+            return 1 + TABLE
+        # One ray led to each vertex, and one away from the last one
+        others = self._paths + connections
+        return (others + shadow + TABLE * connections) / (others + as_path)
 
     def predicted_gain(self, ratio: mi.Float) -> float:
         """By how much, relatively, a choice lowers the variance with which the mean squares of the

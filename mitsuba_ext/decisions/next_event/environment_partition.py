@@ -20,6 +20,7 @@ import mitsuba as mi
 from ...discrete_sampling import ONE_MINUS_EPSILON
 from ...lights.spectra import brightness
 from ...lights.texel_sums import Corners, Rectangle, TexelSums, part_of
+from ...transport.bsdfs import eval_bsdf, sample_bsdf
 from .partition_parts import Branch, Node, Partition, Peak
 from .visibility_maps import Tile, WorldVisibility
 
@@ -144,7 +145,7 @@ class Partitioner:
 
     def _value(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """What the BSDF reflects, cosine included, of light from the direction ``d``."""
-        value = brightness(si.bsdf().eval(self._ctx, si, si.to_local(d), active))
+        value = brightness(eval_bsdf(si.bsdf(), self._ctx, si, si.to_local(d), active)[0])
         return dr.select(active & (value > 0) & dr.isfinite(value), value, 0)
 
     def _corner(self, si, x: mi.UInt32, y: mi.UInt32, active) -> mi.Float:
@@ -158,7 +159,7 @@ class Partitioner:
         while dr.hint(working, label="peaks"):
             i = mi.Float(index) + 0.5
             x, y, z = (i * step - dr.floor(i * step) for step in _STEPS)
-            bs, _weight = bsdf.sample(self._ctx, si, z, mi.Point2f(x, y), working)
+            bs, _weight = sample_bsdf(bsdf, self._ctx, si, z, mi.Point2f(x, y), working)
             is_smooth = working & (bs.pdf > 0)
             is_smooth &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
             d = si.to_world(bs.wo)

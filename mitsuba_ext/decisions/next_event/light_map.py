@@ -79,6 +79,7 @@ class LightMap(Observer):
         # By a hash: consecutive lanes are the samples of one pixel, and pixels come row by row
         scattered = (dr.arange(mi.UInt32, lanes) * 0x9E3779B9) >> 8
         self._is_recorded = scattered % self._stride == 0
+        dr.eval(self._is_recorded)
 
     def connection(
         self,

@@ -15,6 +15,7 @@ from ...regions.surface_rows import BYTES_PER_VOXEL, RowCounts, SurfaceRows, vox
 from ...regions.surface_sides import region
 from ...transport.observer import Observer
 from ...transport.path_decisions import EmitterSampling
+from ..benefit import is_worth
 from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
 from . import light_map_file
@@ -31,12 +32,9 @@ _DEFENSIVE = 0.1
 #: the map for each sample of the pilots (with about three connections each), at most.
 _GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 
-#: What choosing from a table costs, in units of the time of a path (measured: 0 to 15 %), and the
-#: efficiency that it must reach.
-_COST, _LEAST_EFFICIENCY = 0.12, 1.05
-
-#: The efficiency, from few samples, that lets learning go on: tables of more are little better.
-_TRIAL_EFFICIENCY = 1.02
+#: The efficiency that choosing from a table must reach; and that which, from few samples, lets
+#: learning go on: tables of more are little better.
+_LEAST_EFFICIENCY, _TRIAL_EFFICIENCY = 1.03, 1.0
 
 #: Share of all pilots' samples that decide, at least.
 _LEAST_SHARE = 0.2
@@ -141,9 +139,17 @@ class LightMapLearner(Learner):
 
     # ---- Observer ----
 
+    def kernel_state(self) -> list[Observer]:
+        """What kernels depend on."""
+        return self._observers()
+
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         for observer in self._observers():
             observer.begin(lanes, pixel)
+
+    def vertex(self, *arguments) -> None:
+        if self._records is not None:
+            self._records.vertex(*arguments)
 
     def emission(self, *arguments) -> None:
         if self._records is not None:
@@ -197,18 +203,21 @@ class LightMapLearner(Learner):
         """Has the last pilot shown that learning pays, or may it still?"""
         records = self._records
         records.finish()
+        error = 0.0
         is_trial = records.samples < _LEAST_SHARE * self.pilot_samples and not is_last
         if self._is_tested:
             # Samples that did not teach the table from which they were drawn
-            gain = records.measured_gain
+            (gain, error), cost = records.measured, records.cost
         else:
             # Too optimistic: the samples judge what they have taught
             as_path = dr.tile(self._as_path, self.map.rows.count)
             gain = records.predicted_gain(self.map.square_ratios(as_path, probabilities))
-            is_trial = not is_last
-        efficiency = 1 / (max(1 - gain, 1e-3) * (1 + _COST))
-        self._effect = f"about {max(0.0, gain):.0%} less variance"
-        if efficiency < (_TRIAL_EFFICIENCY if is_trial else _LEAST_EFFICIENCY):
+            is_trial, cost = not is_last, records.least_cost
+        efficiency = 1 / (max(1 - gain, 1e-3) * cost)
+        self._effect = f"about {max(0.0, gain):.0%} less variance in {cost:.2f} x the time"
+        # A trial need not be certain
+        least, error = (_TRIAL_EFFICIENCY, 0.0) if is_trial else (_LEAST_EFFICIENCY, error)
+        if not is_worth(efficiency, error, least):
             self._summary = f"lights as path: with {self.map}, {self._effect}"
             return False
         self._is_tested = True

@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from ...lights.environment_directions import EnvironmentDirections
 from ...lights.spectra import brightness
+from ...transport.bsdfs import eval_bsdf, sample_bsdf
 from ...transport.heroes import Heroes
 from ...transport.path_decisions import EmitterSampling, LightNumbers
 
@@ -116,9 +117,9 @@ class ResampledLights(EmitterSampling):
             )
             index += 1
         while dr.hint(active & (index < light_count + bsdf_count), label="BSDF candidates"):
-            bs, _weight = bsdf.sample(
-                self._ctx, si, _fraction(lobe + mi.Float(index) * _STEP_Z), _turned(shift, index),
-                active,
+            bs, _weight = sample_bsdf(
+                bsdf, self._ctx, si, _fraction(lobe + mi.Float(index) * _STEP_Z),
+                _turned(shift, index), active,
             )  # fmt: skip
             is_smooth = active & (bs.pdf > 0)
             is_smooth &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -144,7 +145,7 @@ class ResampledLights(EmitterSampling):
 
     def _consider(self, reservoir: _Reservoir, bsdf, si, ds, value, active) -> _Reservoir:
         """The reservoir after a candidate: a direction with Mitsuba's density and its radiance."""
-        f, by_bsdf = bsdf.eval_pdf(self._ctx, si, si.to_local(ds.d), active)
+        f, by_bsdf = eval_bsdf(bsdf, self._ctx, si, si.to_local(ds.d), active)
         target = brightness(f * value)
         ds.pdf = self._density(ds, ds.pdf, by_bsdf)
         # Erratum of Eq. 4.10 (Cline): f / p, not p / f

@@ -62,6 +62,13 @@ class RouletteTrial(Observer):
         """Lets the effects be those of the paths that come from now on."""
         self.drawn = self.by_throughput = self.unguided = Effect(0.0, 0.0)
 
+    def kernel_state(self) -> tuple:
+        """What kernels depend on."""
+        return (
+            self._path, self._is_recorded, self._slots, self._weight, self._before,
+            self._throughput, self._probability, self._total,
+        )  # fmt: skip
+
     # ---- Observer of the walk ----
 
     def begin(self, lanes: int, pixel: mi.UInt32) -> None:
@@ -79,8 +86,9 @@ class RouletteTrial(Observer):
         )
         self._total = dr.zeros(mi.Float, self._paths)
         dr.eval(
-            self._weight, self._before, self._throughput, self._probability, self._total
-        )
+            self._path, self._is_recorded, self._weight, self._before, self._throughput,
+            self._probability, self._total,
+        )  # fmt: skip
 
     def direction(self, vertex, sample, weight, L, active) -> None:
         active = active & self._is_recorded & (vertex.depth < _BOUNCES)

@@ -43,6 +43,10 @@ class PairRecords(Observer):
         self.tests, self.squares = np.zeros(shape), np.zeros(shape)
         self.error = 0.0
 
+    def kernel_state(self) -> tuple:
+        """What kernels depend on."""
+        return self._path, self._stride, self._size, self._pair, self._value, self._total
+
     # ---- Observer of the walk ----
 
     def begin(self, lanes: int, pixel: mi.UInt32) -> None:

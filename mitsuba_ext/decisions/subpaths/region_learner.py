@@ -101,6 +101,10 @@ class RegionLearner(Learner):
 
     # ---- Observer ----
 
+    def kernel_state(self) -> PairRecords | None:
+        """What kernels depend on."""
+        return self._records
+
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
         if self._records is not None:
             self._records.begin(lanes, pixel)

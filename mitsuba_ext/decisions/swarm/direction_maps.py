@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...transport.bsdfs import eval_bsdf
 from ...transport.path_decisions import Scattering
 from ...transport.vertex import Vertex
 from ..pixel_estimates import brightness
@@ -70,7 +71,7 @@ class MappedScattering(Scattering):
         # A direction of the map
         drawn, _, _ = self.maps.sample(table, [sample_2.x, sample_2.y], from_map)
         direction = vertex.si.to_local(_to_sphere(drawn))
-        of_map, pdf_of_bsdf = vertex.bsdf.eval_pdf(ctx, vertex.si, direction, from_map)
+        of_map, pdf_of_bsdf = eval_bsdf(vertex.bsdf, ctx, vertex.si, direction, from_map)
         is_smooth_sample = ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         bs_value = dr.select(from_map, of_map, weight * bs.pdf)
         pdf_of_bsdf = dr.select(from_map, pdf_of_bsdf, bs.pdf)

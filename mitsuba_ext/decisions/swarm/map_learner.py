@@ -124,6 +124,9 @@ class MapLearner(Learner):
 
     # ---- Observer ----
 
+    #: It keeps arrays that a pass makes: rays, and what they bring
+    can_be_frozen = False
+
     def camera(self, rays: CameraRays) -> None:
         self._rays = rays
 

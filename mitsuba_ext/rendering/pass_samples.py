@@ -1,0 +1,64 @@
+"""The samples of a pass, from camera rays to the image block: what is recorded (``frozen.py``)."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.estimator import Estimator, Sample
+from ..transport.frozen import frozen
+from . import camera
+from .camera_samples import CameraSamples
+
+
+class GradientsError(Exception):
+    """The radiance depends on parameters of which gradients are asked for."""
+
+
+@frozen(any_width=True)
+def put_samples(
+    estimator: Estimator,
+    samples: CameraSamples,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    lanes: camera.PassLanes,
+    spp: int,
+    weight: mi.Float | float,
+    block: mi.ImageBlock,
+    tally: mi.UInt64,
+) -> None:
+    """Takes the samples of a pass, and puts them into a block. Kernels have the width of the lanes,
+    whatever that of tables is, and read the state of the sampler, which has the same.
+
+    Parameters:
+        estimator: What they are. It must not read arrays on the host.
+        samples: What chooses points of the aperture, times and wavelengths.
+        spp: Samples per pixel of the whole render.
+        weight: How many samples each counts for.
+        tally: Counts of rays, which grow.
+
+    Raises:
+        GradientsError: Gradients are asked for.
+    """
+    film = sensor.film()
+    taken = lanes.lanes(film)
+    numbers = camera.draw_numbers(sensor, sampler, taken, samples)
+    rays = camera.camera_rays(sensor, taken, numbers, spp)
+    sample = estimator(scene, sampler, rays, mi.Bool(True))
+    if dr.grad_enabled(sample.L):
+        raise GradientsError
+    camera.put(film, block, rays, sample, sample.aovs, weight)
+    count_rays(tally, sample)
+
+
+def count_rays(tally: mi.UInt64, sample: Sample) -> None:
+    """Adds the counts of a pass."""
+    counts = (
+        sample.scatter_count,
+        sample.shadow_count,
+        sample.connection_count,
+        dr.select(dr.max(dr.abs(sample.L)) == 0, 1, 0),
+    )
+    for index, count in enumerate(counts):
+        dr.scatter_add(tally, mi.UInt64(count), mi.UInt32(index))

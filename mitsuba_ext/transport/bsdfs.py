@@ -1,0 +1,87 @@
+"""The calls of BSDFs: every place that evaluates or samples one goes through these.
+
+Mitsuba's BSDFs return numbers that are not finite where there is nothing to return, and leave it to
+the weight of the sample, which is zero there, to hide them. ``roughconductor`` does it for every
+sample on its back, ``roughplastic`` and ``principledthin`` at directions in the plane of the
+surface. BSDFs that hold others multiply these numbers: ``blendbsdf`` makes the weight itself
+undefined. ``path`` ends such paths, because in Dr.Jit's LLVM and CUDA backends ``NaN != 0`` is
+false. So do we, where the number comes from: what is not finite counts as not sampled, and as a
+value and a density of zero. Everything else is returned as it is.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+def eval_bsdf(
+    bsdf: mi.BSDFPtr,
+    ctx: mi.BSDFContext,
+    si: mi.SurfaceInteraction3f,
+    wo: mi.Vector3f,
+    active: mi.Bool | bool = True,
+) -> tuple[mi.Spectrum, mi.Float]:
+    """The BSDF's value, cosine included, and the solid angle density of its samples, in the local
+    direction ``wo``."""
+    value, density = bsdf.eval_pdf(ctx, si, wo, active)
+    return _finite_value(value), _finite(density)
+
+
+def bsdf_density(
+    bsdf: mi.BSDFPtr,
+    ctx: mi.BSDFContext,
+    si: mi.SurfaceInteraction3f,
+    wo: mi.Vector3f,
+    active: mi.Bool | bool = True,
+) -> mi.Float:
+    """The second result of :func:`eval_bsdf` alone."""
+    return _finite(bsdf.pdf(ctx, si, wo, active))
+
+
+def sample_bsdf(
+    bsdf: mi.BSDFPtr,
+    ctx: mi.BSDFContext,
+    si: mi.SurfaceInteraction3f,
+    sample_1: mi.Float,
+    sample_2: mi.Point2f,
+    active: mi.Bool | bool = True,
+) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+    """A direction, and value / density there. Where none is sampled, the weight and ``bs.pdf`` are
+    zero, and ``bs.wo`` is some direction."""
+    return _finite_sample(*bsdf.sample(ctx, si, sample_1, sample_2, active))
+
+
+def eval_and_sample_bsdf(
+    bsdf: mi.BSDFPtr,
+    ctx: mi.BSDFContext,
+    si: mi.SurfaceInteraction3f,
+    wo: mi.Vector3f,
+    sample_1: mi.Float,
+    sample_2: mi.Point2f,
+) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
+    """The results of :func:`eval_bsdf` and :func:`sample_bsdf`, in one call of the BSDF."""
+    value, density, bs, weight = bsdf.eval_pdf_sample(ctx, si, wo, sample_1, sample_2)
+    return _finite_value(value), _finite(density), *_finite_sample(bs, weight)
+
+
+def _finite(number: mi.Float) -> mi.Float:
+    return dr.select(dr.isfinite(number), number, 0)
+
+
+def _is_finite(value: mi.Spectrum) -> mi.Bool:
+    return dr.all(dr.isfinite(mi.unpolarized_spectrum(value)))
+
+
+def _finite_value(value: mi.Spectrum) -> mi.Spectrum:
+    return dr.select(_is_finite(value), value, 0)
+
+
+def _finite_sample(
+    bs: mi.BSDFSample3f, weight: mi.Spectrum
+) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+    is_sampled = _is_finite(weight) & dr.isfinite(bs.pdf) & dr.all(dr.isfinite(bs.wo))
+    bs = mi.BSDFSample3f(bs)
+    bs.pdf = dr.select(is_sampled, bs.pdf, 0)
+    bs.wo = dr.select(is_sampled, bs.wo, mi.Vector3f(0, 0, 1))
+    return bs, dr.select(is_sampled, weight, 0)

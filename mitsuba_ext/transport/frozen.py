@@ -1,0 +1,373 @@
+"""Functions that Dr.Jit traces once per scene, and launches again without Python.
+
+To trace a walk takes longer than to run it for a few ten thousand samples: Dr.Jit traces each call
+of a BSDF once for each BSDF of the scene. ``dr.freeze`` records the kernels of a function instead.
+It knows arrays, and objects of Mitsuba that hold arrays. What else a function depends on is
+described here (:class:`_Description`): the classes of our objects and the values of their
+attributes, the parameters of the scene that are no arrays, the number of threads. A recording is
+used again only where all of it is the same.
+
+Nothing is recorded in spectral variants, whose tables of colours are nobody's argument; and where
+kernels call plugins that are written in Python: while these are traced, they may read arrays, and
+free memory of NumPy, for which Dr.Jit ends the process. A function with an argument that nobody can
+describe (a sampler in Python) is not frozen either. The log says why (level ``Debug``). If Dr.Jit
+cannot record a function, the render begins anew without recordings, and the log says so (level
+``Info``).
+
+What a frozen function must keep to:
+
+- It leaves the attributes of its arguments alone: what it changes are the contents of their arrays.
+  (This is checked.)
+- What its arguments hold besides is not changed between calls either, or they say with a method
+  ``kernel_state`` which of their attributes kernels depend on.
+- It reads no array on the host, and its results are arrays, or dataclasses, lists and tuples of
+  these.
+- Kernels whose width is that of an argument read an array of this width directly. Dr.Jit finds the
+  width of kernels that only gather by comparing with widths seen before; this fails where these
+  change, so that all widths are parts of the description, but for functions that say ``any_width``.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .. import registry
+from ..garbage import garbage_left_alone
+
+#: Scenes whose recordings are kept, and recordings of each, at most.
+_MOST_SCENES, _MOST_RECORDINGS = 8, 256
+
+#: Values that are their own description.
+_VALUES = (int, float, str, bytes, bool, type(None), enum.Enum, range)
+
+
+class NotRecordableError(RuntimeError):
+    """Dr.Jit cannot record a function, which had perhaps begun to change its arguments."""
+
+
+class _UndescribedError(Exception):
+    """Nobody knows whether this is the same as before; the message says what it is."""
+
+
+@dataclass
+class _SceneRecordings:
+    """The recordings of one scene.
+
+    Attributes:
+        mark: An array of the scene. While it is held, no other scene has one of its index: scenes
+            themselves cannot be held weakly, and must not be kept alive.
+        held: Objects outside of the scene that descriptions name by their address.
+        recordings: By description.
+        refused: Functions that are not frozen.
+    """
+
+    mark: Any
+    held: dict[int, Any] = field(default_factory=dict)
+    recordings: OrderedDict[Any, _Recording] = field(default_factory=OrderedDict)
+    refused: set[Any] = field(default_factory=set)
+
+
+@dataclass
+class _Current:
+    """The render that is running.
+
+    Attributes:
+        kept: The recordings of its scene.
+        scene: Its scene.
+        values: Parameters of scene and sensor that are no arrays, and the number of threads.
+        own: Addresses of the scene's objects.
+    """
+
+    kept: _SceneRecordings
+    scene: mi.Scene
+    values: Any
+    own: frozenset[int]
+
+
+_scenes: OrderedDict[int, _SceneRecordings] = OrderedDict()
+_current: _Current | None = None
+_is_forbidden = False
+
+T = TypeVar("T")
+
+
+def with_recordings(scene: mi.Scene, sensor: mi.Sensor, act: Callable[[], T]) -> T:
+    """Calls ``act``, which renders ``scene``: frozen functions use what was recorded in earlier
+    renders of it. If Dr.Jit cannot record one of them, ``act`` begins anew, without recordings."""
+    try:
+        with _state(_begun(scene, sensor) if _can_freeze() else None, _is_forbidden):
+            return act()
+    except NotRecordableError as reason:
+        mi.Log(mi.LogLevel.Info, f"the render begins anew, without recordings: {reason}")
+    with _state(None, True):
+        return act()
+
+
+@contextmanager
+def _state(current: _Current | None, is_forbidden: bool) -> Iterator[None]:
+    global _current, _is_forbidden
+    before = _current, _is_forbidden
+    _current, _is_forbidden = current, is_forbidden
+    try:
+        yield
+    finally:
+        _current, _is_forbidden = before
+
+
+def forget_recordings() -> None:
+    """Lets go of all recordings."""
+    _scenes.clear()
+
+
+def frozen(function: Callable | None = None, *, any_width: bool = False) -> Callable:
+    """Decorates a function, or a method, that is to be frozen.
+
+    Parameters:
+        any_width: Are its kernels right for arguments of any width?
+    """
+    if function is None:
+        return functools.partial(frozen, any_width=any_width)
+
+    @functools.wraps(function)
+    def call(*args: Any) -> Any:
+        if _current is None or dr.flag(dr.JitFlag.FreezingScope):
+            return function(*args)
+        return _call(_current, function, args, any_width)
+
+    return call
+
+
+def _can_freeze() -> bool:
+    wanted = dr.is_jit_v(mi.Float) and not mi.is_spectral and dr.flag(dr.JitFlag.KernelFreezing)
+    # A user may freeze a render as a whole
+    return wanted and not _is_forbidden and not dr.flag(dr.JitFlag.FreezingScope)
+
+
+def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
+    parameters = mi.traverse(scene)
+    nodes = (*parameters.hierarchy, *mi.traverse(sensor).hierarchy)
+    if registry.is_any_called() or any(map(_is_foreign, nodes)):
+        mi.Log(mi.LogLevel.Debug, "nothing is recorded: there are plugins in Python")
+        return None
+    mark = next((m for m in (scene.shapes_dr(), scene.emitters_dr()) if dr.width(m) > 0), None)
+    if mark is None or mark.state != dr.VarState.Evaluated:
+        return None
+    kept = _scenes.setdefault(mark.index, _SceneRecordings(mark))
+    _scenes.move_to_end(mark.index)
+    while len(_scenes) > _MOST_SCENES:
+        _scenes.popitem(last=False)
+    sensors = scene.sensors()
+    own = frozenset(_address(o) for o in (*sensors, *scene.emitters(), *scene.shapes()))
+    # Kernels that add from several threads have room for so many
+    threads = dr.thread_count()
+    values = threads, _address(sensor), _values(parameters), _values(mi.traverse(sensor))
+    if _address(sensor) not in own:
+        kept.held[_address(sensor)] = sensor
+    return _Current(kept, scene, values, own)
+
+
+def _is_foreign(thing: mi.Object) -> bool:
+    """Is it written in Python, and called by kernels (samplers are arguments)?"""
+    is_python = type(thing).__module__.partition(".")[0] != "mitsuba"
+    return is_python and not isinstance(thing, (mi.Sampler, mi.Integrator))
+
+
+def _values(parameters: mi.SceneParameters) -> tuple:
+    """Those that are no arrays: they are parts of kernels, and users may change them."""
+    return tuple(
+        (key, value if isinstance(value, _VALUES) else str(value))
+        for key, value in parameters.items()
+        if not _holds_arrays(value)
+    )
+
+
+def _holds_arrays(value: Any) -> bool:
+    # Transforms of textures are numbers, those of cameras and shapes arrays
+    names = getattr(type(value), "DRJIT_STRUCT", ())
+    return dr.is_jit_v(value) or any(_holds_arrays(getattr(value, name)) for name in names)
+
+
+def _address(thing: mi.Object) -> int:
+    return thing.ptr
+
+
+def _call(current: _Current, function: Callable, args: tuple, any_width: bool) -> Any:
+    kept = current.kept
+    description = _Description(current, any_width)
+    try:
+        key = (function, current.values, description.of(args))
+    except _UndescribedError as reason:
+        if function not in kept.refused:
+            mi.Log(mi.LogLevel.Debug, f"{function.__qualname__} is not frozen: {reason}")
+            kept.refused.add(function)
+        return function(*args)
+    if key in kept.refused:
+        return function(*args)
+    kept.held.update(description.held)
+    recording = kept.recordings.get(key)
+    is_new = recording is None
+    if is_new:
+        recording = kept.recordings[key] = _Recording(function)
+        while len(kept.recordings) > _MOST_RECORDINGS:
+            kept.recordings.popitem(last=False)
+    kept.recordings.move_to_end(key)
+    try:
+        result = recording(args, description.arrays)
+    except NotRecordableError as error:
+        # The next render will not try
+        kept.recordings.pop(key, None)
+        kept.refused.add(key)
+        raise NotRecordableError(f"{function.__qualname__} cannot be recorded: {error}") from error
+    except BaseException:
+        kept.recordings.pop(key, None)
+        raise
+    if is_new:
+        again = _Description(current, any_width)
+        if again.of(args) != key[-1] or any(
+            a is not b for a, b in zip(again.arrays, description.arrays)
+        ):
+            what = f"{function.__qualname__} is not frozen: it changes attributes of its arguments"
+            mi.Log(mi.LogLevel.Debug, what)
+            del kept.recordings[key]
+            kept.refused.add(key)
+    return result
+
+
+class _Recording:
+    """What Dr.Jit has recorded of a function, for arguments of one description."""
+
+    def __init__(self, function: Callable) -> None:
+        self._function, self._args = function, ()
+        self._frozen = dr.freeze(self._run, warn_after=1 << 20)
+
+    def _run(self, arrays: list[Any]) -> Any:
+        # The arrays are those that the arguments hold, so that Dr.Jit knows what is read
+        return self._function(*self._args)
+
+    def __call__(self, args: tuple, arrays: list[Any]) -> Any:
+        self._args = args
+        try:
+            # What it frees may be memory of NumPy: Dr.Jit cannot record that, and ends the process
+            with garbage_left_alone():
+                return self._frozen(arrays)
+        except RuntimeError as error:
+            cause = error.__cause__
+            if cause is None or "frozen function" in str(cause):
+                raise NotRecordableError(str(cause or error)) from error
+            raise cause from None
+        finally:
+            self._args = ()
+
+
+class _Description:
+    """All that the kernels of a function depend on but the contents of arrays.
+
+    Parameters:
+        current: The render.
+        any_width: Are the widths of arrays left out?
+
+    Attributes:
+        arrays: The arrays, and what holds such, in the order in which they were met.
+        held: Objects outside of the scene that are named by their address.
+    """
+
+    def __init__(self, current: _Current, any_width: bool) -> None:
+        self._current, self._any_width = current, any_width
+        self._met: dict[int, int] = {}
+        # Addresses of what was met must stay taken
+        self._kept_alive: list[Any] = []
+        self.arrays: list[Any] = []
+        self.held: dict[int, Any] = {}
+
+    def of(self, thing: Any) -> Any:
+        """The description of one thing: a value that can be compared and hashed."""
+        if isinstance(thing, _VALUES):
+            # True is 1, and 1 is 1.0
+            return type(thing), thing
+        if id(thing) in self._met:
+            return "met", self._met[id(thing)]
+        self._met[id(thing)] = len(self._met)
+        self._kept_alive.append(thing)
+        kind = type(thing)
+        if dr.is_jit_v(kind) and dr.is_array_v(kind):
+            if dr.width(thing) == 0:
+                return kind, "empty"
+            self.arrays.append(thing)
+            return kind, self._widths(thing)
+        if isinstance(thing, (list, tuple)):
+            return kind, tuple(self.of(part) for part in thing)
+        if isinstance(thing, dict):
+            return kind, tuple((self.of(key), self.of(value)) for key, value in thing.items())
+        if isinstance(thing, (set, frozenset)) and all(isinstance(x, _VALUES) for x in thing):
+            return kind, frozenset(thing)
+        if isinstance(thing, np.ndarray):
+            return thing.shape, thing.dtype.str, thing.tobytes()
+        if isinstance(thing, (np.number, np.bool_)):
+            return kind, thing.item()
+        if isinstance(thing, type):
+            return thing
+        if isinstance(thing, functools.partial):
+            return kind, self.of(thing.func), self.of(thing.args), self.of(thing.keywords)
+        if callable(thing) and hasattr(thing, "__code__"):
+            return self._function(thing)
+        if isinstance(thing, mi.Object):
+            return self._object(thing)
+        if hasattr(kind, "DRJIT_STRUCT"):
+            self.arrays.append(thing)
+            parts = (self._widths(getattr(thing, name)) for name in kind.DRJIT_STRUCT)
+            return kind, tuple(parts)
+        if kind.__module__.partition(".")[0] in ("mitsuba", "drjit") and not hasattr(
+            thing, "__dict__"
+        ):
+            return kind, str(thing)
+        if hasattr(kind, "kernel_state"):
+            return kind, self.of(thing.kernel_state())
+        if isinstance(thing, slice):
+            return kind, thing.start, thing.stop, thing.step
+        if hasattr(thing, "__dict__"):
+            return kind, tuple((key, self.of(value)) for key, value in vars(thing).items())
+        raise _UndescribedError(f'a "{kind.__module__}.{kind.__qualname__}"')
+
+    def _widths(self, thing: Any) -> Any:
+        if self._any_width:
+            # Scalars stay scalars
+            return dr.width(thing) == 1
+        if dr.is_tensor_v(thing):
+            return dr.shape(thing)
+        return dr.width(thing)
+
+    def _function(self, function: Callable) -> Any:
+        owner = getattr(function, "__self__", None)
+        cells = [cell.cell_contents for cell in function.__closure__ or ()]
+        defaults = function.__defaults__
+        return function.__code__, self.of(owner), self.of(cells), self.of(defaults)
+
+    def _object(self, thing: mi.Object) -> Any:
+        if type(thing).__module__.partition(".")[0] != "mitsuba":
+            raise _UndescribedError(f'a "{type(thing).__name__}", which is written in Python')
+        self.arrays.append(thing)
+        if thing is self._current.scene:
+            return "scene"
+        if isinstance(thing, mi.Sampler):
+            return type(thing), thing.class_name(), thing.wavefront_size()
+        if isinstance(thing, mi.ImageBlock):
+            return (
+                type(thing), tuple(thing.size()), tuple(thing.offset()), thing.channel_count(),
+                thing.coalesce(), thing.normalize(), thing.border_size(),
+                _address(thing.rfilter()) if thing.rfilter() is not None else None,
+                thing.warn_negative(), thing.warn_invalid(),
+            )  # fmt: skip
+        address = _address(thing)
+        if address not in self._current.own:
+            self.held[address] = thing
+        return type(thing), address

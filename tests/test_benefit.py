@@ -1,0 +1,44 @@
+"""Whether what was learned is worth its time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsuba_ext.decisions.benefit import BATCHES, TRIM, gain_of, is_worth, trimmed_batches
+
+
+def _paths(seed: int, count: int = 1 << 14) -> tuple[np.ndarray, np.ndarray]:
+    """Squared errors, and by how much they would be larger: half as much again, on average."""
+    rng = np.random.default_rng(seed)
+    return rng.exponential(2.0, count), rng.exponential(1.0, count)
+
+
+def test_gain_is_the_share_of_the_variance_that_a_decision_removes() -> None:
+    gain, _error = gain_of(trimmed_batches(*_paths(1, 1 << 18)))
+    assert gain == pytest.approx(1 / 3, abs=0.01)
+
+
+def test_error_of_a_gain_is_its_scatter() -> None:
+    found = np.array([gain_of(trimmed_batches(*_paths(seed))) for seed in range(200)])
+    scatter = np.log(1 - found[:, 0]).std(ddof=1)
+    assert found[:, 1].mean() == pytest.approx(scatter, rel=0.15)
+
+
+def test_the_brightest_paths_do_not_decide_alone() -> None:
+    error, more = _paths(1, TRIM)
+    expected = gain_of(trimmed_batches(error, more))[0]
+    more[17] = 1e9
+    assert gain_of(trimmed_batches(error, more))[0] == pytest.approx(expected, abs=0.01)
+    more[17] = np.inf
+    assert gain_of(trimmed_batches(error, more))[0] == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize("sums", [np.zeros((2, BATCHES)), -np.ones((2, BATCHES))])
+def test_where_there_is_no_variance_there_is_no_gain(sums: np.ndarray) -> None:
+    assert gain_of(sums) == (0.0, 0.0)
+
+
+def test_what_is_not_significant_is_not_worth_it() -> None:
+    assert is_worth(1.1, 0.0, 1.03) and is_worth(1.1, 0.05, 1.03)
+    assert not is_worth(1.1, 0.1, 1.03) and not is_worth(1.0, 0.0, 1.03)

@@ -1,0 +1,222 @@
+"""Recorded kernels: the same images without tracing, and nothing stale."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from stage import area, sensor, stage
+
+from mitsuba_ext.transport import frozen
+from mitsuba_ext.transport.walk import Walk
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+INTEGRATORS = ["composed_path", "auto_path", "bdpt", "mlt", "pssmlt", "erpt"]
+
+
+@pytest.fixture(autouse=True)
+def nothing_recorded():
+    frozen.forget_recordings()
+    yield
+    frozen.forget_recordings()
+
+
+def _scene(**changes: Any) -> mi.Scene:
+    lamp = {"type": "sphere", "center": [1, -1, 1.5], "radius": 0.2, "emitter": area(3.0)}
+    return mi.load_dict(stage(second=lamp, **changes), optimize=False)
+
+
+def _image(scene: mi.Scene, integrator: mi.Integrator, seed: int = 1, spp: int = 8) -> np.ndarray:
+    return np.array(mi.render(scene, integrator=integrator, seed=seed, spp=spp))
+
+
+def _traced(scene: mi.Scene, integrator: mi.Integrator, seed: int = 1, spp: int = 8) -> np.ndarray:
+    """Without recordings."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        return _image(scene, integrator, seed, spp)
+
+
+def _assert_same(image: np.ndarray, other: np.ndarray) -> None:
+    # Threads add in any order
+    np.testing.assert_allclose(image, other, rtol=1e-3, atol=1e-4 * other.mean())
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_images_are_those_of_traced_kernels(name: str) -> None:
+    scene, integrator = _scene(), mi.load_dict({"type": name, "max_depth": 4})
+    for seed in (1, 2):
+        _assert_same(_image(scene, integrator, seed), _traced(scene, integrator, seed))
+
+
+def test_a_second_render_traces_nothing(monkeypatch) -> None:
+    calls = []
+    trace = Walk._trace
+    monkeypatch.setattr(Walk, "_trace", lambda *a: calls.append(1) or trace(*a))
+    scene = _scene()
+    _image(scene, mi.load_dict({"type": "composed_path", "max_depth": 3}))
+    assert len(calls) == 1
+    # Another integrator with the same decisions, and another seed
+    _image(scene, mi.load_dict({"type": "composed_path", "max_depth": 3}), seed=5)
+    assert len(calls) == 1
+    # An equal scene is another one
+    _image(_scene(), mi.load_dict({"type": "composed_path", "max_depth": 3}))
+    assert len(calls) == 2
+
+
+def _updated(key: str, value: Callable[[Any], Any]) -> Callable[[mi.Scene], None]:
+    def change(scene: mi.Scene) -> None:
+        parameters = mi.traverse(scene)
+        keys = [k for k in parameters.keys() if k.endswith(key)]
+        assert keys, list(parameters.keys())
+        parameters[keys[0]] = value(parameters[keys[0]])
+        parameters.update()
+
+    return change
+
+
+CHANGES = {
+    "eta": _updated("glass.bsdf.eta", lambda x: 1.8),
+    "place": _updated(
+        "glass.to_world",
+        lambda x: mi.Transform4f().translate([0.5, 0.3, 0.2]) @ mi.Transform4f(x).scale(0.7),
+    ),
+    "bitmap": _updated("picture.bsdf.reflectance.data", lambda x: mi.TensorXf(
+        np.random.default_rng(2).random((7, 3, 3), dtype=np.float32))),
+    "to_uv": _updated("to_uv", lambda x: mi.ScalarTransform3f().scale([3.0, 9.0])),
+    "reflectance": _updated("reflectance.value", lambda x: x * 0.5),
+    "radiance": _updated("radiance.value", lambda x: x * 3),
+    "vertices": _updated("vertex_positions", lambda x: x + 0.1),
+    "near_clip": _updated("near_clip", lambda x: 3.5),
+    "sampling_weight": _updated("emitter.sampling_weight", lambda x: 7.0),
+    "crop": _updated("film.crop_offset", lambda x: mi.ScalarPoint2u(2, 1)),
+    "camera": _updated(
+        "sensor.to_world", lambda x: mi.Transform4f().translate([0.3, 0, 0]) @ mi.Transform4f(x)
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ["composed_path", "bdpt"])
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_changes_in_a_scene_is_seen(change: str, name: str) -> None:
+    squares = {"type": "checkerboard", "to_uv": mi.ScalarTransform4f().scale([4, 4, 1])}
+    scene = _scene(
+        glass={"type": "sphere", "center": [-0.8, -0.6, 0.4], "radius": 0.4,
+               "bsdf": {"type": "dielectric"}},
+        tile={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 0.01]),
+              "bsdf": {"type": "diffuse", "reflectance": squares}},
+        picture={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([1, 0, 0.02]),
+                 "bsdf": {"type": "diffuse", "reflectance": {
+                     "type": "bitmap", "bitmap": mi.Bitmap(np.ones((4, 4, 3), np.float32))}}},
+    )  # fmt: skip
+    integrator = mi.load_dict({"type": name, "max_depth": 4})
+    before = _image(scene, integrator)
+    if change == "crop":
+        parameters = mi.traverse(scene.sensors()[0])
+        size = parameters["film.size"]
+        parameters["film.crop_size"] = mi.ScalarVector2u(size[0] - 4, size[1] - 4)
+        parameters.update()
+        _image(scene, integrator)
+    CHANGES[change](scene)
+    after = _image(scene, integrator)
+    _assert_same(after, _traced(scene, integrator))
+    assert after.shape != before.shape or np.abs(after - before).max() > 1e-3 * before.mean()
+
+
+def test_scenes_that_share_their_sensor_are_two() -> None:
+    """They differ in what no parameter tells."""
+    integrator = mi.load_dict({"type": "composed_path", "max_depth": 3})
+    camera = mi.load_dict(sensor())
+    for distribution in ("ggx", "beckmann"):
+        metal = {"type": "roughconductor", "alpha": 0.3, "distribution": distribution}
+        ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.5, "bsdf": metal}
+        scene = mi.load_dict({**stage(block=None, ball=ball), "sensor": camera}, optimize=False)
+        _assert_same(_image(scene, integrator), _traced(scene, integrator))
+        # Its successor may get its address
+        del scene
+        gc.collect()
+    assert len(frozen._scenes) == 2
+
+
+def test_parameters_of_the_integrator_are_seen() -> None:
+    scene = _scene()
+    for parameters in ({"max_depth": 2}, {"max_depth": 4}, {"max_depth": 4, "rr_depth": 1},
+                       {"max_depth": 4, "hide_emitters": True}):  # fmt: skip
+        integrator = mi.load_dict({"type": "composed_path", **parameters})
+        _assert_same(_image(scene, integrator), _traced(scene, integrator))
+
+
+def test_what_was_learned_is_that_of_the_render() -> None:
+    """Tables of another size, and of other contents, by the same kernels."""
+    scene = _scene()
+    for spp, seed in ((16, 1), (16, 2), (64, 3), (16, 1)):
+        integrator = mi.load_dict({"type": "neepp", "max_depth": 4, "grid": 4})
+        _assert_same(
+            _image(scene, integrator, seed, spp), _traced(scene, integrator, seed, spp)
+        )
+
+
+def test_the_number_of_threads_is_seen() -> None:
+    """Kernels that add from several threads have room for so many."""
+    scene, integrator = _scene(), mi.load_dict({"type": "composed_path", "max_depth": 3})
+    expected, count = _traced(scene, integrator), dr.thread_count()
+    try:
+        for threads in (1, 2, 1, 3):
+            dr.set_thread_count(threads)
+            _assert_same(_image(scene, integrator), expected)
+    finally:
+        dr.set_thread_count(count)
+
+
+def _lit_by_a_plugin() -> mi.Scene:
+    place = mi.ScalarTransform4f().translate([0, 0, 1.9]).rotate([1, 0, 0], 180).scale(0.3)
+    lamp = {"type": "solid_angle_area", "radiance": 5.0}
+    return mi.load_dict(stage(light={"type": "rectangle", "to_world": place, "emitter": lamp}))
+
+
+def test_plugins_in_python_are_traced_each_time() -> None:
+    """Also those of scenes that nobody renders: Dr.Jit traces all of a kind. What they free while a
+    kernel is recorded would end the process."""
+    integrator = mi.load_dict({"type": "composed_path", "max_depth": 3})
+    other = _lit_by_a_plugin()
+    for scene in (other, _scene()):
+        for seed in (1, 2):
+            _assert_same(_image(scene, integrator, seed), _traced(scene, integrator, seed))
+    assert not frozen._scenes
+    scene = _scene()
+    del other
+    gc.collect()
+    _image(scene, integrator)
+    assert len(frozen._scenes) == 1
+
+
+class _ReadingWalk(Walk):
+    """Reads an array while it is traced."""
+
+    def __call__(self, scene, sampler, rays, active):
+        sample = super().__call__(scene, sampler, rays, active)
+        sample.L *= float(dr.opaque(mi.Float, 2.0)[0])
+        return sample
+
+
+def test_what_cannot_be_recorded_is_rendered_all_the_same() -> None:
+    scene, integrator = _scene(), mi.load_dict({"type": "composed_path", "max_depth": 3})
+    expected = 2 * _traced(scene, integrator)
+    integrator.walk = lambda **decisions: _ReadingWalk(3, 5, **decisions)
+    for _ in range(2):
+        _assert_same(_image(scene, integrator), expected)
+
+
+def test_recordings_keep_no_scene_alive() -> None:
+    scene, integrator = _scene(), mi.load_dict({"type": "composed_path"})
+    _image(scene, integrator)
+    things = [scene, *scene.shapes(), *scene.sensors(), *scene.emitters()]
+    counts = [sys.getrefcount(thing) for thing in things]
+    frozen.forget_recordings()
+    assert [sys.getrefcount(thing) for thing in things] == counts
