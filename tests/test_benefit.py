@@ -39,6 +39,16 @@ def test_where_there_is_no_variance_there_is_no_gain(sums: np.ndarray) -> None:
     assert gain_of(sums) == (0.0, 0.0)
 
 
-def test_what_is_not_significant_is_not_worth_it() -> None:
-    assert is_worth(1.1, 0.0, 1.03) and is_worth(1.1, 0.05, 1.03)
-    assert not is_worth(1.1, 0.1, 1.03) and not is_worth(1.0, 0.0, 1.03)
+def test_what_is_uncertain_counts_less() -> None:
+    assert is_worth(1.1, 0.0, 1.03) and is_worth(1.1, 0.5, 1.03)
+    assert not is_worth(1.1, 1.0, 1.03) and not is_worth(1.02, 0.0, 1.03)
+    # Noisy pilots, but much to gain
+    assert is_worth(1.6, 0.8, 1.03)
+    assert not is_worth(0.0, 0.0, 1.03)
+
+
+def test_one_path_of_a_small_pass_is_left_out() -> None:
+    error, more = _paths(1, 512)
+    expected = gain_of(trimmed_batches(error, more))[0]
+    error[3] = 1e9
+    assert gain_of(trimmed_batches(error, more))[0] == pytest.approx(expected, abs=0.02)

@@ -5,12 +5,13 @@ without. Pilots tell both, each with its uncertainty:
 
 - The variance is that of the image by the paths of a pilot, and what it would be if the decision
   had been that of ``path``. The paths are divided into batches, which tell how well the ratio is
-  known. The brightest paths, one in 32768, are left out: they would decide alone.
+  known. The brightest paths, one in 32768 and one in each pass at least, are left out: they would
+  decide alone.
 - The time is calibrated: rays are counted, and what a decision adds to them is known in units of
   the time of a ray. A clock would be closer to the truth on an idle machine, but equal seeds would
   choose differently, and on a busy machine everybody would.
 
-What is not significant follows a fixed prior: not to use what was learned.
+The prior is that nothing is gained or lost: what is uncertain counts less the less is known.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ TABLE, FIRST_GUIDED, GUIDED = 0.2, 0.7, 0.25
 #: Batches of paths, and one path in so many is left out.
 BATCHES, TRIM = 32, 1 << 15
 
-#: Standard errors by which a benefit must be beyond what is asked for.
-_CONFIDENCE = 1.0
+#: What decisions gain in scenes at large: the standard deviation of the logarithm.
+_PRIOR = 0.5
 
 
 def trimmed_batches(error: np.ndarray, more: np.ndarray) -> np.ndarray:
@@ -40,11 +41,10 @@ def trimmed_batches(error: np.ndarray, more: np.ndarray) -> np.ndarray:
         Both sums, shape [2, BATCHES].
     """
     more = np.where(np.isfinite(more), more, 0)
-    count = len(error) // TRIM
+    count = -(-len(error) // TRIM)
     keep = np.ones(len(error), bool)
     if count:
-        size = error + np.abs(more)
-        keep = size < np.partition(size, -count)[-count]
+        keep[np.argpartition(error + np.abs(more), -count)[-count:]] = False
     batch = np.arange(len(error)) % BATCHES
     return np.stack(
         [np.bincount(batch, np.where(keep, x, 0), BATCHES) for x in (error, more)]
@@ -71,6 +71,10 @@ def gain_of(sums: np.ndarray) -> tuple[float, float]:
 
 
 def is_worth(efficiency: float, error: float, least: float) -> bool:
-    """Is an efficiency, of which the logarithm is known up to ``error``, at least ``least``, beyond
-    doubt?"""
-    return efficiency * np.exp(-_CONFIDENCE * error) >= least
+    """Is ``least`` to be expected of an efficiency of which the logarithm is known up to ``error``?
+
+    The less is known of the efficiency, the closer to one it is expected to be. To ask for
+    certainty instead would leave the choice to the seed where pilots are noisy and much is to
+    gain."""
+    known = _PRIOR**2 / (_PRIOR**2 + error**2)
+    return efficiency > 0 and known * np.log(efficiency) >= np.log(least)

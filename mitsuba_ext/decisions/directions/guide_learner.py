@@ -27,8 +27,9 @@ _FIRST_SHARE, _SHARES = 0.6, (0.4, 0.6, 0.8)
 #: Share of all pilots' paths from which the number of bounces is chosen, at least.
 _LEAST_SHARE = 0.2
 
-#: The efficiency that guiding must reach. Trees of all pilots are better than those tested.
-_LEAST_EFFICIENCY = 1.0
+#: The efficiency that guiding must reach. Trees of all pilots are better than those tested, but
+#: only the last stage gains from them.
+_LEAST_EFFICIENCY = 1.03
 
 #: Rays of a path for each segment, about: shadow rays too.
 _RAYS = 1.5
