@@ -10,6 +10,7 @@ import numpy as np
 
 from ..bidirectional.path_moments import Estimate, PathMoments
 from ..bidirectional.technique_observer import TechniqueObserver
+from ..decisions.benefit import gain_of, is_worth, trimmed_batches
 from ..decisions.learner import Learner
 from ..decisions.pixel_estimates import relative_scale
 from ..rendering.camera import film_extent
@@ -84,15 +85,17 @@ class LightPathTrial(Learner):
         image = estimate.mean.reshape(-1, self._width)
         weight = relative_scale(image).ravel() ** 2
         whole, by_camera = (
-            float((variance * weight).sum())
-            for variance in (estimate.bidirectional, estimate.by_camera)
+            variance * weight for variance in (estimate.bidirectional, estimate.by_camera)
         )
+        # Pixels take the place of paths
+        gain, error = gain_of(trimmed_batches(whole, by_camera - whole))
         self.cost = _TIME_OF_A_RAY * float(moments.rays[0] / max(moments.rays[1], 1))
-        self.variance = whole / by_camera if by_camera > 0 else float("inf")
+        self.variance = 1 - gain
         if moments.unreachable > 0:
-            self.variance = 0.0
+            self.variance, error = 0.0, 0.0
         self._moments = None
-        self._choice = LightPathChoice(self.variance * self.cost < 1)
+        efficiency = 1 / (max(self.variance, 1e-3) * self.cost)
+        self._choice = LightPathChoice(is_worth(efficiency, error, 1.0))
         return self._choice
 
     def state(self) -> dict[str, np.ndarray]:
