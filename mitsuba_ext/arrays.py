@@ -8,8 +8,30 @@ from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+#: Bytes at whose multiples Dr.Jit's own arrays begin.
+_ALIGNMENT = 64
 
 T = TypeVar("T")
+
+
+def from_numpy(kind: type[T], values: Any) -> T:
+    """The numbers of ``values``, an array of NumPy or what can be made one, in one row.
+
+    Dr.Jit uses NumPy's memory as it is, and kernels contain whether it is aligned, which would be
+    left to chance: every other process, and every other render, would compile kernels of its own.
+
+    Parameters:
+        kind: The type of the result, such as ``mi.Float``.
+    """
+    dtype = np.dtype(dr.type_v(kind).name.lower())
+    values = np.asarray(values)
+    memory = np.empty(values.size * dtype.itemsize + _ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % _ALIGNMENT
+    aligned = memory[start : start + values.size * dtype.itemsize].view(dtype)
+    aligned[:] = values.ravel()
+    return kind(aligned)
 
 
 def joined(parts: Sequence[T]) -> T:

@@ -17,6 +17,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from .arrays import from_numpy
+
 #: The largest angle, and the largest number, of the steps by which a rotation's bounds are found.
 _BOUNDS_STEP = math.radians(3)
 _MOST_BOUNDS_STEPS = 4096
@@ -181,7 +183,7 @@ class PoseTable:
         rows[:, :, 2, 3] = np.inf  # the time when a row's segment begins
         for index, motion in enumerate(motions):
             rows[index, : len(motion.turns)] = _rows(motion)
-        self._rows = mi.Float(np.ravel(rows).astype(np.float32))
+        self._rows = from_numpy(mi.Float, rows)
 
     def pose(self, index: mi.UInt32, time: mi.Float) -> Pose:
         """The pose of the motion ``index`` at ``time``."""

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..bounds import scene_bounds
 from ..transport.numbers import Numbers
 from . import light_pieces as pieces
@@ -131,11 +132,11 @@ class LightEmission:
         mark = self._pieces.kind + 16 * self._pieces.way + 64 * self._delta_direction
         table[:, 2], table[:, 3] = mark, self._pieces.parameter
         table[:, 4:7] = self._pieces.axis
-        self._table = mi.Float(table.ravel())
+        self._table = from_numpy(mi.Float, table)
         ids = dr.reinterpret_array(mi.UInt32, self._emitters).numpy()
         index = np.zeros(ids.max() + 1, dtype=np.uint32)
         index[ids] = np.arange(count)
-        self._index = mi.UInt32(index)
+        self._index = from_numpy(mi.UInt32, index)
 
     # ---- Sampling ----
 

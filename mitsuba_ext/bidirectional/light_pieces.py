@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..discrete_sampling import alias_tables
 from ..lights.division import emitter_shapes, has_interpolated_normals, triangles
 from ..movers import refuse_moving_lights
@@ -83,7 +84,7 @@ class LightPieces:
         integers = words.view(np.uint32)
         integers[:, 12], integers[:, 14] = table[:, 12], table[:, 14]
         integers[:, 13] = owner
-        self._words = mi.Float(words.ravel())
+        self._words = from_numpy(mi.Float, words)
         self.count = dr.opaque(mi.UInt32, len(table))
         relative = self.probability[owner] * np.concatenate(measures)
         if not relative.any():

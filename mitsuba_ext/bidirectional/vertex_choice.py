@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..transport.path_decisions import SubpathSelection
 from ..transport.vertex import Vertex
 from .light_vertices import VertexCache
@@ -83,7 +84,7 @@ class RegionChoice(VertexChoice):
         self._selection = selection
         region = vertices.region
         # Stable, and so the same in each render
-        self._order = mi.UInt32(np.argsort(_small(region), kind="stable").astype(np.uint32))
+        self._order = from_numpy(mi.UInt32, np.argsort(_small(region), kind="stable"))
         number = dr.zeros(mi.UInt32, selection.count)
         dr.scatter_add(number, mi.UInt32(1), region)
         self._range = mi.ArrayXu([dr.cumsum(number) - number, number])

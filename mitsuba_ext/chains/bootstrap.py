@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..transport.numbers import BothEnds, Numbers
 from .numbers import ProposedNumbers, StateNumbers, StratifiedNumbers, generator, stream
 from .small_steps import SmallSteps
@@ -97,4 +98,4 @@ class Bootstrap:
 
     def _at(self, places: np.ndarray) -> mi.UInt32:
         index = np.searchsorted(self._sums, places, side="right")
-        return mi.UInt32(np.minimum(index, self._last).astype(np.uint32))
+        return from_numpy(mi.UInt32, np.minimum(index, self._last))

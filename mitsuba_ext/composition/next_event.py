@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..bounds import scene_bounds
 from ..decisions.learner import Learner
 from ..decisions.next_event.environment_partition import MOST_SPLITS
@@ -52,9 +53,9 @@ def sampling_weights(scene: mi.Scene) -> LightTable:
     """The choice of ``path``, but with the true densities of points on meshes with interpolated
     normals."""
     cells = LightCells(scene, None)
-    number = mi.UInt32(cells.emitter_index.astype(np.uint32))
+    number = from_numpy(mi.UInt32, cells.emitter_index)
     probability = np.broadcast_to(scene.pdf_emitter(number).numpy(), cells.count)
-    return LightTable(OneRow(), cells, mi.Float((probability * cells.share).astype(np.float32)))
+    return LightTable(OneRow(), cells, from_numpy(mi.Float, probability * cells.share))
 
 
 class LinearLights(DecisionParameters):

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..decisions.learner import Learner
 from ..decisions.swarm.lobe_maps import LobeMapLearner
 from ..decisions.swarm.map_learner import MapLearner
@@ -96,9 +97,9 @@ def _map(learner: MapLearner, pixel: int, place: tuple[int, int], border: int) -
         index = (index << 1) | bit.reshape(shape).astype(np.uint32)
     tile = int(tiles.tile(mi.UInt32(pixel))[0])
     table = np.repeat(np.arange(maps, dtype=np.uint32) + tile * maps, cells.count)
-    cell = mi.UInt32(np.tile(index.ravel(), maps))
+    cell = from_numpy(mi.UInt32, np.tile(index.ravel(), maps))
     # A cell without width has no density
-    is_wide = dr.gather(mi.Float, mi.Float(cells.widths.astype(np.float32)), cell) > 0
+    is_wide = dr.gather(mi.Float, from_numpy(mi.Float, cells.widths), cell) > 0
     found = learner.decision.maps.density(mi.UInt32(table), cell, is_wide)
     density = dr.select(is_wide, found, 0).numpy().reshape(maps, *index.shape)
     if isinstance(learner, LobeMapLearner):

@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
+
 #: Pixels on each side of one that count for it, along each axis.
 _RADIUS = 4
 
@@ -52,7 +54,7 @@ class PixelEstimates:
         means = self._means()
         weight = dr.square(dr.gather(mi.Float, self._scale(means), pixel))
         radiance = dr.select(dr.isfinite(radiance), radiance, 0)
-        mean = dr.gather(mi.Float, mi.Float(means.astype(np.float32)), pixel)
+        mean = dr.gather(mi.Float, from_numpy(mi.Float, means), pixel)
         return weight, dr.square(radiance - mean) * weight
 
     def _means(self) -> np.ndarray:
@@ -63,7 +65,7 @@ class PixelEstimates:
 
     def _scale(self, means: np.ndarray) -> mi.Float:
         mean = self._sum.sum() / max(self._count.sum(), 1)
-        return mi.Float(_inverse(means, mean).astype(np.float32))
+        return from_numpy(mi.Float, _inverse(means, mean))
 
 
 def relative_scale(image: np.ndarray) -> np.ndarray:

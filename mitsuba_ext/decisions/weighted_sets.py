@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..pointsets import points, voronoi_weights
 
 #: Values of the parameter ``weights``.
@@ -68,7 +69,7 @@ class WeightedSets:
                 rows[:, dimension] = count * voronoi_weights(x, _BOUNDARIES[weights])
                 if periods > 1:
                     rows[:, dimension + 1] = _periodic_weights(x, periods)
-        self._table = mi.Float(np.ascontiguousarray(table.ravel()))
+        self._table = from_numpy(mi.Float, table)
         self._opaque_count, self._opaque_sets = (
             dr.opaque(mi.UInt32, n) for n in (count, self._set_count)
         )

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from .images import Pyramid, Size, rgb
 from .layers import Layer
 
@@ -138,7 +139,7 @@ def _affordable(excess: mi.Color3f, radius: mi.Float, size: Size) -> mi.UInt32:
         bright = dr.sum(excess).numpy()
         order = order[np.argsort(-bright[order] / covered[order], kind="stable")]
         order = order[np.cumsum(covered[order]) <= _MOST_COVERED * size.count]
-    return mi.UInt32(np.sort(order).astype(np.uint32))
+    return from_numpy(mi.UInt32, np.sort(order))
 
 
 def _brightness(color: mi.Vector4f) -> mi.Float:

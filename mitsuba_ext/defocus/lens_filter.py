@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from .highlights import Highlights, Visibility, spread, without_highlights
 from .images import LevelView, Pyramid, Size, rgb
 from .layers import Layer
@@ -162,7 +163,7 @@ class _Points:
 
     def turn(self, position: mi.Vector2i) -> mi.Vector2f:
         """Sine and cosine of the angle by which a pixel turns the points."""
-        ranks = mi.UInt32(np.array(_TURNS, dtype=np.uint32))
+        ranks = from_numpy(mi.UInt32, _TURNS)
         rank = dr.gather(mi.UInt32, ranks, mi.UInt32((position.y & 3) * 4 + (position.x & 3)))
         return mi.Vector2f(*dr.sincos(mi.Float(rank) * self._step))
 

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from .images import LevelView, Pyramid
 
 #: Points of the rings, the innermost first. Every point stands for the same area.
@@ -39,7 +40,7 @@ class LensPoints:
     """
 
     def __init__(self, points: np.ndarray) -> None:
-        self._table = mi.Float(np.ascontiguousarray(points, dtype=np.float32).ravel())
+        self._table = from_numpy(mi.Float, points)
         self.count = dr.opaque(mi.UInt32, len(points))
         # Half of the distance between neighbours, in radii
         self._step = 0.5 * math.sqrt(math.pi / len(points))

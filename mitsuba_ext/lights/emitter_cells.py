@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..discrete_sampling import ONE_MINUS_EPSILON, first_above
 from .division import Division, divide, emitter_shapes, triangles
 
@@ -50,9 +51,9 @@ class EmitterCells:
 
         self._only = scene.emitters()[indices[0]] if len(indices) == 1 else None
         self._emitters = dr.gather(
-            mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(np.array(indices, dtype=np.uint32))
+            mi.EmitterPtr, scene.emitters_dr(), from_numpy(mi.UInt32, indices)
         )
-        self._emitter = mi.UInt32(number.astype(np.uint32))
+        self._emitter = from_numpy(mi.UInt32, number)
         self._is_divided = any(d.shape for d in divisions)
         # A textured emitter maps the unit square by its texture: points of its cells are sampled on
         # its shape
@@ -63,18 +64,18 @@ class EmitterCells:
         if self._by_area:
             is_textured = np.array([d.is_textured for d in divisions])
             self._is_textured = mi.Bool(is_textured)
-            self._textured_number = mi.UInt32((np.cumsum(is_textured) - 1).clip(0))
+            self._textured_number = from_numpy(mi.UInt32, (np.cumsum(is_textured) - 1).clip(0))
         self._longest = int(sizes.max())
         self._has_groups = self._longest > 1
         # So that rounding does not move a sample into the neighbouring piece
         inset = np.minimum(2.0**-23, 0.25 * pieces[:, 2:]).T
         corner, size = pieces[:, :2].T + inset, pieces[:, 2:].T - 2 * inset
         # Corner and size of a piece side by side: one access to memory reads all four
-        self._pieces = mi.Float(_floats(np.concatenate([corner, size]).T).ravel())
-        self._share = mi.Float(self.share.astype(np.float32))
+        self._pieces = from_numpy(mi.Float, np.concatenate([corner, size]).T)
+        self._share = from_numpy(mi.Float, self.share)
         if self._has_groups:
-            self._last_piece = mi.UInt32((ends - 1).astype(np.uint32))
-            self._first_piece = mi.UInt32((ends - sizes).astype(np.uint32))
+            self._last_piece = from_numpy(mi.UInt32, ends - 1)
+            self._first_piece = from_numpy(mi.UInt32, ends - sizes)
             # The running sum, within each cell, of the shares of its pieces
             total = np.cumsum(measure)
             below = np.concatenate([[0.0], total])[ends - sizes]
@@ -82,7 +83,7 @@ class EmitterCells:
                 np.maximum(self.share, 1e-300), sizes
             )
             cumulative[ends - 1] = 1
-            self._cumulative = mi.Float(cumulative.astype(np.float32))
+            self._cumulative = from_numpy(mi.Float, cumulative)
         self._inverse([shapes[i] for i in indices], divisions, cell_counts, sizes)
 
     def _inverse(
@@ -99,15 +100,15 @@ class EmitterCells:
         self._kinds = kinds
         self.has_smooth_meshes = any(d.is_smooth for d in divisions)
 
-        def by_id(values, dtype=np.uint32) -> mi.UInt32 | mi.Float:
-            table = np.zeros(int(ids.max(initial=0)) + 1, dtype=dtype)
+        def by_id(values, kind=mi.UInt32) -> mi.UInt32 | mi.Float:
+            table = np.zeros(int(ids.max(initial=0)) + 1)
             table[ids] = values
-            return mi.UInt32(table) if dtype is np.uint32 else mi.Float(table)
+            return from_numpy(kind, table)
 
         if self._by_area:
             self._is_textured_id = by_id([d.is_textured for d in divisions])
             areas = [_area(s) if d.is_textured else 1.0 for s, d in zip(shapes, divisions)]
-            self._density = by_id(np.float32(1 / np.array(areas)), np.float32)
+            self._density = by_id(1 / np.array(areas), mi.Float)
         first = np.cumsum(cell_counts) - cell_counts
         self._first_cell = by_id(first)
         if kinds - {"", "mesh"}:
@@ -129,15 +130,16 @@ class EmitterCells:
             first_entry.append(d.face_first[:-1] + entries)
             cell_of.append(np.repeat(np.arange(len(d.cell_sizes)), d.cell_sizes)[d.face_pieces] + f)
             entries += d.face_first[-1]
-        self._face_cuts = mi.UInt32(np.concatenate(cuts))
-        self._face_first = mi.UInt32(np.concatenate(first_entry).astype(np.uint32))
-        self._cell_of_piece = mi.UInt32(np.concatenate(cell_of).astype(np.uint32))
+        self._face_cuts = from_numpy(mi.UInt32, np.concatenate(cuts))
+        self._face_first = from_numpy(mi.UInt32, np.concatenate(first_entry))
+        self._cell_of_piece = from_numpy(mi.UInt32, np.concatenate(cell_of))
         self._has_cut_faces = any(int(c.max(initial=1)) > 1 for c in cuts)
         if self._has_cut_faces:
             corners = [triangles(mesh) for mesh, d in zip(shapes, divisions) if d.shape == "mesh"]
             a, b, c = (np.concatenate(x).T for x in zip(*corners))
-            self._a = mi.Point3f(_floats(a))
-            self._ab, self._ac = mi.Vector3f(_floats(b - a)), mi.Vector3f(_floats(c - a))
+            self._a, self._ab, self._ac = (
+                mi.Vector3f(*(from_numpy(mi.Float, axis) for axis in x)) for x in (a, b - a, c - a)
+            )
         if self.has_smooth_meshes:
             normals = np.zeros((int(sizes.sum()), 3), dtype=np.float32)
             smooth = np.zeros(len(normals), dtype=bool)
@@ -146,8 +148,8 @@ class EmitterCells:
                 begin, end = end, end + len(d.pieces)
                 if d.is_smooth:
                     normals[begin:end], smooth[begin:end] = d.normals, True
-            self._normal = mi.Normal3f(np.ascontiguousarray(normals.T))
-            self._is_smooth_piece = mi.Bool(smooth)
+            self._normal = mi.Normal3f(*(from_numpy(mi.Float, axis) for axis in normals.T))
+            self._is_smooth_piece = from_numpy(mi.Bool, smooth)
             self._is_smooth = by_id([d.is_smooth for d in divisions])
 
     def sample(
@@ -303,10 +305,6 @@ def _sample_by_area(
 
 def _area(shape: mi.Shape) -> float:
     return float(dr.slice(shape.surface_area()))
-
-
-def _floats(values: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(values, dtype=np.float32)
 
 
 def _slot(x: mi.Float, count: mi.UInt32) -> mi.UInt32:

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..discrete_sampling import ONE_MINUS_EPSILON, alias_tables
 from .environment_texels import EnvironmentTexels
 
@@ -54,7 +55,7 @@ class EnvironmentBins:
         self.share = emitted / emitted.sum()
         # Densities on the sphere, but for 1 / sin θ
         corners = corners * (columns * rows / self._texels.area / bin_weight)[bin][:, None]
-        self._corners = mi.Float(corners.ravel().astype(np.float32))
+        self._corners = from_numpy(mi.Float, corners)
 
         order = np.argsort(bin.astype(np.uint16), kind="stable")
         size = np.bincount(bin, minlength=count)
@@ -62,14 +63,14 @@ class EnvironmentBins:
         of = bin[order]
         threshold, alias = alias_tables(
             mi.Float64((weight * size[bin] / bin_weight[bin])[order]),
-            mi.UInt32((end - size)[of].astype(np.uint32)),
-            mi.UInt32((end - 1)[of].astype(np.uint32)),
+            from_numpy(mi.UInt32, (end - size)[of]),
+            from_numpy(mi.UInt32, (end - 1)[of]),
             int(size.max()),
         )
         entries = np.empty((len(order), 2), dtype=np.uint32)
         entries[order, 0] = threshold.numpy().view(np.uint32)
         entries[order, 1] = order[alias.numpy()]
-        self._entries = mi.UInt32(entries.ravel())
+        self._entries = from_numpy(mi.UInt32, entries)
 
     def sample(
         self, bin: mi.UInt32, ref: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..discrete_sampling import ONE_MINUS_EPSILON
 from ..portals import Portal
 from .environment_directions import EnvironmentDirections
@@ -81,7 +82,7 @@ class PortalMaps:
             size = [p.half_width, p.half_height]
             rows.append([*p.center, *axes, *size, number])
         self.count = len(portals)
-        self._portals = mi.Float(np.array(rows, dtype=np.float32).ravel())
+        self._portals = from_numpy(mi.Float, rows)
         self._row = len(rows[0])
         tables = [self._texels(np.array(frame).reshape(3, 3)) for frame in frames]
         n = self.resolution
@@ -89,9 +90,9 @@ class PortalMaps:
         sums[:, 1:, 1:] = np.cumsum(np.cumsum(tables, axis=1), axis=2)
         # Maps of several orientations keep their relation: portals are chosen by these sums
         scale = 1 / sums[0, -1, -1]
-        self._sums = mi.Float64(scale * sums.ravel())
+        self._sums = from_numpy(mi.Float64, scale * sums)
         values = scale * (n / np.pi) ** 2 * np.ravel(tables)
-        self._values = mi.Float(values.astype(np.float32))
+        self._values = from_numpy(mi.Float, values)
         self._size = dr.opaque(mi.UInt32, n)
 
     # ---- From a point ----

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..bounds import scene_bounds
 from ..movers import is_moving_light
 from .division import emitter_shapes
@@ -85,7 +86,7 @@ def _sent_in(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
     bbox = scene_bounds(scene)
     sphere = bbox.bounding_sphere() if bbox.valid() else mi.ScalarBoundingSphere3f(0.0, 1.0)
     index, sampler = _lanes(len(indices))
-    emitter = dr.gather(mi.UInt32, mi.UInt32(indices.astype(np.uint32)), index)
+    emitter = dr.gather(mi.UInt32, from_numpy(mi.UInt32, indices), index)
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), emitter)
     ref = dr.zeros(mi.Interaction3f, dr.width(index))
     ref.p = mi.Point3f(sphere.center)

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from .spectra import brightness, comparison_wavelengths
 
 #: Angles at which the edge of the disk is searched, up to the largest aperture, in radians.
@@ -56,7 +57,7 @@ class SunDisk:
         upwards = dr.select(
             length > 1e-3, upwards / dr.maximum(length, 1e-3), mi.coordinate_system(sun)[0]
         )
-        sin, cos = dr.sincos(mi.Float(_ANGLES.astype(np.float32)))
+        sin, cos = dr.sincos(from_numpy(mi.Float, _ANGLES))
         si = dr.zeros(mi.SurfaceInteraction3f, len(_ANGLES))
         si.wi = -(sun * cos + upwards * sin)
         si.wavelengths = comparison_wavelengths(len(_ANGLES))

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..discrete_sampling import ONE_MINUS_EPSILON
 from .environment_texels import EnvironmentTexels
 
@@ -103,8 +104,8 @@ class TexelSums:
         sums[1:, 1:] = weight.cumsum(axis=0).cumsum(axis=1)
         #: The integral of the brightness over the sphere, without a sun that is a disk.
         self.emission = float(sums[-1, -1]) * texels.area / (texels.columns * texels.rows)
-        self._sums = mi.Float64((sums / sums[-1, -1]).ravel())
-        self._nodes = mi.Float((node / node.max()).ravel().astype(np.float32))
+        self._sums = from_numpy(mi.Float64, sums / sums[-1, -1])
+        self._nodes = from_numpy(mi.Float, node / node.max())
         self._stride = dr.opaque(mi.UInt32, texels.columns + 1)
         #: From the probability of a texel to a density on the sphere, but for 1 / sin θ.
         self._density = dr.opaque(mi.Float, texels.columns * texels.rows / texels.area)

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..regions.surface_rows import SurfaceRows
 from ..regions.voxel_grid import VoxelGrid
 from .light_cells import LightCells
@@ -36,7 +37,7 @@ def uniform_weights(scene: mi.Scene, cells: LightCells) -> mi.Float:
     """The weights with which Mitsuba chooses: the ``sampling_weight`` of each emitter, divided
     among its cells by area; shape [cells]."""
     weights = np.array([e.sampling_weight() for e in scene.emitters()])
-    return mi.Float((weights[cells.emitter_index] * cells.share).astype(np.float32))
+    return from_numpy(mi.Float, weights[cells.emitter_index] * cells.share)
 
 
 def power_weights(scene: mi.Scene, cells: LightCells) -> mi.Float:
@@ -50,7 +51,7 @@ def power_weights(scene: mi.Scene, cells: LightCells) -> mi.Float:
     # An emitter whose power was estimated as 0, or is lost in rounding, must still be chosen
     cell = np.maximum(cell, _FLOOR * (cell.mean() or 1.0))
     cell[sampling_weight[cells.emitter_index] <= 0] = 0
-    return mi.Float(cell.astype(np.float32))
+    return from_numpy(mi.Float, cell)
 
 
 class VoxelRows:

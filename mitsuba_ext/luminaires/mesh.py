@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..solid_angles.spherical_triangle import SphericalTriangle, spherical_triangle
 from .surface import Surface, SurfacePoint
 
@@ -27,10 +28,10 @@ class MeshSurface(Surface):
     def __init__(self, shape: mi.Shape) -> None:
         super().__init__(shape)
         table, areas, self._is_smooth = _table(shape)
-        self._table = mi.Float(table.ravel())
+        self._table = from_numpy(mi.Float, table)
         self._count = len(table)
         share = np.cumsum(areas) / max(areas.sum(), 1e-300)
-        self._share = mi.Float(np.append(0, share).astype(np.float32))
+        self._share = from_numpy(mi.Float, np.append(0, share))
 
     def _triangle(self, index: mi.UInt32, p: mi.Point3f, active: mi.Bool) -> SphericalTriangle:
         """A triangle as seen from ``p``; one that does not face it has no solid angle."""

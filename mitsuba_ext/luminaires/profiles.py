@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..arrays import from_numpy
 from .ies import Intensities
 
 #: Radiance is intensity over the area that is seen. Of this, at least such a share of the light's
@@ -61,7 +62,7 @@ class AngularTable(Profile):
         rows, self._columns = intensities.values.shape
         self.needs_axis = rows > 1
         self._rows = rows
-        self._values = mi.Float(intensities.values.ravel().astype("float32"))
+        self._values = from_numpy(mi.Float, intensities.values)
 
     def eval(self, cosine, cos_turn, sin_turn):
         vertical = dr.safe_acos(cosine) * (2 / dr.pi * (self._columns - 1))

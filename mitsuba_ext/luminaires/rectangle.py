@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..solid_angles.projected_polygon import ProjectedPolygon
 from ..solid_angles.spherical_polygon import SphericalPolygon, spherical_polygon
 from .surface import Surface, SurfacePoint
@@ -143,7 +144,7 @@ def _column(matrix: mi.Matrix4f, index: int) -> np.ndarray:
 def _data(vector: np.ndarray) -> mi.Vector3f:
     """A vector that is no literal: so the code of all rectangles is the same, and is compiled
     once."""
-    return mi.Vector3f(*(mi.Float(np.array([x], dtype=np.float32)) for x in vector))
+    return mi.Vector3f(*(from_numpy(mi.Float, [x]) for x in vector))
 
 
 @dataclass

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..bidirectional.emission import LightEmission
 
 #: Bits of the table.
@@ -25,7 +26,7 @@ class LightKinds:
 
     def __init__(self, scene: mi.Scene) -> None:
         kinds = [_kind(emitter) for emitter in scene.emitters()]
-        self._kinds = mi.UInt32(np.array(kinds, dtype=np.uint32))
+        self._kinds = from_numpy(mi.UInt32, kinds)
         self._emitters = scene.emitters_dr()
         any_kind = int(np.bitwise_or.reduce(kinds))
         self.has_unhittable = bool(any_kind & (_POINT | _FIXED_DIRECTION))

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..discrete_sampling import ONE_MINUS_EPSILON, first_above
 
 #: At first, of the lengths of new paths, each is as frequent as the one before times this.
@@ -34,16 +35,16 @@ class Techniques:
         # Lights are seen by camera paths only
         chance[(self._lengths == 1) & (self._grown == 0)] = 0
         self._first = chance / chance.sum()
-        self._tables = [mi.UInt32(a.astype(np.uint32)) for a in (self._lengths, self._grown)]
+        self._tables = [from_numpy(mi.UInt32, a) for a in (self._lengths, self._grown)]
         # Where the techniques of each length begin
         starts = np.concatenate([np.zeros(least), np.cumsum([0, *(lengths + 1)])])[: most + 1]
-        self._starts = mi.UInt32(starts.astype(np.uint32))
+        self._starts = from_numpy(mi.UInt32, starts)
         self._set(self._first)
 
     def _set(self, chance: np.ndarray) -> None:
         self._chance = chance
-        self._sums = mi.Float(np.cumsum(chance).astype(np.float32))
-        self._logs = mi.Float(np.log(np.maximum(chance, 1e-30)).astype(np.float32))
+        self._sums = from_numpy(mi.Float, np.cumsum(chance))
+        self._logs = from_numpy(mi.Float, np.log(np.maximum(chance, 1e-30)))
         dr.eval(self._sums, self._logs)
 
     def kernel_state(self) -> tuple:

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from .surface_sides import region
 from .voxel_sides import SIDES, VoxelSides, voxel_coordinates
 
@@ -65,7 +66,7 @@ class NestedRegions:
             self.levels.append(slice(self.count, self.count + len(seen)))
             self.count += len(seen)
         self.parent = np.concatenate(parents)
-        self._table = mi.UInt32(table.ravel())
+        self._table = from_numpy(mi.UInt32, table)
         dr.eval(self._table)
 
     def state(self) -> dict[str, np.ndarray]:
@@ -85,7 +86,7 @@ class NestedRegions:
         regions._pairs = VoxelSides(
             mi.Point3f(regions._origin), mi.Vector3f(regions._scale), _GRIDS[-1]
         )
-        regions._table, regions.count = mi.UInt32(state["table"]), int(state["count"])
+        regions._table, regions.count = from_numpy(mi.UInt32, state["table"]), int(state["count"])
         dr.eval(regions._table)
         return regions
 

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from .surface_sides import lit_normal
 from .voxel_sides import SIDES, VoxelSides, sides, voxel_coordinates, voxel_number
 
@@ -43,11 +44,11 @@ class SurfaceRows:
         pair = np.where(inside, pair, pair_count)
         # Vertices outside come last, and are left out
         order = np.argsort(pair, kind="stable")[: int(inside.sum())]
-        order = mi.UInt32(order.astype(np.uint32))
+        order = from_numpy(mi.UInt32, order)
         self.p, self.n = dr.gather(mi.Point3f, p, order), dr.gather(mi.Normal3f, n, order)
         pairs, first, size = np.unique(pair[order], return_index=True, return_counts=True)
         self.pairs, self.first, self.size = (
-            mi.UInt32(x.astype(np.uint32)) for x in (pairs, first, size)
+            from_numpy(mi.UInt32, x) for x in (pairs, first, size)
         )
         self.count = len(pairs) + 1
         self._row = dr.full(mi.UInt32, self.count - 1, pair_count)
@@ -68,7 +69,7 @@ class SurfaceRows:
         voxel = voxel_number(x // 2, y // 2, z // 2, half)
         pairs = (voxel * SIDES + self.pairs % SIDES).numpy()
         numbers, index = np.unique(pairs, return_inverse=True)
-        return mi.UInt32(index.astype(np.uint32)), len(numbers)
+        return from_numpy(mi.UInt32, index), len(numbers)
 
 
 def voxel_edges(bbox: mi.ScalarBoundingBox3f, resolution: int) -> mi.Vector3f:

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from . import camera
 from .pixel_moments import PixelMoments
 from .render import Job, kernel_cache_misses
@@ -105,7 +106,7 @@ class AdaptiveJob(Job):
         """Renders so many sets of each pixel into the block; did it have to compile a kernel?"""
         begin, misses = time.perf_counter(), kernel_cache_misses()
         pixels = np.repeat(np.arange(len(sets), dtype=np.uint32), sets)
-        table = mi.Float(weight.astype(np.float32))
+        table = from_numpy(mi.Float, weight)
         for start in range(0, len(pixels), self._most_sets):
             self._run_part_of_sets(stage, pixels[start : start + self._most_sets], table)
         seconds, compiled = time.perf_counter() - begin, kernel_cache_misses() > misses
@@ -125,7 +126,7 @@ class AdaptiveJob(Job):
         sampler.seed(dr.opaque(mi.UInt32, seed), size)
         lane = dr.arange(mi.UInt32, size)
         in_set = lane // dr.opaque(mi.UInt32, self._set_size)
-        pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), in_set)
+        pixel = dr.gather(mi.UInt32, from_numpy(mi.UInt32, pixels), in_set)
         lanes = camera.lanes_at(self.film, pixel, dr.zeros(mi.UInt32, size))
         numbers = camera.draw_numbers(self.sensor, sampler, lanes, stage.camera)
         rays = camera.camera_rays(self.sensor, lanes, numbers, self.plan.spp)

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..defocus.denoised import denoised
 from ..defocus.filters import Capture, make_filter
 from ..defocus.images import Size
@@ -131,7 +132,7 @@ class LayeredJob(Job):
         pixels = np.flatnonzero(outside_pixels(self.blurs, self.margin)).astype(np.uint32)
         if self.filter.has_layers:
             least = least_blur_around(self.blurs, self.lens.blur_of_sky)
-            self._least = mi.Float(least.ravel())
+            self._least = from_numpy(mi.Float, least)
             hidden = np.flatnonzero(np.isfinite(least)).astype(np.uint32)
             pixels = np.concatenate([pixels, hidden | _HIDDEN])
         if len(pixels) == 0:
@@ -215,7 +216,7 @@ class LayeredJob(Job):
         self.block = mi.ImageBlock(mi.TensorXf(values), offset=offset)
 
     def _picture(self, sums: list[LayerSums]) -> np.ndarray:
-        capture = Capture(self.size, sums, mi.Float(self.blurs.ravel()))
+        capture = Capture(self.size, sums, from_numpy(mi.Float, self.blurs))
         picture = self.filter.picture(capture)
         shape = (self.size.height, self.size.width, 3)
         return mi.TensorXf(dr.ravel(picture), shape=shape).numpy()[self._inside]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.estimator import Estimator, Sample
+from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.frozen import frozen
 from . import camera
 from .camera_samples import CameraSamples
@@ -41,15 +41,41 @@ def put_samples(
     Raises:
         GradientsError: Gradients are asked for.
     """
-    film = sensor.film()
-    taken = lanes.lanes(film)
-    numbers = camera.draw_numbers(sensor, sampler, taken, samples)
-    rays = camera.camera_rays(sensor, taken, numbers, spp)
-    sample = estimator(scene, sampler, rays, mi.Bool(True))
+    rays, sample = _sampled(estimator, samples, scene, sensor, sampler, lanes, spp)
     if dr.grad_enabled(sample.L):
         raise GradientsError
-    camera.put(film, block, rays, sample, sample.aovs, weight)
+    camera.put(sensor.film(), block, rays, sample, sample.aovs, weight)
     count_rays(tally, sample)
+
+
+@frozen(any_width=True)
+def look(
+    estimator: Estimator,
+    samples: CameraSamples,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    lanes: camera.PassLanes,
+    spp: int,
+) -> mi.Spectrum:
+    """The radiance of samples of which observers learn; the film does not get them. The parameters
+    are those of :func:`put_samples`."""
+    return _sampled(estimator, samples, scene, sensor, sampler, lanes, spp)[1].L
+
+
+def _sampled(
+    estimator: Estimator,
+    samples: CameraSamples,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    lanes: camera.PassLanes,
+    spp: int,
+) -> tuple[CameraRays, Sample]:
+    taken = lanes.lanes(sensor.film())
+    numbers = camera.draw_numbers(sensor, sampler, taken, samples)
+    rays = camera.camera_rays(sensor, taken, numbers, spp)
+    return rays, estimator(scene, sampler, rays, mi.Bool(True))
 
 
 def count_rays(tally: mi.UInt64, sample: Sample) -> None:

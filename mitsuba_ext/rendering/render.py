@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..transport import heroes
 from ..transport.estimator import CameraRays, Sample
 from ..transport.frozen import with_recordings
@@ -26,7 +27,7 @@ from . import camera
 from .dither import dithered_parts
 from .filter_weights import put_splats
 from .interrupts import deferred_interrupt
-from .pass_samples import GradientsError, count_rays, put_samples
+from .pass_samples import GradientsError, count_rays, look, put_samples
 from .plan import Planned, plan_render
 from .stages import DivisibleSchedule, Schedule, Stage
 from .time_budget import TimeBudget
@@ -262,7 +263,8 @@ class Job:
             stage, begin = self._next_stage(schedule), time.perf_counter()
             sampler = self.sampler.clone()
             self._seed(sampler, self.statistics.passes, 1, pixels)
-            lanes = camera.lanes_at(self.film, mi.UInt32(pixels), dr.opaque(mi.UInt32, 0))
+            pixel = from_numpy(mi.UInt32, pixels)
+            lanes = camera.lanes_at(self.film, pixel, dr.opaque(mi.UInt32, 0))
             self._take(stage, sampler, lanes)
             self.statistics.compile_seconds += time.perf_counter() - begin
             dr.sync_thread()
@@ -285,12 +287,20 @@ class Job:
         # The same for all seeds: what a scout decides changes the size of tables, and kernels
         number = 0 if pixels is None else pixels.start
         sampler.seed(dr.opaque(mi.UInt32, number), self._lanes(1, pixels))
-        rays = camera.sample_rays(
-            self.sensor, sampler, 1, self.plan.spp, stage.camera, pixels=pixels
+        lanes = camera.PassLanes.of(self.film, 1, 0, pixels)
+        self._begin(stage, lanes)
+        take = look if self._is_frozen(stage) else look.__wrapped__
+        radiance = take(
+            stage.estimator, stage.camera, self.scene, self.sensor, sampler, lanes, self.plan.spp
         )
-        stage.observer.begin(dr.width(rays.ray), rays.pixel)
-        sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
-        dr.eval(sample.L)
+        dr.eval(radiance)
+
+    def _begin(self, stage: Stage, lanes: camera.PassLanes) -> None:
+        """Tells the observer of a stage, if there is one, which samples come."""
+        if stage.observer is not None:
+            pixel = lanes.lanes(self.film).pixel
+            dr.eval(pixel)
+            stage.observer.begin(lanes.count, pixel)
 
     def _run_pass(self, stage: Stage, spp: int) -> bool:
         """Renders ``spp`` samples per pixel into the block; did it have to compile a kernel?"""
@@ -312,10 +322,7 @@ class Job:
         if not self._is_frozen(stage):
             self._take(stage, sampler, lanes.lanes(self.film))
             return
-        if stage.observer is not None:
-            pixel = lanes.lanes(self.film).pixel
-            dr.eval(pixel)
-            stage.observer.begin(lanes.count, pixel)
+        self._begin(stage, lanes)
         weight = 1.0 if stage.weight == 1 else dr.opaque(mi.Float, stage.weight)
         try:
             put_samples(

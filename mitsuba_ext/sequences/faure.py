@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from .scrambling import fraction, mixed
 
 #: The smallest prime that is not less than the number of dimensions.
@@ -37,7 +38,7 @@ class Faure:
                 for column in range(row, self._size):
                     power = pow(dimension, column - row, base)
                     matrices[dimension, row, column] = comb(column, row) * power % base
-        self._matrices = mi.UInt32(matrices.ravel())
+        self._matrices = from_numpy(mi.UInt32, matrices)
 
     def point(self, index: mi.UInt32, count: int, seed: mi.UInt32) -> mi.UInt32:
         return mi.permute_kensler(index, count, seed)

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from .scrambling import fraction, mixed, scrambled
 
 #: Of each dimension but the first: the inner coefficients of the primitive polynomial, as bits, and
@@ -43,7 +44,7 @@ class Sobol:
             group, place = divmod(bit, _BITS)
             has_bit = (np.arange(self._group_words) >> place) & 1 == 1
             table[:, group, has_bit] ^= columns[:, bit, None]
-        self._table = mi.UInt32(table.ravel())
+        self._table = from_numpy(mi.UInt32, table)
 
     def point(self, index: mi.UInt32, count: int, seed: mi.UInt32) -> mi.UInt32:
         # The upper bits are the same for all samples. They would flip bits of the coordinates,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from ...transport.path_decisions import Roulette
 from ..learner import Learner
 from ..roulette.adjoint_roulette import AdjointRoulette
@@ -35,7 +36,7 @@ class RouletteLearner(Learner):
         return roulette.state() if isinstance(roulette, AdjointRoulette) else {}
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> Roulette:
-        radiance, scale = mi.Float(state["radiance"]), mi.Float(state["scale"])
+        radiance, scale = (from_numpy(mi.Float, state[key]) for key in ("radiance", "scale"))
         self._guide.roulette = AdjointRoulette(self._guide.guide.regions, radiance, scale)
         return self._guide.roulette
 

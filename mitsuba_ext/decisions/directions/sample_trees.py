@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
+
 #: The value that marks a leaf, in place of a probability.
 LEAF = -1.0
 
@@ -93,8 +95,9 @@ class SampleTrees:
         """The trees that :meth:`state` has made arrays of."""
         trees = cls.__new__(cls)
         # As integers: bit patterns of nodes may be those of NaNs
-        trees._nodes = dr.reinterpret_array(mi.Float, mi.UInt32(state["nodes"]))
-        trees._values, trees.share = mi.UInt32(state["values"]), mi.Float(state["share"])
+        trees._nodes = dr.reinterpret_array(mi.Float, from_numpy(mi.UInt32, state["nodes"]))
+        trees._values = from_numpy(mi.UInt32, state["values"])
+        trees.share = from_numpy(mi.Float, state["share"])
         dr.eval(trees._nodes, trees._values, trees.share)
         return trees
 

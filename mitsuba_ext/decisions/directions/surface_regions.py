@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from ...regions.nested_regions import NestedRegions
 from ...regions.surface_sides import lit_normal
 from .path_records import PathRecords
@@ -111,7 +112,7 @@ class SurfaceRegions:
             radiance[regions] = (value[regions] + prior * expected) / np.maximum(
                 throughput[regions] + prior, 1e-30
             )
-        return mi.Float(np.minimum(radiance, 1e30).astype(np.float32))
+        return from_numpy(mi.Float, np.minimum(radiance, 1e30))
 
     def _numbers(self, level: int) -> np.ndarray:
         """For each region, the number of the region of a level in which it lies; a number too large

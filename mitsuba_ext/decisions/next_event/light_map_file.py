@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from ...files import replacing
 from ...lights.division import emitter_shapes
 from ...lights.light_cells import LightCells
@@ -137,9 +138,9 @@ def _light_map(stored: _Stored, scene: mi.Scene, samples: int) -> LightMap:
     light_map = LightMap(scene, rows, cells, samples)
     place = np.argsort(_cell_order(scene, cells))
     light_map.restore(
-        mi.UInt32(_flat(stored.tests[:, place], np.uint32)),
-        mi.UInt32(_flat(stored.successes[:, place], np.uint32)),
-        mi.UInt64(_flat(stored.squares[:, place], np.uint64)),
+        from_numpy(mi.UInt32, stored.tests[:, place]),
+        from_numpy(mi.UInt32, stored.successes[:, place]),
+        from_numpy(mi.UInt64, stored.squares[:, place]),
     )
     return light_map
 
@@ -200,10 +201,6 @@ def _check(stored: _Stored) -> None:
 def _require(condition: bool, fault: str) -> None:
     if not condition:
         raise ValueError(f"has been damaged ({fault}): delete it, and learn it again")
-
-
-def _flat(values: np.ndarray, dtype: type) -> np.ndarray:
-    return np.ascontiguousarray(values, dtype=dtype).ravel()
 
 
 # ---- Fingerprints of scenes and lights ----

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from ...bounds import scene_bounds, shape_bounds
 from ...lights.division import emitter_shapes
 from ...lights.light_cells import LightCells
@@ -97,13 +98,13 @@ class LinearChoice(EmitterSampling):
         # In units of the largest, so that neither a sum nor a quotient leaves the range of a float
         size[:, 1] /= max(size[:, 1].max(), 1e-300)
         self._place, self._plane, self._size = (
-            mi.Float(table.astype(np.float32).ravel()) for table in (place, plane, size)
+            from_numpy(mi.Float, table) for table in (place, plane, size)
         )
         positive = power > 0 if np.any(power > 0) else np.ones(self.count, bool)
         candidates = np.flatnonzero(positive)
         self._candidate_count = len(candidates)
-        self._candidates = mi.UInt32(candidates.astype(np.uint32))
-        self._uniform = mi.Float((positive / len(candidates)).astype(np.float32))
+        self._candidates = from_numpy(mi.UInt32, candidates)
+        self._uniform = from_numpy(mi.Float, positive / len(candidates))
 
     def begin(self, sampler, ray, pixel=None) -> Any:
         return Estimates(mi.Normal3f(0), mi.Bool(False), mi.Float(0)) if self.count > 1 else ()
@@ -302,4 +303,4 @@ def _opaque_bsdfs(scene: mi.Scene) -> mi.Bool:
     table = np.zeros(max((id for id, _ in opaque.values()), default=0) + 1, dtype=bool)
     for id, is_opaque in opaque.values():
         table[id] = is_opaque
-    return mi.Bool(table)
+    return from_numpy(mi.Bool, table)

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from ...discrete_sampling import ONE_MINUS_EPSILON
 from ...transport.observer import Observer
 
@@ -97,7 +98,7 @@ class VisibilityCounts(Observer):
 
     @counts.setter
     def counts(self, values: np.ndarray) -> None:
-        self._counts = mi.UInt64(values)
+        self._counts = from_numpy(mi.UInt64, values)
 
     def release(self) -> None:
         """Lets go of the counts."""
@@ -148,7 +149,7 @@ class PrimaryVisibility:
         weight *= size / weight.sum(axis=(1, 2), keepdims=True)
         weight = (1 - reallocated) + reallocated * weight
         rows = weight.sum(axis=2)
-        self._density = mi.Float(weight.ravel())
+        self._density = from_numpy(mi.Float, weight)
         self._of_rows = _cumulative(rows)
         self._of_columns = _cumulative(weight)
         self._counts = counts
@@ -176,7 +177,7 @@ class PrimaryVisibility:
 def _cumulative(weight: np.ndarray) -> mi.Float:
     """Along the last axis, up to each entry, it included; the last is 1."""
     sums = np.cumsum(weight, axis=-1)
-    return mi.Float((sums / sums[..., -1:]).astype(np.float32).ravel())
+    return from_numpy(mi.Float, sums / sums[..., -1:])
 
 
 def _search(table: mi.Float, first: mi.UInt32, count: int, number: mi.Float, active):
@@ -214,7 +215,7 @@ class WorldVisibility:
         sums = np.zeros((len(weight), counts.rows + 1, counts.columns + 1, 2))
         values = np.stack([weight, weight**2], axis=-1)
         sums[:, 1:, 1:] = values.cumsum(axis=1).cumsum(axis=2)
-        self._sums = mi.Float(sums.astype(np.float32).ravel())
+        self._sums = from_numpy(mi.Float, sums)
         # Opaque: a number that differs from render to render would need another kernel
         self._least = dr.opaque(mi.Float, float(weight.min()))
         self._counts = counts

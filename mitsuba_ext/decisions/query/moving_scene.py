@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from ...motion import Pose, PoseTable
 from ...movers import movers
 from ...transport.path_decisions import SceneQuery
@@ -130,7 +131,7 @@ class MovingSceneQuery(SceneQuery):
                 )
             taken.update(numbers[index + 1])
             owners[numbers[index + 1]] = index
-        return mi.UInt32(owners)
+        return from_numpy(mi.UInt32, owners)
 
 
     def _find_lights(self, moving: Sequence[mi.Shape]) -> mi.UInt32 | None:
@@ -146,7 +147,7 @@ class MovingSceneQuery(SceneQuery):
             return None
         table = np.zeros(max(lights) + 1, dtype=np.uint32)
         table[list(lights)] = list(lights.values())
-        return mi.UInt32(table)
+        return from_numpy(mi.UInt32, table)
 
 
 class _Box:

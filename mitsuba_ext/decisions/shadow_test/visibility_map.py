@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from ...regions.voxel_grid import VoxelGrid
 
 #: Two counters, and two numbers of the roulette's table in the worst case (lights in all voxels).
@@ -75,7 +76,7 @@ class VisibilityMap:
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Takes over the counters of a map of the same scene and grid."""
         self.tests, self.successes, self._holds_light = (
-            mi.UInt32(state[key]) for key in ("tests", "successes", "holds_light")
+            from_numpy(mi.UInt32, state[key]) for key in ("tests", "successes", "holds_light")
         )
 
     def _entry_count(self) -> int:

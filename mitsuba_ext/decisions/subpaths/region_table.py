@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from ...regions.nested_regions import NestedRegions
 from ...regions.surface_sides import lit_normal
 from ...transport.path_decisions import SubpathSelection
@@ -27,9 +28,9 @@ class RegionTable(SubpathSelection):
     ) -> None:
         self._regions, self.count = regions, regions.count
         self._table = alias_rows(
-            mi.Float(probability.ravel().astype(np.float32)), self.count, self.count
+            from_numpy(mi.Float, probability), self.count, self.count
         )
-        self._expected = mi.Float((probability / vertices).ravel().astype(np.float32))
+        self._expected = from_numpy(mi.Float, probability / vertices)
         # Opaque: scenes that differ in it only share their kernels
         self._size = dr.opaque(mi.UInt32, self.count)
         dr.eval(self._expected)

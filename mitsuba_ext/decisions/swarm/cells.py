@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from ...discrete_sampling import ONE_MINUS_EPSILON
 from .nodes import sums_before
 
@@ -53,7 +54,7 @@ class Cells:
             bounds = np.asarray(bounds, np.float32)
             widths = np.diff(bounds.astype(np.float64))[index]
             self.widths = widths / widths.sum()
-            self.bounds = mi.Float(bounds)
+            self.bounds = from_numpy(mi.Float, bounds)
 
     @classmethod
     def line(cls, bits: int) -> Cells:
@@ -112,7 +113,7 @@ class CellDensities:
         self.cells = cells
         self.cumulative = sums_before(mi.UInt32(dr.fma(mass, _ONE, 0.5)), cells.count)
         dr.eval(self.cumulative)
-        self._widths = mi.Float(cells.widths.astype(np.float32))
+        self._widths = from_numpy(mi.Float, cells.widths)
 
     @property
     def bytes(self) -> int:

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from ...transport.colour import to_rgb
 from ...transport.estimator import CameraRays
 from ..learner import Learner
@@ -95,7 +96,7 @@ class MapLearner(Learner):
         self.name, self.decision, self.cells, self.maps = name, decision, cells, maps
         self._extent, self._least_edge = (width, height), tile_edge(samples, maps * cells.count)
         self.tiles = decision.tiles = self._tiles(_FIRST_SAMPLES)
-        self._widths = mi.Float(cells.widths.astype(np.float32))
+        self._widths = from_numpy(mi.Float, cells.widths)
         self.gain, self._always, self._memory, self._vain_stages = 0.0, always, 0, 0
         self._counts: TileCounts | None = TileCounts(self.tiles, maps, cells.count)
         self._pixel: mi.UInt32 | None = None
@@ -225,7 +226,7 @@ class MapLearner(Learner):
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> Any:
         maps = CellDensities(self.cells, self._widths)
-        maps.cumulative = mi.UInt32(state["cumulative"])
+        maps.cumulative = from_numpy(mi.UInt32, state["cumulative"])
         self.decision.maps = maps
         self.decision.tiles = FilmTiles(*self._extent, int(state["edge"]))
         return self.decision

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from .film_tiles import FilmTiles
 
 #: Fixed point of counts and of their squares, of radiance, and of squared radiance.
@@ -130,7 +131,7 @@ class TileCounts:
         step, which = self._tiles.edge // tiles.edge, np.arange(self._maps)
         rows, columns = np.arange(tiles.rows) // step, np.arange(tiles.columns) // step
         tile = rows[:, None] * self._tiles.columns + columns
-        return mi.UInt32((tile[..., None] * self._maps + which).ravel().astype(np.uint32))
+        return from_numpy(mi.UInt32, tile[..., None] * self._maps + which)
 
     def sums(self) -> tuple[mi.Float, mi.Float]:
         """Counts, by table and cell, and sums of squares, by table."""
@@ -157,7 +158,7 @@ class TileCounts:
         weight = np.repeat(scale / brightness, self._maps)
         if choices.lane is not None:
             tile = dr.gather(mi.UInt32, tile, choices.lane)
-        unit = inverse_unit * dr.gather(mi.Float, mi.Float(1 / np.sqrt(scale)), tile)
+        unit = inverse_unit * dr.gather(mi.Float, from_numpy(mi.Float, 1 / np.sqrt(scale)), tile)
         value, later = (
             dr.select(choices.active & dr.isfinite(x), x, 0) * unit
             for x in (choices.value, choices.later)
