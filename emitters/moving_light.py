@@ -49,9 +49,10 @@ class MovingLight(MovingEmitter):
     All integrators that connect paths to lights can use it, those of Mitsuba too. Those that start
     paths from lights refuse it: :monosp:`bdpt`, :monosp:`light_tracer`, :monosp:`mlt`, and
     :monosp:`erpt` and :monosp:`pssmlt` where they are bidirectional. Choices among lights that know
-    where these are (:monosp:`spatial_lights`, :monosp:`next_event` = :monosp:`linear`) take the
-    bounds of the motion for its place. ``sampling_weight`` is that of the nested emitter, and
-    cannot be changed after loading; its other parameters are known to :monosp:`mi.traverse` by
+    where these are take it for where it is during an eighth of the shutter interval
+    (:monosp:`spatial_lights`), or for anywhere within the bounds of its motion
+    (:monosp:`next_event` = :monosp:`linear`). ``sampling_weight`` is that of the nested emitter,
+    and cannot be changed after loading; its other parameters are known to :monosp:`mi.traverse` by
     their usual names.
 
     Errors: other emitters are refused, and so are poses with scales.

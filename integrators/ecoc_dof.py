@@ -92,8 +92,9 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
     glass are. Surfaces that let most light through (:monosp:`mask`, :monosp:`thindielectric`) are
     not there for the layers. Of what is hidden, the first surface only is known. Highlights depend
     on the direction, and the lens sees them from its middle only. Layers are cut where blurs have a
-    gap; in a hedge there is none. Samples outside of the film reach an eighth of its longer edge.
-    Noise of the nested integrator in what is in focus stays as it is.
+    gap; in a hedge there is none. Samples outside of the film reach a quarter of its longer edge;
+    beyond, all is as it is there. Noise of the nested integrator in what is in focus stays as it
+    is.
 
     The sensor must be a :monosp:`thinlens`, or a :monosp:`perspective` with both parameters given.
     The film is any but a :monosp:`specfilm`, with any filter and crop window. Output variables

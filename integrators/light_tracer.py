@@ -50,9 +50,9 @@ class LightTracerIntegrator(WalkIntegrator):
     **Use it when** light reaches diffuse surfaces through glass or by mirrors (caustics), above all
     from small lamps, points and spots, or as an independent check of other integrators. **Not
     when** mirrors or glass matter in the image, or when most light goes where the camera does not
-    look: a lamp far away, or a sky over a large scene. Very small scenes, and scenes far from the
-    origin, differ from :monosp:`path` (by up to 8 % in a quarter of the image, in a scene moved by
-    a thousand times its size); the page of :class:`bdpt` tells why.
+    look: a lamp far away, or a sky over a large scene. Scenes far from the origin differ from
+    :monosp:`path` (by up to 8 % in a quarter of the image, in a scene moved by a thousand times its
+    size); the page of :class:`bdpt` tells why.
 
     **What it cannot see.** A vertex cannot be connected to the sensor by way of a mirror, or
     through glass, masks and null surfaces. Whatever the camera sees in a smooth mirror, through

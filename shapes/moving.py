@@ -68,9 +68,11 @@ class Moving(mi.Mesh):
     **Lights.** One of the nested shapes may be an area light, of any type of emitter and shape.
     Connections sample it at the pose of the path's time, and MIS weights have the densities of that
     time. A second light gets a :monosp:`moving` of its own, with the same motion. Choices among
-    lights take it as a whole, and the bounds of its motion for its place. Integrators that start
-    paths from lights refuse lights that move: :monosp:`bdpt`, :monosp:`light_tracer`,
-    :monosp:`mlt`, and :monosp:`erpt` and :monosp:`pssmlt` where they are bidirectional.
+    lights take it as a whole. :monosp:`spatial_lights` takes it for where it is during an eighth of
+    the shutter interval, :monosp:`next_event` = :monosp:`linear` for anywhere within the bounds of
+    its motion. Integrators that start paths from lights refuse lights that move: :monosp:`bdpt`,
+    :monosp:`light_tracer`, :monosp:`mlt`, and :monosp:`erpt` and :monosp:`pssmlt` where they are
+    bidirectional.
 
     Only integrators of this package see these shapes. **Mitsuba's own**, such as :monosp:`path` or
     :monosp:`aov`, **render the scene without them, and there is no way to stop them** (a light

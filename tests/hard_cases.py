@@ -48,6 +48,8 @@ class HardCase:
         seeds: Number of renders of the integrator: two are enough if the pixels are independent.
         unit: Edge of the squares of pixels whose errors are independent of each other.
         reference: The integrator of Mitsuba that has the right mean.
+        truth: Makes a scene of the same image, of which that integrator renders it rightly; by
+            default, the scene itself.
     """
 
     make: Callable[[], Scene]
@@ -59,6 +61,7 @@ class HardCase:
     seeds: int = 2
     unit: int = 1
     reference: str = "path"
+    truth: Callable[[], Scene] | None = None
 
 
 def _many_lights() -> Scene:
@@ -232,7 +235,8 @@ def _scaled(factor: float) -> Scene:
 
 HARD_CASES: dict[str, HardCase] = {
     "plain": HardCase(stage),
-    "scaled_by_1e-3": HardCase(lambda: _scaled(1e-3)),
+    # There, rays of Mitsuba's `path` start behind what is near
+    "scaled_by_1e-3": HardCase(lambda: _scaled(1e-3), truth=stage),
     "scaled_by_1e4": HardCase(lambda: _scaled(1e4)),
     "moved_by_1e3_sizes": HardCase(lambda: stage(_translated(3e3, -2e3, 1e3))),
     "radiance_1e-4": HardCase(lambda: stage(radiance=1e-4)),

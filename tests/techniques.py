@@ -103,9 +103,8 @@ _LEARNERS = (
 #: ``path`` does not find beams, and errs where normals are interpolated; where rays start far above
 #: surfaces, light paths and camera paths miss different things; and a thousand lights take minutes.
 _UNLIKE_PATH = (
-    "directional_area_light", "smooth_normal_lamp", "scaled_by_1e-3", "moved_by_1e3_sizes",
-    "thousand_lights",
-)  # fmt: skip
+    "directional_area_light", "smooth_normal_lamp", "moved_by_1e3_sizes", "thousand_lights",
+)
 _OF_CAMERA_PATHS = ("sky_through_portals", "medium")
 _LIGHT_PATHS = tuple(
     case for case in HARD_CASES if case not in (*_UNLIKE_PATH, *_OF_CAMERA_PATHS)

@@ -80,6 +80,20 @@ def test_a_white_film_stays_white(changes):
     assert np.allclose(image, 1, rtol=1e-3)
 
 
+def test_corners_of_wide_circles_see_what_lies_far_around_the_film():
+    """A white panel ends 4.5 of 32 pixels beside the film, where circles have a radius of 8."""
+    place = mi.ScalarTransform4f().translate([0, -2, 0.6]).rotate([1, 0, 0], 90)
+    # At the distance of the panel, half of the film is 2 tan(22.5°) = 0.828 wide
+    panel = {"type": "rectangle", "to_world": place.scale(0.828 * 20.5 / 16), "emitter": area(1.0)}
+    view = mi.ScalarTransform4f().look_at([0, -4, 0.6], [0, 0, 0.6], [0, 0, 1])
+    lens = {"aperture_radius": 0.84, "focus_distance": 4.0}
+    camera = sensor("thinlens", **lens, film=film(32, 32), to_world=view)
+    scene = mi.load_dict({"type": "scene", "sensor": camera, "panel": panel})
+    expected, found = (rendered(scene, x, 256) for x in (mi.load_dict(EMITTED), ecoc()))
+    corners = np.ix_([0, 1, 2, -3, -2, -1], [0, 1, 2, -3, -2, -1])
+    assert found[corners].mean() == pytest.approx(expected[corners].mean(), abs=0.02)
+
+
 @pytest.mark.slow
 def test_a_crop_is_the_part_of_the_whole_picture():
     whole = rendered(signs(), ecoc(), 64)

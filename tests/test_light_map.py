@@ -28,6 +28,7 @@ from mitsuba_ext.decisions.next_event.light_table import Choice, LightTable
 from mitsuba_ext.decisions.scout import Scout
 from mitsuba_ext.decisions.shadow_test.light_map_roulette import LightMapRoulette
 from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.lights.shutter_times import ShutterTimes
 from mitsuba_ext.regions.surface_rows import RowCounts, SurfaceRows
 from mitsuba_ext.regions.surface_sides import region
 from mitsuba_ext.transport.estimator import CameraRays
@@ -233,12 +234,13 @@ def test_the_grid_follows_the_number_of_samples_and_the_memory():
 
 def test_voxels_of_a_selection_without_learning_fit_into_the_memory():
     scene = floor()
+    times = ShutterTimes(scene, mi.load_dict({"type": "perspective"}))
 
     def rows(**parameters) -> int:
         integrator = mi.load_dict(
             {"type": "neepp", "light_sampling": "spatial", **parameters}
         )
-        return integrator.slots["next_event"].voxel_rows(scene, 80).count
+        return integrator.slots["next_event"].voxel_rows(scene, 80, times).count
 
     assert 1 < rows(max_memory=0.5) <= 2**19 / 40 / 80 < rows()
     assert rows(grid=1) == 2

@@ -22,6 +22,7 @@ from statistical import (
 )
 from techniques import REFERENCE, TECHNIQUES
 
+from mitsuba_ext.composition.decision_parameters import Setting
 from mitsuba_ext.decisions.query.moving_scene import scene_query
 
 Scene = dict[str, Any]
@@ -208,6 +209,31 @@ def test_image_is_the_average_of_images_at_rest(light: str, name: str) -> None:
     technique = REFERENCE if name == "path" else TECHNIQUES[name]
     images = two_halves(scene, technique.make(3), 4096, SEEDS)
     assert_same_pixels_on_average(images, reference(light), precision=0.004, tile=4)
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_spatial_choice_knows_where_lights_are_at_the_time_of_the_path(moves: bool) -> None:
+    """Two lamps that change places above a floor: the one overhead is chosen."""
+    lamps = {
+        f"lamp_{x}": {"type": "moving", "translate": [-2.0 * x * moves, 0, 0],
+                      "lamp": {"type": "sphere", "center": [x, 0, 0.2], "radius": 0.05,
+                               "bsdf": diffuse(0.0), "emitter": area(1.0)}}
+        for x in (-1, 1)
+    }  # fmt: skip
+    floor = rectangle(mi.ScalarTransform4f().scale(2), bsdf=diffuse(0.5))
+    view = {"type": "perspective", "shutter_open": 0.0, "shutter_close": 1.0}
+    scene = mi.load_dict({"type": "scene", "sensor": view, "floor": floor, **lamps})
+    choice = mi.load_dict({"type": "composed_path", "next_event": "spatial"}).slots["next_event"]
+    table = choice.decision(Setting(scene, scene.sensors()[0], 0, 3, 5, 16))
+    si = dr.zeros(mi.SurfaceInteraction3f, 4)
+    si.p = mi.Point3f([-1, 1, -1, 1], 0, 0)
+    si.time = mi.Float(0.03, 0.03, 0.97, 0.97)
+    row = table.visit(table.begin(None, None), scene, si, mi.Bool(True))
+    at_rest = [e.nested if moves else e for e in scene.emitters()]
+    left = mi.UInt32(next(i for i, e in enumerate(at_rest) if e.bbox().min.x < 0))
+    chosen = table.probability(row, scene, si, left, mi.Bool(True)).numpy()
+    overhead = np.array([1, 0, 0, 1] if moves else [1, 0, 1, 0])
+    assert np.abs(chosen - overhead).max() < 0.1
 
 
 @pytest.mark.parametrize("depth", [3, pytest.param(1, marks=pytest.mark.slow)])

@@ -94,6 +94,7 @@ class _RecordingQuery(SceneQuery):
     """A decision without state: only its arguments can differ from bounce to bounce."""
 
     def __init__(self, recorder: _Recorder, occluded: _Recorder) -> None:
+        super().__init__()
         self.recorder, self.shadow = recorder, occluded
 
     def closest(self, scene, ray, coherent, active):

@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import from_numpy
 from ..bounds import scene_bounds
 from ..transport.numbers import Numbers
+from ..transport.ray_starts import ray_starts
 from . import light_pieces as pieces
 from .light_pieces import LightPieces, Piece
 from .stored_interaction import needs_whole_interaction
@@ -19,7 +20,7 @@ from .stored_interaction import needs_whole_interaction
 _TO_BACK = 1 / 16
 
 #: By how much of Mitsuba's offset rays start above a light. Connections end closer to it: with the
-#: whole offset, light paths miss more of what is near, in small scenes and far from the origin.
+#: whole offset, light paths miss more of what is near, far from the origin.
 _OFFSET = 0.05
 
 #: The radius of the disks on which paths from infinity begin, in units of that of the scene.
@@ -112,6 +113,7 @@ class LightEmission:
                 'paths cannot start from the emitter "directionalarea" in spectral variants: it '
                 "chooses its wavelengths itself"
             )
+        self._starts = ray_starts(scene)
         box = scene_bounds(scene)
         sphere = box.bounding_sphere() if box.valid() else mi.ScalarBoundingSphere3f(0.0, 1.0)
         self._centre, self._radius = mi.Point3f(sphere.center), mi.Float(_MARGIN * sphere.radius)
@@ -181,7 +183,7 @@ class LightEmission:
             )  # fmt: skip
         ray.o, ray.d, ray.maxt = start.p, d, dr.largest(mi.Float)
         if self._has_surfaces:
-            above = dr.fma(_OFFSET, start.spawn_ray(d).o - start.p, start.p)
+            above = dr.fma(_OFFSET, self._starts.along(start, d).o - start.p, start.p)
             ray.o = dr.select(is_surface, above, ray.o)
         weight /= row.probability * row.density
         sound = active & dr.all(dr.isfinite(weight)) & (row.probability > 0)

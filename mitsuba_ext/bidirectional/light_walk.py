@@ -240,7 +240,7 @@ class LightWalk:
             β[rr_active] *= dr.rcp(survival)
 
             # ----- Move on to the next vertex -----
-            ray = si.spawn_ray(si.to_world(bs.wo))
+            ray = self.query.starts.along(si, si.to_world(bs.wo))
             pi = self.query.closest(scene, ray, coherent=False, active=active_next)
             scatter_count = paths.scatter_count + dr.select(active_next, 1, 0)
             active_next &= pi.is_valid()

@@ -155,6 +155,6 @@ def _is_occluded_by_others(query, scene, ray, target, active) -> mi.Bool:
         active &= pi.is_valid()
         passes = active & (pi.shape.emitter() != None)  # noqa: E711
         occluded |= active & ~passes
-        ray = query.interaction(pi, ray).spawn_ray_to(target)
+        ray = query.starts.towards(query.interaction(pi, ray), target)
         active = passes
     return occluded

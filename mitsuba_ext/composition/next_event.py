@@ -23,6 +23,7 @@ from ..decisions.next_event.visibility_learner import VisibilityLearner
 from ..errors import InputError
 from ..files import check_target
 from ..lights.light_cells import LightCells
+from ..lights.shutter_times import ShutterTimes
 from ..lights.weights import VoxelRows, power_weights, spatial_weights
 from ..portals import portals
 from ..regions.voxel_grid import VoxelGrid
@@ -85,20 +86,21 @@ class SpatialLights(DecisionParameters):
         if len(scene.emitters()) < 2 or not scene_bounds(scene).valid():
             return None
         cells = LightCells(scene, None)
-        rows = self.voxel_rows(scene, cells.count)
+        times = ShutterTimes(scene, setting.sensor)
+        rows = self.voxel_rows(scene, cells.count, times)
         return LightTable(rows, cells, spatial_weights(scene, rows, cells))
 
-    def voxel_rows(self, scene: mi.Scene, cells: int) -> VoxelRows:
+    def voxel_rows(self, scene: mi.Scene, cells: int, times: ShutterTimes) -> VoxelRows:
         """Voxels, not more than there is memory for."""
-        rows = VoxelRows(VoxelGrid(scene, self.grid or _SPATIAL_GRID))
+        rows = VoxelRows(VoxelGrid(scene, self.grid or _SPATIAL_GRID), times)
         limit = self.max_memory * 2**20 / (cells * TABLE_BYTES)
-        while rows.count > limit and rows.voxels.resolution > 1:
-            rows = VoxelRows(VoxelGrid(scene, int(0.8 * rows.voxels.resolution)))
-        if self.grid > rows.voxels.resolution:
+        while rows.count > limit and rows.resolution > 1:
+            rows = VoxelRows(VoxelGrid(scene, int(0.8 * rows.resolution)), times)
+        if self.grid > rows.resolution:
             mi.Log(
                 mi.LogLevel.Warn,
                 f"The table of grid={self.grid} would exceed max_memory={self.max_memory:g} MiB: "
-                f"grid={rows.voxels.resolution} is used.",
+                f"grid={rows.resolution} is used.",
             )
         return rows
 

@@ -13,6 +13,7 @@ from ..regions.surface_rows import SurfaceRows
 from ..regions.voxel_grid import VoxelGrid
 from .light_cells import LightCells
 from .power import emitter_powers
+from .shutter_times import ShutterTimes
 from .spectra import brightness, comparison_wavelengths
 
 #: Least weight of a cell, relative to the mean of its row (pbrt's).
@@ -55,24 +56,37 @@ def power_weights(scene: mi.Scene, cells: LightCells) -> mi.Float:
 
 
 class VoxelRows:
-    """A row for each occupied voxel; the last one stands for all other points."""
+    """A row for each interval of time in each occupied voxel; the last one stands for all other
+    points."""
 
-    def __init__(self, voxels: VoxelGrid) -> None:
-        self.voxels = voxels
-        self.count = voxels.occupied_count + 1
+    def __init__(self, voxels: VoxelGrid, times: ShutterTimes) -> None:
+        self._voxels, self._times = voxels, times
+        self.resolution = voxels.resolution
+        self.count = voxels.occupied_count * times.count + 1
 
     def row(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
-        voxel, known = self.voxels.index(si.p, active)
-        return dr.select(known, voxel, self.count - 1)
+        voxel, known = self._voxels.index(si.p, active)
+        row = voxel
+        if self._times.count > 1:
+            row = voxel * self._times.count + self._times.index(si.time)
+        return dr.select(known, row, self.count - 1)
+
+    def sample(self, row: mi.UInt32, sampler: mi.Sampler) -> tuple[mi.Point3f, mi.Float]:
+        """A random point of the voxel of a row, and a time of its interval."""
+        sample = mi.Point3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d())
+        voxel = row // self._times.count
+        time = self._times.sample(row - voxel * self._times.count, sampler)
+        return self._voxels.point(voxel, sample), time
 
 
 def spatial_weights(scene: mi.Scene, rows: VoxelRows, cells: LightCells) -> mi.Float:
     """The mean radiance / pdf with which each cell arrives at points of a voxel, whether visible or
-    not (as in pbrt-v3's ``SpatialLightDistribution``); shape [rows · cells]."""
+    not (as in pbrt-v3's ``SpatialLightDistribution``), during an interval of time; shape
+    [rows · cells]."""
 
     def arrives(row: mi.UInt32, cell: mi.UInt32, sampler: mi.Sampler) -> mi.Float:
-        sample = mi.Point3f(sampler.next_1d(), sampler.next_1d(), sampler.next_1d())
-        return _light(cells, cell, rows.voxels.point(row, sample), sampler)[0]
+        p, time = rows.sample(row, sampler)
+        return _light(cells, cell, p, time, sampler)[0]
 
     means = _means(rows.count - 1, cells.count, _VOXEL_POINTS, arrives)
     return _with_last_row(scene, cells, means)
@@ -86,7 +100,8 @@ def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) ->
         size = dr.gather(mi.UInt32, rows.size, row)
         index = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(size)), size - 1)
         index += dr.gather(mi.UInt32, rows.first, row)
-        value, d = _light(cells, cell, dr.gather(mi.Point3f, rows.p, index), sampler)
+        # Of lights that move, pilots see the other times
+        value, d = _light(cells, cell, dr.gather(mi.Point3f, rows.p, index), mi.Float(0), sampler)
         cosine = dr.maximum(dr.dot(d, dr.gather(mi.Normal3f, rows.n, index)), 0) + _LEAST_COSINE
         # In double precision: the square of a bright light may exceed the range of single precision
         return dr.square(mi.Float64(value * cosine))
@@ -96,12 +111,12 @@ def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) ->
 
 
 def _light(
-    cells: LightCells, cell: mi.UInt32, p: mi.Point3f, sampler: mi.Sampler
+    cells: LightCells, cell: mi.UInt32, p: mi.Point3f, time: mi.Float, sampler: mi.Sampler
 ) -> tuple[mi.Float, mi.Vector3f]:
     """Samples ``cell`` from ``p``: the brightness of radiance / pdf, and the direction."""
     lanes = dr.width(cell)
     ref = dr.zeros(mi.SurfaceInteraction3f, lanes)
-    ref.p, ref.wavelengths = p, comparison_wavelengths(lanes)
+    ref.p, ref.time, ref.wavelengths = p, time, comparison_wavelengths(lanes)
     ds, weight = cells.sample(cell, ref, sampler.next_2d(), mi.Bool(True))
     value = brightness(weight)
     # Some emitters return a single number for all lanes: it is widened

@@ -16,7 +16,7 @@ from .light_subpaths import HIGH, LOW
 from .lights import light_start_densities
 from .memory import Head, Logs, PathMemory, Place, log
 from .plan import Plan
-from .space import PathSpace, is_same, towards, turned
+from .space import PathSpace, towards, turned
 
 #: Stands for a surface that does not shine.
 NO_LIGHT = 0xFFFFFFFF
@@ -106,7 +106,7 @@ def trace_from_camera(
         towards_light = next_is_end & ~grows
         given = towards_light & kinds.is_infinite(emitter, towards_light)
         ahead = dr.select(is_end | grows | given, dr.inf, dr.norm(target.p - place.p))
-        found = is_new | is_same(si, place.p, dr.minimum(distance, ahead))
+        found = is_new | space.is_same(si, place.p, dr.minimum(distance, ahead))
         shines = (light != NO_LIGHT) & (light == emitter)
         ends = dr.select(unhittable, ~is_new, shines & (is_infinite | found))
         active &= dr.select(is_end, ends, si.is_valid() & found)
@@ -212,7 +212,7 @@ def trace_from_camera(
         cosine = geometric_cosine(si, wo)
         p_before = mi.Point3f(si.p)
         active = goes_on
-        ray = si.spawn_ray(next_d)
+        ray = query.starts.along(si, next_d)
         # From where the ray begins: it would miss a near vertex otherwise
         aimed = dr.normalize(target.p - ray.o)
         ray.d = dr.select(grows | given | is_given, next_d, aimed)

@@ -9,7 +9,7 @@ from ..transport.bsdfs import sample_bsdf
 from ..transport.numbers import Numbers
 from .memory import Head, PathMemory, Place
 from .plan import Plan
-from .space import PathSpace, is_same, turned
+from .space import PathSpace, turned
 
 #: Angles, in radians, by which perturbations turn directions. Displacements of light that comes
 #: from infinity, in units of the radius of the scene.
@@ -60,7 +60,7 @@ def grow_from_light(
         is_kept = index == plan.rest
         is_last = index == last
         # What is kept must be found again
-        active &= si.is_valid() & (~is_kept | is_same(si, place.p, si.t))
+        active &= si.is_valid() & (~is_kept | space.is_same(si, place.p, si.t))
 
         # ----- Where does the path go on? -----
         lobe, sample = numbers.next_1d(), numbers.next_2d()
@@ -81,7 +81,7 @@ def grow_from_light(
         memory.places.write(Place(p, lobe, discrete), head.at + index, active)
         is_done |= active & is_last
         active &= goes_on
-        ray = si.spawn_ray(d)
+        ray = space.query.starts.along(si, d)
         index -= 1
     return memory, head, numbers, is_done
 

@@ -88,16 +88,15 @@ class PathSpace:
         film = mi.Point2f((seen.position - self._offset) / self.size)
         return dr.clip(film, 0, 1 - 2.0**-24), seen.active
 
+    def is_same(self, si: mi.SurfaceInteraction3f, p: mi.Point3f, reach: mi.Float) -> mi.Bool:
+        """Has a ray found the vertex at ``p``, as far as its numbers are exact? A surface close
+        before it is another vertex: the densities of the path hold for the one that was sampled.
 
-def is_same(si: mi.SurfaceInteraction3f, p: mi.Point3f, reach: mi.Float) -> mi.Bool:
-    """Has a ray found the vertex at ``p``, as far as its numbers are exact? A surface close before
-    it is another vertex: the densities of the path hold for the one that was sampled.
-
-    Parameters:
-        reach: The length of the shortest segment that ends at the vertex.
-    """
-    exact = mi.math.RayEpsilon * (1 + dr.max(dr.abs(p)) + si.t)
-    return si.is_valid() & (dr.norm(si.p - p) <= dr.minimum(exact, _MISS * reach))
+        Parameters:
+            reach: The length of the shortest segment that ends at the vertex.
+        """
+        exact = self.query.starts.distance(p) + mi.math.RayEpsilon * si.t
+        return si.is_valid() & (dr.norm(si.p - p) <= dr.minimum(exact, _MISS * reach))
 
 
 def towards(p: mi.Point3f, place: Place, is_direction: mi.Bool) -> mi.Vector3f:

@@ -111,6 +111,6 @@ def _follow(scene, query, sampler, ray, going, throughput):
         going &= si.is_valid() & is_specular & (bounces < _MOST_BOUNCES)
         weight = mi.unpolarized_spectrum(weight)
         throughput = dr.select(going, throughput * weight, throughput)
-        ray = dr.select(going, si.spawn_ray(si.to_world(bs.wo)), ray)
+        ray = dr.select(going, query.starts.along(si, si.to_world(bs.wo)), ray)
         bounces += 1
     return si, throughput, bounces

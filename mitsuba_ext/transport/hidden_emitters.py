@@ -21,7 +21,7 @@ def behind_emitters(
     ray = mi.Ray3f(ray)
     on_emitter = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
     while on_emitter:
-        ray = query.interaction(pi, ray).spawn_ray(ray.d)
+        ray = query.starts.along(query.interaction(pi, ray), ray.d)
         pi = query.closest(scene, ray, coherent=True, active=on_emitter)
         on_emitter &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
     return ray, pi

@@ -72,6 +72,10 @@ class LensView:
         """Everything about that."""
         return self._query.interaction(self.closest(ray, active), ray)
 
+    def onward(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Ray3f:
+        """The ray that leaves a surface where another one met it, in the same direction."""
+        return self._query.starts.along(si, ray.d)
+
     def surface_behind(
         self, ray: mi.Ray3f, passes: Passes, active: mi.Bool
     ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
@@ -88,5 +92,5 @@ def _walk(view, ray, passes, active):
         side = dr.sign(dr.dot(si.n, ray.d))
         going &= si.is_valid() & passes(si, side, going) & (steps < _MOST_PASSED)
         steps += 1
-        ray = dr.select(going, si.spawn_ray(ray.d), ray)
+        ray = dr.select(going, view.onward(si, ray), ray)
     return si, side

@@ -5,9 +5,18 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .ray_starts import RayStarts
+
 
 class SceneQuery:
-    """How a ray meets the scene."""
+    """How a ray meets the scene.
+
+    Parameters (and attributes):
+        starts: Where rays start that leave a surface; by default, where Mitsuba's do.
+    """
+
+    def __init__(self, starts: RayStarts = RayStarts()) -> None:  # noqa: B008  (never modified)
+        self.starts = starts
 
     def closest(
         self, scene: mi.Scene, ray: mi.Ray3f, coherent: bool, active: mi.Bool
@@ -42,7 +51,7 @@ class SceneQuery:
         self, scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f
     ) -> mi.Ray3f:
         """The ray from ``si`` to the light that ``ds`` is about."""
-        ray = si.spawn_ray_to(ds.p)
+        ray = self.starts.towards(si, ds.p)
         if any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters()):
             # Mitsuba puts ds.p behind the bounds of the scene, which it knows wrongly where
             # rectangles were merged (``bounds.py``): its shadow rays may end before a wall

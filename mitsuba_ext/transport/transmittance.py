@@ -36,7 +36,7 @@ def transmittance(
     medium = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
     ray = query.shadow_ray(scene, si, ds)
     # Light from infinity is attenuated as far as Mitsuba's point of the light, and blocked by all
-    left = si.spawn_ray_to(ds.p).maxt
+    left = query.starts.towards(si, ds.p).maxt
     T = mi.Spectrum(1)
     active = mi.Bool(active)
     while dr.hint(active, label="transmittance"):
@@ -63,7 +63,7 @@ def transmittance(
         is_met &= dr.max(T) > 0
         crosses = is_met & met.is_medium_transition()
         medium = dr.select(crosses, met.target_medium(ray.d), medium)
-        onward = met.spawn_ray(ray.d)
+        onward = query.starts.along(met, ray.d)
         onward.maxt = ray.maxt - met.t
         ray = dr.select(is_met, onward, ray)
         left = dr.select(is_met, left - met.t, left)

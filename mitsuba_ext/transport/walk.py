@@ -207,7 +207,7 @@ class Walk:
 
             # ----- Move on to the next vertex -----
             bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)
-            ray = si.spawn_ray(si.to_world(bs.wo))
+            ray = self.query.starts.along(si, si.to_world(bs.wo))
             valid |= si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
             is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
             onward = PathState(

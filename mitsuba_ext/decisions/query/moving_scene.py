@@ -14,6 +14,7 @@ from ...arrays import from_numpy
 from ...motion import Pose, PoseTable
 from ...movers import movers
 from ...transport.path_decisions import SceneQuery
+from ...transport.ray_starts import RayStarts, ray_starts
 
 #: The owner of shapes that do not move.
 _NOBODY = 0xFFFFFFFF
@@ -26,7 +27,8 @@ def scene_query(scene: mi.Scene) -> SceneQuery:
         ValueError: A shape belongs to two movers, or to one and to the static scene.
     """
     moving = movers(scene)
-    return MovingSceneQuery(scene, moving) if moving else SceneQuery()
+    starts = ray_starts(scene)
+    return MovingSceneQuery(scene, moving, starts) if moving else SceneQuery(starts)
 
 
 class MovingSceneQuery(SceneQuery):
@@ -35,12 +37,16 @@ class MovingSceneQuery(SceneQuery):
     Parameters:
         scene: The static scene.
         moving: The movers, as from :func:`movers`.
+        starts: Where rays start that leave a surface.
 
     Attributes:
         scenes (list[mi.Scene]): What each of them moves, at rest.
     """
 
-    def __init__(self, scene: mi.Scene, moving: Sequence[mi.Shape]) -> None:
+    def __init__(
+        self, scene: mi.Scene, moving: Sequence[mi.Shape], starts: RayStarts
+    ) -> None:
+        super().__init__(starts)
         self.scenes = [mover.at_rest for mover in moving]
         self._poses = PoseTable([mover.motion for mover in moving])
         self._boxes = [_Box(mover.bbox()) for mover in moving]
