@@ -53,8 +53,8 @@ class PathMetropolis(ChainIntegrator):
      * - luminance_samples
        - |int|
        - Independent paths, at least, that estimate the brightness of the image, and from which
-         chains start; without a time limit, a quarter of all mutations if that is more. (Default:
-         100000)
+         chains start; a quarter of all mutations if that is more, or with a time limit as many as
+         take a fifth of the time. (Default: 100000)
      * - chains
        - |int|
        - Chains, which run in parallel; there are no more than mutations. 0 stands for as many as

@@ -36,8 +36,8 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
      * - luminance_samples
        - |int|
        - Independent samples, at least, that estimate the brightness of the image, and from which
-         chains start; without a time limit, a quarter of all mutations if that is more. (Default:
-         100000)
+         chains start; a quarter of all mutations if that is more, or with a time limit as many as
+         take a fifth of the time. (Default: 100000)
      * - mutation_size_low
        - |float|
        - By how much small steps change a number, at least. (Default: 1/1024)

@@ -30,6 +30,10 @@ _CHAINS, _LENGTH = {False: (1 << 14, 1 << 16), True: (1 << 16, 1 << 18)}, 64
 #: brightness of what chains find.
 _BOOTSTRAP_SHARE, _MOST_BOOTSTRAP = 0.25, 1 << 24
 
+#: With a time limit, the share of the time that is left for the bootstrap, and samples that measure
+#: its speed.
+_BOOTSTRAP_TIME, _SPEED_SAMPLES = 0.2, 1 << 16
+
 #: The largest standard error of the brightness without a warning.
 _UNSURE = 0.05
 
@@ -198,9 +202,21 @@ class MetropolisRender(ChainRender):
         return scale
 
     def _bootstrap_share(self, total: int) -> int:
+        share = int(_BOOTSTRAP_SHARE * total)
         if self._integrator.timeout > 0:
-            return 0
-        return min(int(_BOOTSTRAP_SHARE * total), _MOST_BOOTSTRAP)
+            share = min(share, self._timed_share())
+        return min(share, _MOST_BOOTSTRAP)
+
+    def _timed_share(self) -> int:
+        """Samples of the bootstrap that suit the time limit. Other samples measure the speed: the
+        number of those that count must not depend on what they find."""
+        # The first stage has compiled the kernels
+        begin = time.perf_counter()
+        seed = stream(self._seed, FIRST_STAGE)
+        count = Bootstrap(self._target, seed, _SPEED_SAMPLES).count
+        seconds = time.perf_counter() - begin
+        left = self._integrator.timeout - (time.perf_counter() - self._start)
+        return int(_BOOTSTRAP_TIME * max(0.0, left) * count / seconds)
 
     def _write(self, chains: Chains, image: ChainImage, start: Start) -> None:
         mutations = chains.done * chains.count
