@@ -203,7 +203,7 @@ class MetropolisRender(ChainRender):
 
     def _bootstrap_share(self, total: int) -> int:
         share = int(_BOOTSTRAP_SHARE * total)
-        if self._integrator.timeout > 0:
+        if self._integrator.timeout > 0 and share > self._settings.bootstrap:
             share = min(share, self._timed_share())
         return min(share, _MOST_BOOTSTRAP)
 
@@ -214,7 +214,8 @@ class MetropolisRender(ChainRender):
         begin = time.perf_counter()
         seed = stream(self._seed, FIRST_STAGE)
         count = Bootstrap(self._target, seed, _SPEED_SAMPLES).count
-        seconds = time.perf_counter() - begin
+        # No clock is fine enough to be divided by, whatever it says
+        seconds = max(time.perf_counter() - begin, 1e-6)
         left = self._integrator.timeout - (time.perf_counter() - self._start)
         return int(_BOOTSTRAP_TIME * max(0.0, left) * count / seconds)
 

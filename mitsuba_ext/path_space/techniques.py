@@ -11,11 +11,6 @@ from ..discrete_sampling import ONE_MINUS_EPSILON, first_above
 #: At first, of the lengths of new paths, each is as frequent as the one before times this.
 _DECAY = 0.7
 
-#: At first, of the paths of each length, the share of those made from the camera alone. Only these
-#: find light behind water or glass that leads to a diffuse surface, and their density bounds what
-#: one path brings: where they are rare, one sample in a million has a tenth of all light.
-_FROM_CAMERA = 0.5
-
 #: The share of the first distribution in one that is learned: no technique is left out, since some
 #: find little light, but bright paths.
 _FLOOR = 0.3
@@ -35,9 +30,7 @@ class Techniques:
         lengths = np.arange(least, most + 1)
         self._lengths = np.repeat(lengths, lengths + 1)
         self._grown = np.concatenate([np.arange(n + 1) for n in lengths])
-        is_camera = self._grown == self._lengths
-        share = np.where(is_camera, _FROM_CAMERA, (1 - _FROM_CAMERA) / self._lengths)
-        chance = _DECAY ** (self._lengths - least) * share
+        chance = _DECAY ** (self._lengths - least) / (self._lengths + 1)
         # Lights are seen by camera paths only
         chance[(self._lengths == 1) & (self._grown == 0)] = 0
         self._first = chance / chance.sum()
