@@ -58,7 +58,7 @@ class PathMetropolis(ChainIntegrator):
      * - chains
        - |int|
        - Chains, which run in parallel; there are no more than mutations. 0 stands for as many as
-         suit the render: 16384, and more if each then makes 64 mutations. (Default: 0)
+         suit the render: 1024, and more if each then makes 1024 mutations. (Default: 0)
      * - two_stage
        - |bool|
        - Estimate the brightness of parts of the image first, and spread mutations evenly over them

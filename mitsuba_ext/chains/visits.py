@@ -21,10 +21,10 @@ from .small_steps import SmallSteps
 from .stored import Arrays, StateFile
 from .target import Found, ImageTarget
 
-#: Chains without and with light paths, at least and at most: these need several kernels for each
-#: mutation, which take as long to trace as 65536 mutations. Mutations of a chain, about, where
-#: these bounds allow it.
-_CHAINS, _LENGTH = {False: (1 << 14, 1 << 16), True: (1 << 16, 1 << 18)}, 64
+#: Chains without and with light paths, at least and at most, and mutations of a chain, about, where
+#: these bounds allow it. Longer chains spread what a bright sample began with. Those with light
+#: paths need several kernels for each mutation, which take as long to trace as 65536 mutations.
+_CHAINS, _LENGTH = {False: (1 << 10, 1 << 16), True: (1 << 16, 1 << 18)}, {False: 1024, True: 64}
 
 #: Samples of the bootstrap, in proportion to the mutations, and at most: their mean is the
 #: brightness of what chains find.
@@ -256,4 +256,4 @@ def _suitable(mutations: int, target: ImageTarget) -> int:
     """A number of chains. Longer chains forget better where they began; more of them keep the
     processor busy, above all where each mutation is several kernels."""
     fewest, most = _CHAINS[target.has_light_paths]
-    return min(max(mutations // _LENGTH, fewest), most)
+    return min(max(mutations // _LENGTH[target.has_light_paths], fewest), most)
