@@ -53,12 +53,12 @@ class PathMetropolis(ChainIntegrator):
      * - luminance_samples
        - |int|
        - Independent paths, at least, that estimate the brightness of the image, and from which
-         chains start; without a time limit, a quarter of all mutations if that is more. (Default:
-         100000)
+         chains start; a quarter of all mutations if that is more, or with a time limit as many as
+         take a fifth of the time. (Default: 100000)
      * - chains
        - |int|
        - Chains, which run in parallel; there are no more than mutations. 0 stands for as many as
-         suit the render: 16384, and more if each then makes 64 mutations. (Default: 0)
+         suit the render: 1024, and more if each then makes 1024 mutations. (Default: 0)
      * - two_stage
        - |bool|
        - Estimate the brightness of parts of the image first, and spread mutations evenly over them

@@ -36,8 +36,8 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
      * - luminance_samples
        - |int|
        - Independent samples, at least, that estimate the brightness of the image, and from which
-         chains start; without a time limit, a quarter of all mutations if that is more. (Default:
-         100000)
+         chains start; a quarter of all mutations if that is more, or with a time limit as many as
+         take a fifth of the time. (Default: 100000)
      * - mutation_size_low
        - |float|
        - By how much small steps change a number, at least. (Default: 1/1024)
@@ -51,8 +51,8 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
      * - chains
        - |int|
        - Chains, which run in parallel; there are no more than mutations. 0 stands for as many as
-         suit the render: 16384 (65536 with light paths), and more if each then makes 64 mutations.
-         (Default: 0)
+         suit the render: 1024, and more if each then makes 1024 mutations (with light paths 65536,
+         and more if each then makes 64). (Default: 0)
      * - two_stage
        - |bool|
        - Estimate the brightness of parts of the image first, and spread mutations evenly over them

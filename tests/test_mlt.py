@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from typing import Any
 
@@ -267,3 +268,38 @@ def test_statistics_have_rates_of_acceptance() -> None:
     integrator = mlt()
     mi.render(mi.load_dict(stage(), optimize=False), integrator=integrator, spp=64)
     assert "of large steps" in integrator.statistics.learned
+
+# ---- Where water meets a wall ----
+
+
+def _waterline() -> mi.Scene:
+    """The camera sees the line where water meets a wall, from above; a small lamp shines there."""
+    wall = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}
+    return mi.load_dict({
+        "type": "scene",
+        "sensor": {
+            "type": "perspective", "fov": 8.0, "near_clip": 0.01,
+            "to_world": T().look_at([0, -0.9, 0.7], [0, 1, -0.35], [0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
+        },
+        "wall": {
+            "type": "rectangle", "bsdf": wall,
+            "to_world": T().translate([0, 1, 0]).rotate([1, 0, 0], 90),
+        },
+        "water": {
+            "type": "rectangle", "bsdf": {"type": "dielectric", "int_ior": "water"},
+            "to_world": T().translate([0, 0, -0.33]),
+        },
+        "lamp": {
+            "type": "sphere", "center": [0.2, 0.1, 0.8], "radius": 0.05,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 100.0}},
+        },
+    })  # fmt: skip
+
+
+def test_chains_do_not_stay_where_water_meets_a_wall() -> None:
+    # Vertices lie so close to each other there that their points do not tell the ray's direction
+    integrator = mi.load_dict({"type": "mlt", "max_depth": 4, "chains": 512})
+    mi.render(_waterline(), integrator=integrator, spp=2048, seed=3)
+    stayed = re.search(r"stayed at one path for (\d+) of 1024", integrator.statistics.learned)
+    assert int(stayed[1]) < 200

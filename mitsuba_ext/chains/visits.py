@@ -21,14 +21,18 @@ from .small_steps import SmallSteps
 from .stored import Arrays, StateFile
 from .target import Found, ImageTarget
 
-#: Chains without and with light paths, at least and at most: these need several kernels for each
-#: mutation, which take as long to trace as 65536 mutations. Mutations of a chain, about, where
-#: these bounds allow it.
-_CHAINS, _LENGTH = {False: (1 << 14, 1 << 16), True: (1 << 16, 1 << 18)}, 64
+#: Chains without and with light paths, at least and at most, and mutations of a chain, about, where
+#: these bounds allow it. Longer chains spread what a bright sample began with. Those with light
+#: paths need several kernels for each mutation, which take as long to trace as 65536 mutations.
+_CHAINS, _LENGTH = {False: (1 << 10, 1 << 16), True: (1 << 16, 1 << 18)}, {False: 1024, True: 64}
 
 #: Samples of the bootstrap, in proportion to the mutations, and at most: their mean is the
 #: brightness of what chains find.
 _BOOTSTRAP_SHARE, _MOST_BOOTSTRAP = 0.25, 1 << 24
+
+#: With a time limit, the share of the time that is left for the bootstrap, and samples that measure
+#: its speed.
+_BOOTSTRAP_TIME, _SPEED_SAMPLES = 0.2, 1 << 16
 
 #: The largest standard error of the brightness without a warning.
 _UNSURE = 0.05
@@ -198,9 +202,22 @@ class MetropolisRender(ChainRender):
         return scale
 
     def _bootstrap_share(self, total: int) -> int:
-        if self._integrator.timeout > 0:
-            return 0
-        return min(int(_BOOTSTRAP_SHARE * total), _MOST_BOOTSTRAP)
+        share = int(_BOOTSTRAP_SHARE * total)
+        if self._integrator.timeout > 0 and share > self._settings.bootstrap:
+            share = min(share, self._timed_share())
+        return min(share, _MOST_BOOTSTRAP)
+
+    def _timed_share(self) -> int:
+        """Samples of the bootstrap that suit the time limit. Other samples measure the speed: the
+        number of those that count must not depend on what they find."""
+        # The first stage has compiled the kernels
+        begin = time.perf_counter()
+        seed = stream(self._seed, FIRST_STAGE)
+        count = Bootstrap(self._target, seed, _SPEED_SAMPLES).count
+        # No clock is fine enough to be divided by, whatever it says
+        seconds = max(time.perf_counter() - begin, 1e-6)
+        left = self._integrator.timeout - (time.perf_counter() - self._start)
+        return int(_BOOTSTRAP_TIME * max(0.0, left) * count / seconds)
 
     def _write(self, chains: Chains, image: ChainImage, start: Start) -> None:
         mutations = chains.done * chains.count
@@ -239,4 +256,4 @@ def _suitable(mutations: int, target: ImageTarget) -> int:
     """A number of chains. Longer chains forget better where they began; more of them keep the
     processor busy, above all where each mutation is several kernels."""
     fewest, most = _CHAINS[target.has_light_paths]
-    return min(max(mutations // _LENGTH, fewest), most)
+    return min(max(mutations // _LENGTH[target.has_light_paths], fewest), most)

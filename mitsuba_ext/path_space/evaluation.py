@@ -161,13 +161,10 @@ def trace_from_camera(
             beam_end = is_given & kinds.is_beam(emitter, is_given)
             end_p = dr.select(beam_end, ds.p, target.p)
             memory.places.write(
-                Place(end_p, target.lobe, target.is_discrete), at + index + 1,
+                Place(end_p, target.lobe, target.is_discrete, target.d), at + index + 1,
                 goes_on & beam_end,
             )
-        old_here, old_next = memory.places[old.at + index], memory.places[old.at + index + 1]
-        old_given = (index + 1 == old.length) & kinds.is_infinite(old.emitter, next_is_end)
-        old_d = towards(old_here.p, old_next, old_given)
-        aside = turned(old_d, sample, LOW, HIGH)
+        aside = turned(memory.places[old.at + index].d, sample, LOW, HIGH)
         sampled_d = dr.select(plan.perturbs & ~is_discrete, aside, si.to_world(bs.wo))
         next_d = dr.select(grows, sampled_d, next_d)
         wo = si.to_local(next_d)
@@ -187,6 +184,11 @@ def trace_from_camera(
         value = dr.select(goes_on, value * si.to_world_mueller(factor, -wo, si.wi), value)
         goes_on &= dr.max(dr.abs(value)) > 0
 
+        ray = query.starts.along(si, next_d)
+        # From where the ray begins: it would miss a near vertex otherwise
+        aimed = dr.normalize(target.p - ray.o)
+        ray.d = dr.select(grows | given | is_given, next_d, aimed)
+
         # ----- Store -----
         before_at, here_at = at + index - 1, at + index
         through_lobe = dr.select(is_discrete & ~is_end, _lobe_ratio(si, bs), 0)
@@ -200,6 +202,7 @@ def trace_from_camera(
                 dr.select(is_new, dr.select(is_infinite, d, si.p), place.p),
                 lobe,
                 dr.select(is_end, mi.UInt32(0), dr.select(is_discrete, mi.UInt32(1), 0)),
+                ray.d,
             ),
             here_at, active & (is_end | goes_on),
         )
@@ -212,10 +215,6 @@ def trace_from_camera(
         cosine = geometric_cosine(si, wo)
         p_before = mi.Point3f(si.p)
         active = goes_on
-        ray = query.starts.along(si, next_d)
-        # From where the ray begins: it would miss a near vertex otherwise
-        aimed = dr.normalize(target.p - ray.o)
-        ray.d = dr.select(grows | given | is_given, next_d, aimed)
         pi = query.closest(scene, ray, coherent=False, active=active)
         scatter += dr.select(active, 1, 0)
         index += 1

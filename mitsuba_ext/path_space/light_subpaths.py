@@ -78,7 +78,8 @@ def grow_from_light(
         # ----- Store the vertex -----
         p = dr.select(is_kept, place.p, si.p)
         discrete = dr.select(goes_on & is_discrete & ~turns, mi.UInt32(1), 0)
-        memory.places.write(Place(p, lobe, discrete), head.at + index, active)
+        here = Place(p, lobe, discrete, mi.Vector3f(0))
+        memory.places.write(here, head.at + index, active)
         is_done |= active & is_last
         active &= goes_on
         ray = space.query.starts.along(si, d)
@@ -93,7 +94,7 @@ def _begin(space, memory, old, new, plan, ray, numbers, active, begins):
     kinds = space.kinds
     is_infinite = kinds.is_infinite(emitted.index, begins)
     p = dr.select(is_infinite, -emitted.ray.d, emitted.start.p)
-    end = Place(p, mi.Float(0), mi.UInt32(0))
+    end = Place(p, mi.Float(0), mi.UInt32(0), mi.Vector3f(0))
     memory.places.write(end, new.at + new.length, begins)
     is_sound = begins & (dr.max(emitted.weight) > 0)
 

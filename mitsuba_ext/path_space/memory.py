@@ -17,11 +17,15 @@ class Place:
         lobe: The number, in [0, 1), that chooses the lobe of the BSDF, where the path is scattered
             by a discrete one.
         is_discrete: Is it scattered by a mirror, smooth glass, or a hole of a mask? 0 or 1.
+        d: The direction of the ray from here to the next vertex, on the way from the camera. Rays
+            begin at a small distance from a surface, so that two points that lie close to each
+            other do not tell it.
     """
 
     p: mi.Point3f
     lobe: mi.Float
     is_discrete: mi.UInt32
+    d: mi.Vector3f
 
 
 @dataclass
