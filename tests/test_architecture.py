@@ -15,6 +15,9 @@ PACKAGE = ROOT / "mitsuba_ext"
 #: The folders of plugins, which are installed as parts of the package.
 PLUGINS = ("integrators", "emitters", "bsdfs", "shapes", "samplers", "sensors")
 
+#: Arrays of Dr.Jit, as Mitsuba calls them.
+_ARRAYS = ("Float", "Float64", "UInt32", "UInt64", "Int32", "Bool")
+
 #: By room, what it imports nothing of.
 FORBIDDEN = {
     "transport": {"decisions", "bidirectional", "chains", "path_space", "composition", "rendering",
@@ -116,3 +119,17 @@ def test_the_parser_of_imports_sees_relative_and_absolute_ones(tmp_path: Path) -
         ("decisions", "lights", "weights"), ("decisions", "next_event", "maps", "grid", "Grid"),
         ("bounds",), ("rendering", "plan"), ("composition", "slots"),
     }  # fmt: skip
+
+
+def test_kernels_read_no_memory_of_numpy_that_may_not_be_aligned() -> None:
+    """``from_numpy`` aligns it: otherwise kernels differ from one render to the next by chance."""
+    found = []
+    for file in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if not (isinstance(node, ast.Call) and node.args):
+                continue
+            called, value = ast.unparse(node.func), ast.unparse(node.args[0])
+            is_array = called in {f"mi.{kind}" for kind in _ARRAYS}
+            if is_array and (value.startswith("np.") or ".astype(" in value):
+                found.append(f"{file.relative_to(ROOT)}:{node.lineno}")
+    assert not found

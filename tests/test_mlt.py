@@ -269,6 +269,7 @@ def test_statistics_have_rates_of_acceptance() -> None:
     mi.render(mi.load_dict(stage(), optimize=False), integrator=integrator, spp=64)
     assert "of large steps" in integrator.statistics.learned
 
+
 # ---- Where water meets a wall ----
 
 

@@ -8,12 +8,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..path_space.memory import Head, Logs, Place
 from .path_target import PathState
 from .target import Contribution
 
 #: Arrays by name.
 Arrays = dict[str, np.ndarray]
+
 
 class StateFile(Protocol):
     """Where the state of a render is kept."""
@@ -72,4 +74,4 @@ def _array(array: np.ndarray) -> Any:
     if array.ndim == 2:
         return {2: mi.Point2f, 3: mi.Color3f}[len(array)](array)
     kinds = {"float32": mi.Float, "uint32": mi.UInt32, "uint64": mi.UInt64}
-    return kinds[array.dtype.name](array)
+    return from_numpy(kinds[array.dtype.name], array)

@@ -13,7 +13,7 @@ from ..decisions.next_event.light_map_file import fingerprint
 from ..files import replacing
 
 #: Number of the format of these files.
-_FORMAT = 1
+_FORMAT = 2
 
 #: By slot, what the decision of the last stage is made of.
 States = dict[str, dict[str, np.ndarray]]
