@@ -1,5 +1,5 @@
 # Needs: Debian or Ubuntu, make, apt, Python >= 3.9 with venv. (On other systems, install an LLVM
-# library by hand: mitsuba_ext/llvm.py says which ones work.)
+# library by hand: mitsuba_ext/startup/llvm.py says which ones work.)
 #
 #   make demo    compares two of our integrators with `path` on three of our scenes, in two to four
 #                minutes
@@ -45,7 +45,7 @@ lint: setup
 
 # The package in its environment, and an LLVM library that works (to check this takes milliseconds).
 setup: $(VENV)/.installed
-	@$(BIN)/python -I -m mitsuba_ext.llvm_install --ensure
+	@$(BIN)/python -I -m mitsuba_ext.startup.llvm_install --ensure
 
 $(VENV)/.installed: pyproject.toml setup.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 9))' || \

@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_ext import registry
 from mitsuba_ext.materials.dispersive_interface import DispersiveInterface, fresnel_spectrum
+from mitsuba_ext.startup import registry
 
 
 @registry.plugin

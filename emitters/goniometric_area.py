@@ -7,10 +7,10 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_ext import registry
 from mitsuba_ext.luminaires.area_luminaire import AreaLuminaire
 from mitsuba_ext.luminaires.ies import read_ies
 from mitsuba_ext.luminaires.profiles import AngularTable, PowerOfCosine
+from mitsuba_ext.startup import registry
 
 
 @registry.plugin

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext import registry
 from mitsuba_ext.luminaires.area_luminaire import AreaLuminaire
+from mitsuba_ext.startup import registry
 
 
 @registry.plugin

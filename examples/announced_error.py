@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 import mitsuba_ext  # noqa: F401
-from mitsuba_ext.compare import images, metrics
+from mitsuba_ext.images import image_files, metrics
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer, RenderRequest
 from mitsuba_ext.long_renders.long_render import Goal, LongRender
 from mitsuba_ext.long_renders.state import RenderState
@@ -49,7 +49,7 @@ def rendered(scene: str, integrator: str, seed: int, goal: Goal) -> LongRender:
 def rgb(render: LongRender) -> tuple[np.ndarray, np.ndarray]:
     """Mean and variance."""
     batches = render.state.images
-    return tuple(images.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance))
+    return tuple(image_files.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance))
 
 
 def main() -> None:

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 import mitsuba_ext  # noqa: F401
-from mitsuba_ext.chosen import LastScene
-from mitsuba_ext.compare import metrics
+from mitsuba_ext.images import metrics
+from mitsuba_ext.inputs.chosen import LastScene
 from mitsuba_ext.rendering.batches import batch_seeds
 
 import mitsuba as mi  # isort: skip

@@ -22,7 +22,7 @@ import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
-from mitsuba_ext.scenes import load_scene
+from mitsuba_ext.inputs.scenes import load_scene
 
 
 def errors(images: list[np.ndarray]) -> tuple[float, float]:

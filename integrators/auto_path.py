@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext import registry
 from mitsuba_ext.composition.decision_parameters import ParameterReader
 from mitsuba_ext.composition.directions import Guided
 from mitsuba_ext.composition.next_event import LearnedLights
 from mitsuba_ext.composition.roulette import GuidedRoulette
 from mitsuba_ext.composition.swarm import MAPS
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.startup import registry
 
 #: The numbers of a camera ray that can have maps.
 _CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")

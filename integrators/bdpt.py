@@ -8,7 +8,6 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext import registry
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.light_walk import STRIDE
 from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
@@ -18,6 +17,7 @@ from mitsuba_ext.composition.light_side import LightSide
 from mitsuba_ext.composition.slots import BIDIRECTIONAL_SLOTS, read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera import film_extent
+from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import Estimator
 from mitsuba_ext.transport.path_decisions import NoConnections, SubpathSelection
 

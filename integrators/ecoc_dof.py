@@ -8,18 +8,18 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsuba_ext import registry
 from mitsuba_ext.composition.wrapping_integrator import WrappingIntegrator
 from mitsuba_ext.decisions.query.moving_scene import scene_query
 from mitsuba_ext.defocus.filters import FILTERS
 from mitsuba_ext.defocus.thin_lens import ThinLens
-from mitsuba_ext.denoising import denoiser
-from mitsuba_ext.movers import is_moving_camera
+from mitsuba_ext.images.denoising import denoiser
 from mitsuba_ext.parameters import MOST_SPP
 from mitsuba_ext.rendering.layered_job import LayeredJob
 from mitsuba_ext.rendering.pinhole import LensCentre
 from mitsuba_ext.rendering.render import render
 from mitsuba_ext.rendering.stages import Schedule, Stage
+from mitsuba_ext.scene.movers import is_moving_camera
+from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.path_decisions import SceneQuery
 
 #: The sensors whose rays begin in the middle of a lens, or can.

@@ -6,12 +6,6 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext import registry
-from mitsuba_ext.chains.noise_filters import NoiseFilters
-from mitsuba_ext.chains.path_target import PathTarget
-from mitsuba_ext.chains.redistribution import RedistributionRender, RedistributionSettings
-from mitsuba_ext.chains.small_steps import SmallSteps
-from mitsuba_ext.chains.target import ImageTarget
 from mitsuba_ext.composition.metropolis_integrator import MetropolisIntegrator
 from mitsuba_ext.composition.path_mutations import (
     MOST,
@@ -20,6 +14,15 @@ from mitsuba_ext.composition.path_mutations import (
     path_target,
     read_switches,
 )
+from mitsuba_ext.metropolis.chains.noise_filters import NoiseFilters
+from mitsuba_ext.metropolis.chains.path_target import PathTarget
+from mitsuba_ext.metropolis.chains.redistribution import (
+    RedistributionRender,
+    RedistributionSettings,
+)  # fmt: skip
+from mitsuba_ext.metropolis.chains.small_steps import SmallSteps
+from mitsuba_ext.metropolis.chains.target import ImageTarget
+from mitsuba_ext.startup import registry
 
 #: Parameters for chains of primary samples alone.
 _PRIMARY = (

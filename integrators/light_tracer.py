@@ -6,7 +6,6 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext import registry
 from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_tracer import LightTracer
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
@@ -14,9 +13,10 @@ from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
 from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
-from mitsuba_ext.movers import sensor_at_rest
 from mitsuba_ext.rendering.camera import check_takes_splats
 from mitsuba_ext.rendering.stages import OneStage
+from mitsuba_ext.scene.movers import sensor_at_rest
+from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.walk import Walk
 
 #: Memory for the vertices of a pass, and about what a path takes besides.

@@ -6,10 +6,6 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext import registry
-from mitsuba_ext.chains.path_target import PathTarget
-from mitsuba_ext.chains.small_steps import SmallSteps
-from mitsuba_ext.chains.visits import ChainSettings, MetropolisRender
 from mitsuba_ext.composition.chain_integrator import ChainIntegrator
 from mitsuba_ext.composition.path_mutations import (
     MOST,
@@ -18,6 +14,10 @@ from mitsuba_ext.composition.path_mutations import (
     path_target,
     read_switches,
 )
+from mitsuba_ext.metropolis.chains.path_target import PathTarget
+from mitsuba_ext.metropolis.chains.small_steps import SmallSteps
+from mitsuba_ext.metropolis.chains.visits import ChainSettings, MetropolisRender
+from mitsuba_ext.startup import registry
 
 
 @registry.plugin

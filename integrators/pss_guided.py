@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext import registry
 from mitsuba_ext.composition.connections import Connections
 from mitsuba_ext.composition.decision_parameters import ParameterReader
 from mitsuba_ext.composition.directions import Guided
@@ -12,6 +11,7 @@ from mitsuba_ext.composition.roulette import GuidedRoulette
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.decisions.directions.guide_learner import GuideLearner
 from mitsuba_ext.decisions.directions.guided_directions import GuidedDirections
+from mitsuba_ext.startup import registry
 
 
 @registry.plugin

@@ -6,10 +6,10 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext import registry
-from mitsuba_ext.chains.target import ImageTarget
-from mitsuba_ext.chains.visits import ChainSettings, MetropolisRender
 from mitsuba_ext.composition.metropolis_integrator import MetropolisIntegrator
+from mitsuba_ext.metropolis.chains.target import ImageTarget
+from mitsuba_ext.metropolis.chains.visits import ChainSettings, MetropolisRender
+from mitsuba_ext.startup import registry
 
 
 @registry.plugin

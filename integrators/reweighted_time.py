@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from mitsuba_ext import registry
 from mitsuba_ext.composition.reweighted_camera import ReweightedCamera
+from mitsuba_ext.startup import registry
 
 
 @registry.plugin

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext import registry
 from mitsuba_ext.composition.swarm import MAPS
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.startup import registry
 
 #: By parameter, the slot that its maps fill.
 _SLOTS = {

@@ -11,7 +11,7 @@ selected later. Scenes then name the plugins as they name Mitsuba's own::
 
 from pathlib import Path
 
-from . import mitsuba_import
+from .startup import mitsuba_import
 
 __version__ = "0.1.0"
 

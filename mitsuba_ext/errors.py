@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import re
+
+#: Where Mitsuba quotes the error of a plugin that is written in Python.
+_TRACEBACK = "Traceback (most recent call last):\n"
+
 
 class InputError(ValueError):
     """An input of the user cannot be used. The message is one line that names it and the fault."""
@@ -9,3 +14,18 @@ class InputError(ValueError):
 
 class InstallationError(RuntimeError):
     """Installed software cannot be used. The message says what to do."""
+
+
+def one_line(error: BaseException | str) -> str:
+    """A message of Mitsuba without source positions ("[parser.cpp:12] ", "[PLYMesh] ") and line
+    breaks. For an error in a plugin that is written in Python, Mitsuba quotes the whole traceback:
+    this keeps only the message at its end."""
+    text = str(error)
+    if _TRACEBACK in text:
+        before, *_, last = text.split(_TRACEBACK)
+        # The frames are indented; what follows is "ValueError: message"
+        kind, _colon, message = re.sub(r"\A(?: .*\n)*", "", last).partition(": ")
+        text = before + (message or kind)
+    text = re.sub(r"\[\w+(?:\.(?:cpp|h):\d+)?\] ", "", text)
+    # "Found 1 unreferenced property in …:\n  - float "radiusx": 3"
+    return re.sub(r"\s*\n\s*(?:- )?", " ", text).strip() or type(error).__name__

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext import registry
 from mitsuba_ext.sequences.sequence_sampler import SequenceSampler
 from mitsuba_ext.sequences.sobol import Sobol
+from mitsuba_ext.startup import registry
 
 
 @registry.plugin

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext import registry
-from mitsuba_ext.motion import Motion, PoseTable
-from mitsuba_ext.motion_parameters import read_motion
-from mitsuba_ext.nesting import class_name
+from mitsuba_ext.motion.motion_parameters import read_motion
+from mitsuba_ext.motion.rigid_motion import Motion, PoseTable
+from mitsuba_ext.scene.nesting import class_name
+from mitsuba_ext.startup import registry
 
 #: Sensors of Mitsuba that a motion cannot be given to, and why.
 _REFUSED = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext import registry
-from mitsuba_ext.portals import Portal
+from mitsuba_ext.scene.portals import Portal
+from mitsuba_ext.startup import registry
 
 
 @registry.plugin

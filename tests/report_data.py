@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from mitsuba_ext.compare import metrics, write_report
-from mitsuba_ext.compare.images import write_exr
+from mitsuba_ext.compare import write_report
+from mitsuba_ext.images import metrics
+from mitsuba_ext.images.image_files import write_exr
 
 HOSTILE = '<script>alert(1)</script>"\'&'
 REFUSAL = "the reference is too noisy: its own relMSE is 0.1"

@@ -31,7 +31,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsuba_ext.garbage import garbage_left_alone
+from mitsuba_ext.startup.garbage import garbage_left_alone
 
 SCENES = Path(__file__).parents[1] / "scenes"
 

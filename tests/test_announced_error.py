@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsuba_ext.compare.metrics import RELATIVE_FLOOR
+from mitsuba_ext.images.metrics import RELATIVE_FLOOR
 from mitsuba_ext.long_renders.announced_error import announced_error
 
 _BATCHES, _SPP, _SIDE = 8, 16, 64

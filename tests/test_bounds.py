@@ -8,7 +8,7 @@ import pytest
 from hard_cases import diffuse, film, lookat, sensor
 from statistical import batches
 
-from mitsuba_ext.bounds import scene_bounds
+from mitsuba_ext.scene.bounds import scene_bounds
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -13,11 +13,11 @@ from hard_cases import film, sensor, stage
 from statistical import one_thread, some
 from test_pssmlt import ALONE, pssmlt
 
-from mitsuba_ext.chains.looped import LoopedChains
-from mitsuba_ext.chains.numbers import generator
-from mitsuba_ext.chains.path_chains import PathChains
-from mitsuba_ext.chains.stored import arrays_of, value_of
-from mitsuba_ext.chains.target import Contribution
+from mitsuba_ext.metropolis.chains.looped import LoopedChains
+from mitsuba_ext.metropolis.chains.numbers import generator
+from mitsuba_ext.metropolis.chains.path_chains import PathChains
+from mitsuba_ext.metropolis.chains.stored import arrays_of, value_of
+from mitsuba_ext.metropolis.chains.target import Contribution
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -82,7 +82,7 @@ def test_renders_of_other_kinds_go_on_where_they_were_stopped(
     tmp_path: Path, which: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also those of chains of paths, and of batches."""
-    monkeypatch.setattr("mitsuba_ext.chains.redistribution._BATCH", 32**2)
+    monkeypatch.setattr("mitsuba_ext.metropolis.chains.redistribution._BATCH", 32**2)
     monkeypatch.setattr(PathChains, "launch", 4)
     scene, file = mi.load_dict(stage()), tmp_path / "chains.npz"
 

@@ -12,9 +12,9 @@ import click
 import pytest
 from conftest import PATH, in_subprocess
 
-from mitsuba_ext import pages
 from mitsuba_ext.compare import read_exr
-from mitsuba_ext.names import MITSUBA_INTEGRATORS
+from mitsuba_ext.inputs import pages
+from mitsuba_ext.inputs.names import MITSUBA_INTEGRATORS
 
 # ---- bad input ----
 
@@ -210,7 +210,7 @@ def test_every_integrator_of_mitsuba_is_known_by_name(variant):
 
 
 def test_list_shows_every_plugin(run):
-    from mitsuba_ext import registry
+    from mitsuba_ext.startup import registry
 
     code, out, _ = run("list")
     assert code == 0

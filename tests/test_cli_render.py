@@ -19,10 +19,11 @@ from conftest import PATH
 
 from mitsuba_ext.cli import image_render
 from mitsuba_ext.cli.stopping import Stop, stopping
-from mitsuba_ext.compare import images, load_scene, read_exr, write_exr
+from mitsuba_ext.compare import load_scene, read_exr, write_exr
+from mitsuba_ext.images import image_files
+from mitsuba_ext.inputs.scene_remarks import scene_remarks
 from mitsuba_ext.rendering import interrupts, plan, seed_passes
 from mitsuba_ext.rendering import render as rendering
-from mitsuba_ext.scene_remarks import scene_remarks
 
 
 def test_render_writes_an_exr_with_metadata(run, make_scene, tmp_path):
@@ -240,7 +241,7 @@ def test_terminal_that_is_closed_keeps_the_image_and_the_exit_code(
 def test_signals_do_not_interrupt_the_writing_of_the_image(
     run, make_scene, tmp_path, third_pass_gets, monkeypatch
 ):
-    integrator, write, exits = third_pass_gets("SIGTERM"), images.write_film, []
+    integrator, write, exits = third_pass_gets("SIGTERM"), image_files.write_film, []
     monkeypatch.setattr(interrupts, "TOGETHER", 0.02)
     monkeypatch.setattr(os, "_exit", exits.append)
 
@@ -251,7 +252,7 @@ def test_signals_do_not_interrupt_the_writing_of_the_image(
         time.sleep(0.05)
         write(path, film, metadata, *others, **options)
 
-    monkeypatch.setattr(images, "write_film", interrupted)
+    monkeypatch.setattr(image_files, "write_film", interrupted)
     output = tmp_path / "a.exr"
     arguments = ("render", make_scene(), "-o", output, "--integrator", integrator, "--spp", 40)
     assert (run(*arguments)[0], exits) == (143, [])
@@ -307,7 +308,7 @@ def test_output_that_cannot_hold_the_film_is_refused_before_rendering(
     def full_disk(*_):
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(images, "write_film", full_disk)
+    monkeypatch.setattr(image_files, "write_film", full_disk)
     code, _, err = run("render", make_scene(), "-o", tmp_path / "b.exr")
     assert code == 2 and "b.exr: cannot be written (No space left on device)" in err
     assert not list(tmp_path.glob("b*"))

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from mitsuba_ext.compare import flip, metrics
+from mitsuba_ext.images import flip, metrics
 
 needs_flip = pytest.mark.skipif(flip._evaluator() is None, reason="flip-evaluator is not installed")
 

@@ -9,9 +9,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext import denoising
-from mitsuba_ext.compare import InputError, images, read_exr
-from mitsuba_ext.compare.metrics import relative_mse
+from mitsuba_ext.compare import InputError, read_exr
+from mitsuba_ext.composition.guides import render_guides
+from mitsuba_ext.images import denoising, image_files
+from mitsuba_ext.images.metrics import relative_mse
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -56,7 +57,7 @@ def test_a_long_render_is_denoised_too(run, make_scene, tmp_path, calls):
                      "--checkpoint", tmp_path / "kept",
                      "--preview", tmp_path / "b.png")  # fmt: skip
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    assert code == 0 and images.open_bitmap(tmp_path / "a.png").width() == 8
+    assert code == 0 and image_files.open_bitmap(tmp_path / "a.png").width() == 8
     assert len(calls) == 1 and (tmp_path / "a.noisy.exr").exists()
 
 
@@ -64,7 +65,7 @@ def test_guides_are_in_the_form_that_the_denoiser_takes(calls):
     scene = mi.load_dict(mi.cornell_box() | {"sensor": {
         "type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0],
         [0, 1, 0]), "film": {"type": "hdrfilm", "width": 6, "height": 4}}})  # fmt: skip
-    guides = denoising.render_guides(scene, scene.sensors()[0])
+    guides = render_guides(scene, scene.sensors()[0])
     albedo, normal = np.split(np.stack(list(guides.values()), axis=2), 2, axis=2)
     image = denoising.denoise(np.ones((4, 6, 3)), albedo, normal)
     assert image.shape == (4, 6, 3) and image.dtype == np.float32 and (image == 0.5).all()
@@ -77,13 +78,13 @@ def test_an_image_is_guided_by_its_layers(run, tmp_path, calls):
     rng = np.random.default_rng(1)
     names = ["R", "G", "B", *(f"View.Albedo.{c}" for c in "RGB"), *(f"normal.{c}" for c in "XYZ")]
     pixels = rng.random((4, 5, 9), dtype=np.float32)
-    images.write_exr(tmp_path / "a.exr", pixels, names, {})
+    image_files.write_exr(tmp_path / "a.exr", pixels, names, {})
     assert "guided by albedo and normal" in run("denoise", tmp_path / "a.exr")[1]
     np.testing.assert_array_equal(calls[0].albedo, pixels[..., 3:6])
     np.testing.assert_allclose(calls[0].normal, pixels[..., 6:], atol=1e-6)
     found = read_exr(tmp_path / "a.denoised.exr")[0]
     np.testing.assert_array_equal(found["G"], pixels[..., 1] / 2)
-    images.write_exr(tmp_path / "b.exr", pixels[..., :3], "RGB", {})
+    image_files.write_exr(tmp_path / "b.exr", pixels[..., :3], "RGB", {})
     assert "nothing but the image" in run("denoise", tmp_path / "b.exr", "-o",
                                           tmp_path / "b.jpg")[1]  # fmt: skip
     code, _, err = run("denoise", tmp_path / "b.exr", "-o", tmp_path / "b.exr")
@@ -114,7 +115,7 @@ def _guides(*shapes, **film):
         "type": "scene", "sensor": {"type": "perspective", "fov": 20, "film": film},
         **{f"shape{n}": shape for n, shape in enumerate(shapes)},
     })  # fmt: skip
-    found = denoising.render_guides(scene, scene.sensors()[0], seed=1)
+    found = render_guides(scene, scene.sensors()[0], seed=1)
     assert list(found) == [*(f"albedo.{c}" for c in "RGB"), *(f"normal.{c}" for c in "XYZ")]
     return np.stack(list(found.values()), axis=2)
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mitsuba_ext import cli
-from mitsuba_ext.compare import InputError, metrics, read_exr, read_image, write_exr
+from mitsuba_ext.compare import InputError, read_exr, read_image, write_exr
+from mitsuba_ext.images import metrics
 
 #: Height, width: not square, so that a mix-up of the axes shows.
 SHAPE = (4, 6)

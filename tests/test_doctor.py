@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import mitsuba_ext
-from mitsuba_ext import doctor, registry
+from mitsuba_ext.startup import doctor, registry
 
 pytestmark = pytest.mark.usefixtures("variant")
 

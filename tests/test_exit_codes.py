@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from conftest import in_subprocess
 
-from mitsuba_ext import cli, denoising, doctor
+from mitsuba_ext import cli
 from mitsuba_ext.cli import supervisor
-from mitsuba_ext.compare import images, write_exr
+from mitsuba_ext.compare import write_exr
 from mitsuba_ext.compare.experiment import Experiment
+from mitsuba_ext.images import denoising, image_files
 from mitsuba_ext.rendering.seed_passes import SeedPasses
+from mitsuba_ext.startup import doctor
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -58,7 +60,7 @@ def image(tmp_path) -> Path:
 def test_render(exits, make_scene, tmp_path, monkeypatch):
     target = ("-o", tmp_path / "a.exr", "--spp", 4)
     exits("render", (0, (make_scene(), *target)), (2, (tmp_path / "no.xml", *target)))
-    monkeypatch.setattr(images, "count_non_finite", lambda film: (3, 48))
+    monkeypatch.setattr(image_files, "count_non_finite", lambda film: (3, 48))
     exits("render", (1, (make_scene(), *target)))
     run_pass = SeedPasses._run_pass
     for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)):

@@ -13,11 +13,11 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from mitsuba_ext import chosen
 from mitsuba_ext.cli.common import kernels_compiled
 from mitsuba_ext.cli.frames import pictures
 from mitsuba_ext.cli.render_job import RenderJob
 from mitsuba_ext.compare import InputError, read_exr
+from mitsuba_ext.inputs import chosen
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 
@@ -181,7 +181,7 @@ def test_a_function_moves_things_without_another_load(run, make_scene, tmp_path,
         "/></shape>", '><rgb name="reflectance" value="0.5, 0.5, 0.5"/></bsdf></shape>')
     scene = make_scene(body=body)
     (tmp_path / "animate.py").write_text(FUNCTION)
-    with mock.patch("mitsuba_ext.chosen.load_scene", wraps=chosen.load_scene) as load:
+    with mock.patch("mitsuba_ext.inputs.chosen.load_scene", wraps=chosen.load_scene) as load:
         code, _, err = run("render", scene, "-o", tmp_path / "a.#.exr", "--spp", 64, *options,
                            "--parameters", f"{tmp_path / 'animate.py'}:move",
                            "--frames", "0:3")  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from statistical import load, one_thread, some
 
-from mitsuba_ext.plugin_text import parse_plugin
+from mitsuba_ext.inputs.plugin_text import parse_plugin
 
 pytestmark = pytest.mark.usefixtures("variant")
 

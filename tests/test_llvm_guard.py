@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from mitsuba_ext import llvm, llvm_install, runtime
 from mitsuba_ext.errors import InstallationError
+from mitsuba_ext.startup import llvm, llvm_install, runtime
 
 ROOT = Path(__file__).parents[1]
 
@@ -223,7 +223,7 @@ def test_probe_that_cannot_import_drjit_says_nothing_about_the_library(
 
 def test_ensure_without_a_usable_library_is_one_sentence(fake: Path) -> None:
     process = subprocess.run(
-        [sys.executable, "-m", "mitsuba_ext.llvm_install", "--ensure"],
+        [sys.executable, "-m", "mitsuba_ext.startup.llvm_install", "--ensure"],
         env={**os.environ, llvm.VARIABLE: str(fake)},
         cwd=ROOT,
         capture_output=True,

@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 from conftest import PATH, in_subprocess
 
-from mitsuba_ext.compare import images, load_reference, read_exr
+from mitsuba_ext.compare import load_reference, read_exr
 from mitsuba_ext.errors import InputError
+from mitsuba_ext.images import image_files
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.intervals import Interval
@@ -220,7 +221,7 @@ def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkey
         return render(self, batch, learned)
 
     # It may come at any time, and would end the process by default
-    describe, write = CheckpointFolder.describe, images.write_film
+    describe, write = CheckpointFolder.describe, image_files.write_film
 
     def before(*arguments):
         os.kill(os.getpid(), signal.SIGUSR1)
@@ -231,7 +232,7 @@ def test_a_signal_keeps_the_render_and_goes_on(run, make_scene, tmp_path, monkey
         write(*arguments, **options)
 
     monkeypatch.setattr(CheckpointFolder, "describe", before)
-    monkeypatch.setattr(images, "write_film", after)
+    monkeypatch.setattr(image_files, "write_film", after)
     monkeypatch.setattr(BatchRenderer, "render", signalled)
     code, out, _ = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
                        "--checkpoint", tmp_path / "kept")  # fmt: skip

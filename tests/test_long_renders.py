@@ -11,7 +11,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.compare import InputError, metrics
+from mitsuba_ext.compare import InputError
+from mitsuba_ext.images import metrics
 from mitsuba_ext.long_renders import dispatch, long_render
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer, RenderRequest
 from mitsuba_ext.long_renders.folder import CheckpointFolder

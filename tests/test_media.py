@@ -18,7 +18,7 @@ from statistical import (
     z_exact,
 )
 
-from mitsuba_ext.media import has_media, may_have_media
+from mitsuba_ext.scene.media import has_media, may_have_media
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.free_flight import Distances
 from mitsuba_ext.transport.path_decisions import DirectionSamples

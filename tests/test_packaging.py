@@ -17,7 +17,7 @@ import pytest
 from conftest import SCENE
 
 import mitsuba_ext
-from mitsuba_ext import runtime
+from mitsuba_ext.startup import runtime
 
 ROOT = Path(__file__).parents[1]
 PYPROJECT = (ROOT / "pyproject.toml").read_text()

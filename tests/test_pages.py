@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from mitsuba_ext import pages, registry
 from mitsuba_ext.composition.slots import SLOTS
-from mitsuba_ext.specifications import make_named
+from mitsuba_ext.inputs import pages
+from mitsuba_ext.inputs.specifications import make_named
+from mitsuba_ext.startup import registry
 
 import mitsuba as mi  # isort: skip
 

@@ -15,7 +15,7 @@ from test_environment_bins import MORE_ENVIRONMENTS, _square
 
 from mitsuba_ext.decisions.next_event.portal_sampling import PortalSampling
 from mitsuba_ext.lights.portal_maps import PortalMaps
-from mitsuba_ext.portals import Portal, portals
+from mitsuba_ext.scene.portals import Portal, portals
 from mitsuba_ext.transport.path_decisions import LightNumbers
 
 pytestmark = pytest.mark.usefixtures("variant")

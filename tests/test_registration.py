@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from mitsuba_ext import registry, runtime
+from mitsuba_ext.startup import registry, runtime
 
 LLVM_VARIANTS = [name for name in runtime.SUPPORTED_VARIANTS if name.startswith("llvm")]
 
@@ -49,7 +49,7 @@ def _run(code: str) -> str:
         "import mitsuba_ext, mitsuba as mi; mi.set_variant('llvm_ad_rgb'); load_all()",
         "import mitsuba as mi; mi.set_variant('scalar_rgb'); import mitsuba_ext;"
         "mi.set_variant('llvm_ad_rgb'); load_all()",
-        "import mitsuba_ext.runtime, mitsuba as mi; mi.set_variant('llvm_ad_rgb');"
+        "import mitsuba_ext.startup.runtime, mitsuba as mi; mi.set_variant('llvm_ad_rgb');"
         "import mitsuba_ext; load_all()",
     ],
     ids=["import, variant", "scalar, import, variant", "runtime, variant, import"],

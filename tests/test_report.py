@@ -21,8 +21,8 @@ from report_data import (
 )
 
 from mitsuba_ext.compare import InputError, write_report
-from mitsuba_ext.compare.images import write_exr
 from mitsuba_ext.compare.report import crops, formats, pictures
+from mitsuba_ext.images.image_files import write_exr
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from statistical import assert_same_image
 
-from mitsuba_ext.scenes import load_scene
+from mitsuba_ext.inputs.scenes import load_scene
 
 pytestmark = [
     pytest.mark.usefixtures("variant"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..movers import sensor_at_rest
+from ..scene.movers import sensor_at_rest
 from ..transport.lens_view import LensView
 from ..transport.numbers import hashed
 from ..transport.path_decisions import SceneQuery

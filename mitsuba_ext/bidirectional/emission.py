@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import from_numpy
-from ..bounds import scene_bounds
+from ..scene.bounds import scene_bounds
 from ..transport.numbers import Numbers
 from ..transport.ray_starts import ray_starts
 from . import light_pieces as pieces

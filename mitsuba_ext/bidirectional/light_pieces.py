@@ -19,7 +19,7 @@ import numpy as np
 from ..arrays import from_numpy
 from ..discrete_sampling import alias_tables
 from ..lights.division import emitter_shapes, has_interpolated_normals, triangles
-from ..movers import refuse_moving_lights
+from ..scene.movers import refuse_moving_lights
 from .emitter_choice import emitter_probabilities
 
 # Kinds of pieces

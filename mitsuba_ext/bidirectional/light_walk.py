@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..garbage import garbage_left_alone
+from ..startup.garbage import garbage_left_alone
 from ..transport.bsdfs import sample_bsdf
 from ..transport.frozen import frozen
 from ..transport.heroes import Heroes

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..movers import movers
+from ..scene.movers import movers
 from ..transport.estimator import CameraRays, Sample
 from ..transport.frozen import frozen
 from ..transport.numbers import BothEnds, Numbers, copied, go_to, reached

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..movers import is_moving_camera, point_at_rest, sensor_at_rest, viewing_axis
+from ..scene.movers import is_moving_camera, point_at_rest, sensor_at_rest, viewing_axis
 from ..transport.path_decisions import SceneQuery
 
 #: The sensors of Mitsuba to which a point can be connected.

@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..movers import movers
+from ..scene.movers import movers
 
 #: BSDFs that know of the surface no more than ``wi`` and ``uv``, what is nested in them aside.
 _PLAIN_BSDFS = frozenset({

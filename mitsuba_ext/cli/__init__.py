@@ -40,7 +40,7 @@ def cli() -> None:
 @click.command(short_help="Check the installation.")
 def doctor() -> int:
     """Check Mitsuba's version, the LLVM library, and a small render."""
-    from .. import doctor as doctor_module
+    from ..startup import doctor as doctor_module
 
     return doctor_module.main()
 

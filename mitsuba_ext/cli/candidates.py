@@ -9,7 +9,8 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .. import names, registry
+from ..inputs import names
+from ..startup import registry
 
 if TYPE_CHECKING:
     import click

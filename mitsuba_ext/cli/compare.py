@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..names import check_integrator
-from ..variants import select_variant
+from ..inputs.names import check_integrator
+from ..inputs.variants import select_variant
 from . import candidates, supervisor
 from .common import (
     INTERRUPTED,
@@ -119,7 +119,7 @@ def compare(
     parameters. Square brackets hold what is nested in an integrator, in the same form:
     "variance:nested=[neepp:grid=8],batches=32".
     """
-    from ..scenes import check_scene_file
+    from ..inputs.scenes import check_scene_file
 
     given = {"--spp": spp, "--time": seconds, "--sweep": sweep, "--until": until}
     if sum(value is not None for value in given.values()) != 1:
@@ -210,7 +210,7 @@ def _has_trouble(scene: Mapping[str, Any]) -> bool:
 
 def _sort_out(names: Sequence[str]) -> tuple[list[Path], list[str]]:
     """Which of the arguments are scenes: XML files, unless an <integrator> is their root."""
-    from ..specifications import is_fragment
+    from ..inputs.specifications import is_fragment
 
     paths = [Path(name) for name in names]
     scenes = [

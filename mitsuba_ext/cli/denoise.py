@@ -21,15 +21,15 @@ def denoise(image: Path, output: Path | None) -> int:
     It is guided by the layers of an EXR whose names end with "albedo" and "normal", such as those
     of --integrator "aov:aovs=albedo:albedo,normal:sh_normal,img=[path]".
     """
-    from ..compare import images
-    from ..denoising import denoise_file, denoiser
     from ..errors import InputError
-    from ..variants import select_variant
+    from ..images import image_files
+    from ..images.denoising import denoise_file, denoiser
+    from ..inputs.variants import select_variant
 
     target = output or image.with_name(f"{image.stem}.denoised{image.suffix}")
     if target.exists() and target.samefile(image):
         raise InputError(f"{target}: is the image itself, which is kept: choose another --output")
-    images.check_target(target)
+    image_files.check_target(target)
     denoiser()
     select_variant("scalar_rgb")
     guides = denoise_file(image, [target], {})

@@ -47,17 +47,18 @@ def diff(a: Path, b: Path, as_json: bool, output: Path | None) -> int:
     beyond ±4, one of them is probably biased. z assumes that pixels are independent. With a
     reconstruction filter wider than a pixel they are not, and z is too large.
     """
-    from ..compare import images, machine
+    from ..images import image_files
+    from ..startup import machine
 
     if output is not None:
         if output.suffix.lower() != ".exr":
             raise click.UsageError(f"{output}: the difference is written as .exr")
-        images.check_target(output)
+        image_files.check_target(output)
     image, reference = _read(a), _read(b)
     difference = _compare(image, reference)
     if output is not None:
         metadata = {"image": str(a), "reference": str(b), "versions": machine.versions()}
-        images.write_exr(output, image.pixels - reference.pixels, "RGB", metadata)
+        image_files.write_exr(output, image.pixels - reference.pixels, "RGB", metadata)
     if as_json:
         click.echo(json.dumps(_record(image, reference, difference)))
         return 0
@@ -97,8 +98,8 @@ class _Difference:
 
 
 def _read(path: Path) -> _Image:
-    from ..compare import metrics, reading
-    from ..scenes import InputError
+    from ..errors import InputError
+    from ..images import metrics, reading
 
     pixels, variance, metadata = reading.read_image(path)
     for name, values in (("", pixels), ("variance: ", variance)):
@@ -110,8 +111,8 @@ def _read(path: Path) -> _Image:
 def _compare(image: _Image, reference: _Image) -> _Difference:
     import numpy as np
 
-    from ..compare import metrics
-    from ..scenes import InputError
+    from ..errors import InputError
+    from ..images import metrics
 
     if image.size != reference.size:
         raise InputError(
@@ -225,7 +226,7 @@ def _print(image: _Image, reference: _Image, difference: _Difference) -> None:
 
 def _noise(reference: _Image, difference: _Difference) -> float | None:
     """The relMSE that was subtracted."""
-    from ..compare import metrics
+    from ..images import metrics
 
     if difference.identical or reference.variance is None:
         return None

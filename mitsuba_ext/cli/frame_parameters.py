@@ -17,7 +17,7 @@ class FrameParameters(NamedTuple):
 
     Attributes:
         definitions: Values of the scene file's ``$name`` parameters.
-        values: Of the loaded scene, as JSON; see :func:`~mitsuba_ext.scene_values.as_text`.
+        values: Of the loaded scene, as JSON; see :func:`~mitsuba_ext.inputs.scene_values.as_text`.
     """
 
     definitions: dict[str, str]
@@ -48,7 +48,7 @@ def load_function(text: str) -> Callable[[int], FrameParameters]:
         raise InputError(f'{source}: there is no function "{name}"')
 
     def parameters(frame: int) -> FrameParameters:
-        from ..scene_values import as_text
+        from ..inputs.scene_values import as_text
 
         try:
             found = function(frame)

@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .. import denoising
-from ..chosen import LastScene
-from ..compare import images, machine
+from ..composition.guides import render_guides
+from ..images import denoising, image_files
+from ..inputs.chosen import LastScene
+from ..inputs.variants import select_variant
 from ..long_renders.batch_renderer import RenderRequest
 from ..long_renders.folder import CheckpointFolder
-from ..variants import select_variant
+from ..startup import machine
 from . import statistics
 from .common import kernels_compiled, say
 from .frame_parameters import FrameParameters
@@ -82,7 +83,7 @@ def render_image(
     if long and long.folder and picture.name:
         long = replace(long, folder=long.folder / picture.name)
     for file in filter(None, (output, order.preview)):
-        images.check_target(file)
+        image_files.check_target(file)
     if order.denoise:
         denoising.denoiser()
     guides = {}
@@ -108,14 +109,14 @@ def render_image(
     ) -> None:
         layers = {**job.variance(), **(others or {})}
         # The render waits for an image that is soon replaced
-        images.write_film(target, job.film, metadata(), layers, is_compressed=is_final)
+        image_files.write_film(target, job.film, metadata(), layers, is_compressed=is_final)
 
     def show(is_asked: bool) -> None:
         if is_asked or (long and long.folder):
             # A frame that is there counts as finished
             write(picture.unfinished if order.is_one_of_many else output, is_final=False)
         if order.preview:
-            images.write_film(order.preview, job.film, metadata())
+            image_files.write_film(order.preview, job.film, metadata())
 
     report.image = {}
     if picture.name:
@@ -146,7 +147,7 @@ def render_image(
                 job = RenderJob(chosen, seed)
             is_new = kernels_compiled() > compiled
             for file in filter(None, (output, order.preview)):
-                images.check_film(file, job.film, job.integrator.aov_names())
+                image_files.check_film(file, job.film, job.integrator.aov_names())
             for remark in job.remarks(is_sensor_chosen=sensor_index is not None):
                 report.warn(remark)
             if order.denoise and (remark := denoising.remark(job.film)):
@@ -155,7 +156,7 @@ def render_image(
                 # The render's kernels take longer to compile, and nothing can be printed meanwhile
                 report.note("compiling kernels (later renders like this one find them in a cache)")
             if order.denoise:
-                guides = denoising.render_guides(job.scene, job.sensor, seed)
+                guides = render_guides(job.scene, job.sensor, seed)
             job.run(order.spp, order.seconds, show, report)
         except (KeyboardInterrupt, OSError) as error:
             # After SIGHUP, showing progress on the closed terminal raises an OSError
@@ -179,10 +180,10 @@ def render_image(
         else:
             write(target)
             if order.preview:
-                images.write_film(order.preview, job.film, metadata())
+                image_files.write_film(order.preview, job.film, metadata())
         if order.is_one_of_many and target == output:
             picture.unfinished.unlink(missing_ok=True)
-        bad, pixel_count = images.count_non_finite(job.film)
+        bad, pixel_count = image_files.count_non_finite(job.film)
         if bad:
             report.warn(f"{bad} of {pixel_count} pixels of {target} are NaN or infinite")
         figures = {

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..chosen import LastScene
 from ..errors import InputError
+from ..inputs.chosen import LastScene
 from ..long_renders.batch_renderer import BatchRenderer, RenderRequest
 from ..long_renders.dask_cluster import dask_cluster
 from ..long_renders.folder import CheckpointFolder

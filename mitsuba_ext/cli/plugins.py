@@ -19,7 +19,8 @@ def list_plugins(name: str | None) -> int:
     """Show the plugins, or the page of the plugin NAME."""
     from rich.table import Table
 
-    from .. import pages, registry
+    from ..inputs import pages
+    from ..startup import registry
 
     files = {kind: registry.plugin_files(kind) for kind in registry.plugin_names()}
     console = console_for_tables()
@@ -51,7 +52,7 @@ def list_plugins(name: str | None) -> int:
 
 
 def _no_page(name: str, ours: list[str]) -> click.UsageError:
-    from .. import names
+    from ..inputs import names
 
     if name in names.MITSUBA_INTEGRATORS:
         return click.UsageError(

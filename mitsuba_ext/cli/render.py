@@ -9,11 +9,11 @@ from pathlib import Path
 
 import click
 
+from ..inputs.names import check_integrator
+from ..inputs.variants import select_variant
 from ..long_renders.intervals import Interval
-from ..names import check_integrator
 from ..parameters import MOST_SPP
 from ..rendering.interrupts import requests_to_keep
-from ..variants import select_variant
 from . import candidates
 from .common import (
     MAX_SEED,
@@ -158,10 +158,10 @@ def render(
     """
     if specification and not plugins:
         check_integrator(specification)
-    from ..scenes import check_scene_file
+    from ..inputs.scenes import check_scene_file
 
     check_scene_file(scene)
-    from ..chosen import LastScene
+    from ..inputs.chosen import LastScene
     from .image_render import Order, is_finished, render_image
     from .long_job import LongOptions
     from .reports import Report
@@ -218,7 +218,7 @@ def render(
 
 def _all_sensors(scene, definitions, variant, plugins, frames, function) -> list[int]:
     """The numbers of a scene's sensors, in the first of the frames."""
-    from ..scenes import load_scene
+    from ..inputs.scenes import load_scene
 
     select_variant(variant, plugins)
     (picture,) = pictures(Path("#"), definitions, [None], 0, frames and frames[:1])

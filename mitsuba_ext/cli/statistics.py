@@ -16,7 +16,7 @@ def lines(
 
     Args:
         seeds: Those of the samples in the image.
-        versions: See :func:`~mitsuba_ext.compare.machine.versions`.
+        versions: See :func:`~mitsuba_ext.startup.machine.versions`.
     """
     names = ", ".join(map(str, seeds[:4])) + (", …" if len(seeds) > 4 else "")
     found = [

@@ -27,8 +27,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from .. import marks
-from ..processes import python_command
 from ..rendering import interrupts
+from ..startup.processes import python_command
 from .common import INTERRUPTED, say
 
 #: Value of the click context's ``obj`` in a process that was started from a shell.

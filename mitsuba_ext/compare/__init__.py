@@ -17,17 +17,18 @@
 
 from __future__ import annotations
 
+from ..errors import InputError
+from ..images.flip import mean_flip
+from ..images.image_files import read_exr, write_exr
+from ..images.metrics import Errors, errors, reference_noise, relative_mse
+from ..images.reading import read_image
+from ..inputs.scenes import LoadedScene, load_scene
+from ..inputs.specifications import NamedIntegrator, make_named
 from ..progress import Step
-from ..scenes import InputError, LoadedScene, load_scene
-from ..specifications import NamedIntegrator, make_named
 from .budgets import Budget, equal_samples, equal_time, sweep, until
 from .comparison import Comparison, SceneSetup
 from .experiment import Contender, Experiment
-from .flip import mean_flip
-from .images import read_exr, write_exr
 from .intervals import Estimate
-from .metrics import Errors, errors, reference_noise, relative_mse
-from .reading import read_image
 from .references import Reference, load_reference, render_reference
 from .report import write_report
 from .runs import Run

@@ -15,15 +15,17 @@ from typing import TYPE_CHECKING, Any, Union
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import InputError
 from ..files import replacing
+from ..images import image_files
+from ..inputs.scenes import LoadedScene, check_source, load_scene, scene_name
+from ..inputs.specifications import Specification, make_named
 from ..marks import REFERENCES, in_use
 from ..progress import Step, reporting
-from ..scenes import InputError, LoadedScene, check_source, load_scene, scene_name
-from ..specifications import Specification, make_named
-from . import images, references, results, timing
+from ..startup.machine import machine, versions
+from . import references, results, timing
 from .budgets import Budget
 from .experiment import Experiment, make_all
-from .machine import machine, versions
 from .references import Reference
 from .report import write_report
 
@@ -58,8 +60,8 @@ class Comparison:
 
     Args:
         scenes: XML files, dicts, or :class:`SceneSetup` of them.
-        integrators: Specifications (:func:`mitsuba_ext.specifications.make_named`), or a mapping
-            of labels to them. Ratios are given relative to the first.
+        integrators: Specifications (:func:`mitsuba_ext.inputs.specifications.make_named`), or a
+            mapping of labels to them. Ratios are given relative to the first.
         budget: Samples, seconds or error of each run: see :mod:`.budgets`.
         seeds: Runs of each integrator at each level.
         folder: For ``results.json``, ``report.html``, images and references; made if missing. Runs
@@ -201,7 +203,7 @@ class Comparison:
             progress(step._replace(label=f"{name}{count}: {step.label}"))
 
         try:
-            images.check_comparable(scene.scene.sensors()[0].film())
+            image_files.check_comparable(scene.scene.sensors()[0].film())
         except InputError as error:
             raise InputError(f"{scene.source}: {error}") from error
         if setup.reference:

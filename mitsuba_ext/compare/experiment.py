@@ -19,14 +19,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..errors import InputError, one_line
+from ..images import image_files, metrics
+from ..inputs.scenes import LoadedScene
+from ..inputs.specifications import NamedIntegrator, Specification, make_named
 from ..marks import has_crashed, mark_of, marked, renew
-from ..nesting import with_nested
 from ..progress import Step
-from ..scenes import InputError, LoadedScene, one_line
-from ..specifications import NamedIntegrator, Specification, make_named
-from . import images, metrics, timing
+from ..scene.nesting import with_nested
+from ..startup.machine import machine, versions
+from . import timing
 from .budgets import Budget
-from .machine import machine, versions
 from .references import Reference
 from .runs import Run, RunFolder
 from .zero_radiance import zero_radiance_share
@@ -81,8 +83,8 @@ class Experiment:
 
     Args:
         scene: The scene; its own integrator matters only for the settings that others take over.
-        integrators: Specifications (:func:`mitsuba_ext.specifications.make_named`), or a mapping
-            of labels to them. Figures are given relative to the first.
+        integrators: Specifications (:func:`mitsuba_ext.inputs.specifications.make_named`), or a
+            mapping of labels to them. Figures are given relative to the first.
         budget: Samples, seconds or error of each run.
         rounds: Runs of each integrator at each level.
         folder: Stores the runs; those that it already holds are not rendered again.
@@ -230,7 +232,7 @@ class Experiment:
     def _measure(self, contender: Contender, index: int, round: int, path: Path) -> Run:
         level, seed = self.budget.level(index), run_seed(index, round)
         timed = self._render(contender, level, seed)
-        pixels = images.to_rgb(timed.image, images.film_channels(self._film))
+        pixels = image_files.to_rgb(timed.image, image_files.film_channels(self._film))
         if fault := metrics.describe_non_finite(pixels):
             raise ValueError(f"seed {seed}: {fault}")
         report = timing.own_statistics(contender.named.integrator)

@@ -23,13 +23,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..errors import InputError, one_line
 from ..files import replacing
+from ..images import image_files, metrics
+from ..inputs.scenes import LoadedScene, scene_name
+from ..inputs.specifications import NamedIntegrator, Specification, make_named
 from ..marks import mark_of, marked
 from ..rendering.batches import Batches, batch_seeds, each_batch
-from ..scenes import InputError, LoadedScene, one_line, scene_name
-from ..specifications import NamedIntegrator, Specification, make_named
-from . import images, metrics
-from .machine import versions
+from ..startup.machine import versions
 
 if TYPE_CHECKING:
     from ..long_renders.divided_references import ReferenceWorkers
@@ -87,7 +88,7 @@ def load_reference(path: str | Path, size: tuple[int, int] | None = None) -> Ref
             does not have the requested ``size``.
     """
     path = Path(path)
-    channels, metadata = images.read_exr(path)
+    channels, metadata = image_files.read_exr(path)
     mean = _stack(channels, "mean.")
     variance = _stack(channels, "variance.")
     if mean is None:
@@ -183,14 +184,15 @@ def _render(
     start = time.perf_counter()
     with marked(mark_of(folder, f"{named.label}_{scene.content_hash}")):
         for batches in rendered:
-            if fault := metrics.describe_non_finite(images.to_rgb(batches.mean, batches.channels)):
+            rgb = image_files.to_rgb(batches.mean, batches.channels)
+            if fault := metrics.describe_non_finite(rgb):
                 raise InputError(f"has {fault}")
             with replacing(partial) as temporary:
                 batches.save(temporary)
             if progress is not None:
                 progress(batches.count / batch_count)
-    mean = images.to_rgb(batches.mean, batches.channels)
-    variance = images.to_rgb(batches.variance, batches.channels)
+    mean = image_files.to_rgb(batches.mean, batches.channels)
+    variance = image_files.to_rgb(batches.variance, batches.channels)
     if not mean.any():
         raise InputError("is black")
     metadata = {
@@ -201,7 +203,7 @@ def _render(
         "seconds": time.perf_counter() - start,
     }
     channels = [f"{name}.{color}" for name in ("mean", "variance") for color in _RGB]
-    images.write_exr(path, np.concatenate([mean, variance], axis=2), channels, metadata)
+    image_files.write_exr(path, np.concatenate([mean, variance], axis=2), channels, metadata)
     partial.unlink(missing_ok=True)
     return load_reference(path, scene.size)
 

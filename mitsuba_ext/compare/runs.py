@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from .. import marks
+from ..errors import InputError
 from ..files import replacing
-from ..scenes import InputError
-from . import images
-from .metrics import Errors
+from ..images import image_files
+from ..images.metrics import Errors
 
 #: The file beside a run's that holds its times in other sessions.
 _TIMES = ".times.json"
@@ -65,7 +65,7 @@ class Run:
 
     def image(self) -> np.ndarray:
         """The image, (height, width, 3), read from its file."""
-        channels, _ = images.read_exr(self.path)
+        channels, _ = image_files.read_exr(self.path)
         return np.stack([channels[name] for name in "RGB"], axis=2)
 
     @property
@@ -125,7 +125,7 @@ class RunFolder:
         if not path.is_file():
             return None
         try:
-            _, metadata = images.read_exr(path)
+            _, metadata = image_files.read_exr(path)
             run = Run(**json.loads(str(metadata["run"])), path=path)
         except (InputError, KeyError, TypeError, ValueError):
             return None
@@ -138,7 +138,7 @@ class RunFolder:
         """Writes a run, and returns it with its path."""
         header = {**metadata, "spp": run.spp, "seed": run.seed, "seconds": run.seconds,
                   "run": json.dumps(run.record())}
-        images.write_exr(path, image, "RGB", header)
+        image_files.write_exr(path, image, "RGB", header)
         return replace(run, path=path)
 
     def add_time(self, run: Run, seconds: float) -> None:

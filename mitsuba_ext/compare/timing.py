@@ -6,9 +6,9 @@ import gc
 import time
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..movers import check_motion_is_seen
 from ..rendering.batches import sample_count
 from ..rendering.camera import forget_state
+from ..scene.movers import check_motion_is_seen
 
 if TYPE_CHECKING:
     import mitsuba as mi

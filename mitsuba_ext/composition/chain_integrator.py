@@ -13,9 +13,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..chains.path_target import PathTarget
-from ..chains.render import ChainRender
-from ..chains.target import ImageTarget
+from ..metropolis.chains.path_target import PathTarget
+from ..metropolis.chains.render import ChainRender
+from ..metropolis.chains.target import ImageTarget
 from ..parameters import MOST_SPP
 from ..rendering.batches import sample_count
 from ..rendering.camera import check_takes_splats, find_sensor

@@ -11,8 +11,8 @@ from typing import Any
 import mitsuba as mi
 
 from ..bidirectional.path_tracer import BidirectionalPathTracer
-from ..chains.small_steps import SmallSteps
-from ..chains.target import ImageTarget
+from ..metropolis.chains.small_steps import SmallSteps
+from ..metropolis.chains.target import ImageTarget
 from ..transport.path_decisions import Weights
 from ..transport.without_lengths import WithoutLengths
 from .chain_integrator import ChainIntegrator

@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import from_numpy
-from ..bounds import scene_bounds
 from ..decisions.learner import Learner
 from ..decisions.next_event.environment_partition import MOST_SPLITS
 from ..decisions.next_event.light_map_learner import LightMapLearner
@@ -25,9 +24,10 @@ from ..files import check_target
 from ..lights.light_cells import LightCells
 from ..lights.shutter_times import ShutterTimes
 from ..lights.weights import VoxelRows, power_weights, spatial_weights
-from ..portals import portals
 from ..regions.voxel_grid import VoxelGrid
 from ..rendering.camera import film_extent
+from ..scene.bounds import scene_bounds
+from ..scene.portals import portals
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 
 #: Candidates that take as long as a path, about.

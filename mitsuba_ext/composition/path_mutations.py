@@ -6,9 +6,9 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..chains.path_target import PathTarget
-from ..path_space.mutations import Mutations, Switches
-from ..path_space.space import PathSpace
+from ..metropolis.chains.path_target import PathTarget
+from ..metropolis.path_space.mutations import Mutations, Switches
+from ..metropolis.path_space.space import PathSpace
 from ..rendering.stages import OneStage
 from ..transport.path_decisions import Weights
 from ..transport.without_lengths import WithoutLengths

@@ -10,10 +10,10 @@ from typing import Any
 import mitsuba as mi
 
 from ..decisions.camera.pixel_sets import PixelSets
-from ..rendering.staged_integrator import NO_LIMIT
 from ..rendering.stages import Schedule, Stage
 from .camera_numbers import PURPOSES, WeightedNumbers, samples_per_set
 from .decision_parameters import ParameterReader, Setting
+from .staged_integrator import NO_LIMIT
 from .wrapping_integrator import WrappingIntegrator
 
 

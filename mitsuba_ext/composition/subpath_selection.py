@@ -15,9 +15,9 @@ from ..decisions.learner import Learner
 from ..decisions.pixel_estimates import brightness
 from ..decisions.query.moving_scene import scene_query
 from ..decisions.subpaths.region_learner import LightVertexSample, RegionLearner
-from ..movers import movers
 from ..regions.surface_sides import lit_normal
 from ..rendering.camera import film_extent
+from ..scene.movers import movers
 from .decision_parameters import DecisionParameters, Setting
 
 #: Light paths that show where there are vertices.

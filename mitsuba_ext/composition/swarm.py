@@ -14,8 +14,8 @@ from ..decisions.swarm.cells import Cells
 from ..decisions.swarm.direction_maps import DirectionMapLearner, MappedScattering
 from ..decisions.swarm.light_maps import LightMapLearner, LightMaps, light_cells
 from ..decisions.swarm.lobe_maps import LobeMapLearner, MappedLobes, divides
-from ..media import has_homogeneous_media
 from ..rendering.camera import film_extent
+from ..scene.media import has_homogeneous_media
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 
 #: By how much unequal weights of samples may raise the variance of images in which no map helps.

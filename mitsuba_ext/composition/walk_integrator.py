@@ -17,11 +17,10 @@ from ..decisions.query.moving_aovs import moving_aovs
 from ..decisions.query.moving_scene import scene_query
 from ..errors import InputError
 from ..files import check_target
-from ..media import refuse_media, refuse_missing_colours, refuse_moving_grids
-from ..movers import movers
 from ..rendering.aovs import check_aovs
 from ..rendering.camera import film_extent
-from ..rendering.staged_integrator import NO_LIMIT, StagedIntegrator
+from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
+from ..scene.movers import movers
 from ..transport.estimator import CameraRays, Estimator
 from ..transport.path_decisions import EmitterSampling, SceneQuery
 from ..transport.walk import Walk
@@ -30,6 +29,7 @@ from .camera_numbers import WeightedNumbers, samples_per_set
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 from .schedule import Schedule, pilot_samples
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
+from .staged_integrator import NO_LIMIT, StagedIntegrator
 
 
 class WalkIntegrator(StagedIntegrator):

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..garbage import garbage_left_alone
-from ..movers import check_motion_is_seen
-from ..nesting import refuse_checkpoint
-from ..rendering.staged_integrator import StagedIntegrator
 from ..rendering.stages import OneStage, Schedule
+from ..scene.movers import check_motion_is_seen
+from ..scene.nesting import refuse_checkpoint
+from ..startup.garbage import garbage_left_alone
 from ..transport.estimator import CameraRays, Sample
+from .staged_integrator import StagedIntegrator
 
 
 class WrappingIntegrator(StagedIntegrator):

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..denoising import denoiser
+from ..images.denoising import denoiser
 from .images import Size, filled
 from .layers import LayerSums
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..bounds import scene_bounds
+from ..scene.bounds import scene_bounds
 
 #: The sine of the polar angle at the poles, where densities would be infinite.
 LEAST_SINE = 1e-7

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..arrays import from_numpy
 from ..discrete_sampling import ONE_MINUS_EPSILON
-from ..portals import Portal
+from ..scene.portals import Portal
 from .environment_directions import EnvironmentDirections
 from .spectra import brightness, comparison_wavelengths
 from .sun import SunDisk

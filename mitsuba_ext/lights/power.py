@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import from_numpy
-from ..bounds import scene_bounds
-from ..movers import is_moving_light
+from ..scene.bounds import scene_bounds
+from ..scene.movers import is_moving_light
 from .division import emitter_shapes
 from .spectra import brightness
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..movers import is_moving_light
+from ..scene.movers import is_moving_light
 
 #: Intervals where lights move. With lamps that cross the scene, 8 have 0.63 times the error of one,
 #: and 32 no less than 8.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import median_filter
 
-from ..compare.metrics import RELATIVE_FLOOR
+from ..images.metrics import RELATIVE_FLOOR
 
 #: Width of the neighbourhood, in pixels, that tells how bright a pixel is.
 _NEIGHBOURS = 3

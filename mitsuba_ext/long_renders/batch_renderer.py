@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..chosen import LastScene
-from ..compare.machine import versions
-from ..errors import InputError
-from ..nesting import with_nested
-from ..scenes import one_line
+from ..errors import InputError, one_line
+from ..inputs.chosen import LastScene
+from ..scene.nesting import with_nested
+from ..startup.machine import versions
 from .bundle import Bundle
 from .integrator_batches import IntegratorBatches
 from .state import Batch, BatchResult
@@ -30,7 +29,7 @@ class RenderRequest:
         seed: Of the random numbers.
         variant, plugins: Mitsuba's variant, and modules that register other plugins.
         threads: Of a process; 0 for as many as there are cores.
-        values: Of the loaded scene, as :func:`~mitsuba_ext.scene_values.as_text` makes them;
+        values: Of the loaded scene, as :func:`~mitsuba_ext.inputs.scene_values.as_text` makes them;
             ``None`` if no frame has any.
         description: What the image depends on, as JSON: a process that would render another image
             refuses. Empty for what each process finds.

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..content_hash import hash_each
 from ..errors import InputError
-from ..scene_files import named_by_absolute_path
-from ..scenes import LoadedScene
+from ..inputs.content_hash import hash_each
+from ..inputs.scene_files import named_by_absolute_path
+from ..inputs.scenes import LoadedScene
 
 
 @dataclass(frozen=True)

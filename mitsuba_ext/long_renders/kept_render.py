@@ -10,12 +10,12 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..compare.machine import versions
-from ..content_hash import hash_code
 from ..decisions.next_event.light_map_file import fingerprint
-from ..nesting import with_nested
+from ..inputs.content_hash import hash_code
 from ..rendering.batches import sample_count
 from ..rendering.interrupts import deferred_interrupt
+from ..scene.nesting import with_nested
+from ..startup.machine import versions
 from .folder import CheckpointFolder
 from .integrator_batches import IntegratorBatches
 from .intervals import Interval, LastKept

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-from ..compare import images
 from ..errors import InputError
+from ..images import image_files
 from .announced_error import announced_error
 from .dispatch import QUEUE, Dispatch
 from .integrator_batches import IntegratorBatches
@@ -115,7 +115,8 @@ class LongRender:
         if batches is None or batches.count < _FEWEST:
             return None
         if batches.count >= _LATER * self._error[0]:
-            rgb = [images.to_rgb(x, batches.channels) for x in (batches.mean, batches.variance)]
+            both = (batches.mean, batches.variance)
+            rgb = [image_files.to_rgb(each, batches.channels) for each in both]
             self._error = batches.count, announced_error(*rgb)
         return self._error[1]
 

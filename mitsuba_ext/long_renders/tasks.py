@@ -11,7 +11,7 @@ from typing import NamedTuple
 import drjit as dr
 
 from ..errors import InputError
-from ..variants import select_variant
+from ..inputs.variants import select_variant
 from .batch_renderer import BatchRenderer, RenderRequest
 from .bundle import Bundle
 from .folder import difference

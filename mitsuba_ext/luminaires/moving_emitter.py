@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.motion import Motion, Pose, PoseTable
+from mitsuba_ext.motion.rigid_motion import Motion, Pose, PoseTable
 
 
 class MovingEmitter(mi.Emitter):

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..bounds import scene_bounds
+from ..scene.bounds import scene_bounds
 from .voxel_sides import voxel_at, voxel_coordinates, voxel_number
 
 #: The index of an empty voxel.

@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..garbage import garbage_left_alone
-from ..movers import check_motion_is_seen
+from ..scene.movers import check_motion_is_seen
+from ..startup.garbage import garbage_left_alone
 from .camera import film_told, find_sensor
 
 

@@ -13,9 +13,9 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
-from ..garbage import garbage_left_alone
-from ..movers import check_motion_is_seen
-from ..nesting import with_nested
+from ..scene.movers import check_motion_is_seen
+from ..scene.nesting import with_nested
+from ..startup.garbage import garbage_left_alone
 from .batches import sample_count
 from .camera import film_extent, film_told
 from .film_sums import FilmSums

@@ -41,8 +41,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import registry
-from ..garbage import garbage_left_alone
+from ..startup import registry
+from ..startup.garbage import garbage_left_alone
 
 #: Scenes whose recordings are kept, and recordings of each, at most.
 _MOST_SCENES, _MOST_RECORDINGS = 8, 256

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
-from ..movers import point_at_rest, sensor_at_rest, viewing_axis
+from ..scene.movers import point_at_rest, sensor_at_rest, viewing_axis
 from .path_decisions import SceneQuery
 
 #: Surfaces that a ray may pass before it counts as having met one.

@@ -28,7 +28,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..media import may_have_grids, may_have_media
+from ..scene.media import may_have_grids, may_have_media
 from .estimator import CameraRays
 from .free_flight import (
     Distances,

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..bounds import scene_bounds
+from ..scene.bounds import scene_bounds
 
 #: Scenes whose coordinates are all smaller have distances of their own.
 _SMALL = 0.1

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 
-from ..garbage import garbage_left_alone
+from ..startup.garbage import garbage_left_alone
 from .connection import Connection, Connector
 from .emission import can_be_hit, emission
 from .estimator import CameraRays, Sample

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..images import replacing
+from ...images.image_files import replacing
 from .records import read_results
 
 __all__ = ["write_report"]

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...scenes import InputError
-from .. import metrics, reading
+from ...errors import InputError
+from ...images import metrics, reading
 from .records import Record, pictured_runs
 
 #: The exposure maps this percentile of the reference's luminance …

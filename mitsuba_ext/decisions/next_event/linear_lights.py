@@ -10,12 +10,12 @@ import mitsuba as mi
 import numpy as np
 
 from ...arrays import from_numpy
-from ...bounds import scene_bounds, shape_bounds
 from ...lights.division import emitter_shapes
 from ...lights.light_cells import LightCells
 from ...lights.spectra import comparison_wavelengths
 from ...lights.weights import power_weights
-from ...movers import is_moving_light
+from ...scene.bounds import scene_bounds, shape_bounds
+from ...scene.movers import is_moving_light
 from ...transport.path_decisions import EmitterSampling
 
 #: Added to the largest cosine under which a vertex sees a light. Glossy reflection does not

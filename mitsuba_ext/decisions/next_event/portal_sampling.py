@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...lights.portal_maps import PortalMaps
-from ...portals import portals
+from ...scene.portals import portals
 from ...transport.path_decisions import EmitterSampling
 
 #: No portal.

@@ -8,7 +8,7 @@ import re
 import drjit as dr
 import mitsuba as mi
 
-from ...motion import Pose
+from ...motion.rigid_motion import Pose
 from .moving_scene import MovingSceneQuery
 
 #: The channels of the variables that are no single number, and which of these a motion changes.

@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 
 from ...arrays import from_numpy
-from ...motion import Pose, PoseTable
-from ...movers import movers
+from ...motion.rigid_motion import Pose, PoseTable
+from ...scene.movers import movers
 from ...transport.path_decisions import SceneQuery
 from ...transport.ray_starts import RayStarts, ray_starts
 

@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...bounds import scene_bounds
 from ...regions.voxel_grid import EMPTY
+from ...scene.bounds import scene_bounds
 from ...transport.path_decisions import ShadowTest
 from ..learner import Learner
 from .rejection_law import WORTHWHILE, RejectionLaw, rejected_share

@@ -1,0 +1,19 @@
+"""What guides a denoiser, for scenes with or without shapes that move."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from ..decisions.query.moving_scene import scene_query
+from ..rendering import guides
+
+
+def render_guides(scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> dict[str, np.ndarray]:
+    """Albedo and shading normal of what the camera sees, in mirrors and through glass too. Replaces
+    the contents of the film.
+
+    Returns:
+        Arrays (height, width) by the names of channels: ``albedo.R``, …, ``normal.Z``.
+    """
+    return guides.render_guides(scene, sensor, scene_query(scene), seed)

@@ -1,0 +1,230 @@
+"""The base class of our integrators that render in stages: what Mitsuba calls, and errors where
+Mitsuba's are cryptic.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+import operator
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from ..long_renders.intervals import Interval
+from ..parameters import read_parameter
+from ..rendering import camera
+from ..rendering import render as rendering
+from ..rendering.stages import Schedule
+
+#: What stands for "as many as there are".
+NO_LIMIT = 0xFFFFFFFF
+
+#: Parameters on which a render that is kept does not depend.
+_NOT_OF_THE_IMAGE = ("timeout", "checkpoint", "checkpoint_every")
+
+
+class StagedIntegrator(mi.SamplingIntegrator):
+    """An integrator that renders in stages and passes (``render.py``).
+
+    .. pluginparameters::
+
+     * - timeout
+       - |float|
+       - Seconds after which to stop, learning and compilation included; 0 or less for no limit. The
+         number of samples follows from the speed of the first passes (short ones, until one
+         compiles nothing, and then one of a quarter of the time left), and not from the clock, so
+         that stopping does not prefer fast samples. Pilots get at most a quarter of the samples
+         that fit. The time is kept as well as the speed is steady; a short pass of each pilot, and
+         one of the rest, are always taken. (Default: -1)
+
+     * - checkpoint
+       - |string|
+       - A folder that keeps the render: a second one (the same scene, seed and parameters) goes on
+         from there, up to ``spp``, which may be higher than before. It renders in batches, as
+         ``mitsuba-ext render --checkpoint`` does. Only the outermost integrator can have it.
+         (Default: none)
+     * - checkpoint_every
+       - |string|
+       - How often it is kept: :monosp:`60s`, :monosp:`10m`, :monosp:`2h` or :monosp:`100spp`. Only
+         with :monosp:`checkpoint`. (Default: 60s)
+
+    Attributes:
+        sees_motion: It renders ``moving`` shapes.
+        progress: Called after each pass with the fraction done; it may raise or call ``cancel``.
+        statistics: Of the last render (:class:`~mitsuba_ext.rendering.render.RenderStatistics`).
+    """
+
+    sees_motion = True
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.name = props.plugin_name()
+        # Read before the base class reads them: its errors do not name the plugin
+        self.timeout = self.parameter(props, "timeout", -1.0)
+        self.parameter(props, "hide_emitters", False)
+        super().__init__(props)
+        # Deprecated by Mitsuba, which says so in the log
+        self.samples_per_pass = self.parameter(props, "samples_per_pass", NO_LIMIT, minimum=1)
+        self.checkpoint = self.parameter(props, "checkpoint", "")
+        if self.checkpoint:
+            self.checkpoint_every = self._interval(props)
+        self._is_batch = False
+        self.progress: Callable[[float], None] | None = None
+        self.statistics = rendering.RenderStatistics()
+        self.is_cancelled = False
+
+    # ---- What a subclass says ----
+
+    def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
+        """The samples per pixel of each pilot stage, out of ``spp``; none where nothing learns."""
+        return []
+
+    @property
+    def sample_cost(self) -> int:
+        """The time of a sample in units of that of a path, about: passes are the shorter."""
+        return 1
+
+    @property
+    def most_lanes(self) -> int:
+        """Samples of a pass, at most, as its memory allows."""
+        return NO_LIMIT
+
+    def samples_per_set(self, spp: int) -> int:
+        """So many samples of a pixel belong together, out of ``spp``: a timeout keeps them whole.
+        """
+        return 1
+
+    @property
+    def needs_equal_samples(self) -> str:
+        """Why all pixels must get the same number of samples; empty if they need not. It ends a
+        sentence in an error message, and says what to change."""
+        return ""
+
+    @property
+    def default_spp(self) -> int:
+        """Samples per pixel of a render that does not say how many; 0 for the sampler's number."""
+        return 0
+
+    def schedule(
+        self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
+    ) -> Schedule:
+        """Makes one stage for each entry of ``samples`` (samples per pixel): pilots, and the last
+        one."""
+        raise NotImplementedError
+
+    def parameters(self) -> dict[str, Any]:
+        """What ``str()`` shows besides the common parameters."""
+        return {}
+
+    def common_parameters(self) -> dict[str, Any]:
+        """What ``str()`` shows of all integrators of a kind."""
+        if not self.checkpoint:
+            return {"timeout": self.timeout}
+        every = self.checkpoint_every
+        return {
+            "timeout": self.timeout,
+            "checkpoint": self.checkpoint,
+            "checkpoint_every": f"{every.spp}spp" if every.spp else f"{every.seconds:g}s",
+        }
+
+    # ---- What Mitsuba calls ----
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        spp = spp or self.default_spp
+        if self._is_batch:
+            return self.render_once(scene, sensor, seed, spp, develop, evaluate)
+        self.is_cancelled = False
+        if self.checkpoint:
+            return self._render_kept(scene, sensor, seed, spp, develop, evaluate)
+        return self.render_once(scene, sensor, seed, spp, develop, evaluate)
+
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
+        """The render as a whole, or a batch of one that is kept."""
+        return rendering.render(self, scene, sensor, seed, spp, develop, evaluate)
+
+    def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
+        """The values of the channels that :meth:`aov_names` names, where the walk has none."""
+        return []
+
+    def cancel(self) -> None:
+        """Ends the running render after the current pass (call it from ``progress`` or from another
+        thread); the image of the finished passes is returned."""
+        self.is_cancelled = True
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        raise self.no_gradients()
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        raise self.no_gradients()
+
+    def to_string(self) -> str:
+        parameters = {**self.common_parameters(), **self.parameters()}
+        lines = ",\n".join(f"  {key} = {value}" for key, value in parameters.items())
+        return f"{self.name}[\n{lines}\n]"
+
+    # ---- Renders that are kept ----
+
+    def _interval(self, props: mi.Properties) -> Interval:
+        text = self.parameter(props, "checkpoint_every", "60s")
+        try:
+            return Interval.parse(text)
+        except ValueError as error:
+            raise ValueError(f'"{self.name}": the parameter "checkpoint_every": {error}') from None
+
+    def _render_kept(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
+        # Batches stand above a single render
+        from ..long_renders.kept_render import KeptRender
+
+        begin = time.perf_counter()
+        sensor = camera.find_sensor(scene, sensor)
+        seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
+        shown = {**self.common_parameters(), **self.parameters()}
+        shown = {key: value for key, value in shown.items() if key not in _NOT_OF_THE_IMAGE}
+        kept = KeptRender(self, Path(self.checkpoint), self.checkpoint_every, str(shown))
+        timeout, progress = self.timeout, self.progress
+        self.timeout, self.progress, self._is_batch = -1.0, None, True
+        try:
+            state, is_interrupted = kept.run(
+                scene, sensor, seed & 0xFFFFFFFF, spp, timeout if timeout > 0 else None, progress
+            )
+        finally:
+            self.timeout, self.progress, self._is_batch = timeout, progress, False
+        totals = state.totals
+        self.statistics = rendering.RenderStatistics(
+            len(state.done), state.spp, time.perf_counter() - begin, totals.compile_seconds,
+            totals.learning_seconds, dict(totals.rays), totals.connections,
+            self.statistics.zero_radiance, totals.learned, totals.memory_bytes,
+            is_interrupted or self.is_cancelled,
+        )  # fmt: skip
+        image = camera.develop(sensor.film(), develop, evaluate)
+        if is_interrupted:
+            raise KeyboardInterrupt
+        return image
+
+    def check_sampled(self) -> None:
+        """
+        Raises:
+            ValueError: Another integrator draws samples of one that is to keep its render.
+        """
+        if self.checkpoint:
+            raise ValueError(
+                f'"{self.name}": the parameter "checkpoint" has no effect where another integrator '
+                f"draws the samples: leave it out"
+            )
+
+    # ---- Helpers ----
+
+    def parameter(self, props: mi.Properties, key: str, default: Any, **accepted: Any) -> Any:
+        """A parameter of the scene, checked: see :func:`mitsuba_ext.parameters.read_parameter`,
+        which also says what ``accepted`` can be."""
+        return read_parameter(self.name, props, key, default, **accepted)
+
+    def no_gradients(self) -> NotImplementedError:
+        """What to raise where gradients are asked for."""
+        return NotImplementedError(
+            f'"{self.name}" does not compute gradients: use an integrator made for that, such as '
+            f'"prb".'
+        )

@@ -1,0 +1,1 @@
+"""Image files, their metrics, and the denoiser."""

@@ -1,0 +1,120 @@
+"""What a command renders: a scene file, an integrator, a sensor."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+
+from ..errors import InputError
+from .content_hash import hash_code
+from .scene_remarks import scene_remarks
+from .scene_values import SceneValues
+from .scenes import LoadedScene, load_scene
+from .specifications import NamedIntegrator, make_named
+
+
+@dataclass
+class Chosen:
+    """A scene, with what renders it.
+
+    Attributes:
+        loaded: The scene.
+        named: The integrator.
+        sensor_index: The number of the sensor.
+    """
+
+    loaded: LoadedScene
+    named: NamedIntegrator
+    sensor_index: int
+
+    @classmethod
+    def of(cls, loaded: LoadedScene, specification: str | None, sensor_index: int) -> Chosen:
+        """
+        Args:
+            loaded: The scene, with its integrator if ``specification`` is ``None``.
+            specification: The integrator; ``None`` for the scene's.
+
+        Raises:
+            InputError: The integrator or the sensor cannot be used.
+        """
+        named = _of_scene(loaded) if specification is None else make_named(
+            specification, loaded.settings
+        )
+        count = len(loaded.scene.sensors())
+        if sensor_index >= count:
+            raise InputError(
+                f"{loaded.source}: there is no sensor {sensor_index}: the scene has {count}"
+            )
+        return cls(loaded, named, sensor_index)
+
+    @property
+    def scene(self) -> mi.Scene:
+        return self.loaded.scene
+
+    @property
+    def sensor(self) -> mi.Sensor:
+        return self.scene.sensors()[self.sensor_index]
+
+    def remarks(self, is_sensor_chosen: bool) -> list[str]:
+        """Warnings about what the image will not show."""
+        remarks = scene_remarks(self.scene, self.sensor, self.named.integrator, self.named.name)
+        count = len(self.scene.sensors())
+        if count > 1 and not is_sensor_chosen:
+            remarks.append(f"the scene has {count} sensors: the first is rendered (see --sensor)")
+        return remarks
+
+
+class LastScene:
+    """Keeps the scene that was loaded last, for images that need the same one."""
+
+    def __init__(self) -> None:
+        self._key: tuple | None = None
+        self._loaded: LoadedScene | None = None
+        self._values: SceneValues | None = None
+
+    def choose(
+        self, path: Path, size: tuple[int, int] | None, definitions: Mapping[str, str],
+        specification: str | None, sensor_index: int, values: str | None = None,
+        moved: Callable[[str], str] | None = None,
+    ) -> Chosen:  # fmt: skip
+        """The scene of a file, with what renders it.
+
+        Args:
+            path: The file.
+            size: Of the image; ``None`` for the film's.
+            definitions: Values of the file's ``$name`` parameters.
+            specification: The integrator; ``None`` for the scene's.
+            values: Of the loaded scene, as :func:`.scene_values.as_text` makes them; ``None`` if no
+                image will have any.
+            moved: See :func:`.scenes.load_scene`.
+
+        Raises:
+            InputError: The scene, the integrator or the sensor cannot be used.
+        """
+        is_own, has_values = specification is None, values is not None
+        key = (mi.variant(), path, size, tuple(definitions.items()), is_own, has_values)
+        if key != self._key:
+            # First: Dr.Jit compiles the methods of all living objects
+            self._key = self._loaded = self._values = None
+            gc.collect()  # what mi.traverse returns refers to itself
+            self._loaded = load_scene(path, size, definitions, is_own, has_values, moved)
+            self._values = SceneValues(self._loaded.scene) if has_values else None
+            self._key = key
+        if self._values:
+            self._values.set(values or "")
+        return Chosen.of(self._loaded, specification, sensor_index)
+
+
+def _of_scene(loaded: LoadedScene) -> NamedIntegrator:
+    integrator, name = loaded.scene.integrator(), loaded.integrator_name
+    if integrator is None:
+        raise InputError(
+            f"{loaded.source}: the scene has no integrator: name one with --integrator"
+        )
+    # The scene's files have its parameters
+    code = hash_code([type(integrator)]) or ""
+    return NamedIntegrator(name, name, dict(loaded.settings), integrator, code)

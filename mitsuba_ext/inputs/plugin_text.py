@@ -1,0 +1,82 @@
+"""Parses plugins written as text: ``NAME:key=value,key=[NAME:key=value]``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from itertools import accumulate
+from typing import Any
+
+from ..errors import InputError
+
+
+def parse_plugin(text: str) -> dict[str, Any]:
+    """The plugin that ``text`` describes, as a dict for ``mi.load_dict``.
+
+    - A comma begins a parameter only where ``key=`` follows. Other commas belong to the value,
+      which may be a list.
+    - A value in square brackets is a nested plugin: text of the same form, to any depth. Its name
+      determines its kind.
+
+    >>> parse_plugin("neepp:max_depth=6,hide_emitters=true,aovs=d:depth,a:albedo")
+    {'type': 'neepp', 'max_depth': 6, 'hide_emitters': True, 'aovs': 'd:depth,a:albedo'}
+    >>> parse_plugin("variance:nested=[path:max_depth=6],batches=8")
+    {'type': 'variance', 'nested': {'type': 'path', 'max_depth': 6}, 'batches': 8}
+
+    Raises:
+        InputError: The text has another form; the message quotes it.
+    """
+    try:
+        return _parse(text)
+    except ValueError as error:
+        raise InputError(f'integrator "{text}": {error}') from error
+
+
+def _parse(text: str) -> dict[str, Any]:
+    name, colon, rest = text.partition(":")
+    if not re.fullmatch(r"\w+", name) or (colon and not rest):
+        raise ValueError(f'expected NAME or NAME:key=value,key=value, found "{text}"')
+    plugin: dict[str, Any] = {"type": name}
+    for item in _split(rest):
+        key, equals, value = item.partition("=")
+        if not (re.fullmatch(r"\w+", key) and equals and value) or value.endswith(","):
+            raise ValueError(f'expected key=value, found "{item}"')
+        if key in plugin:
+            raise ValueError(f'"{key}" is given twice')
+        plugin[key] = _parse_value(value)
+    return plugin
+
+
+def _split(text: str) -> Iterator[str]:
+    """The parameters: the parts between the commas that begin one, outside of brackets."""
+    depths = _depths(text)
+    if min(depths, default=0) < 0:
+        raise ValueError('found "]" without "["')
+    if depths and depths[-1] > 0:
+        raise ValueError('found "[" without "]"')
+    start = 0
+    for index, depth in enumerate(depths):
+        if text[index] == "," and depth == 0 and re.match(r"\w+=", text[index + 1 :]):
+            yield text[start:index]
+            start = index + 1
+    if text:
+        yield text[start:]
+
+
+def _depths(text: str) -> list[int]:
+    """The number of open brackets after each character."""
+    return list(accumulate((character == "[") - (character == "]") for character in text))
+
+
+def _parse_value(text: str) -> Any:
+    if text.startswith("["):
+        if _depths(text).index(0) < len(text) - 1:
+            raise ValueError(f'expected nothing after "]" but a comma and key=, found "{text}"')
+        return _parse(text[1:-1])
+    if text in ("true", "false"):
+        return text == "true"
+    if re.fullmatch(r"[+-]?\d+", text):
+        return int(text)
+    if re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", text):
+        return float(text)
+    return text

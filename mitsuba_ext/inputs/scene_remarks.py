@@ -1,0 +1,52 @@
+"""Warnings about what an integrator ignores in a scene."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from ..scene.media import has_media
+from ..scene.nesting import class_name, with_nested
+
+#: Integrators that need no light and ignore media by design: two show properties of surfaces, one
+#: renders primitives that emit.
+_NO_LIGHT_NEEDED = {
+    "AOVIntegrator", "DepthIntegrator", "BasicVolumetricPrimitiveRadianceFieldIntegrator",
+}  # fmt: skip
+
+#: "volpath", "volpathmis" and "prbvolpath".
+_SEES_MEDIA = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator"}
+
+
+def scene_remarks(
+    scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator, name: str
+) -> list[str]:
+    """Warns of media that ``integrator`` does not see, and of a scene without lights.
+
+    Parameters:
+        name: What the sentences call the integrator.
+
+    Returns:
+        Sentences. There is none about integrators that are neither Mitsuba's nor ours: they may see
+        media, and need no lights.
+    """
+    tracers = [
+        each
+        for each in with_nested(integrator)
+        if type(each).__module__.split(".")[0] in ("mitsuba", "mitsuba_ext")
+        and class_name(each) not in _NO_LIGHT_NEEDED
+        and len(with_nested(each)) == 1
+    ]
+    remarks = []
+    # Those of ours render media, or refuse to
+    blind = [
+        each
+        for each in tracers
+        if class_name(each) not in _SEES_MEDIA and not hasattr(each, "sees_media")
+    ]
+    if blind and has_media(scene):
+        remarks.append(
+            f'the scene has participating media, and "{name}" treats them as absent: use "volpath"'
+        )
+    if tracers and not scene.emitters():
+        remarks.append("the scene has no light: the image is black")
+    return remarks

@@ -1,0 +1,126 @@
+"""Values of a scene's objects, as ``mi.traverse`` names them, set without loading the scene again.
+
+Values travel as JSON text, so that requests to other processes can hold and compare them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import InputError, one_line
+from .names import did_you_mean
+
+
+def as_text(values: Mapping[str, Any]) -> str:
+    """Values as JSON; empty text for none.
+
+    Args:
+        values: Numbers, lists of them, NumPy and Dr.Jit arrays, and transforms, by key.
+
+    Raises:
+        InputError: Something else is among them.
+    """
+    plain = {key: _plain(key, value) for key, value in values.items()}
+    return json.dumps(plain, sort_keys=True) if plain else ""
+
+
+def _plain(key: str, value: Any) -> Any:
+    if _is_transform(value):
+        value = np.squeeze(np.array(value.matrix))
+    elif dr.is_array_v(value):
+        value = np.squeeze(np.array(value))
+    try:
+        found = np.asarray(value)
+        if found.dtype.kind in "biuf" and np.isfinite(found).all():
+            return found.tolist()
+    except (TypeError, ValueError):  # a ragged list
+        pass
+    raise InputError(
+        f'the value of "{key}" must be a number, a list or array of numbers, or a transform, and '
+        f"finite: found {type(value).__name__}"
+    )
+
+
+class SceneValues:
+    """The values of a scene.
+
+    Parameters:
+        scene: Loaded with the names of its objects kept.
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        self._parameters = mi.traverse(scene)
+        self._before: dict[str, Any] = {}
+
+    def set(self, text: str) -> None:
+        """Sets values, and those that were set before back to the scene's own.
+
+        Args:
+            text: From :func:`as_text`.
+
+        Raises:
+            InputError: The scene has no such parameter, or it takes no such value.
+        """
+        values = json.loads(text) if text else {}
+        found = self._parameters
+        for key in values:
+            if key not in found:
+                raise InputError(
+                    f'the scene has no parameter "{key}"{did_you_mean(key, list(found.keys()))} '
+                    f"(an object with an id is called by it)"
+                )
+            if key not in self._before:
+                self._before[key] = _copy(found[key])
+        for key, own in self._before.items():
+            try:
+                found[key] = _like(own, values[key]) if key in values else _copy(own)
+            except (TypeError, ValueError, RuntimeError) as error:
+                raise InputError(
+                    f'"{key}" cannot be set to {_short(values[key])}: it is of type '
+                    f"{type(own).__name__} ({one_line(error)})"
+                ) from None
+        if self._before:
+            found.update()
+
+
+def _copy(value: Any) -> Any:
+    return value if isinstance(value, (bool, int, float, str)) else type(value)(value)
+
+
+def _like(own: Any, value: Any) -> Any:
+    """The value, of the type of the scene's own. Arrays keep their size, which other parameters
+    depend on."""
+    kind = type(own)
+    if isinstance(own, (bool, int, float)):
+        if isinstance(value, list):
+            raise ValueError("one number is expected")
+        return kind(value)
+    if _is_transform(own) or dr.is_tensor_v(own):
+        shape = np.squeeze(np.array(own.matrix)).shape if _is_transform(own) else own.shape
+        array = np.array(value, dtype=np.float32)
+        if array.shape != tuple(shape):
+            raise ValueError(f"{'x'.join(map(str, shape))} numbers are expected")
+        return kind(array)
+    # One number is enough for a colour, but not for a list of vertices
+    is_flexible = dr.size_v(kind) != dr.Dynamic and not isinstance(value, list)
+    if not is_flexible and np.size(value) != len(own):
+        raise ValueError(f"{len(own)} numbers are expected")
+    result = kind(value)
+    # Literals would be compiled into the kernel
+    dr.make_opaque(result)
+    return result
+
+
+def _is_transform(value: Any) -> bool:
+    return "Transform" in type(value).__name__
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 60 else f"{text[:50]}…"

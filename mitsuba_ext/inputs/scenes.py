@@ -1,0 +1,321 @@
+"""Loads scenes for the command line and for notebooks.
+
+Mitsuba's ``load_file`` cannot change the size of a film, and gives neither the files of a scene nor
+the maximum depth of its integrator. :func:`load_scene` gets these from ``mi.parser``, and turns
+every error in a scene into an :class:`InputError` of one line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InputError, one_line
+from ..rendering.aovs import check_nodes
+from .content_hash import hash_each, hash_files
+from .scene_files import files_of, named_in
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+#: Settings that all integrators of a comparison share: the maximum depth, the depth from which on
+#: Russian roulette is played, and whether emitters are hidden from the camera.
+SETTINGS = ("max_depth", "rr_depth", "hide_emitters")
+
+#: How Mitsuba's integrators print a depth without limit.
+_UNLIMITED = 2**32 - 1
+
+
+def check_source(source: object) -> None:
+    """Checks that ``source`` can be a scene: a file, or a dict of the active variant.
+
+    Raises:
+        InputError: It cannot.
+    """
+    if isinstance(source, Mapping):
+        check_variant(source)
+    elif not isinstance(source, (str, Path)):
+        raise InputError(
+            f"a scene must be an XML file or a dict, found an object of type "
+            f"{type(source).__name__}"
+        )
+    else:
+        check_scene_file(Path(source))
+
+
+def check_variant(value: object) -> None:
+    """Checks that the objects of Mitsuba in ``value`` (a scene's dict, or an item of one) are of
+    the active variant: Mitsuba ignores others, or misinterprets them.
+
+    Raises:
+        InputError: One is of another variant.
+    """
+    import mitsuba as mi
+
+    if isinstance(value, Mapping):
+        for item in value.values():
+            check_variant(item)
+    elif isinstance(value, mi.Object) and value.variant_name() not in ("", mi.variant()):
+        raise InputError(
+            f'the object "{value.class_name()}" was made in the variant "{value.variant_name()}", '
+            f'and the active one is "{mi.variant()}": make it again, or give a dict'
+        )
+
+
+@dataclass
+class LoadedScene:
+    """A scene, and data about it that Mitsuba's scene object does not have.
+
+    Attributes:
+        scene: The ``mi.Scene``.
+        path: The XML file; ``None`` for a scene made from a dict.
+        parameters: The ``$name`` parameters that were passed to it.
+        files: The XML file, and all files that it names, by their absolute paths.
+        file_hashes: SHA-256 of each of them, by the file that links lead to.
+        content_hash: SHA-256 over the XML or dict, its parameters, and all these files.
+        settings: ``max_depth`` and ``rr_depth`` of the scene's own integrator, as far as it has
+            them, and ``hide_emitters`` where it is set.
+        integrator_name: Plugin name of the scene's own integrator; empty if there is none.
+        size: Width and height of the image in pixels (of the crop window, if there is one).
+    """
+
+    scene: mi.Scene
+    path: Path | None
+    parameters: dict[str, str]
+    files: list[Path]
+    file_hashes: dict[Path, str]
+    content_hash: str
+    settings: dict[str, int | bool]
+    integrator_name: str
+    size: tuple[int, int]
+
+    @property
+    def source(self) -> str:
+        """How messages name the scene."""
+        return "the scene" if self.path is None else str(self.path)
+
+
+def scene_name(source: str | Path | Mapping[str, Any] | None) -> str:
+    """A short name: that of the file, or of its folder if the file is called ``scene.xml``."""
+    if source is None or isinstance(source, Mapping):
+        return "scene"
+    path = Path(source)
+    generic = path.stem == "scene" and path.resolve().parent.name
+    return generic or path.stem
+
+
+def check_scene_file(path: Path) -> None:
+    """Raises :class:`InputError` if there is no such file; does not import Mitsuba."""
+    if not path.is_file():
+        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such scene'}")
+
+
+def load_scene(
+    source: str | Path | Mapping[str, Any],
+    size: tuple[int, int] | None = None,
+    parameters: Mapping[str, object] | None = None,
+    keep_integrator: bool = True,
+    keep_names: bool = False,
+    moved: Callable[[str], str] | None = None,
+) -> LoadedScene:
+    """Loads a scene in the active variant.
+
+    Args:
+        source: The XML file, or a dict as for ``mi.load_dict``.
+        size: Width and height that replace those of the film.
+        parameters: Values for the ``$name`` placeholders of the file.
+        keep_integrator: ``False`` leaves the scene's integrator out, so that a scene whose
+            integrator is unknown here can be rendered with another.
+        keep_names: Objects stay what they are in the file, for ``mi.traverse``: by default, Mitsuba
+            merges meshes of the same material, and equal materials.
+        moved: Says where a file is now that was at an absolute path; other texts it returns.
+
+    Raises:
+        InputError: The file is missing or broken, something in it cannot be made or is of another
+            variant, it has no sensor, or ``size`` was given for a film with a crop window.
+    """
+    import mitsuba as mi
+
+    is_dict = isinstance(source, Mapping)
+    check_source(source)
+    path = None if is_dict else Path(source)
+    label = "the scene" if is_dict else str(path)
+    strings = {key: _as_xml(value) for key, value in (parameters or {}).items()}
+    if is_dict and strings:
+        raise InputError(f"a scene from a dict has no $parameters: found {', '.join(strings)}")
+    config = mi.parser.ParserConfig(mi.variant())
+    if keep_names:
+        config.merge_meshes = config.merge_equivalent = False
+    with _search_path(path):
+        try:
+            if is_dict:
+                state = mi.parser.parse_dict(config, _with_own_bitmaps(source))
+            else:
+                state = mi.parser.parse_file(config, str(path), **strings)
+            check_nodes(state)
+            if moved:
+                for (node, key), name in list(named_in(state)):
+                    node.props[key] = moved(name)
+            files = files_of(state, strings)
+            file_hashes = hash_each(files)
+            content_hash = hash_files(file_hashes, strings, source if is_dict else None)
+            integrator = _integrator_node(state)
+            # Before transform_all(): afterwards, a node may be freed memory
+            integrator_name = integrator.props.plugin_name() if integrator else ""
+            settings = _settings(integrator)
+            if not keep_integrator:
+                _drop_integrators(state)
+            if size is not None:
+                _set_film_size(state, size)
+            mi.parser.transform_all(config, state)
+            scene = mi.parser.instantiate(config, state)
+        except InputError as error:
+            raise InputError(f"{label}: {error}") from error
+        except Exception as error:  # a plugin's constructor may raise anything
+            message = one_line(error)
+            raise InputError(message if label in message else f"{label}: {message}") from error
+    if not isinstance(scene, mi.Scene):
+        raise InputError(f"{label}: the outermost element must be a <scene>")
+    if not scene.sensors():
+        raise InputError(f"{label}: the scene has no sensor")
+    film = scene.sensors()[0].film()
+    if size is not None and tuple(film.size()) != size:
+        # A sensor without a <film> element got Mitsuba's default one
+        _resize_default_film(scene, size)
+    return LoadedScene(
+        scene=scene,
+        path=path,
+        parameters=strings,
+        files=files,
+        file_hashes=file_hashes,
+        content_hash=content_hash,
+        settings=settings,
+        integrator_name=integrator_name,
+        size=(int(film.crop_size()[0]), int(film.crop_size()[1])),
+    )
+
+
+def _with_own_bitmaps(source: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of a scene's dict and of its bitmaps. In spectral variants, Mitsuba's ``bitmap``
+    converts the pixels of a ``mi.Bitmap`` in place: without the copy, loading the dict again would
+    give another scene."""
+    import mitsuba as mi
+
+    def copy(value: Any) -> Any:
+        if isinstance(value, mi.Bitmap):
+            return mi.Bitmap(value)
+        return _with_own_bitmaps(value) if isinstance(value, Mapping) else value
+
+    return {key: copy(value) for key, value in source.items()}
+
+
+def _as_xml(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+@contextlib.contextmanager
+def _search_path(path: Path | None) -> Iterator[None]:
+    """Makes Mitsuba search for meshes and textures beside the file ``path``: ``mi.load_file`` adds
+    this folder to the search path, but the functions of ``mi.parser`` do not."""
+    import mitsuba as mi
+
+    if path is None:
+        yield
+        return
+    resolver = mi.file_resolver()
+    resolver.prepend(str(path.resolve().parent))
+    try:
+        yield
+    finally:
+        del resolver[0]
+
+
+def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None:
+    """The integrator of the scene that traces the paths: inside a wrapper such as ``aov``, the
+    first one that sets ``max_depth``."""
+    import mitsuba as mi
+
+    nodes = [
+        node
+        for node in state.nodes
+        if node.type == mi.ObjectType.Integrator
+        or (node.type == mi.ObjectType.Unknown and _is_integrator(node, ""))
+    ]
+    with_depth = [node for node in nodes if SETTINGS[0] in node.props]
+    return (with_depth or nodes or [None])[0]
+
+
+def _settings(node: mi.parser.SceneNode | None) -> dict[str, int | bool]:
+    """The :data:`SETTINGS` of an integrator: those that the file sets, else the default depths,
+    which can only be read from the integrator's ``str()``."""
+    import mitsuba as mi
+
+    if node is None:
+        return {}
+    own = mi.Properties(node.props)  # a copy, because reading a property marks it as queried
+    text = ""
+    with contextlib.suppress(Exception):  # a wrapper or an unknown plugin: its defaults are unknown
+        properties = mi.Properties(node.props.plugin_name())
+        text = str(mi.PluginManager.instance().create_object(properties))
+    settings: dict[str, int | bool] = {}
+    for key in SETTINGS:
+        printed = re.search(rf"\b{key} = (-?\d+)", text)
+        if key in own:
+            settings[key] = own[key]
+        elif printed:
+            value = int(printed.group(1))
+            settings[key] = -1 if value == _UNLIMITED else value
+    return settings
+
+
+def _drop_integrators(state: mi.parser.ParserState) -> None:
+    import mitsuba as mi
+
+    properties = state.root.props
+    for key in list(properties.keys()):
+        value = properties[key]
+        if isinstance(value, mi.Properties.ResolvedReference):
+            is_integrator = _is_integrator(state.nodes[value.index()], key)
+        else:
+            is_integrator = isinstance(value, mi.Integrator)
+        if is_integrator:
+            del properties[key]
+
+
+def _is_integrator(node: mi.parser.SceneNode, key: str) -> bool:
+    """Is the node an integrator? The parser of dicts does not know the kind of a plugin that is
+    written in Python, so this makes one to see."""
+    import mitsuba as mi
+
+    if node.type != mi.ObjectType.Unknown:
+        return node.type == mi.ObjectType.Integrator
+    try:
+        properties = mi.Properties(node.props.plugin_name())
+        return isinstance(mi.PluginManager.instance().create_object(properties), mi.Integrator)
+    except Exception:  # no such plugin, or it cannot be made without its parameters
+        return key == "integrator"
+
+
+def _set_film_size(state: mi.parser.ParserState, size: tuple[int, int]) -> None:
+    import mitsuba as mi
+
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Film:
+            if any(key.startswith("crop_") for key in node.props.keys()):
+                raise InputError(
+                    f"a size cannot be given for a film with a crop window "
+                    f"({mi.parser.file_location(state, node)})"
+                )
+            node.props["width"], node.props["height"] = size
+
+
+def _resize_default_film(scene: mi.Scene, size: tuple[int, int]) -> None:
+    import mitsuba as mi
+
+    parameters = mi.traverse(scene.sensors()[0])
+    parameters["film.size"] = list(size)
+    parameters.update()

@@ -1,0 +1,1 @@
+"""Metropolis light transport: chains of random numbers and of paths."""

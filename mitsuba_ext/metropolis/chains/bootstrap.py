@@ -1,0 +1,101 @@
+"""Independent samples from which chains start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...arrays import from_numpy
+from ...transport.numbers import BothEnds, Numbers
+from .numbers import ProposedNumbers, StateNumbers, StratifiedNumbers, generator, stream
+from .small_steps import SmallSteps
+from .target import Found, ImageTarget
+
+#: Samples that are evaluated at a time, without and with light paths: what these find is stored.
+_MOST_LANES = {False: 1 << 20, True: 1 << 18}
+
+#: Streams of random numbers, which differ from those of the chains.
+_CAMERA, _LIGHT, _CHOICE = 0, 1, 2
+
+
+class Bootstrap:
+    """Samples of the target function, stratified over the film. Chains that start at some of them,
+    chosen in proportion to the target function, have no start-up bias: the product of the mean of
+    the samples and of what the chains find is right on average, from the first mutation on.
+
+    Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997, section 3.2; D. Cline,
+    PhD thesis, 2007, section 7.11.2.
+
+    Parameters:
+        target: What is sampled.
+        seed: Of the random numbers.
+        count: How many samples there are at least.
+        take: Is given what they find, a part of the samples at a time.
+
+    Attributes:
+        count: How many there are: a square.
+        mean: The mean of the target function.
+        error: The standard error of ``mean``, relative to it, as of samples without strata.
+    """
+
+    def __init__(
+        self,
+        target: ImageTarget,
+        seed: int,
+        count: int,
+        take: Callable[[Found], None] | None = None,
+    ) -> None:
+        self._seed, self._has_light = seed, target.has_light_paths
+        self._cells = math.isqrt(count - 1) + 1
+        self.count = self._cells**2
+        # Parts of equal width: they share kernels
+        parts = -(-self.count // _MOST_LANES[target.has_light_paths])
+        width, values = -(-self.count // parts), []
+        for part in range(parts):
+            index = dr.arange(mi.UInt32, width) + dr.opaque(mi.UInt32, part * width)
+            found = target.evaluate(self.numbers(index), index < dr.opaque(mi.UInt32, self.count))
+            values.append(found.target.numpy())
+            if take is not None:
+                take(found)
+        values = np.concatenate(values)[: self.count]
+        values = values.astype(np.float64)
+        self._sums = np.cumsum(values)
+        self.mean = float(self._sums[-1]) / self.count
+        deviation = float(np.std(values)) / math.sqrt(self.count)
+        self.error = deviation / self.mean if self.mean > 0 else 0.0
+        # Rounding must not choose a black sample
+        self._last = int(np.searchsorted(self._sums, self._sums[-1]))
+        self._offset = float(mi.sample_tea_float32(mi.UInt32(seed), _CHOICE)[0])
+
+    def numbers(self, index: mi.UInt32, records: Sequence[StateNumbers] = ()) -> Numbers:
+        """The numbers of these samples; ``records`` are told what is drawn, by camera paths and by
+        light paths."""
+        camera, light = records or [StateNumbers(SmallSteps())] * 2
+        seed = stream(self._seed, _CAMERA)
+        numbers = StratifiedNumbers.begin(generator(seed, index), index, self._cells, camera)
+        if not self._has_light:
+            return numbers
+        rng = generator(stream(self._seed, _LIGHT), index)
+        none = dr.zeros(mi.UInt32, dr.width(index))
+        return BothEnds(numbers, ProposedNumbers(rng, none, mi.UInt32(none), light))
+
+    def choose(self, count: int) -> mi.UInt32:
+        """The indices of ``count`` samples, in proportion to the target function. One random offset
+        for all of them keeps the numbers of choices near their expectation."""
+        return self._at((np.arange(count) + self._offset) / count * self._sums[-1])
+
+    def choose_by_energy(self, energy: float) -> mi.UInt32:
+        """The indices of samples, each as often as its value of the target function holds this
+        ``energy``, on average."""
+        if self._sums[-1] == 0:
+            return dr.zeros(mi.UInt32, 0)
+        count = int(np.floor(self._sums[-1] / energy - self._offset)) + 1
+        return self._at((np.arange(count) + self._offset) * energy)
+
+    def _at(self, places: np.ndarray) -> mi.UInt32:
+        index = np.searchsorted(self._sums, places, side="right")
+        return from_numpy(mi.UInt32, np.minimum(index, self._last))

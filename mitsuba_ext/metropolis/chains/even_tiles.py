@@ -1,0 +1,62 @@
+"""Weights that spread chains evenly over the film."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from ...rendering.camera import film_extent
+from .target import Found
+
+#: Samples for each tile, about, that estimate its luminance.
+_SAMPLES = 64
+
+#: A tile counts as no darker than this share of the mean: weights stay bounded.
+_FLOOR = 0.05
+
+
+class EvenTiles:
+    """Weights of the target function: in inverse proportion to the luminance of the film's tiles,
+    as far as samples know it. Dark parts of the image then get as many visits as bright ones. The
+    image has the same mean with any weights.
+
+    Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997, section 5.3 (two-stage
+    MLT).
+
+    Parameters:
+        film: Its crop window is divided.
+        samples: How many will be taken of the whole film. The chains must start from others.
+    """
+
+    def __init__(self, film: mi.Film, samples: int) -> None:
+        width, height = film_extent(film)
+        self._offset = mi.ScalarPoint2f(film.crop_offset())
+        tiles = max(1.0, samples / _SAMPLES)
+        self._side = max(1.0, math.sqrt(width * height / tiles))
+        self._columns = math.ceil(width / self._side)
+        self._rows = math.ceil(height / self._side)
+        self._sums = dr.zeros(mi.Float, self._columns * self._rows)
+        self._inverse = dr.full(mi.Float, 1, dr.width(self._sums))
+
+    def take(self, found: Found) -> None:
+        """Learns from some of the samples."""
+        for part in found.parts:
+            tile = self._tile(part.position)
+            dr.scatter_add(self._sums, part.target, tile, part.target > 0)
+        dr.eval(self._sums)
+        mean = dr.mean(self._sums)
+        relative = dr.select(mean > 0, self._sums / mean, 1)
+        self._inverse = dr.rcp(dr.maximum(relative, _FLOOR))
+        dr.eval(self._inverse)
+
+    def at(self, position: mi.Point2f) -> mi.Float:
+        """The weight at a place on the film."""
+        return dr.gather(mi.Float, self._inverse, self._tile(position))
+
+    def _tile(self, position: mi.Point2f) -> mi.UInt32:
+        place = (position - self._offset) / self._side
+        column = dr.clip(mi.Int32(place.x), 0, self._columns - 1)
+        row = dr.clip(mi.Int32(place.y), 0, self._rows - 1)
+        return mi.UInt32(row * self._columns + column)

@@ -1,0 +1,137 @@
+"""Chains around an estimator that is one kernel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...transport.frozen import frozen
+from .chains import MOST_NUMBERS, Chains, Counts, acceptance
+from .numbers import LocalNumbers, ProposedNumbers, RecordedNumbers
+from .target import Contribution
+
+
+class LoopedChains(Chains):
+    """All mutations of a launch are one traced loop around the estimator. What it finds has one
+    place on the film: no splats. See :class:`Chains`."""
+
+    _parts_of_state = ("_rngs", "_state", "_known", "_values", "_weight", "_earlier")
+
+    def _begin(self, bootstrap, winners):
+        record = RecordedNumbers(
+            dr.zeros(mi.Float, MOST_NUMBERS * self.count), self.count, self.rules.steps
+        )
+        numbers = bootstrap.numbers(winners, [record, record])
+        self._state, _sample = self._target(numbers)
+        self._known = dr.minimum(numbers.index, MOST_NUMBERS)
+        self._values = record.written
+        self._earlier = dr.opaque(mi.Float, 0, self.count)
+        # Evaluated now, the first launch has the kernel of the others
+        dr.eval(self._state, self._known, self._values, self._rngs)
+
+    def kernel_state(self) -> tuple:
+        """What kernels depend on, but for the states."""
+        return (
+            self._target, self._image, self.rules.steps, self.count, self._large_step,
+            self._uses_uniform, self._uniform_weight, self._energy,
+        )  # fmt: skip
+
+    def advance(self, steps):
+        before = self._rngs[0], self._state, self._known, self._weight, self._earlier, self._values
+        rng, *after, counts = self._launched(dr.opaque(mi.UInt32, steps), *before)
+        dr.eval(rng, after, self._values, counts, self._image.tensors())
+        self._rngs, (self._state, self._known, self._weight, self._earlier) = [rng], after
+        self.done += steps
+        return counts
+
+    @frozen
+    def _launched(self, *arguments: Any) -> tuple:
+        return self._mutated(*arguments)
+
+    @dr.syntax
+    def _mutated(
+        self,
+        steps: mi.UInt32,
+        rng: mi.PCG32,
+        state: Contribution,
+        known: mi.UInt32,
+        weight: mi.Float,
+        earlier: mi.Float,
+        values: mi.Float,
+    ) -> tuple[mi.PCG32, Contribution, mi.UInt32, mi.Float, mi.Float, Counts]:
+        """Makes ``steps`` mutations of each chain; the numbers of the states, ``values``, are
+        replaced."""
+        count, none = dr.opaque(mi.UInt32, self.count), dr.zeros(mi.UInt32, self.count)
+        lane = dr.arange(mi.UInt32, self.count)
+        rng, known = mi.PCG32(rng), mi.UInt32(known)
+        weight, earlier = mi.Float(weight), mi.Float(earlier)
+        counts = Counts.none(self.count)
+        vector = dr.alloc_local(mi.Float, MOST_NUMBERS, value=dr.zeros(mi.Float))
+        index = mi.UInt32(none)
+        while index < known:
+            vector[index] = dr.gather(mi.Float, values, index * count + lane)
+            index += 1
+
+        step = mi.UInt32(none)
+        while step < steps:
+            # ----- Propose -----
+            is_large = rng.next_float32() < self._large_step
+            threshold = rng.next_float32()
+            moved = dr.select(is_large, 0, known)
+            before = mi.PCG32(rng)
+            numbers_now = LocalNumbers(vector, self.rules.steps)
+            numbers = ProposedNumbers(rng, mi.UInt32(none), moved, numbers_now)
+            proposal, sample = self._target(numbers)
+            rng = numbers.rng
+
+            # ----- Accept or reject -----
+            a = acceptance(state.target, proposal.target)
+            is_accepted = threshold < a
+            counts = counts.plus(is_large, is_accepted, proposal.target, sample, weight)
+
+            # ----- Add what is left behind to the image -----
+            left = dr.select(is_accepted, state, proposal)
+            weight += 1 - a
+            visits, earlier = self._added(state, proposal, is_accepted, weight, a, earlier)
+            self._image.add(left, visits * self._share(left.target))
+            if dr.hint(self._uses_uniform, mode="scalar"):
+                share = self._share(proposal.target)
+                self._image.add_uniform(proposal, dr.select(is_large, share, 0))
+            weight = dr.select(is_accepted, a, weight)
+            state = dr.select(is_accepted, proposal, state)
+
+            # ----- Remember the numbers of the new state: the same again -----
+            again = ProposedNumbers(before, mi.UInt32(none), moved, numbers_now)
+            drawn = dr.minimum(numbers.index, MOST_NUMBERS)
+            index = dr.select(is_accepted, mi.UInt32(0), drawn)
+            while index < drawn:
+                vector[index] = again.next_1d()
+                index += 1
+            known = dr.select(is_accepted, drawn, known)
+            step += 1
+
+        index = mi.UInt32(none)
+        while index < known:
+            dr.scatter(values, vector[index], index * count + lane)
+            index += 1
+        return rng, state, known, weight, earlier, counts
+
+    def _added(
+        self, state: Contribution, proposal: Contribution, is_accepted: mi.Bool,
+        weight: mi.Float, a: mi.Float, earlier: mi.Float,
+    ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
+        """How many visits are added to the image now: ``weight`` of a state that is left, or
+        ``a`` of a proposal. ``earlier`` is
+        for chains that remember visits of earlier states."""
+        return dr.select(is_accepted, weight, a), earlier
+
+    def _last(self) -> mi.Float:
+        """How many visits of the last state are added."""
+        return self._weight
+
+    def end(self):
+        self._image.add(self._state, self._last() * self._share(self._state.target))
+        self._weight = dr.opaque(mi.Float, 0, self.count)
+        dr.eval(self._image.tensors(), self._weight)

@@ -1,0 +1,158 @@
+"""Chains of light paths."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ...transport.frozen import frozen
+from ...transport.numbers import Numbers, copied
+from ..path_space.memory import Head, Logs, PathMemory, Place, stride
+from ..path_space.mutations import NEW_PATH
+from .chains import Chains, Counts
+from .numbers import ProposedNumbers, StateNumbers, stream
+from .path_target import PathState
+
+#: Streams of numbers that all chains share: of the kinds of mutations, and of places on the film.
+_KIND, _FILM = 6, 7
+
+
+class PathChains(Chains):
+    """All mutations of a launch are one traced loop. All chains make the same kind of mutation at a
+    time, if their paths allow it: lanes of a processor then do the same. See :class:`Chains`."""
+
+    _parts_of_state = ("_rngs", "_state", "_places", "_logs", "_weight")
+
+    def _begin(self, bootstrap, winners):
+        self._state, self._places, self._logs = self._first(bootstrap.numbers(winners))
+        dr.eval(self._state, self._places, self._logs)
+
+    @frozen
+    def _first(self, numbers: Numbers) -> tuple[PathState, Place, Logs]:
+        """New paths, and their vertices."""
+        memory, at = PathMemory.of(self._target.most), dr.zeros(mi.UInt32, self.count)
+        memory, _numbers, proposal = self._target.mutations.new_path(
+            memory, at, copied(numbers), mi.Bool(True)
+        )
+        state = self._as_state(proposal)
+        return state, *self._stored(memory, state.head)
+
+    def kernel_state(self) -> tuple:
+        """What kernels depend on, but for the states."""
+        return (
+            self._target, self._image, self.rules.large_step > 0, self.rules.steps, self.count,
+            self._large_step, self._uses_uniform, self._uniform_weight, self._energy,
+        )  # fmt: skip
+
+    def _as_state(self, proposal) -> PathState:
+        return PathState(proposal.head, self._target.contribution(proposal), proposal.log_density)
+
+    def advance(self, steps):
+        seeds = [dr.opaque(mi.UInt32, stream(self._seed, n)) for n in (_KIND, _FILM)]
+        before = self._rngs[0], self._state, self._weight, self._places, self._logs
+        rng, *after, counts = self._launched(
+            dr.opaque(mi.UInt32, steps), dr.opaque(mi.UInt32, self.done), seeds, *before
+        )
+        dr.eval(rng, after, counts, self._image.tensors())
+        self._rngs, (self._state, self._weight, self._places, self._logs) = [rng], after
+        self.done += steps
+        return counts
+
+    @frozen
+    def _launched(self, *arguments: Any) -> tuple:
+        return self._mutated(*arguments)
+
+    @dr.syntax
+    def _mutated(
+        self,
+        steps: mi.UInt32,
+        done: mi.UInt32,
+        seeds: list[mi.UInt32],
+        rng: mi.PCG32,
+        state: PathState,
+        weight: mi.Float,
+        places: Place,
+        logs: Logs,
+    ) -> tuple[mi.PCG32, PathState, mi.Float, Place, Logs, Counts]:
+        """Makes ``steps`` mutations of each chain, after ``done`` earlier ones."""
+        mutations = self._target.mutations
+        none, lane = dr.zeros(mi.UInt32, self.count), dr.arange(mi.UInt32, self.count)
+        rng, weight = mi.PCG32(rng), mi.Float(weight)
+        counts = Counts.none(self.count)
+        memory = self._loaded(state.head, places, logs)
+        unused = StateNumbers(self.rules.steps)
+        step = mi.UInt32(none)
+        while step < steps:
+            # ----- Propose -----
+            which = mi.sample_tea_float32(seeds[0], done + step)
+            kind = mutations.kind(which, self._large_step)
+            place = mutations.place(lane, seeds[1], done + step)
+            threshold = rng.next_float32()
+            numbers = ProposedNumbers(rng, mi.UInt32(none), mi.UInt32(none), unused)
+            memory, numbers, proposal = mutations.mutate(
+                memory, state.head, state.density, kind, place, numbers
+            )
+            rng = numbers.rng
+            new = self._as_state(proposal)
+
+            # ----- Accept or reject -----
+            # Densities of states are those of new paths, times their contributions as such
+            change = new.density - state.density + proposal.log_ratio
+            ratio = new.found.target / state.found.target * dr.exp(change)
+            ratio = dr.select(dr.isfinite(ratio), ratio, 0)
+            a = dr.select(new.found.target > 0, dr.minimum(ratio, 1), 0)
+            a = dr.select(state.found.target > 0, a, 1)
+            is_accepted = threshold < a
+            is_large = kind == NEW_PATH
+            counts = counts.plus(
+                is_large, is_accepted, new.found.target, self._target.sample(proposal), weight
+            )
+
+            # ----- Add what is left behind to the image -----
+            left = dr.select(is_accepted, state.found, new.found)
+            visits = dr.select(is_accepted, weight + (1 - a), a)
+            self._image.add(left, visits * self._share(left.target))
+            if dr.hint(self._uses_uniform, mode="scalar"):
+                share = self._share(new.found.target)
+                self._image.add_uniform(new.found, dr.select(is_large, share, 0))
+            weight = dr.select(is_accepted, a, weight + (1 - a))
+            # The vertices of the new path lie where those of the next proposal would
+            state = dr.select(is_accepted, new, state)
+            step += 1
+
+        places, logs = self._stored(memory, state.head)
+        return rng, state, weight, places, logs, counts
+
+    # ---- Vertices between launches ----
+
+    @dr.syntax
+    def _loaded(self, head: Head, places: Place, logs: Logs) -> PathMemory:
+        memory = PathMemory.of(self._target.most)
+        lane, count = dr.arange(mi.UInt32, self.count), dr.opaque(mi.UInt32, self.count)
+        index = dr.zeros(mi.UInt32, self.count)
+        while index <= head.length:
+            where = index * count + lane
+            memory.places[head.at + index] = dr.gather(Place, places, where)
+            memory.logs[head.at + index] = dr.gather(Logs, logs, where)
+            index += 1
+        return memory
+
+    @dr.syntax
+    def _stored(self, memory: PathMemory, head: Head) -> tuple[Place, Logs]:
+        size = self.count * stride(self._target.most)
+        places, logs = dr.zeros(Place, size), dr.zeros(Logs, size)
+        lane, count = dr.arange(mi.UInt32, self.count), dr.opaque(mi.UInt32, self.count)
+        index = dr.zeros(mi.UInt32, self.count)
+        while index <= head.length:
+            where = index * count + lane
+            dr.scatter(places, memory.places[head.at + index], where)
+            dr.scatter(logs, memory.logs[head.at + index], where)
+            index += 1
+        return places, logs
+
+    def end(self):
+        self._image.add(self._state.found, self._weight * self._share(self._state.found.target))
+        self._weight = dr.opaque(mi.Float, 0, self.count)
+        dr.eval(self._image.tensors(), self._weight)

@@ -1,0 +1,130 @@
+"""What renders with chains have in common."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from ...rendering.camera import film_extent
+from ...rendering.render import RenderStatistics, kernel_cache_misses
+from ...rendering.time_budget import TimeBudget
+from .chains import Chains, Counts
+from .looped import LoopedChains
+from .path_chains import PathChains
+from .path_target import PathTarget
+from .stepped import SteppedChains
+from .target import ImageTarget
+
+#: The stream of random numbers of a first stage, besides those of the bootstrap and of the chains.
+FIRST_STAGE = 5
+
+
+class Stoppable(Protocol):
+    """What a render asks of its integrator."""
+
+    timeout: float
+    is_cancelled: bool
+    progress: Callable[[float], None] | None
+
+
+class ChainRender:
+    """One render. The film must hold camera samples, to which the light of the chains is added.
+
+    Parameters:
+        integrator: Says when to stop.
+        target: What is sampled.
+        seed: Of the random numbers.
+        spp: Samples, or mutations, per pixel.
+        camera_spp: Camera samples per pixel that the film holds.
+        statistics: Of the render so far; they are brought up to date.
+        start: When it began, by ``time.perf_counter``.
+    """
+
+    def __init__(
+        self,
+        integrator: Stoppable,
+        target: ImageTarget,
+        seed: int,
+        spp: int,
+        camera_spp: int,
+        statistics: RenderStatistics,
+        start: float,
+    ) -> None:
+        self._integrator, self._target = integrator, target
+        self._seed, self._spp, self._camera_spp = seed, spp, camera_spp
+        self._statistics, self._start = statistics, start
+        self._film = target.sensor.film()
+        width, height = film_extent(self._film)
+        self._pixel_count = width * height
+        self._counts = {name: 0.0 for name in Counts.__dataclass_fields__}
+        self._mutations = 0
+
+    def run(self, interrupt: threading.Event) -> None:
+        """Renders, and adds what was found to the film: also if an exception ends it."""
+        raise NotImplementedError
+
+    @property
+    def _kind(self) -> type[Chains]:
+        if isinstance(self._target, PathTarget):
+            return PathChains
+        return SteppedChains if self._target.has_light_paths else LoopedChains
+
+    def _repeat(
+        self, count: int, width: int, interrupt: threading.Event, act: Callable[[int], int]
+    ) -> bool:
+        """Calls ``act`` until ``count`` steps are made, or as many as the time allows. It is told
+        how many it may make, and says how many it made. Were all of them made?
+
+        Parameters:
+            width: Lanes of a step.
+        """
+        integrator, done = self._integrator, 0
+        budget = TimeBudget(integrator.timeout, self._start, width, 0).stage(count, 0, True)
+        while done < budget.samples:
+            if interrupt.is_set() or integrator.is_cancelled:
+                return False
+            begin, misses = time.perf_counter(), kernel_cache_misses()
+            made = act(min(budget.longest, budget.samples - done))
+            done += made
+            dr.sync_thread()
+            if kernel_cache_misses() == misses:
+                budget.passed(made, done, time.perf_counter() - begin)
+            self._statistics.passes += 1
+            if integrator.progress is not None:
+                integrator.progress(min(1.0, done / budget.samples))
+        return True
+
+    def _count(self, counts: Counts, mutations: int) -> None:
+        longest = float(dr.max(counts.longest)[0])
+        self._counts["longest"] = max(self._counts["longest"], longest)
+        for name in self._counts:
+            if name != "longest":
+                self._counts[name] += float(dr.sum(mi.Float64(getattr(counts, name)))[0])
+        self._mutations += mutations
+
+    def _report(self, samples: int) -> None:
+        """Brings the statistics up to date, after so many samples per pixel."""
+        counts, statistics = self._counts, self._statistics
+        statistics.rays["camera"] += self._mutations
+        statistics.rays["scatter"] += int(counts["scatter"])
+        statistics.rays["shadow"] += int(counts["shadow"])
+        statistics.connections += int(counts["connections"])
+        statistics.zero_radiance = counts["black"] / max(1, self._mutations)
+        statistics.spp = samples
+
+    def _rates(self) -> str:
+        counts = self._counts
+        small = _percent(counts["accepted_small"], self._mutations - counts["large"])
+        if not counts["large"]:
+            return f"accepted: {small} of small steps"
+        large = _percent(counts["accepted_large"], counts["large"])
+        return f"accepted: {large} of large steps, {small} of small steps"
+
+
+def _percent(part: float, whole: float) -> str:
+    return f"{part / whole:.1%}" if whole else "none"

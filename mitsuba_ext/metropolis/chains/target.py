@@ -1,0 +1,153 @@
+"""The function that chains sample: from random numbers to what they add to the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from ...rendering.camera import Lanes, camera_rays, draw_numbers, film_extent
+from ...rendering.camera_samples import CameraSamples
+from ...transport.colour import to_rgb
+from ...transport.estimator import CameraRays, Estimator, Sample
+from ...transport.frozen import frozen
+from ...transport.numbers import Numbers, copied, go_to, reached
+
+
+@dataclass
+class Contribution:
+    """What a vector of numbers adds to the image at one place.
+
+    Attributes:
+        position: Where on the film.
+        value: The colour, if the film were one pixel.
+        target: The luminance of ``value`` (negative components, which spectral variants have, count
+            by their absolute value), times the weight of the place on the film.
+    """
+
+    position: mi.Point2f
+    value: mi.Color3f
+    target: mi.Float
+
+
+@dataclass
+class Found:
+    """What vectors of numbers, one in each lane, add to the image.
+
+    Attributes:
+        target: What chains sample in proportion to: the sum of the luminances of all contributions.
+        parts: The contributions, in arrays of any width.
+        lanes: For each of the parts, the lanes to which its contributions belong.
+        sample: The estimator's.
+    """
+
+    target: mi.Float
+    parts: list[Contribution]
+    lanes: list[mi.UInt32]
+    sample: Sample
+
+
+class PlaceWeights(Protocol):
+    """How much the target function prefers places on the film."""
+
+    def at(self, position: mi.Point2f) -> mi.Float:
+        """The weight of a place; positive."""
+
+
+@dataclass
+class ImageTarget:
+    """Makes a camera ray of the first numbers, anywhere on the film, and an estimate of its
+    radiance of the others.
+
+    Parameters:
+        scene, sensor: What is rendered.
+        estimator: Of the radiance. The sample in a lane must not depend on other lanes.
+        spp: Samples per pixel of the whole render, for ray differentials.
+        has_light_paths: Does the estimator trace light paths, which draw numbers of their own?
+        weights: Of places on the film; ``None`` where all count the same.
+        bound: The target function is what the sum of luminances is beyond it.
+    """
+
+    scene: mi.Scene
+    sensor: mi.Sensor
+    estimator: Estimator
+    spp: int
+    has_light_paths: bool = False
+    weights: PlaceWeights | None = None
+    bound: float = 0.0
+
+    def __call__(self, numbers: Numbers) -> tuple[Contribution, Sample]:
+        """What the camera path finds, with the target function of that, and the whole sample."""
+        camera, sample = self._camera(numbers, mi.Bool(True))
+        camera.target = beyond_bound(camera.target, self.bound)
+        return camera, sample
+
+    def evaluate(self, numbers: Numbers, active: mi.Bool | bool = True) -> Found:
+        """Everything, evaluated; also the place that ``numbers`` have reached."""
+        camera, sample = self._found(numbers, mi.Bool(active))
+        lane = dr.arange(mi.UInt32, dr.width(camera.target))
+        parts, lanes = [camera], [lane]
+        for splats in sample.splats:
+            value = to_rgb(splats.value, splats.wavelengths)
+            parts.append(self._contribution(splats.position, dr.select(splats.active, value, 0)))
+            lanes.append(splats.sample)
+        dr.eval(numbers, parts, lanes, sample)
+        target = camera.target
+        if sample.splats:
+            target = mi.Float(target)
+            for part, lane in zip(parts[1:], lanes[1:]):
+                dr.scatter_add(target, part.target, lane)
+        target = beyond_bound(target, self.bound)
+        dr.eval(target)
+        return Found(target, parts, lanes, sample)
+
+    def _found(self, numbers: Numbers, active: mi.Bool) -> tuple[Contribution, Sample]:
+        if not getattr(self.estimator, "can_be_frozen", False):
+            return self._camera(numbers, active)
+        *found, place = self._recorded(numbers, active)
+        go_to(numbers, place)
+        return tuple(found)
+
+    @frozen
+    def _recorded(self, numbers: Numbers, active: mi.Bool) -> tuple:
+        numbers = copied(numbers)
+        return *self._camera(numbers, active), reached(numbers)
+
+    def _camera(self, numbers: Numbers, active: mi.Bool) -> tuple[Contribution, Sample]:
+        rays = self._rays(numbers)
+        sample = self.estimator(self.scene, numbers, rays, active)
+        value = to_rgb(sample.L * rays.importance, rays.ray.wavelengths)
+        return self._contribution(rays.position, dr.select(active, value, 0)), sample
+
+    def learn(self, seed: int) -> None:
+        """Estimators of random walks have nothing to learn."""
+
+    def _contribution(self, position: mi.Point2f, value: mi.Color3f) -> Contribution:
+        """What is not finite counts as black: it is no place to stay."""
+        target = mi.luminance(dr.abs(value))
+        is_sound = dr.isfinite(target)
+        if self.weights is not None:
+            target *= self.weights.at(position)
+        return Contribution(position, dr.select(is_sound, value, 0), dr.select(is_sound, target, 0))
+
+    def _rays(self, numbers: Numbers) -> CameraRays:
+        film = self.sensor.film()
+        width, height = film_extent(film)
+        drawn = draw_numbers(self.sensor, numbers, None, CameraSamples())
+        place = drawn.film * mi.ScalarPoint2f(width, height)
+        corner = mi.Point2i(
+            dr.minimum(mi.Int32(place.x), width - 1), dr.minimum(mi.Int32(place.y), height - 1)
+        )
+        drawn.film = place - mi.Point2f(corner)
+        pixel = mi.UInt32(corner.y * width + corner.x)
+        lanes = Lanes(pixel, corner + mi.Point2i(film.crop_offset()), mi.UInt32(0))
+        return camera_rays(self.sensor, lanes, drawn, self.spp)
+
+
+def beyond_bound(luminance: mi.Float, bound: float) -> mi.Float:
+    """What luminance is beyond a bound; all of it, if that is 0."""
+    if bound == 0:
+        return luminance
+    return dr.maximum(luminance - dr.opaque(mi.Float, bound), 0)

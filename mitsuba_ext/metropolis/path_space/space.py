@@ -1,0 +1,117 @@
+"""The paths of a scene: what making and evaluating them needs to know."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ...bidirectional.emission import LightEmission
+from ...bidirectional.sensor import ConnectableSensor
+from ...rendering.camera import CameraNumbers, Lanes, camera_rays, film_extent
+from ...transport.estimator import CameraRays
+from ...transport.heroes import Heroes
+from ...transport.path_decisions import SceneQuery
+from .lights import LightKinds
+from .memory import Head, Place
+
+#: By how much, in units of the shortest segment that meets there, a ray may miss a vertex: more
+#: would change the geometric factors of the path.
+_MISS = 0.1
+
+
+# Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
+class PathSpace:
+    """Paths from the camera to a light.
+
+    Parameters (and attributes):
+        scene, sensor: What is rendered.
+        emission: Where light paths begin.
+        connectable: What they are connected to; ``None`` where they cannot be.
+        query: How a ray meets the scene.
+        spp: Samples per pixel of the whole render, for ray differentials.
+        least, most: Lengths of paths, in segments.
+        hides_emitters: Do camera rays pass through area lights, and is the sky invisible?
+
+    Attributes:
+        kinds: The kinds of lights.
+        heroes: What becomes of the wavelengths where light disperses.
+        radius: Of the scene, about.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        emission: LightEmission,
+        connectable: ConnectableSensor | None,
+        query: SceneQuery,
+        spp: int,
+        least: int,
+        most: int,
+        hides_emitters: bool = False,
+    ) -> None:
+        self.scene, self.sensor, self.emission = scene, sensor, emission
+        self.connectable, self.query, self.spp = connectable, query, spp
+        self.least, self.most, self.hides_emitters = least, most, hides_emitters
+        self.kinds, self.heroes = LightKinds(scene), Heroes(scene)
+        self.radius = emission.radius
+        width, height = film_extent(sensor.film())
+        self._width, self._height = width, height
+        self.size = mi.ScalarVector2f(width, height)
+        self._offset = mi.ScalarVector2f(sensor.film().crop_offset())
+
+    def camera_ray(self, head: Head) -> CameraRays:
+        """The camera ray of a path."""
+        place = head.film * self.size
+        corner = mi.Point2i(
+            dr.minimum(mi.Int32(place.x), self._width - 1),
+            dr.minimum(mi.Int32(place.y), self._height - 1),
+        )
+        numbers = CameraNumbers(
+            place - mi.Point2f(corner), head.aperture, head.time, head.wavelength
+        )
+        pixel = mi.UInt32(corner.y * self._width + corner.x)
+        lanes = Lanes(pixel, corner + mi.Point2i(self.sensor.film().crop_offset()), mi.UInt32(0))
+        return camera_rays(self.sensor, lanes, numbers, self.spp)
+
+    def on_film(
+        self, p: mi.Point3f, ray: mi.Ray3f, head: Head, active: mi.Bool
+    ) -> tuple[mi.Point2f, mi.Bool]:
+        """Where on the film a point is seen by the path's point of the aperture, as
+        :attr:`Head.film`, and whether it is seen, if nothing is in between. ``ray`` is any camera
+        ray of the path."""
+        if self.connectable is None:
+            return mi.Point2f(0), mi.Bool(False)
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+        si.p, si.time, si.wavelengths = p, ray.time, ray.wavelengths
+        seen, _weight = self.connectable.connect(si, head.aperture, active)
+        film = mi.Point2f((seen.position - self._offset) / self.size)
+        return dr.clip(film, 0, 1 - 2.0**-24), seen.active
+
+    def is_same(self, si: mi.SurfaceInteraction3f, p: mi.Point3f, reach: mi.Float) -> mi.Bool:
+        """Has a ray found the vertex at ``p``, as far as its numbers are exact? A surface close
+        before it is another vertex: the densities of the path hold for the one that was sampled.
+
+        Parameters:
+            reach: The length of the shortest segment that ends at the vertex.
+        """
+        exact = self.query.starts.distance(p) + mi.math.RayEpsilon * si.t
+        return si.is_valid() & (dr.norm(si.p - p) <= dr.minimum(exact, _MISS * reach))
+
+
+def towards(p: mi.Point3f, place: Place, is_direction: mi.Bool) -> mi.Vector3f:
+    """The direction from ``p`` to a vertex, which may be a direction itself."""
+    return dr.select(is_direction, mi.Vector3f(place.p), dr.normalize(place.p - p))
+
+
+def turned(d: mi.Vector3f, sample: mi.Point2f, low: float, high: float) -> mi.Vector3f:
+    """A direction at an angle to ``d`` between ``low`` and ``high``, of which the logarithm is
+    uniformly distributed: the density depends on the angle alone, and is the same both ways.
+
+    Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997, section 5.3; D. Cline,
+    PhD thesis, 2007, Fig. 7.26.
+    """
+    angle = low * dr.power(high / low, sample.x)
+    sin, cos = dr.sincos(angle)
+    y, x = dr.sincos(dr.two_pi * sample.y)
+    return mi.Frame3f(d).to_world(mi.Vector3f(sin * x, sin * y, cos))

@@ -1,0 +1,1 @@
+"""Rigid motion in time, and the parameters that describe it."""

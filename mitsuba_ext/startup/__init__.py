@@ -1,0 +1,1 @@
+"""What happens before a scene is read: LLVM, Mitsuba, plugins. Facts about this machine."""
