@@ -22,6 +22,9 @@ What a frozen function must keep to:
   ``kernel_state`` which of their attributes kernels depend on.
 - It reads no array on the host, and its results are arrays, or dataclasses, lists and tuples of
   these.
+- An array among its arguments is a literal in all calls or in none (``dr.opaque`` makes it none).
+  Kernels hold literals, until Dr.Jit meets another value: the first render of a scene would have
+  kernels of its own, and its image would differ from the second one by rounding.
 - Kernels whose width is that of an argument read an array of this width directly. Dr.Jit finds the
   width of kernels that only gather by comparing with widths seen before; this fails where these
   change, so that all widths are parts of the description, but for functions that say ``any_width``.

@@ -80,8 +80,12 @@ class Bootstrap:
         if not self._has_light:
             return numbers
         rng = generator(stream(self._seed, _LIGHT), index)
-        none = dr.zeros(mi.UInt32, dr.width(index))
-        return BothEnds(numbers, ProposedNumbers(rng, none, mi.UInt32(none), light))
+        # No literal: recorded kernels (transport/frozen.py) would hold it until the first mutation,
+        # and the first render of a scene would differ from the second one by rounding
+        known = dr.opaque(mi.UInt32, 0, dr.width(index))
+        return BothEnds(
+            numbers, ProposedNumbers(rng, dr.zeros(mi.UInt32, dr.width(index)), known, light)
+        )
 
     def choose(self, count: int) -> mi.UInt32:
         """The indices of ``count`` samples, in proportion to the target function. One random offset

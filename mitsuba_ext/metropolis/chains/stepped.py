@@ -26,7 +26,7 @@ class SteppedChains(Chains):
     _parts_of_state = ("_rngs", "_state", "_parts", "_lanes", "_known", "_values", "_weight")
 
     def _begin(self, bootstrap, winners):
-        empty = [dr.zeros(mi.Float, most * self.count) for most in self._most]
+        empty = [dr.opaque(mi.Float, 0, most * self.count) for most in self._most]
         records = self._records(empty)
         numbers = bootstrap.numbers(winners, records)
         found = self._target.evaluate(numbers)
