@@ -20,6 +20,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 INTEGRATORS = ["composed_path", "auto_path", "bdpt", "mlt", "pssmlt", "erpt"]
 
+#: So few that each makes several mutations.
+_CHAINS = {"mlt": {"chains": 256}, "pssmlt": {"chains": 256}}
+
 
 @pytest.fixture(autouse=True)
 def nothing_recorded():
@@ -50,7 +53,8 @@ def _assert_same(image: np.ndarray, other: np.ndarray) -> None:
 
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_images_are_those_of_traced_kernels(name: str) -> None:
-    scene, integrator = _scene(), mi.load_dict({"type": name, "max_depth": 4})
+    parameters = {"type": name, "max_depth": 4, **_CHAINS.get(name, {})}
+    scene, integrator = _scene(), mi.load_dict(parameters)
     for seed in (1, 2):
         _assert_same(_image(scene, integrator, seed), _traced(scene, integrator, seed))
 
@@ -68,6 +72,24 @@ def test_a_second_render_traces_nothing(monkeypatch) -> None:
     # An equal scene is another one
     _image(_scene(), mi.load_dict({"type": "composed_path", "max_depth": 3}))
     assert len(calls) == 2
+
+
+def test_a_result_that_no_recording_knows_is_refused() -> None:
+    """Dr.Jit returns it as it was when it was recorded."""
+
+    class Numbers:
+        def __init__(self, values: mi.Float) -> None:
+            self.values = values
+
+    @frozen.frozen
+    def next_ones(values: mi.Float) -> Numbers:
+        return Numbers(values + 1)
+
+    scene = _scene()
+    with pytest.raises(TypeError, match=r"next_ones is frozen, and returns a .*Numbers"):
+        frozen.with_recordings(
+            scene, scene.sensors()[0], lambda: next_ones(dr.opaque(mi.Float, 1, 4))
+        )
 
 
 def _updated(key: str, value: Callable[[Any], Any]) -> Callable[[mi.Scene], None]:

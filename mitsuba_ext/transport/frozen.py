@@ -20,8 +20,8 @@ What a frozen function must keep to:
   (This is checked.)
 - What its arguments hold besides is not changed between calls either, or they say with a method
   ``kernel_state`` which of their attributes kernels depend on.
-- It reads no array on the host, and its results are arrays, or dataclasses, lists and tuples of
-  these.
+- It reads no array on the host, and its results are arrays, or dataclasses, dicts, lists and tuples
+  of these. (This is checked.)
 - An array among its arguments is a literal in all calls or in none (``dr.opaque`` makes it none).
   Kernels hold literals, until Dr.Jit meets another value: the first render of a scene would have
   kernels of its own, and its image would differ from the second one by rounding.
@@ -37,7 +37,7 @@ import functools
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from typing import Any, TypeVar
 
 import drjit as dr
@@ -235,6 +235,7 @@ def _call(current: _Current, function: Callable, args: tuple, any_width: bool) -
         kept.recordings.pop(key, None)
         raise
     if is_new:
+        _check_result(function, result)
         again = _Description(current, any_width)
         if again.of(args) != key[-1] or any(
             a is not b for a, b in zip(again.arrays, description.arrays)
@@ -244,6 +245,27 @@ def _call(current: _Current, function: Callable, args: tuple, any_width: bool) -
             del kept.recordings[key]
             kept.refused.add(key)
     return result
+
+
+def _check_result(function: Callable, result: Any) -> None:
+    """Dr.Jit would return an object that it does not know as it was when it was recorded.
+
+    Raises:
+        TypeError: There is such an object in a result.
+    """
+    kind = type(result)
+    if isinstance(result, _VALUES) or dr.is_array_v(kind) or hasattr(kind, "DRJIT_STRUCT"):
+        return
+    if isinstance(result, dict):
+        parts = list(result.values())
+    elif isinstance(result, (list, tuple)):
+        parts = list(result)
+    elif is_dataclass(kind):
+        parts = list(vars(result).values())
+    else:
+        raise TypeError(f"{function.__qualname__} is frozen, and returns a {kind.__qualname__}")
+    for part in parts:
+        _check_result(function, part)
 
 
 class _Recording:

@@ -83,24 +83,35 @@ def copied(numbers: Numbers) -> Numbers:
     if isinstance(numbers, BothEnds):
         return BothEnds(copied(numbers.camera), copied(numbers.light))
     result = copy.copy(numbers)
-    for key, value in vars(numbers).items():
-        if dr.is_array_v(value) or hasattr(type(value), "DRJIT_STRUCT"):
-            setattr(result, key, type(value)(value))
+    for key, value in _arrays(numbers).items():
+        setattr(result, key, type(value)(value))
     return result
 
 
 def reached(numbers: Numbers) -> Any:
     """The place that numbers have reached, as a frozen function returns it: a sampler keeps it."""
-    return () if isinstance(numbers, mi.Sampler) else numbers
+    if isinstance(numbers, mi.Sampler):
+        return ()
+    if isinstance(numbers, BothEnds):
+        return reached(numbers.camera), reached(numbers.light)
+    return _arrays(numbers)
 
 
 def go_to(numbers: Numbers, place: Any) -> None:
     """Lets ``numbers`` go on where a frozen function has got to with copies of them."""
     if isinstance(numbers, BothEnds):
-        go_to(numbers.camera, place.camera)
-        go_to(numbers.light, place.light)
+        go_to(numbers.camera, place[0])
+        go_to(numbers.light, place[1])
     elif not isinstance(numbers, mi.Sampler):
-        vars(numbers).update(vars(place))
+        vars(numbers).update(place)
+
+
+def _arrays(numbers: Numbers) -> dict[str, Any]:
+    """The attributes that drawing changes; others, such as a record of what was drawn, stay."""
+    return {
+        key: value for key, value in vars(numbers).items()
+        if dr.is_array_v(value) or hasattr(type(value), "DRJIT_STRUCT")
+    }  # fmt: skip
 
 
 # Not a dataclass: loops only read it, and it has not the width of their state
