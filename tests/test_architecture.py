@@ -1,5 +1,5 @@
 """Imports point one way: plugins → composition → decisions → transport, regions, lights; rendering
-knows estimators only, and ``pointsets`` needs nobody's scene."""
+knows estimators only, ``pointsets`` needs nobody's scene, and no two rooms import each other."""
 
 from __future__ import annotations
 
@@ -20,29 +20,30 @@ _ARRAYS = ("Float", "Float64", "UInt32", "UInt64", "Int32", "Bool")
 
 #: By room, what it imports nothing of.
 FORBIDDEN = {
-    "transport": {"decisions", "bidirectional", "chains", "path_space", "composition", "rendering",
+    "transport": {"decisions", "bidirectional", "metropolis", "composition", "rendering", *PLUGINS},
+    "regions": {"transport", "decisions", "bidirectional", "metropolis", "composition", "rendering",
+                *PLUGINS},
+    "lights": {"decisions", "bidirectional", "metropolis", "composition", "rendering", *PLUGINS},
+    "decisions": {"bidirectional", "metropolis", "composition", "rendering", *PLUGINS},
+    "bidirectional": {"decisions", "metropolis", "composition", "rendering", *PLUGINS},
+    "metropolis/chains": {"decisions", "bidirectional", "composition", *PLUGINS},
+    "metropolis/path_space": {"decisions", "composition", *PLUGINS},
+    "rendering": {"decisions", "bidirectional", "metropolis", "composition", "long_renders",
                   *PLUGINS},
-    "regions": {"transport", "decisions", "bidirectional", "chains", "path_space", "composition",
-                "rendering", *PLUGINS},
-    "lights": {"decisions", "bidirectional", "chains", "path_space", "composition", "rendering",
-               *PLUGINS},
-    "decisions": {"bidirectional", "chains", "path_space", "composition", "rendering", *PLUGINS},
-    "bidirectional": {"decisions", "chains", "path_space", "composition", "rendering", *PLUGINS},
-    "chains": {"decisions", "bidirectional", "composition", *PLUGINS},
-    "path_space": {"decisions", "chains", "composition", *PLUGINS},
-    "rendering": {"decisions", "bidirectional", "chains", "path_space", "composition", *PLUGINS},
     "composition": set(PLUGINS),
-    "defocus": {"transport", "regions", "lights", "decisions", "bidirectional", "chains",
-                "path_space", "composition", "rendering", *PLUGINS},
+    "defocus": {"transport", "regions", "lights", "decisions", "bidirectional", "metropolis",
+                "composition", "rendering", *PLUGINS},
     "pointsets": {"transport", "regions", "lights", "decisions", "composition", "rendering",
                   *PLUGINS},
-    "sequences": {"transport", "regions", "lights", "decisions", "bidirectional", "chains",
-                  "path_space", "composition", "rendering", *PLUGINS},
+    "sequences": {"transport", "regions", "lights", "decisions", "bidirectional", "metropolis",
+                  "composition", "rendering", *PLUGINS},
     "solid_angles": {"transport", "regions", "lights", "luminaires", "decisions", "bidirectional",
-                     "chains", "path_space", "composition", "rendering", *PLUGINS},
-    "luminaires": {"transport", "regions", "lights", "decisions", "bidirectional", "chains",
-                   "path_space", "composition", "rendering", *PLUGINS},
+                     "metropolis", "composition", "rendering", *PLUGINS},
+    "luminaires": {"transport", "regions", "lights", "decisions", "bidirectional", "metropolis",
+                   "composition", "rendering", *PLUGINS},
     "compare": {"transport", "regions", "lights", "decisions", "composition", *PLUGINS},
+    "images": {"compare", "inputs", "rendering", "long_renders", "composition", *PLUGINS},
+    "long_renders": {"compare", "composition", *PLUGINS},
 }  # fmt: skip
 
 
@@ -81,6 +82,27 @@ def test_a_room_imports_nothing_that_stands_above_it(room: str) -> None:
         if module and module[0] in FORBIDDEN[room]
     ]
     assert not upward, "\n".join(upward)
+
+
+def test_few_modules_stand_loose() -> None:
+    loose = {file.stem for file in PACKAGE.glob("*.py")} - {"__init__", "__main__"}
+    assert len(loose) <= 8, loose
+
+
+def test_no_rooms_import_each_other() -> None:
+    """Nor in a circle of more of them."""
+    imports: dict[str, set[str]] = {}
+    for file, package in _files(PACKAGE):
+        room = package[1] if len(package) > 1 else file.stem
+        imported = {module[0] for module in _imports(file, package) if module}
+        imports.setdefault(room, set()).update(imported - {room, "__version__"})
+    rooms = dict(imports)
+    while True:
+        free = {room for room, imported in rooms.items() if not imported & set(rooms)}
+        if not free:
+            break
+        rooms = {room: imported for room, imported in rooms.items() if room not in free}
+    assert not rooms, rooms
 
 
 def test_bsdfs_are_called_in_one_place() -> None:
