@@ -21,7 +21,8 @@ from defocus import reference_of, scene_of, ssim, timed
 from equal_samples import print_header, print_row
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from mitsuba_ext.images.denoising import denoiser, render_guides
+from mitsuba_ext.composition.guides import render_guides
+from mitsuba_ext.images.denoising import denoiser
 from mitsuba_ext.images.flip import mean_flip
 
 import drjit as dr  # isort: skip
