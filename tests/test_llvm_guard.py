@@ -119,7 +119,7 @@ def test_failed_probe_overrules_the_version(
 def test_usable_library_is_chosen_silently(fake: Path) -> None:
     code = f"""
 import os, mitsuba_ext, drjit
-from mitsuba_ext import llvm, runtime
+from mitsuba_ext.startup import llvm, runtime
 runtime.check("llvm_ad_rgb")
 print(os.environ["{llvm.VARIABLE}"] == runtime.loaded_library().path)
 print(drjit.detail.llvm_version()[0] >= llvm.OLDEST)
@@ -139,7 +139,7 @@ def test_working_default_is_left_alone() -> None:
 def test_choice_of_the_user_is_respected_and_refused_by_name(fake: Path) -> None:
     code = f"""
 import os, mitsuba_ext
-from mitsuba_ext import runtime
+from mitsuba_ext.startup import runtime
 print(os.environ["{llvm.VARIABLE}"])
 {PRINT_CHECK}
 """
@@ -150,13 +150,13 @@ print(os.environ["{llvm.VARIABLE}"])
 
 
 def test_path_that_does_not_exist_is_refused_by_name() -> None:
-    code = f"import mitsuba_ext\nfrom mitsuba_ext import runtime\n{PRINT_CHECK}"
+    code = f"import mitsuba_ext\nfrom mitsuba_ext.startup import runtime\n{PRINT_CHECK}"
     process = run(code, **{llvm.VARIABLE: "/nowhere/libLLVM.so"})
     assert "/nowhere/libLLVM.so), which cannot be opened" in process.stdout
 
 
 def test_mitsuba_imported_first_says_to_import_us_before(fake: Path) -> None:
-    code = f"import mitsuba, mitsuba_ext\nfrom mitsuba_ext import runtime\n{PRINT_CHECK}"
+    code = f"import mitsuba, mitsuba_ext\nfrom mitsuba_ext.startup import runtime\n{PRINT_CHECK}"
     process = run(code, LD_LIBRARY_PATH=str(fake.parent))
     assert "import mitsuba_ext before mitsuba" in process.stdout.splitlines()[2]
 
@@ -164,7 +164,7 @@ def test_mitsuba_imported_first_says_to_import_us_before(fake: Path) -> None:
 def test_set_variant_raises_our_sentence_where_drjit_refused_the_library(fake: Path) -> None:
     code = """
 import mitsuba_ext, mitsuba as mi
-from mitsuba_ext import runtime
+from mitsuba_ext.startup import runtime
 runtime.guard(mi)
 mi.set_variant("scalar_rgb")
 try:

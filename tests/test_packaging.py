@@ -105,7 +105,7 @@ print(__name__, sys.argv[1:], importlib.util.find_spec("mitsuba_ext.integrators.
     command = tmp_path / "command"
     command.write_text("""
 import pathlib, subprocess, sys
-from mitsuba_ext.processes import python_command
+from mitsuba_ext.startup.processes import python_command
 sys.path.append(pathlib.Path("added by a user"))
 subprocess.run(python_command("worker", "1 + 1", "'"))
 """)
@@ -122,7 +122,8 @@ def test_no_process_is_started_with_what_the_current_folder_holds() -> None:
 def test_source_tree_that_is_not_installed_finds_its_plugins(source_tree: Path) -> None:
     code = """
 import mitsuba_ext
-from mitsuba_ext import cli, registry
+from mitsuba_ext import cli
+from mitsuba_ext.startup import registry
 print(*registry.plugin_files("integrators"))
 cli.main(["list"])
 """
@@ -160,7 +161,7 @@ def test_archive_and_wheel_work_in_another_environment(source_tree: Path, tmp_pa
     code = """
 import inspect, pathlib, sys
 import mitsuba_ext
-from mitsuba_ext import doctor, registry
+from mitsuba_ext.startup import doctor, registry
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 assert pathlib.Path(inspect.getfile(mitsuba_ext)).is_relative_to(sys.prefix)

@@ -20,7 +20,7 @@ WRAPPERS = (
 )
 
 def load_all():
-    from mitsuba_ext import registry
+    from mitsuba_ext.startup import registry
     for name in registry.plugin_names()["integrators"]:
         if name == "reweighted_wavelength" and not mi.is_spectral:
             continue
