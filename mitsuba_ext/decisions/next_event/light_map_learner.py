@@ -30,7 +30,7 @@ _DEFENSIVE = 0.1
 
 #: Voxels along each axis where the scene's author leaves the choice to us, at most; and entries of
 #: the map for each sample of the pilots (with about three connections each), at most.
-_GRID, _ENTRIES_PER_SAMPLE = 16, 2.0
+_GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 
 #: The efficiency that choosing from a table must reach; and that which, from few samples, lets
 #: learning go on: tables of more are little better.
