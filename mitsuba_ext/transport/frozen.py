@@ -226,6 +226,8 @@ def _call(current: _Current, function: Callable, args: tuple, any_width: bool) -
     kept.recordings.move_to_end(key)
     try:
         result = recording(args, description.arrays)
+        if is_new:
+            _check_result(function, result)
     except NotRecordableError as error:
         # The next render will not try
         kept.recordings.pop(key, None)
@@ -235,7 +237,6 @@ def _call(current: _Current, function: Callable, args: tuple, any_width: bool) -
         kept.recordings.pop(key, None)
         raise
     if is_new:
-        _check_result(function, result)
         again = _Description(current, any_width)
         if again.of(args) != key[-1] or any(
             a is not b for a, b in zip(again.arrays, description.arrays)
