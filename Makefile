@@ -38,7 +38,7 @@ test-slow: setup
 	$(PYTEST) -m slow
 
 bench: setup
-	$(BIN)/python examples/benchmark.py
+	$(BIN)/python benchmarks/benchmark.py
 
 lint: setup
 	$(BIN)/python -m ruff check .

@@ -17,7 +17,7 @@ from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, Setting
 
 #: The time of a ray of a bidirectional sample, in units of that of a ray of ``path``: both ends of
-#: a connection are evaluated, forth and back. ``examples/bidirectional.py`` measures 1.5 in
+#: a connection are evaluated, forth and back. ``benchmarks/bidirectional.py`` measures 1.5 in
 #: door_ajar, 1.6 to 1.8 in seven other scenes, and 2.2 in caustic. A clock would make equal seeds
 #: choose differently.
 _TIME_OF_A_RAY = 1.5

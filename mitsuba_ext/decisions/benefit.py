@@ -20,7 +20,7 @@ import numpy as np
 
 #: What decisions cost for each event, in units of the time of a ray: choosing a light from a table
 #: (medians over 15 scenes: 0.1 to 0.4), guiding the first direction of a path (0.3 to 1), and each
-#: further one. ``examples/decision_costs.py`` measures them.
+#: further one. ``benchmarks/decision_costs.py`` measures them.
 TABLE, FIRST_GUIDED, GUIDED = 0.2, 0.7, 0.25
 
 #: Batches of paths, and one path in so many is left out.
