@@ -3,7 +3,7 @@ units of that of ``path``, and for each event in units of a ray.
 
     python benchmarks/decision_costs.py scenes/rooms.xml …
 
-The constants of ``mitsuba_ext/decisions/benefit.py`` are medians of what this prints.
+The constants of ``mitsuba_ext/learning/benefit.py`` are medians of what this prints.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mi
 
 import mitsuba as mi  # isort: skip
 
-from mitsuba_ext.decisions.next_event import light_map_learner  # isort: skip
+from mitsuba_ext.learning.next_event import light_map_learner  # isort: skip
 
 #: Both learned decisions are kept, whatever they are worth.
 _GUIDED = {"type": "guided_directions", "always_guide": True}

@@ -18,7 +18,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
-from mitsuba_ext.decisions.weighted_sets import WEIGHTS
+from mitsuba_ext.maps.weighted_sets import WEIGHTS
 from mitsuba_ext.pointsets import PATTERNS
 
 import mitsuba as mi  # isort: skip

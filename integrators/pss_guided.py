@@ -9,8 +9,8 @@ from mitsuba_ext.composition.decision_parameters import ParameterReader
 from mitsuba_ext.composition.directions import Guided
 from mitsuba_ext.composition.roulette import GuidedRoulette
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
-from mitsuba_ext.decisions.directions.guide_learner import GuideLearner
 from mitsuba_ext.decisions.directions.guided_directions import GuidedDirections
+from mitsuba_ext.learning.directions.guide_learner import GuideLearner
 from mitsuba_ext.startup import registry
 
 

@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.decisions.next_event.light_map import LightMap
-from mitsuba_ext.decisions.next_event.light_map_learner import LightMapLearner
-from mitsuba_ext.decisions.next_event.light_table import Choice
+from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
+from mitsuba_ext.lights.choice import Choice
 from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.maps.light_map import LightMap
 from mitsuba_ext.regions.surface_rows import SurfaceRows, voxel_edges
 from mitsuba_ext.regions.surface_sides import region
 from mitsuba_ext.transport.path_decisions import EmitterSampling, LightNumbers

@@ -1,5 +1,6 @@
-"""Imports point one way: plugins → composition → decisions → transport, regions, lights; rendering
-knows estimators only, ``pointsets`` needs nobody's scene, and no two rooms import each other."""
+"""Imports point one way: plugins → composition → learning → decisions → maps → transport, regions,
+lights; rendering knows estimators only, ``pointsets`` needs nobody's scene, and no two rooms import
+each other."""
 
 from __future__ import annotations
 
@@ -18,30 +19,35 @@ PLUGINS = ("integrators", "emitters", "bsdfs", "shapes", "samplers", "sensors")
 #: Arrays of Dr.Jit, as Mitsuba calls them.
 _ARRAYS = ("Float", "Float64", "UInt32", "UInt64", "Int32", "Bool")
 
+#: What replaces decisions of the walk: what is stored, what reads it, and what learns it.
+LEARNED = ("maps", "decisions", "learning")
+
+#: Estimators that are no walk from the camera.
+PATHS = ("bidirectional", "metropolis")
+
 #: By room, what it imports nothing of.
 FORBIDDEN = {
-    "transport": {"decisions", "bidirectional", "metropolis", "composition", "rendering", *PLUGINS},
-    "regions": {"transport", "decisions", "bidirectional", "metropolis", "composition", "rendering",
-                *PLUGINS},
-    "lights": {"decisions", "bidirectional", "metropolis", "composition", "rendering", *PLUGINS},
-    "decisions": {"bidirectional", "metropolis", "composition", "rendering", *PLUGINS},
-    "bidirectional": {"decisions", "metropolis", "composition", "rendering", *PLUGINS},
-    "metropolis/chains": {"decisions", "bidirectional", "composition", *PLUGINS},
-    "metropolis/path_space": {"decisions", "metropolis/chains", "composition", *PLUGINS},
-    "rendering": {"decisions", "bidirectional", "metropolis", "composition", "long_renders",
-                  *PLUGINS},
+    "transport": {*LEARNED, *PATHS, "composition", "rendering", *PLUGINS},
+    "regions": {"transport", *LEARNED, *PATHS, "composition", "rendering", *PLUGINS},
+    "lights": {*LEARNED, *PATHS, "composition", "rendering", *PLUGINS},
+    "maps": {"decisions", "learning", *PATHS, "composition", "rendering", *PLUGINS},
+    "decisions": {"learning", *PATHS, "composition", "rendering", *PLUGINS},
+    "learning": {*PATHS, "composition", "rendering", *PLUGINS},
+    "bidirectional": {*LEARNED, "metropolis", "composition", "rendering", *PLUGINS},
+    "metropolis/chains": {*LEARNED, "bidirectional", "composition", *PLUGINS},
+    "metropolis/path_space": {*LEARNED, "metropolis/chains", "composition", *PLUGINS},
+    "rendering": {*LEARNED, *PATHS, "composition", "long_renders", *PLUGINS},
     "composition": set(PLUGINS),
-    "defocus": {"transport", "regions", "lights", "decisions", "bidirectional", "metropolis",
-                "composition", "rendering", *PLUGINS},
-    "pointsets": {"transport", "regions", "lights", "decisions", "composition", "rendering",
+    "defocus": {"transport", "regions", "lights", *LEARNED, *PATHS, "composition", "rendering",
+                *PLUGINS},
+    "pointsets": {"transport", "regions", "lights", *LEARNED, "composition", "rendering", *PLUGINS},
+    "sequences": {"transport", "regions", "lights", *LEARNED, *PATHS, "composition", "rendering",
                   *PLUGINS},
-    "sequences": {"transport", "regions", "lights", "decisions", "bidirectional", "metropolis",
-                  "composition", "rendering", *PLUGINS},
-    "solid_angles": {"transport", "regions", "lights", "luminaires", "decisions", "bidirectional",
-                     "metropolis", "composition", "rendering", *PLUGINS},
-    "luminaires": {"transport", "regions", "lights", "decisions", "bidirectional", "metropolis",
-                   "composition", "rendering", *PLUGINS},
-    "compare": {"transport", "regions", "lights", "decisions", "composition", *PLUGINS},
+    "solid_angles": {"transport", "regions", "lights", "luminaires", *LEARNED, *PATHS,
+                     "composition", "rendering", *PLUGINS},
+    "luminaires": {"transport", "regions", "lights", *LEARNED, *PATHS, "composition", "rendering",
+                   *PLUGINS},
+    "compare": {"transport", "regions", "lights", *LEARNED, "composition", *PLUGINS},
     "images": {"compare", "inputs", "rendering", "long_renders", "composition", *PLUGINS},
     "long_renders": {"compare", "composition", *PLUGINS},
 }  # fmt: skip

@@ -12,12 +12,12 @@ from hard_cases import area, diffuse, film, lookat, rectangle, sensor
 from maps import vertex_at
 
 from mitsuba_ext.composition.decision_parameters import Setting
-from mitsuba_ext.decisions.directions.guide_learner import GuideLearner, most_efficient
 from mitsuba_ext.decisions.directions.guided_directions import GuidedDirections
-from mitsuba_ext.decisions.directions.path_records import BYTES_PER_RECORD, PathRecords
-from mitsuba_ext.decisions.directions.surface_regions import SurfaceRegions
-from mitsuba_ext.decisions.directions.tile_regions import TileRegions
-from mitsuba_ext.decisions.pixel_estimates import PixelEstimates
+from mitsuba_ext.learning.directions.guide_learner import GuideLearner, most_efficient
+from mitsuba_ext.learning.directions.path_records import BYTES_PER_RECORD, PathRecords
+from mitsuba_ext.learning.directions.surface_regions import SurfaceRegions
+from mitsuba_ext.learning.directions.tile_regions import TileRegions
+from mitsuba_ext.learning.pixel_estimates import PixelEstimates
 from mitsuba_ext.transport.path_decisions import DirectionSamples
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -9,11 +9,12 @@ import pytest
 from lights import ball
 from maps import connect, floor, lamp, learner_of, map_of, observe, row_of, surface, vertex_at
 
-from mitsuba_ext.decisions.benefit import TABLE
-from mitsuba_ext.decisions.next_event.light_map_learner import LightMapLearner
-from mitsuba_ext.decisions.next_event.light_table import Choice, LightTable, OneRow
-from mitsuba_ext.decisions.shadow_test.light_map_roulette import LightMapRouletteLearner
+from mitsuba_ext.decisions.next_event.light_table import LightTable, OneRow
+from mitsuba_ext.learning.benefit import TABLE
+from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
+from mitsuba_ext.learning.shadow_test.light_map_roulette_learner import LightMapRouletteLearner
 from mitsuba_ext.lights import weights as lights_weights
+from mitsuba_ext.lights.choice import Choice
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.transport.path_decisions import EmitterSampling
 

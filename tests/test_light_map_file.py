@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from maps import floor, lamp, map_of
 
-from mitsuba_ext.decisions.next_event import light_map_file
-from mitsuba_ext.decisions.next_event.light_map_learner import LightMapLearner
+from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
 from mitsuba_ext.lights.division import emitter_shapes
+from mitsuba_ext.maps import light_map_file
 
 pytestmark = pytest.mark.usefixtures("variant")
 

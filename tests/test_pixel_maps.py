@@ -12,10 +12,12 @@ import pytest
 from statistical import load
 
 from mitsuba_ext.composition.pixel_maps import light_probabilities, pixel_maps
-from mitsuba_ext.decisions.swarm.camera_maps import CameraMapLearner
-from mitsuba_ext.decisions.swarm.cells import Cells
-from mitsuba_ext.decisions.swarm.light_maps import LightMapLearner, light_cells
-from mitsuba_ext.decisions.swarm.lobe_maps import LobeMapLearner, lobe_cells
+from mitsuba_ext.decisions.swarm.mapped_lights import light_cells
+from mitsuba_ext.decisions.swarm.mapped_lobes import lobe_cells
+from mitsuba_ext.learning.swarm.camera_map_learner import CameraMapLearner
+from mitsuba_ext.learning.swarm.light_numbers_learner import LightNumbersLearner
+from mitsuba_ext.learning.swarm.lobe_map_learner import LobeMapLearner
+from mitsuba_ext.maps.swarm.cells import Cells
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -74,8 +76,8 @@ def _panel() -> mi.Scene:
 _LEARNERS = {
     "line": lambda: _learner(CameraMapLearner, Cells.line(6)),
     "square": lambda: _learner(CameraMapLearner, Cells.square(5)),
-    "lamps": lambda: _learner(LightMapLearner, light_cells(_lamps(), 0)),
-    "panel": lambda: _learner(LightMapLearner, light_cells(_panel(), 1)),
+    "lamps": lambda: _learner(LightNumbersLearner, light_cells(_lamps(), 0)),
+    "panel": lambda: _learner(LightNumbersLearner, light_cells(_panel(), 1)),
     "lobes": lambda: _learner(LobeMapLearner, lobe_cells(), 24),
 }
 

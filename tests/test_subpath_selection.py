@@ -19,8 +19,8 @@ from mitsuba_ext.bidirectional.light_vertices import PackedVertices, VertexCache
 from mitsuba_ext.bidirectional.light_walk import LightWalk
 from mitsuba_ext.bidirectional.partial_sums import PartialSums, Sums
 from mitsuba_ext.bidirectional.vertex_choice import RegionChoice
-from mitsuba_ext.decisions.subpaths import region_learner
 from mitsuba_ext.decisions.subpaths.region_table import RegionTable
+from mitsuba_ext.learning.subpaths import region_learner
 from mitsuba_ext.regions.nested_regions import NestedRegions
 from mitsuba_ext.regions.surface_sides import lit_normal
 from mitsuba_ext.transport.path_decisions import EmitterSampling

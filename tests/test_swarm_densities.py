@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mitsuba_ext.composition.swarm import doubling_pilots, stage_weights
-from mitsuba_ext.decisions.swarm.cells import CellDensities, Cells
-from mitsuba_ext.decisions.swarm.estimate import Form, Grid, Shares, estimate
-from mitsuba_ext.decisions.swarm.film_tiles import FilmTiles
-from mitsuba_ext.decisions.swarm.tile_counts import Choices, TileCounts
+from mitsuba_ext.learning.swarm.estimate import Form, Grid, Shares, estimate
+from mitsuba_ext.learning.swarm.tile_counts import Choices, TileCounts
+from mitsuba_ext.maps.swarm.cells import CellDensities, Cells
+from mitsuba_ext.maps.swarm.film_tiles import FilmTiles
 from mitsuba_ext.rendering.dither import dithered_parts
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -7,15 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.decisions.shadow_test.visibility_map import (
-    MAX_VOXELS,
-    VisibilityMap,
-    _row_and_column,
-)
-from mitsuba_ext.decisions.shadow_test.visibility_roulette import (
-    VisibilityLearner,
-    VisibilityRoulette,
-)
+from mitsuba_ext.decisions.shadow_test.visibility_roulette import VisibilityRoulette
+from mitsuba_ext.learning.shadow_test.visibility_roulette_learner import VisibilityRouletteLearner
+from mitsuba_ext.maps.visibility_map import MAX_VOXELS, VisibilityMap, _row_and_column
 from mitsuba_ext.regions.voxel_grid import VoxelGrid
 from mitsuba_ext.transport.estimator import CameraRays
 
@@ -169,7 +163,7 @@ def test_the_same_seed_gives_bitwise_the_same_map(scenes):
     walk_maps = []
     for _ in range(2):
         integrator = mi.load_dict({"type": "neepp", "max_depth": 4})
-        learner = VisibilityLearner(12, 16, 4, law="affine", slope=10, floor=0.1)
+        learner = VisibilityRouletteLearner(12, 16, 4, law="affine", slope=10, floor=0.1)
         learner.start(scene, mi.Point3f(), mi.Normal3f())
         walk, visibility = integrator.walk(observer=learner), learner._map
         sampler = mi.load_dict({"type": "independent"})

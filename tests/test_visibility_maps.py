@@ -16,12 +16,8 @@ from test_environment_bins import _square
 from test_two_stage import LANES, _everywhere, _scene, _vertex
 
 from mitsuba_ext.decisions.next_event.two_stage import TwoStage
-from mitsuba_ext.decisions.next_event.visibility_learner import VisibilityLearner
-from mitsuba_ext.decisions.next_event.visibility_maps import (
-    PrimaryVisibility,
-    Tile,
-    VisibilityCounts,
-)
+from mitsuba_ext.learning.next_event.environment_visibility_learner import VisibilityLearner
+from mitsuba_ext.maps.environment_visibility import PrimaryVisibility, Tile, VisibilityCounts
 from mitsuba_ext.rendering.render import kernel_cache_misses
 from mitsuba_ext.transport.path_decisions import LightNumbers
 

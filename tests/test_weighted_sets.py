@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mitsuba_ext.decisions.weighted_sets import WEIGHTS, WeightedSets
+from mitsuba_ext.maps.weighted_sets import WEIGHTS, WeightedSets
 from mitsuba_ext.pointsets import PATTERNS, voronoi_weights
 
 pytestmark = pytest.mark.usefixtures("variant")

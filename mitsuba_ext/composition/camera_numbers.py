@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from ..decisions.camera.pixel_sets import PixelSets
-from ..decisions.weighted_sets import WEIGHTS, WeightedSets
+from ..maps.weighted_sets import WEIGHTS, WeightedSets
 from ..pointsets import PATTERNS
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 from .swarm import check_has_wavelengths

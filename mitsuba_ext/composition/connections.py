@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..decisions.connections.weighted_connections import NoFirstConnections, WeightedConnections
-from ..decisions.weighted_sets import MOST_SLOW_POINTS, SLOW_PATTERN, WEIGHTS, WeightedSets
+from ..maps.weighted_sets import MOST_SLOW_POINTS, SLOW_PATTERN, WEIGHTS, WeightedSets
 from ..pointsets import PATTERNS
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..decisions.learner import Learner
+from ..learning.learner import Learner
 from ..parameters import read_parameter
 from ..rendering.camera import film_extent
 

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import mitsuba as mi
 
-from ..decisions.directions.guide_learner import GuideLearner
-from ..decisions.directions.surface_regions import SurfaceRegions
-from ..decisions.directions.tile_regions import MOST_BOUNCES, TileRegions
-from ..decisions.learner import Learner
+from ..learning.directions.guide_learner import GuideLearner
+from ..learning.directions.surface_regions import SurfaceRegions
+from ..learning.directions.tile_regions import MOST_BOUNCES, TileRegions
+from ..learning.learner import Learner
 from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 

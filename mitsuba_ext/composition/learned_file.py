@@ -9,8 +9,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from ..decisions.next_event.light_map_file import fingerprint
 from ..files import replacing
+from ..maps.light_map_file import fingerprint
 
 #: Number of the format of these files.
 _FORMAT = 2

@@ -10,9 +10,9 @@ import numpy as np
 
 from ..bidirectional.path_moments import Estimate, PathMoments
 from ..bidirectional.technique_observer import TechniqueObserver
-from ..decisions.benefit import gain_of, is_worth, trimmed_batches
-from ..decisions.learner import Learner
-from ..decisions.pixel_estimates import relative_scale
+from ..learning.benefit import gain_of, is_worth, trimmed_batches
+from ..learning.learner import Learner
+from ..learning.pixel_estimates import relative_scale
 from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, Setting
 

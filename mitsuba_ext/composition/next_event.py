@@ -10,17 +10,17 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import from_numpy
-from ..decisions.learner import Learner
 from ..decisions.next_event.environment_partition import MOST_SPLITS
-from ..decisions.next_event.light_map_learner import LightMapLearner
 from ..decisions.next_event.light_table import TABLE_BYTES, LightTable, OneRow
 from ..decisions.next_event.linear_lights import LinearChoice
 from ..decisions.next_event.portal_sampling import PortalSampling
 from ..decisions.next_event.resampled_lights import ResampledLights
 from ..decisions.next_event.two_stage import TwoStage
-from ..decisions.next_event.visibility_learner import VisibilityLearner
 from ..errors import InputError
 from ..files import check_target
+from ..learning.learner import Learner
+from ..learning.next_event.environment_visibility_learner import VisibilityLearner
+from ..learning.next_event.light_map_learner import LightMapLearner
 from ..lights.light_cells import LightCells
 from ..lights.shutter_times import ShutterTimes
 from ..lights.weights import VoxelRows, power_weights, spatial_weights

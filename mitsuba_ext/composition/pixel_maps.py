@@ -11,9 +11,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import from_numpy
-from ..decisions.learner import Learner
-from ..decisions.swarm.lobe_maps import LobeMapLearner
-from ..decisions.swarm.map_learner import MapLearner
+from ..learning.learner import Learner
+from ..learning.swarm.lobe_map_learner import LobeMapLearner
+from ..learning.swarm.map_learner import MapLearner
 from ..rendering.camera import film_extent
 
 

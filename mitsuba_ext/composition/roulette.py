@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ..decisions.directions.guide_learner import GuideLearner
-from ..decisions.directions.guided_roulette import RouletteLearner
-from ..decisions.learner import Learner
+from ..learning.directions.guide_learner import GuideLearner
+from ..learning.directions.guided_roulette import RouletteLearner
+from ..learning.learner import Learner
 from .decision_parameters import DecisionParameters, Setting
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..decisions.learner import Learner
-from ..decisions.scout import SCOUT_DEPTH, Scout
+from ..learning.learner import Learner
+from ..learning.scout import SCOUT_DEPTH, Scout
 from ..rendering.camera_samples import CameraSamples
 from ..rendering.stages import Stage
 from ..transport.estimator import Estimator

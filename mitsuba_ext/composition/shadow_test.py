@@ -8,10 +8,11 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..decisions.learner import Learner
-from ..decisions.next_event.light_map_learner import LightMapLearner
-from ..decisions.shadow_test.light_map_roulette import LightMapRouletteLearner
-from ..decisions.shadow_test.visibility_roulette import VisibilityLearner, has_lights_at_points
+from ..decisions.shadow_test.visibility_roulette import has_lights_at_points
+from ..learning.learner import Learner
+from ..learning.next_event.light_map_learner import LightMapLearner
+from ..learning.shadow_test.light_map_roulette_learner import LightMapRouletteLearner
+from ..learning.shadow_test.visibility_roulette_learner import VisibilityRouletteLearner
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 from .next_event import LearnedLights
 
@@ -79,7 +80,7 @@ class RejectedShadowRays(DecisionParameters):
             return LightMapRouletteLearner(lights, **law)
         if not self._has_own_map or not self.can_learn(setting.scene, setting.pilot_spp):
             return None
-        return VisibilityLearner(self.grid, self.max_memory, self.refine, **law)
+        return VisibilityRouletteLearner(self.grid, self.max_memory, self.refine, **law)
 
     def _uses_own_map(self, slots: Slots) -> bool:
         return not isinstance(slots.get("next_event"), LearnedLights)

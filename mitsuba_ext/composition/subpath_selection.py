@@ -11,10 +11,10 @@ from ..bidirectional.both_ends import from_both_ends
 from ..bidirectional.emission import LightEmission
 from ..bidirectional.light_vertices import LightVertices, PackedVertices, VertexCache
 from ..bidirectional.light_walk import LightWalk
-from ..decisions.learner import Learner
-from ..decisions.pixel_estimates import brightness
 from ..decisions.query.moving_scene import scene_query
-from ..decisions.subpaths.region_learner import LightVertexSample, RegionLearner
+from ..learning.learner import Learner
+from ..learning.pixel_estimates import brightness
+from ..learning.subpaths.region_learner import LightVertexSample, RegionLearner
 from ..regions.surface_sides import lit_normal
 from ..rendering.camera import film_extent
 from ..scene.movers import movers

@@ -8,12 +8,16 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ..decisions.learner import Learner
-from ..decisions.swarm.camera_maps import CameraMapLearner, MappedNumbers
-from ..decisions.swarm.cells import Cells
-from ..decisions.swarm.direction_maps import DirectionMapLearner, MappedScattering
-from ..decisions.swarm.light_maps import LightMapLearner, LightMaps, light_cells
-from ..decisions.swarm.lobe_maps import LobeMapLearner, MappedLobes, divides
+from ..decisions.swarm.mapped_lights import LightMaps, light_cells
+from ..decisions.swarm.mapped_lobes import MappedLobes, divides
+from ..decisions.swarm.mapped_numbers import MappedNumbers
+from ..decisions.swarm.mapped_scattering import MappedScattering
+from ..learning.learner import Learner
+from ..learning.swarm.camera_map_learner import CameraMapLearner
+from ..learning.swarm.direction_map_learner import DirectionMapLearner
+from ..learning.swarm.light_numbers_learner import LightNumbersLearner
+from ..learning.swarm.lobe_map_learner import LobeMapLearner
+from ..maps.swarm.cells import Cells
 from ..rendering.camera import film_extent
 from ..scene.media import has_homogeneous_media
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
@@ -145,7 +149,7 @@ class LightMapsChoice(Swarm):
         lights = self._lights.decision(setting) if self._lights else None
         dimension = lights.choice_dimension if lights else 0
         maps = LightMaps(light_cells(setting.scene, dimension))
-        return LightMapLearner(self.summary, maps, width, height, **self._how(setting))
+        return LightNumbersLearner(self.summary, maps, width, height, **self._how(setting))
 
 
 class LobeMaps(Swarm):

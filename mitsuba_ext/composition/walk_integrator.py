@@ -12,11 +12,11 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..decisions.learner import Learner
 from ..decisions.query.moving_aovs import moving_aovs
 from ..decisions.query.moving_scene import scene_query
 from ..errors import InputError
 from ..files import check_target
+from ..learning.learner import Learner
 from ..rendering.aovs import check_aovs
 from ..rendering.camera import film_extent
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids

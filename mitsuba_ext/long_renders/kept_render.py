@@ -10,8 +10,8 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..decisions.next_event.light_map_file import fingerprint
 from ..inputs.content_hash import hash_code
+from ..maps.light_map_file import fingerprint
 from ..rendering.batches import sample_count
 from ..rendering.interrupts import deferred_interrupt
 from ..scene.nesting import with_nested

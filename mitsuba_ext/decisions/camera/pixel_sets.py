@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...maps.weighted_sets import WeightedSets
 from ...transport.numbers import Numbers
-from ..weighted_sets import WeightedSets
 
 
 class PixelSets:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ...maps.weighted_sets import WeightedSets
 from ...transport.path_decisions import ConnectionCount, LightNumbers
-from ..weighted_sets import WeightedSets
 
 #: The golden ratio: its multiples, modulo one, are evenly spread.
 _GOLDEN = 0.6180339887

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
+from ...maps.sample_trees import SampleTrees
 from ...transport.path_decisions import DirectionSamples
-from .sample_trees import SampleTrees
 
 
 class Regions(Protocol):

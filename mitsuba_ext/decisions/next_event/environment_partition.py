@@ -20,9 +20,9 @@ import mitsuba as mi
 from ...discrete_sampling import ONE_MINUS_EPSILON
 from ...lights.spectra import brightness
 from ...lights.texel_sums import Corners, Rectangle, TexelSums, part_of
+from ...maps.environment_visibility import Tile, WorldVisibility
 from ...transport.bsdfs import eval_bsdf, sample_bsdf
 from .partition_parts import Branch, Node, Partition, Peak
-from .visibility_maps import Tile, WorldVisibility
 
 #: The first rectangles of each partition: so many columns and rows at least.
 _GRID = (4, 2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 from typing import Protocol
 
 import drjit as dr
@@ -11,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...discrete_sampling import alias_tables
+from ...lights.choice import Choice
 from ...lights.light_cells import LightCells
 from ...transport.path_decisions import EmitterSampling
 
@@ -37,21 +37,6 @@ class OneRow:
 
     def row(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
         return mi.UInt32(0)
-
-
-@dataclass
-class Choice:
-    """What was chosen for a connection.
-
-    Attributes:
-        row: Row of the table at the vertex.
-        cell: What was chosen there.
-        probability: With what probability.
-    """
-
-    row: mi.UInt32
-    cell: mi.UInt32
-    probability: mi.Float
 
 
 class LightTable(EmitterSampling):

@@ -12,10 +12,16 @@ import mitsuba as mi
 
 from ...lights.environment_texels import EnvironmentTexels
 from ...lights.texel_sums import TexelSums
+from ...maps.environment_visibility import (
+    Cell,
+    PrimaryVisibility,
+    Tile,
+    VisibilityCounts,
+    WorldVisibility,
+)  # fmt: skip
 from ...transport.heroes import Heroes
 from ...transport.path_decisions import EmitterSampling
 from .environment_partition import Partition, Partitioner
-from .visibility_maps import Cell, PrimaryVisibility, Tile, VisibilityCounts, WorldVisibility
 
 
 @dataclass

@@ -17,7 +17,7 @@ class BounceRecords:
         bounces: Bounces of a path that are recorded, at most.
 
     Attributes:
-        map, cell, density: As :class:`~mitsuba_ext.decisions.swarm.tile_counts.Choices` says, for
+        map, cell, density: As :class:`~mitsuba_ext.learning.swarm.tile_counts.Choices` says, for
             each record; density 0 where there is none.
         lane: Whose record it is.
     """

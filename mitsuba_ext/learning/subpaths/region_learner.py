@@ -10,12 +10,12 @@ import mitsuba as mi
 import numpy as np
 
 from ...arrays import joined
+from ...decisions.subpaths.region_table import RegionTable
 from ...regions.nested_regions import NestedRegions
 from ...transport.path_decisions import SubpathSelection
 from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
 from .pair_records import PairRecords
-from .region_table import RegionTable
 
 #: Share of the choices that go by the number of vertices alone: no vertex is chosen more rarely
 #: than a tenth as often as by a uniform choice.

@@ -12,13 +12,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...maps.swarm.cells import CellDensities, Cells
 from ...transport.bsdfs import eval_bsdf
 from ...transport.path_decisions import Scattering
 from ...transport.vertex import Vertex
-from ..pixel_estimates import brightness
-from .cells import CellDensities, Cells
-from .map_learner import MapLearner
-from .tile_counts import Choices
 
 #: The share of the directions that maps choose.
 SHARE = 0.5
@@ -31,7 +28,7 @@ class MappedScattering(Scattering):
     """Mixes directions of a map with those of the BSDF. Its densities are those of the mixture.
 
     Attributes:
-        cells, maps, tiles: See :class:`~mitsuba_ext.decisions.swarm.camera_maps.MappedNumbers`.
+        cells, maps, tiles: See :class:`~mitsuba_ext.decisions.swarm.mapped_numbers.MappedNumbers`.
         is_recorded: Does somebody learn?
         cell, density, inverse, lane: What each lane of the running pass chose, if somebody learns:
             the cell, the density of the mixture over that of the BSDF, and uniform density over
@@ -133,46 +130,3 @@ def _to_square(d: mi.Vector3f) -> list[mi.Float]:
     """The inverse of :func:`_to_sphere`."""
     u = mi.warp.uniform_sphere_to_square(d)
     return [dr.clip(u.x, 0, 1 - 2**-24), dr.clip(u.y, 0, 1 - 2**-24)]
-
-
-class DirectionMapLearner(MapLearner):
-    """Learns the maps of :class:`MappedScattering`, which is its ``decision``."""
-
-    needs_measurement = True
-
-    def __init__(
-        self, name: str, decision: MappedScattering, width: int, height: int, **how
-    ) -> None:
-        super().__init__(name, decision, width, height, decision.cells, **how)
-        decision.is_recorded = True
-
-    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
-        super().begin(lanes, pixel)
-        if self.is_learning:
-            self._lane = dr.arange(mi.UInt32, lanes)
-            self._before = dr.full(mi.UInt32, 0x7F800000, lanes)
-            dr.eval(self._lane, self._before)
-
-    def direction(self, vertex, sample, weight, L, active) -> None:
-        if self.is_learning:
-            # What a path has brought never falls: the least is that before the first bounce.
-            # Floats that are not negative have the order of their bits
-            bits = dr.reinterpret_array(mi.UInt32, dr.maximum(brightness(L), 0))
-            active = active & is_smooth(vertex)
-            dr.scatter_reduce(dr.ReduceOp.Min, self._before, bits, self._lane, active)
-
-    def choices(self, radiance: mi.Float) -> Choices:
-        chosen = self.decision
-        before = dr.reinterpret_array(mi.Float, self._before)
-        value = dr.maximum(self.total - before, 0) * self.importance
-        return Choices(
-            mi.UInt32(0), chosen.cell, chosen.density, value, chosen.density > 0,
-            share=SHARE, scale=chosen.inverse,
-        )  # fmt: skip
-
-    def stop(self) -> None:
-        super().stop()
-        chosen = self.decision
-        chosen.is_recorded = False
-        chosen.cell = chosen.density = chosen.inverse = chosen.lane = None
-        self._lane = self._before = None

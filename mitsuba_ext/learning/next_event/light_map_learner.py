@@ -9,8 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...decisions.next_event.light_table import LightTable
 from ...lights.light_cells import LightCells
 from ...lights.weights import uniform_weights
+from ...maps import light_map_file
+from ...maps.light_map import BYTES_PER_ENTRY, LightMap
 from ...regions.surface_rows import BYTES_PER_VOXEL, RowCounts, SurfaceRows, voxel_edges
 from ...regions.surface_sides import region
 from ...transport.observer import Observer
@@ -18,10 +21,7 @@ from ...transport.path_decisions import EmitterSampling
 from ..benefit import is_worth
 from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
-from . import light_map_file
 from .connection_records import ConnectionRecords
-from .light_map import BYTES_PER_ENTRY, LightMap
-from .light_table import LightTable
 
 #: Share of the choices that what was learned does not decide: half of them go by the unoccluded
 #: contributions, half are those of ``path``, so that no choice is less likely than 1/20 of what it

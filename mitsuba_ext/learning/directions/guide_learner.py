@@ -9,16 +9,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...decisions.directions.guided_directions import GuidedDirections, Regions
+from ...decisions.roulette.adjoint_roulette import AdjointRoulette
+from ...maps.sample_trees import SampleTrees
 from ...transport.observer import Observer
 from ...transport.path_decisions import DirectionSamples, Roulette
 from ..benefit import BATCHES, FIRST_GUIDED, GUIDED, gain_of, is_worth
 from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
-from ..roulette.adjoint_roulette import AdjointRoulette
-from ..roulette.roulette_trial import BYTES_PER_PATH, RouletteTrial
-from .guided_directions import GuidedDirections, Regions
 from .path_records import BYTES_PER_RECORD, PathRecords
-from .sample_trees import SampleTrees
+from .roulette_trial import BYTES_PER_PATH, RouletteTrial
 
 #: The share of the samples that trees decide in the second pilot, and those from which one is
 #: chosen as soon as it is known what they are worth.

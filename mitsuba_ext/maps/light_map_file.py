@@ -10,11 +10,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import from_numpy
-from ...files import replacing
-from ...lights.division import emitter_shapes
-from ...lights.light_cells import LightCells
-from ...regions.surface_rows import BYTES_PER_VOXEL, SurfaceRows, voxel_edges
+from ..arrays import from_numpy
+from ..files import replacing
+from ..lights.division import emitter_shapes
+from ..lights.light_cells import LightCells
+from ..regions.surface_rows import BYTES_PER_VOXEL, SurfaceRows, voxel_edges
 from .light_map import BYTES_PER_ENTRY, MOST_SQUARED, LightMap
 
 _FORMAT = 2

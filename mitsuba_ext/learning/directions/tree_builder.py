@@ -19,7 +19,7 @@ import mitsuba as mi
 
 from ...arrays import joined
 from ...discrete_sampling import first_above
-from .sample_trees import LEAF
+from ...maps.sample_trees import LEAF
 
 #: The node of a tree without a split.
 UNIFORM = 0

@@ -13,22 +13,18 @@ heuristic over whole paths: E. Veach, PhD dissertation, Stanford 1997, section 9
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...maps.swarm.cells import CellDensities, Cells
 from ...transport.path_decisions import DirectionSamples
-from ..pixel_estimates import brightness
 from .bounce_records import BounceRecords
-from .cells import CellDensities, Cells
-from .map_learner import MapLearner
-from .tile_counts import Choices
 
 #: Bounces with maps, and numbers of reflections before that have maps of their own.
-_BOUNCES, _REFLECTIONS = 8, 3
+BOUNCES, REFLECTIONS = 8, 3
 
 #: The share of the paths that draw uniform numbers.
 _UNIFORM_SHARE = 0.2
@@ -66,7 +62,7 @@ class MappedLobes(DirectionSamples):
     """Warps the number that chooses a lobe, where light is reflected or transmitted.
 
     Attributes:
-        cells, maps, tiles: See :class:`~mitsuba_ext.decisions.swarm.camera_maps.MappedNumbers`.
+        cells, maps, tiles: See :class:`~mitsuba_ext.decisions.swarm.mapped_numbers.MappedNumbers`.
         is_recorded: Does somebody learn?
         records: What the running pass chose, if somebody learns.
     """
@@ -79,7 +75,7 @@ class MappedLobes(DirectionSamples):
         self.records: BounceRecords | None = None
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
-        self.records = BounceRecords(dr.width(ray), _BOUNCES) if self.is_recorded else None
+        self.records = BounceRecords(dr.width(ray), BOUNCES) if self.is_recorded else None
         if pixel is None or (self.maps is None and self.records is None):
             return ()
         is_uniform = mi.Bool(self.maps is None)
@@ -98,13 +94,13 @@ class MappedLobes(DirectionSamples):
         stays = (dr.dot(vertex.path.arrival.ref.n, -incident) > 0) == was_front
         is_reflected = active & (vertex.depth > 0) & stays
         reflections += dr.select(is_reflected, mi.UInt32(1), 0)
-        is_mapped = active & (vertex.depth < _BOUNCES) & _flags(vertex.bsdf.flags())
-        which = vertex.depth * _REFLECTIONS + dr.minimum(reflections, _REFLECTIONS - 1)
+        is_mapped = active & (vertex.depth < BOUNCES) & _flags(vertex.bsdf.flags())
+        which = vertex.depth * REFLECTIONS + dr.minimum(reflections, REFLECTIONS - 1)
         weight = density = mi.Float(1)
         if self.maps is None:
             cell = self.cells.find([sample_1])
         else:
-            table, found = tile * (_BOUNCES * _REFLECTIONS) + which, self.cells.find([sample_1])
+            table, found = tile * (BOUNCES * REFLECTIONS) + which, self.cells.find([sample_1])
             (sample_1,), density, cell = self.maps.sample(
                 table, [sample_1], is_mapped & ~is_uniform
             )
@@ -123,49 +119,3 @@ def path_density(product: mi.Float) -> mi.Float:
     """The density of the numbers of a path, relative to uniform ones; ``product`` is that under the
     maps of all bounces so far."""
     return dr.lerp(product, 1.0, _UNIFORM_SHARE)
-
-
-@dataclass
-class LobeChoices(Choices):
-    """Choices of the bounces of paths, whose densities multiply.
-
-    Attributes:
-        records: The choices of the bounces.
-    """
-
-    records: BounceRecords | None = None
-
-    def under(self, q: mi.Float) -> mi.Float:
-        return path_density(self.records.products(q))
-
-
-class LobeMapLearner(MapLearner):
-    """Learns the maps of :class:`MappedLobes`, which is its ``decision``."""
-
-    #: What the maps of single bounces promise does not add up
-    needs_measurement = True
-
-    #: Maps of each bounce: by the number of reflections before it
-    reflections = _REFLECTIONS
-
-    def __init__(self, name: str, decision: MappedLobes, width: int, height: int, **how) -> None:
-        maps = _BOUNCES * _REFLECTIONS
-        super().__init__(name, decision, width, height, decision.cells, maps=maps, **how)
-        decision.is_recorded = True
-
-    def direction(self, vertex, sample, weight, L, active) -> None:
-        if self.is_learning:
-            self.decision.records.before(vertex.depth, brightness(L), active)
-
-    def choices(self, radiance: mi.Float) -> Choices:
-        records = self.decision.records
-        value = records.after(self.total) * dr.gather(mi.Float, self.importance, records.lane)
-        density = path_density(records.products(records.density))
-        return LobeChoices(
-            records.map, records.cell, density, value, records.density > 0, records.lane,
-            later=records.next_one(value), records=records,
-        )  # fmt: skip
-
-    def stop(self) -> None:
-        super().stop()
-        self.decision.is_recorded, self.decision.records = False, None

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import from_numpy
+from ..arrays import from_numpy
 
 #: The value that marks a leaf, in place of a probability.
 LEAF = -1.0

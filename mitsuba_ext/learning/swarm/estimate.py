@@ -32,7 +32,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from .nodes import Nodes, sums_before
+from ...maps.swarm.nodes import Nodes, sums_before
 
 
 class Form(NamedTuple):

@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 
 from ...arrays import joined
+from ...maps.sample_trees import SampleTrees
 from .path_records import PathRecords
-from .sample_trees import SampleTrees
 from .tree_builder import DEPTH, UNIFORM, Samples, TreeBuilder
 
 #: Edges, in tiles, of the larger tiles whose trees are the priors of the smaller ones.

@@ -11,10 +11,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...maps.swarm.cells import CellDensities, Cells
 from ...transport.numbers import Numbers
-from .cells import CellDensities, Cells
-from .map_learner import MapLearner
-from .tile_counts import Choices
 
 
 class MappedNumbers:
@@ -64,21 +62,3 @@ class MappedNumbers:
             self.maps.density(table, (cell + k * step) % count) for k in range(self._periods)
         )
         return sum(densities) / self._periods
-
-
-class CameraMapLearner(MapLearner):
-    """Learns maps of :class:`MappedNumbers`, which is its ``decision``."""
-
-    def __init__(self, name: str, decision: MappedNumbers, width: int, height: int, **how) -> None:
-        super().__init__(name, decision, width, height, decision.cells, **how)
-
-    def drawn(self) -> tuple[mi.UInt32, mi.Float]:
-        return self.decision.drawn
-
-    def choices(self, radiance: mi.Float) -> Choices:
-        cell, density = self.decision.drawn
-        return Choices(mi.UInt32(0), cell, density, radiance, mi.Bool(True))
-
-    def stop(self) -> None:
-        super().stop()
-        self.decision.drawn = None

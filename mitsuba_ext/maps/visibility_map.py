@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import from_numpy
-from ...regions.voxel_grid import VoxelGrid
+from ..arrays import from_numpy
+from ..regions.voxel_grid import VoxelGrid
 
 #: Two counters, and two numbers of the roulette's table in the worst case (lights in all voxels).
 _BYTES_PER_ENTRY = 16

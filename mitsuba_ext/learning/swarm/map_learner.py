@@ -9,13 +9,13 @@ import mitsuba as mi
 import numpy as np
 
 from ...arrays import from_numpy
+from ...maps.swarm.cells import CellDensities, Cells
+from ...maps.swarm.film_tiles import FilmTiles
 from ...transport.colour import to_rgb
 from ...transport.estimator import CameraRays
 from ..learner import Learner
 from ..pixel_estimates import brightness
-from .cells import CellDensities, Cells
 from .estimate import Form, Grid, Shares, estimate
-from .film_tiles import FilmTiles
 from .tile_counts import Candidate, Choices, TileCounts
 
 #: How densities may follow from what was found; and how they do as long as nothing is known of

@@ -13,9 +13,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...arrays import from_numpy
-from ...discrete_sampling import ONE_MINUS_EPSILON
-from ...transport.observer import Observer
+from ..arrays import from_numpy
+from ..discrete_sampling import ONE_MINUS_EPSILON
+from ..transport.observer import Observer
 
 #: Edge of a tile in pixels, at least; and tiles of a film, at most.
 _TILE, _MOST_TILES = 8, 8192

@@ -7,10 +7,10 @@ import mitsuba as mi
 import numpy as np
 
 from ...arrays import from_numpy
+from ...maps.sample_trees import SampleTrees
 from ...regions.nested_regions import NestedRegions
 from ...regions.surface_sides import lit_normal
 from .path_records import PathRecords
-from .sample_trees import SampleTrees
 from .tree_builder import UNIFORM, Samples, TreeBuilder
 
 #: The weight, in samples, of the surrounding region as the prior of a region's mean radiance.

@@ -6,9 +6,9 @@ import mitsuba as mi
 import numpy as np
 
 from ...arrays import from_numpy
+from ...decisions.roulette.adjoint_roulette import AdjointRoulette
 from ...transport.path_decisions import Roulette
 from ..learner import Learner
-from ..roulette.adjoint_roulette import AdjointRoulette
 from .guide_learner import GuideLearner
 
 

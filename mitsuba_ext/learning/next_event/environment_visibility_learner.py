@@ -7,11 +7,11 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from ...decisions.next_event.two_stage import TwoStage
 from ...lights.environment_texels import EnvironmentTexels
 from ...lights.texel_sums import TexelSums
+from ...maps.environment_visibility import PrimaryVisibility, VisibilityCounts, WorldVisibility
 from ..learner import Learner
-from .two_stage import TwoStage
-from .visibility_maps import PrimaryVisibility, VisibilityCounts, WorldVisibility
 
 #: Cells of a tile in each space: columns and rows, powers of two.
 CELLS = {"primary": (16, 16), "world": (32, 16)}

@@ -6,11 +6,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...lights.choice import Choice
 from ...transport.mis import power_heuristic
 from ...transport.observer import Observer
 from ..benefit import BATCHES, TABLE, gain_of, trimmed_batches
 from ..pixel_estimates import PixelEstimates, brightness
-from .light_table import Choice
 
 #: Connections of a path that are recorded, those of its first vertices; and paths of a pass, at
 #: most, about.

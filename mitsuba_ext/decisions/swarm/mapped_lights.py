@@ -13,11 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...maps.swarm.cells import CellDensities, Cells
 from ...transport.path_decisions import EmitterSampling, LightNumbers
-from ..pixel_estimates import brightness
-from .cells import CellDensities, Cells
-from .map_learner import MapLearner
-from .tile_counts import Choices
 
 #: Bits of a cell's number: of all, of those that tell the light, and of those of each axis of it.
 _BITS, _LIGHT_BITS, _POINT_BITS = 11, 8, 5
@@ -109,7 +106,7 @@ class LightMaps:
     """The maps, and how they warp the numbers of a connection.
 
     Attributes:
-        cells, maps, tiles: See :class:`~mitsuba_ext.decisions.swarm.camera_maps.MappedNumbers`.
+        cells, maps, tiles: See :class:`~mitsuba_ext.decisions.swarm.mapped_numbers.MappedNumbers`.
         is_recorded: Does somebody learn?
     """
 
@@ -138,37 +135,3 @@ class LightMaps:
         u[: len(drawn)] = drawn
         choice = u.pop(0) if has_choice else numbers.choice
         return LightNumbers(mi.Point2f(*u), choice), LightChoice(cell, density, active)
-
-
-class LightMapLearner(MapLearner):
-    """Learns :class:`LightMaps`, which are its ``decision``."""
-
-    def __init__(self, name: str, decision: LightMaps, width: int, height: int, **how) -> None:
-        super().__init__(name, decision, width, height, decision.cells, **how)
-        decision.is_recorded = True
-
-    def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
-        super().begin(lanes, pixel)
-        if not self.is_learning:
-            return
-        self._lane = dr.arange(mi.UInt32, lanes)
-        self._cell = dr.zeros(mi.UInt32, lanes)
-        self._density, self._value = dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes)
-        dr.eval(self._lane, self._cell, self._density, self._value)
-
-    def connection(self, choice, vertex, ds, contribution, value, pdf, visible, tested) -> None:
-        if not self.is_learning:
-            return
-        found = visible & choice.is_mapped
-        dr.scatter(self._cell, choice.cell, self._lane, found)
-        dr.scatter(self._density, choice.density, self._lane, found)
-        dr.scatter(self._value, brightness(value), self._lane, found)
-
-    def choices(self, radiance: mi.Float) -> Choices:
-        value = self._value * self.importance
-        return Choices(mi.UInt32(0), self._cell, self._density, value, self._density > 0)
-
-    def stop(self) -> None:
-        super().stop()
-        self.decision.is_recorded = False
-        self._lane = self._cell = self._density = self._value = None

@@ -9,13 +9,13 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ...lights.light_cells import LightCells
-from ...lights.spectra import brightness
-from ...lights.weights import unoccluded_weights
-from ...regions.surface_rows import SurfaceRows
-from ...transport.observer import Observer
-from ...transport.vertex import Vertex
-from .light_table import Choice
+from ..lights.choice import Choice
+from ..lights.light_cells import LightCells
+from ..lights.spectra import brightness
+from ..lights.weights import unoccluded_weights
+from ..regions.surface_rows import SurfaceRows
+from ..transport.observer import Observer
+from ..transport.vertex import Vertex
 
 #: Fixed point of the squared ratios. They are clipped, so that a single one cannot dominate.
 _UNIT, _LIMIT = 2.0**20, 16.0

@@ -1,0 +1,52 @@
+"""Makes a roulette on the shadow ray of a light map that another learner fills."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from ...decisions.shadow_test.light_map_roulette import LightMapRoulette
+from ...decisions.shadow_test.rejection_law import WORTHWHILE
+from ...transport.path_decisions import ShadowTest
+from ..learner import Learner
+from ..next_event.light_map_learner import LightMapLearner
+
+
+class LightMapRouletteLearner(Learner):
+    """Makes a roulette of the light map that another learner fills.
+
+    Parameters:
+        lights: Who learns the map; comes before this learner.
+        slope, floor, law: See :class:`.LightMapRoulette`.
+    """
+
+    def __init__(self, lights: LightMapLearner, slope: float, floor: float, law: str) -> None:
+        self._lights, self._law = lights, {"slope": slope, "floor": floor, "law": law}
+        self._summary = ""
+        lights.keep_map()
+
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> None:
+        return None
+
+    def learn(self, scene: mi.Scene, is_last: bool) -> ShadowTest | None:
+        if not is_last or self._lights.map is None:
+            return None
+        return self._make_roulette()
+
+    def state(self) -> dict[str, np.ndarray]:
+        # All of it is in the light map
+        return {} if self._lights.map is None else {"law": np.array(self._law["law"])}
+
+    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> ShadowTest | None:
+        return self._make_roulette()
+
+    def _make_roulette(self) -> ShadowTest | None:
+        """The roulette by the map; ``None`` if it does not pay."""
+        roulette = LightMapRoulette(self._lights.map, **self._law)
+        pays = roulette.rejected_share >= WORTHWHILE
+        verb = "rejects" if pays else "does not reject"
+        self._summary = f"{verb} {roulette.rejected_share:.0%} of the shadow rays"
+        return roulette if pays else None
+
+    def __str__(self) -> str:
+        return self._summary
