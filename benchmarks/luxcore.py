@@ -7,8 +7,8 @@ variance and CPU time:
 The scene is handed over as meshes, to another process: LuxCore's libraries and Mitsuba's do not go
 together in one. It must be made of ``diffuse``, smooth ``dielectric`` and smooth ``conductor`` (a
 mirror of the same colour there), area lights and a ``perspective`` camera, and is rendered as a
-square. Errors and times are those of ``benchmarks/equal_samples.py``, with the mean of all images of
-``bdpt``. Images of LuxCore are scaled to that mean; ``mean`` shows by how much they differed.
+square. Errors and times are those of ``benchmarks/equal_samples.py``, with the mean of all images
+of ``bdpt``. Images of LuxCore are scaled to that mean; ``mean`` shows by how much they differed.
 """
 
 from __future__ import annotations

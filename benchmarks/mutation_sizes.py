@@ -3,8 +3,8 @@
     .venv/bin/python benchmarks/mutation_sizes.py ring pool keyhole --spp 32 --seeds 8
 
 Both sizes are multiplied by each factor. Writes a row of Markdown for each scene and integrator:
-the error (as in ``benchmarks/equal_samples.py``) in units of that of the default sizes, and the rate
-of accepted small steps.
+the error (as in ``benchmarks/equal_samples.py``) in units of that of the default sizes, and the
+rate of accepted small steps.
 """
 
 from __future__ import annotations

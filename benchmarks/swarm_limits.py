@@ -1,5 +1,5 @@
 """Measures one kind of map alone, and what maps that know everything would gain:
-``.venv/bin/python benchmarks/swarm_limits.py six_balls time_map --depth 2 --spp 16 --edges 1,2,4,8``.
+``.venv/bin/python benchmarks/swarm_limits.py six_balls time_map --depth 2 --spp 16 --edges 1,2,4``.
 
 The gain is σ/μ (root mean squared error over the mean of the image) of plain paths, divided by that
 of ``swarm_path`` with this map only, over four seeds, at equal samples and at equal CPU time. For

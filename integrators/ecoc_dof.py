@@ -71,7 +71,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
 
     **Use it when** a preview, an animation or a look is wanted, and defocus makes the noise.
     **Not when** the image must be right: use :monosp:`path` with a :monosp:`thinlens`.
-    ``docs/results.md`` has figures, and pictures that show where it errs.
+    ``docs/results/ecoc_dof.md`` has figures, and pictures that show where it errs.
 
     **Layers.** There are up to five: two before the focus, one in focus, two behind; fewer where
     all things are blurred alike. One ray for each pixel tells where the limits between them are.
