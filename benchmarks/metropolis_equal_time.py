@@ -6,8 +6,8 @@
 For each scene and integrator, writes a row of Markdown: mutations or samples per pixel, the CPU
 time, the error, the 99th percentile of the pixels' errors, both also in units of those of the first
 integrator, and the mean of the image. Errors are those of ``benchmarks/equal_samples.py``:
-variances between seeds. Those of filters, which are biased, are squared differences from the mean of the
-unbiased integrators, less the variance of that.
+variances between seeds. Those of filters, which are biased, are squared differences from the mean
+of the unbiased integrators, less the variance of that.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Measures patterns and weights of light, lens, time and wavelength samples on scenes.
 
 ``benchmarks/reweighted_rendering.py direct`` (or ``lens``, ``time``, ``wavelength``) prints, for
-each scene, the error and the time of all patterns and weights, and of the path tracer with Mitsuba's
-samplers (five minutes per scene). It plots the gains to ``docs/figures``.
+each scene, the error and the time of all patterns and weights, and of the path tracer with
+Mitsuba's samplers (five minutes per scene). It plots the gains to ``docs/figures``.
 """
 
 from __future__ import annotations

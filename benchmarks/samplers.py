@@ -4,8 +4,8 @@
 
 Writes one row of Markdown for each scene and number of samples: error and time of each sampler, in
 units of those of ``independent``. Errors are those of ``benchmarks/equal_samples.py``. Samplers
-that round the number of samples up are credited with what they take: their error is multiplied by it,
-and their time divided.
+that round the number of samples up are credited with what they take: their error is multiplied by
+it, and their time divided.
 
 Samplers may have parameters. Noise that blurs away is compared by ``--blur``, the standard
 deviation in pixels of a Gaussian filter of the images:

@@ -54,8 +54,9 @@ class AdaptiveSampling(WrappingIntegrator):
     and their samples take no longer; or a :monosp:`threshold` is to end the render. **Not when**
     the mean error counts, noise is about the same everywhere, noisy pixels are also the slow ones
     (things before an empty background), or a stratified sampler does better than independent
-    samples. ``docs/results/adaptive.md`` has figures: in the three scenes measured, at equal time, the 95th
-    percentile of the errors was 0.93 to 1.21 of that of uniform samples, and the mean 1.06 to 1.31.
+    samples. ``docs/results/adaptive.md`` has figures: in the three scenes measured, at equal time,
+    the 95th percentile of the errors was 0.93 to 1.21 of that of uniform samples, and the mean 1.06
+    to 1.31.
 
     The samples of the sensor (:monosp:`spp`) are the mean over all pixels. The first pass takes the
     same number of each pixel, and so do the pilots of a nested integrator that learns. Each later
