@@ -155,6 +155,7 @@ class LearnedLights(DecisionParameters):
             int(self.max_memory * 2**20),
             setting.pilot_samples,
             film_extent(setting.sensor.film())[0],
+            setting.pixel_count * setting.spp,
             Path(self.load_map) if self.load_map else None,
             Path(self.save_map) if self.save_map else None,
             self._plugin,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
@@ -32,6 +33,11 @@ _DEFENSIVE = 0.1
 #: the map for each sample of the pilots (with about three connections each), at most.
 _GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 
+#: Entries of the map of the first pilot for each sample of the render, at most: an entry takes a
+#: third of the time of a sample, all stages together. A finer map follows where the first pilot
+#: promises at least this efficiency.
+_TRIAL_ENTRIES, _FINER_EFFICIENCY = 0.15, 1.2
+
 #: The efficiency that choosing from a table must reach; and that which, from few samples, lets
 #: learning go on: tables of more are little better.
 _LEAST_EFFICIENCY, _TRIAL_EFFICIENCY = 1.03, 1.0
@@ -53,6 +59,7 @@ class LightMapLearner(Learner):
         max_memory: Bytes that the map may take.
         pilot_samples: Samples of all pilots together.
         film_width: Pixels of a row of the film, with its border where that is sampled.
+        render_samples: Samples of the render, pilots included.
         load, save: Files of a map to begin with, and of the map that was learned.
         plugin: What errors call the plugin.
 
@@ -67,12 +74,14 @@ class LightMapLearner(Learner):
         max_memory: int,
         pilot_samples: int,
         film_width: int,
+        render_samples: float = math.inf,
         load: Path | None = None,
         save: Path | None = None,
         plugin: str = "neepp",
     ) -> None:
         self.target, self.grid = target, grid
         self.max_memory, self.pilot_samples = max_memory, pilot_samples
+        self.render_samples = render_samples
         self.load, self.save, self.plugin = load, save, plugin
         self._pixels = PixelEstimates(film_width)
         # A loaded map brings its region and its rows
@@ -81,7 +90,10 @@ class LightMapLearner(Learner):
         self.map: LightMap | None = None
         self._records: ConnectionRecords | None = None
         self._summary, self._effect = "", "not measured"
+        self._efficiency = 1.0
         self._is_tested = False
+        # Makes a finer map than that of the first pilot
+        self._finer_map: Callable[[], LightMap] | None = None
 
     def keep_map(self) -> None:
         """Asks for the map also where it does not pay for the choice of lights."""
@@ -96,7 +108,7 @@ class LightMapLearner(Learner):
                 parameter=f'"{self.plugin}": the parameter "load_map"',
             )  # fmt: skip
         elif dr.width(p) > 0:
-            self.map = self._new_map(scene, p, n)
+            self.map = self._first_map(scene, p, n)
             # Mitsuba samples these with a wrong density
             self._is_needed |= self.map.cells.has_smooth_meshes
             if self.map.cells.count == 1 and not self._is_needed:
@@ -104,18 +116,32 @@ class LightMapLearner(Learner):
         if self.map is None:
             return None
         self._scene = scene
-        self._set_as_path(scene)
+        return self._begin_map()
+
+    def _begin_map(self) -> LightTable:
+        """The choice of the first pilot that fills a map."""
+        self._set_as_path(self._scene)
+        self._is_tested = False
         if not self._is_needed:
             self._records = ConnectionRecords(
-                scene, self._pixels, self.map.rows.count, self._as_path
+                self._scene, self._pixels, self.map.rows.count, self._as_path
             )
         return self._selection(self._probabilities(self.map.unoccluded))
 
-    def _new_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
+    def _first_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
+        """The map of the first pilot."""
+        limit = math.inf if self.grid else self.pilot_samples * _ENTRIES_PER_SAMPLE
+        trial = math.inf if self._is_needed else self.render_samples * _TRIAL_ENTRIES
+        light_map = self._new_map(scene, p, n, min(limit, trial))
+        if trial < limit and light_map.rows.resolution < _GRID:
+            self._finer_map = lambda: self._new_map(scene, p, n, limit)
+        return light_map
+
+    def _new_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f, limit: float) -> LightMap:
+        """The finest map of at most ``limit`` entries."""
         bbox = region(p)
         grid = self.grid or _GRID
         cells = LightCells(scene, voxel_edges(bbox, grid))
-        limit = math.inf if self.grid else self.pilot_samples * _ENTRIES_PER_SAMPLE
         counts = RowCounts(bbox, p, n)
 
         def fits(grid: int) -> bool:
@@ -174,8 +200,13 @@ class LightMapLearner(Learner):
         self.map.evaluate()
         probabilities = self._probabilities(self.map.weights(self.target))
         if self._records is not None and not self._pays(probabilities, is_last):
-            self.map = self._records = None
+            self.map = self._records = self._finer_map = None
             return EmitterSampling()
+        if self._finer_map is not None and not is_last:
+            make, self._finer_map = self._finer_map, None
+            if self._records is not None and self._efficiency >= _FINER_EFFICIENCY:
+                self.map = make()
+                return self._begin_map()
         if is_last:
             self._summary = f"{self.map}, {self._effect}"
             if self.save is not None:
@@ -193,7 +224,7 @@ class LightMapLearner(Learner):
         return self._selection(self._probabilities(self.map.weights(self.target)))
 
     def finish(self) -> None:
-        self.map = self._scene = None
+        self.map = self._scene = self._finer_map = None
 
     def _set_as_path(self, scene: mi.Scene) -> None:
         cells = self.map.cells
@@ -213,7 +244,7 @@ class LightMapLearner(Learner):
             as_path = dr.tile(self._as_path, self.map.rows.count)
             gain = records.predicted_gain(self.map.square_ratios(as_path, probabilities))
             is_trial, cost = not is_last, records.least_cost
-        efficiency = 1 / (max(1 - gain, 1e-3) * cost)
+        efficiency = self._efficiency = 1 / (max(1 - gain, 1e-3) * cost)
         self._effect = f"about {max(0.0, gain):.0%} less variance in {cost:.2f} x the time"
         # A trial need not be certain
         least, error = (_TRIAL_EFFICIENCY, 0.0) if is_trial else (_LEAST_EFFICIENCY, error)

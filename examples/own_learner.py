@@ -1,0 +1,91 @@
+"""A learner of one's own: choose lights by what the pilot's connections to each have brought.
+
+    mitsuba-ext compare scenes/window.xml --plugin examples/own_learner.py --size 160x90 \\
+        --spp 64 path "composed_path:next_event=[proven_lights],pilot_spp=8"
+
+Unlike ``learned_lights``, this one has the same probabilities everywhere in the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mitsuba_ext  # noqa: F401  (before mitsuba: it chooses the LLVM library)
+from mitsuba_ext.composition.decision_parameters import DecisionParameters, ParameterReader, Setting
+from mitsuba_ext.composition.decision_plugin import DecisionPlugin
+from mitsuba_ext.decisions.next_event.light_table import LightTable, OneRow
+from mitsuba_ext.learning.learner import Learner
+from mitsuba_ext.lights.light_cells import LightCells
+from mitsuba_ext.lights.spectra import brightness
+
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
+import numpy as np  # isort: skip
+
+#: The share of the choices that stays uniform: a light that no pilot sample saw may shine too.
+UNIFORM_SHARE = 0.2
+
+#: Sums are integers in this unit, so that the order in which threads add does not change them.
+UNIT = 2.0**20
+
+
+class ProvenLights(Learner):
+    """Sums up, for each light, what connections to it bring to the image."""
+
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightTable:
+        self._cells = LightCells(scene, None)
+        self._sums = dr.zeros(mi.UInt64, self._cells.count)
+        dr.eval(self._sums)
+        return self._table(np.ones(self._cells.count))
+
+    def connection(self, choice, vertex, ds, contribution, value, pdf, visible, tested) -> None:
+        """The walk has traced the shadow ray of a connection, which brings ``value``."""
+        brought = dr.minimum(brightness(value), 1e3)
+        dr.scatter_add(self._sums, mi.UInt64(brought * UNIT), choice.cell, visible)
+
+    def learn(self, scene: mi.Scene, is_last: bool) -> LightTable:
+        return self._table(self._sums.numpy().astype(float))
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What a render that goes on later needs, to choose as this one does."""
+        return {"sums": self._sums.numpy()}
+
+    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightTable:
+        self._cells = LightCells(scene, None)
+        return self._table(state["sums"].astype(float))
+
+    def _table(self, sums: np.ndarray) -> LightTable:
+        learned = sums / sums.sum() if sums.sum() > 0 else np.full(len(sums), 1 / len(sums))
+        self._shares = (1 - UNIFORM_SHARE) * learned + UNIFORM_SHARE / len(sums)
+        return LightTable(OneRow(), self._cells, mi.Float(self._shares.tolist()))
+
+    def __str__(self) -> str:
+        return f"proven lights: the most likely one has {self._shares.max():.0%} of the choices"
+
+
+class ProvenLightsParameters(DecisionParameters):
+    """Makes the learner of a render. There are no parameters to read from the scene."""
+
+    name = "proven_lights"
+    slots = ("next_event",)
+
+    #: Samples per pixel from which it learns, unless the integrator's ``pilot_spp`` says otherwise
+    pilot_spp = 8
+
+    def __init__(self, read: ParameterReader) -> None:
+        pass
+
+    def can_learn(self, scene: mi.Scene, spp: int) -> bool:
+        return spp > 0 and len(scene.emitters()) > 1
+
+    def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
+        return ProvenLights() if self.can_learn(setting.scene, setting.pilot_spp) else None
+
+
+class ProvenLightsPlugin(DecisionPlugin):
+    """What a scene file nests into the slot ``next_event``."""
+
+    kind = ProvenLightsParameters
+
+
+mi.register_sampler("proven_lights", lambda props: ProvenLightsPlugin(props))
