@@ -6,7 +6,7 @@
 #   make test    runs the default tests, on all cores
 #   make test-slow  runs the long statistical tests, and other slow tests
 #   make bench   runs the benchmarks on our scenes, and on ../shared/scenes if it exists; writes a
-#                report, and the figures of the README
+#                report, and the table and the plot of docs/results/benchmark.md
 #   make lint    checks the code's style
 #   make clean   removes everything that was built, `.venv` included, but not `out/`
 #

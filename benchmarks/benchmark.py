@@ -1,8 +1,8 @@
 """Speed against error of our integrators and ``path``, on our scenes and on those of the papers.
 
 ``make bench`` runs all of it (more than an hour on two cores), writes one report, and puts its
-figures into the README; ``benchmarks/benchmark.py open kitchen`` runs some scenes, and does not
-change the README. Runs that ``out/benchmark`` holds are not rendered again.
+figures into docs/results/benchmark.md; ``benchmarks/benchmark.py open kitchen`` runs some scenes,
+and does not change that page. Runs that ``out/benchmark`` holds are not rendered again.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ THEIRS = {
 #: Maximum depth of the stored references, and of all integrators.
 DEPTH = {"max_depth": 6}
 
-README = ROOT / "README.md"
+PAGE = ROOT / "docs" / "results" / "benchmark.md"
 FIGURE = ROOT / "docs" / "figures" / "efficiency.svg"
 
 
@@ -109,12 +109,12 @@ def _setup(name: str) -> compare.SceneSetup:
 
 
 def _write_table(results: dict[str, Any]) -> None:
-    """Replaces the table between the marks in the README."""
-    text = README.read_text(encoding="utf-8")
+    """Replaces the table between the marks in the page."""
+    text = PAGE.read_text(encoding="utf-8")
     marks = "<!-- benchmark: begin -->", "<!-- benchmark: end -->"
     pattern = f"(?<={marks[0]}\n).*(?={marks[1]})"
     table = "\n".join(_table(results)) + "\n"
-    README.write_text(re.sub(pattern, lambda _: table, text, flags=re.DOTALL), encoding="utf-8")
+    PAGE.write_text(re.sub(pattern, lambda _: table, text, flags=re.DOTALL), encoding="utf-8")
 
 
 def _table(results: dict[str, Any]) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from techniques import Technique
+from test_furnace import check_furnace
 
 from mitsuba_ext import compare
 
@@ -37,6 +40,35 @@ def test_comparison_runs_in_any_folder(tmp_path, monkeypatch):
     (comparison,) = seen
     assert all(Path(setup.source).is_file() for setup in comparison.scenes)
     assert comparison.folder.resolve() == tmp_path / "out" / "example"
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize(
+    ("file", "plugin"), [("nearest_light", "nearest_light"), ("own_learner", "proven_lights")]
+)
+def test_a_technique_of_ones_own_has_the_exact_radiance(file: str, plugin: str):
+    runpy.run_path(str(EXAMPLES / f"{file}.py"))
+    technique = Technique("composed_path", {"next_event": {"type": plugin}, "rr_depth": 100})
+    check_furnace("furnace_lamps", technique, max_depth=3, precision=0.005)
+    assert len((EXAMPLES / f"{file}.py").read_text().splitlines()) < 100
+
+
+def test_the_page_on_techniques_shows_lines_of_the_example():
+    page = (EXAMPLES.parent / "docs" / "add_a_technique.md").read_text(encoding="utf-8")
+    example = (EXAMPLES / "nearest_light.py").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    lines = {line for block in blocks for line in block.splitlines() if line.strip(" .")}
+    assert blocks and all(line in example for line in lines)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file", ["frames", "denoise"])
+def test_other_examples_write_their_images(file: str, tmp_path, monkeypatch):
+    if file == "denoise":
+        pytest.importorskip("mitsuba_oidn")
+    monkeypatch.chdir(tmp_path)
+    subprocess.run([sys.executable, EXAMPLES / f"{file}.py"], check=True, timeout=300)
+    assert len(list(tmp_path.glob("*.png"))) == {"frames": 8, "denoise": 2}[file]
 
 
 @pytest.mark.slow

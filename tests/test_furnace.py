@@ -30,7 +30,10 @@ def _has_answer(furnace: str, max_depth: int) -> bool:
     return any(region.exact(max_depth) is not None for region in FURNACES[furnace].regions)
 
 
-def _check(furnace: str, technique: Technique, max_depth: int, precision: float = 0.002) -> None:
+def check_furnace(
+    furnace: str, technique: Technique, max_depth: int, precision: float = 0.002
+) -> None:
+    """Fails if the radiance of a furnace is not the exact one."""
     regions = [r for r in FURNACES[furnace].regions if r.exact(max_depth) is not None]
     scene = load(furnace, width=SIZE, height=SIZE)
     spp, seeds = (SPP // 4, MANY_SEEDS) if technique.makes_splats else (SPP, 2)
@@ -54,11 +57,11 @@ def test_furnace_has_the_exact_radiance(furnace: str, max_depth: int, name: str)
     # Where nine of ten shadow rays are rejected, there is noise; and where light paths miss things
     precision = 0.01 if TECHNIQUES[name].parameters.get("floor") else 0.002
     precision = 0.02 if name == "light_tracer" else precision
-    _check(furnace, TECHNIQUES[name], max_depth, precision)
+    check_furnace(furnace, TECHNIQUES[name], max_depth, precision)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("furnace", FURNACES)
 def test_path_has_the_exact_radiance(furnace: str) -> None:
     """The answers themselves, checked once against Mitsuba."""
-    _check(furnace, REFERENCE, -1)
+    check_furnace(furnace, REFERENCE, -1)

@@ -1,1 +1,2 @@
-"""Paths from lights: emission, the light walk with its stored vertices, and the sensor's end."""
+"""Light paths: emission, the light walk with its stored vertices, and connections to camera paths
+and to the sensor."""

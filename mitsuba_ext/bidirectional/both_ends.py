@@ -1,4 +1,4 @@
-"""Choices of lights that do not depend on the end from which a path is looked at."""
+"""Choices of lights that are the same whether a camera path or a light path reaches the vertex."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from ..transport.path_decisions import EmitterSampling
 
 
 def from_both_ends(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
-    """A vertex as if it were seen at right angles to the surface: from the side from which a BSDF
-    that does not transmit is seen by camera and light alike, and from the front of others."""
+    """The interaction with ``wi`` replaced by a direction along the normal. For a two-sided BSDF
+    that does not transmit, this direction is on the side of ``wi``, since camera paths and light
+    paths reach the vertex from the same side. For others it is on the front side."""
     flags = si.bsdf().flags()
     transmits = mi.has_flag(flags, mi.BSDFFlags.Transmission)
     is_behind = (si.wi.z < 0) & mi.has_flag(flags, mi.BSDFFlags.BackSide) & ~transmits
@@ -22,14 +23,14 @@ def from_both_ends(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
 
 
 class FromBothEnds(EmitterSampling):
-    """Asks a next event decision about vertices as :func:`from_both_ends` shows them.
+    """Passes vertices to a next event decision as :func:`from_both_ends` changes them.
 
     A decision may distinguish the two sides of a surface. A camera path and a light path reach the
-    vertex from different directions, behind transmission from different sides. Only if both are
-    told the same density, the weights of all techniques add up to one.
+    vertex from different directions, and from different sides if the surface transmits. The MIS
+    weights of all techniques add up to one only if both compute the same density.
 
     Parameters:
-        decision: What chooses the lights.
+        decision: The decision that chooses the lights.
     """
 
     def __init__(self, decision: EmitterSampling) -> None:

@@ -26,8 +26,8 @@ class End:
     Attributes:
         si: The interaction there.
         wo: Direction towards the other end, local.
-        pdf: Density with which the subpath that comes from ``si.wi`` goes on to the other end.
-        reverse_pdf: Density of the opposite way through the vertex.
+        pdf: Density with which the subpath that comes from ``si.wi`` samples ``wo``.
+        reverse_pdf: Density with which a path that comes from ``wo`` samples ``si.wi``.
         sums: Partial sums of the subpath.
     """
 
@@ -45,8 +45,8 @@ def joining_weight(
     squared_distance: mi.Float,
     expected: mi.Float | float = 1.0,
 ) -> mi.Float:
-    """The MIS weight of joining two subpaths. ``expected`` is what the selection of light vertices
-    expects, if there is one."""
+    """The MIS weight of connecting two subpaths. ``expected`` is :meth:`SubpathSelection.expected`,
+    if a selection chooses the vertices."""
     inverse = dr.rcp(squared_distance)
     to_one = other.pdf * geometric_cosine(one.si, one.wo) * inverse
     to_other = one.pdf * geometric_cosine(other.si, other.wo) * inverse
@@ -63,9 +63,10 @@ def joining_by_camera(
     is_first: mi.Bool | bool,
     factor: mi.Float | float,
 ) -> mi.Vector2f | tuple[()]:
-    """:meth:`PartialSums.by_camera` of joining the subpath of a camera, which ends with ``one``, to
-    that of a light, of which ``other`` is the last vertex, and the first where ``is_first``.
-    ``factor`` is 1 / (how often they are connected): in truth, not as MIS weights assume."""
+    """:meth:`PartialSums.by_camera` for connecting a camera path that ends in ``one`` to a light
+    path that ends in ``other``, at its first vertex behind the light where ``is_first``.
+    ``factor`` is 1 / (expected number of times they are connected): the true number, not that
+    which MIS weights assume."""
     to_other = one.pdf * geometric_cosine(other.si, other.wo) * dr.rcp(squared_distance)
     ratios = sums.by_camera(to_other, other.sums, other.reverse_pdf, is_first)
     return () if isinstance(ratios, tuple) else ratios * factor
@@ -76,15 +77,15 @@ class LightSubpaths(Subpaths):
 
     Parameters:
         scene: The scene.
-        vertices: Of the light paths, of which there are as many as camera paths. There is at least
-            one vertex.
-        choice: Chooses among them.
+        vertices: The vertices of the light paths, at least one. There are as many light paths as
+            camera paths.
+        choice: Chooses among these vertices.
         sums: Computes the partial sums of the MIS weights.
-        query: How a ray meets the scene.
-        connections: Connections of each vertex.
+        query: Intersects rays with the scene.
+        connections: Number of connections of each camera path vertex.
         max_depth: Longest path in segments.
         observer: Is told of connections to vertices that are chosen by regions.
-        techniques: Is told what is found.
+        techniques: Is told the contributions of connections.
     """
 
     def __init__(
@@ -127,12 +128,13 @@ class LightSubpaths(Subpaths):
     def _connect(
         self, scene: mi.Scene, numbers: tuple[mi.Point2f, ...], vertex: Vertex, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.UInt32]:
-        """One connection, to a vertex that ``numbers`` choose."""
+        """Connects ``vertex`` to a light path vertex that ``numbers`` choose. Returns the
+        contribution, and the number of shadow rays."""
         considered = active
         chosen = self._choice.choose(numbers, vertex, active)
         active, factor = chosen.active, chosen.factor * self._share
         other = self._vertices.at(chosen.index, active)
-        # The path's segments: those of both subpaths, and one in between
+        # Segments of the path: those of both subpaths, and one that connects them
         active &= vertex.depth + other.depth + 2 <= self._max_depth
         si, far = vertex.si, other.si
         d = far.p - si.p
@@ -142,7 +144,7 @@ class LightSubpaths(Subpaths):
         d /= dr.select(active, distance, 1)
         wo, back = si.to_local(d), far.to_local(-d)
 
-        # ----- What both ends let through -----
+        # ----- Throughput of the connection -----
         value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, active)
         value = si.to_world_mueller(value, -wo, si.wi)
         far_bsdf = far.bsdf()
@@ -153,7 +155,7 @@ class LightSubpaths(Subpaths):
         )
         value *= vertex.path.β * other.β * (factor / dr.select(active, squared_distance, 1))
 
-        # ----- How else this path could have been found -----
+        # ----- MIS weight -----
         reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
         far_pdf = bsdf_density(far_bsdf, self._ctx, far, back, active)
         near_end = End(si, wo, pdf, reverse, vertex.path.sums)
@@ -163,7 +165,7 @@ class LightSubpaths(Subpaths):
         )
         value *= mis
 
-        # ----- Is anything in between? -----
+        # ----- Shadow ray -----
         active &= (dr.max(dr.abs(value)) > 0) & dr.all(dr.isfinite(value))
         ds = dr.zeros(mi.DirectionSample3f, dr.width(active))
         ds.p, ds.d, ds.dist = far.p, d, distance

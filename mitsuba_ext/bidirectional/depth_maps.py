@@ -10,35 +10,40 @@ from ..transport.lens_view import LensView
 from ..transport.numbers import hashed
 from ..transport.path_decisions import SceneQuery
 
-#: The numbers that choose the middle of the aperture.
+#: The random number, in x and y, that chooses the middle of the aperture.
 _MIDDLE = 0.5
 
 
 class DepthMaps:
-    """The inverse depth of what is seen through each piece of the aperture. The pieces have equal
-    areas: they are squares of the numbers that choose points of the aperture.
+    """A map for each piece of the aperture: the inverse depth of the surfaces seen through it. The
+    pieces have equal areas: each is a square in the space of the random numbers that choose points
+    of the aperture.
 
     A pixel has one ray, from a random point of the piece through a random point of the pixel, at a
-    random time. A map takes 4 bytes for each pixel. All is in the frame in which the sensor rests.
+    random time. A map takes 4 bytes for each pixel. All points are in the frame in which the sensor
+    rests.
 
-    Where the middle of the aperture sees a point, and its inverse depth, are called the *place* of
-    the point: x and y in units of the film's size, and z.
+    The *place* of a point is its position on the film, seen through the middle of the aperture (x
+    and y, in units of the film's size), and its inverse depth (z).
 
     Parameters:
         scene: The scene.
         sensor: A ``thinlens``, which may move.
-        query: How a ray meets the scene.
-        pieces: There are ``pieces``² of them.
-        most_pixels: Of a map along its longer edge. It has no more than the film.
+        query: Intersects rays with the scene.
+        pieces: The aperture has ``pieces``² pieces.
+        most_pixels: Largest number of pixels of a map along its longer edge. A map never has more
+            pixels than the film.
 
     Attributes:
-        shape (tuple[int, int]): Width and height.
-        places (mi.Point3f): Of everything that was seen, in any map.
-        nearest, farthest (float): Inverse depths of the nearest and the farthest of these.
-        margins (tuple[float, float]): How far the choice of the point of the aperture moves points
-            between these depths on the film, in x and y, from where its middle sees them.
-        parallax (float): By how much more a point at one of these depths is moved than one at the
-            other, between opposite points of the aperture; in units of the film's longer edge.
+        shape (tuple[int, int]): Width and height of a map.
+        places (mi.Point3f): The places of all points that were seen, in any map.
+        nearest, farthest (float): Inverse depths of the nearest and the farthest of these points.
+        margins (tuple[float, float]): For points between these depths: the largest distance on the
+            film, in x and y, between their positions seen through the middle and through the edge
+            of the aperture.
+        parallax (float): Between opposite points of the aperture, points at these two depths move
+            on the film by different distances. This is the difference, in units of the film's
+            longer edge.
     """
 
     def __init__(
@@ -53,13 +58,13 @@ class DepthMaps:
         self.nearest = self.farthest = self.parallax = 0.0
         self.margins = (0.0, 0.0)
         if dr.width(self.places) > 0:
-            # Not equal: they are divided by their difference
+            # Never equal: the table divides by their difference
             self.nearest = 1.001 * float(dr.slice(dr.max(self.places.z)))
             self.farthest = 0.999 * float(dr.slice(dr.min(self.places.z)))
             self._measure(size)
 
     def place(self, p: mi.Point3f) -> mi.Point3f:
-        """The place of a point; 0 where it is behind the lens."""
+        """The place of a point; 0 if the point is behind the lens."""
         return self._place(p, self._view.inverse_depth(p, mi.Bool(True)))
 
     def _place(self, p: mi.Point3f, inverse_depth: mi.Float) -> mi.Point3f:
@@ -76,19 +81,20 @@ class DepthMaps:
         return ds.uv / mi.ScalarVector2f(self._sensor.film().crop_size())
 
     def lens_numbers(self, piece: mi.UInt32, numbers: mi.Point2f) -> mi.Point2f:
-        """The numbers that choose the point of a piece at relative coordinates in [0, 1)²."""
+        """The random numbers that choose a point of a piece: from relative coordinates in it,
+        [0, 1)²."""
         corner = mi.Point2f(piece % self.pieces, piece // self.pieces)
         return (corner + numbers) / self.pieces
 
     def is_seen(
         self, place: mi.Point3f, numbers: mi.Point2f, piece: mi.UInt32, nearest: mi.Float
     ) -> mi.Bool:
-        """Is a point seen through a point of the aperture, in the map of its piece?
+        """Is a point seen through a point of the aperture, by the map of that piece?
 
         Parameters:
-            place: Of the point.
-            numbers: Choose the point of the aperture.
-            nearest: The inverse depth up to which nothing hides it.
+            place: The point's place.
+            numbers: The random numbers that choose the point of the aperture.
+            nearest: Surfaces with a larger inverse depth than this hide the point.
         """
         seen = self._seen_from(place, numbers)
         active = dr.all((seen >= 0) & (seen < 1))
@@ -122,8 +128,8 @@ class DepthMaps:
         return place.z
 
     def _measure(self, size: list[int]) -> None:
-        """Margins and parallax. The edge of the aperture moves points from the middle of the film
-        as it moves all others."""
+        """Computes margins and parallax, for points seen in the middle of the film. Points seen
+        elsewhere on the film move by the same distances."""
         place = mi.Point3f(_MIDDLE, _MIDDLE, mi.Float([self.farthest, self.nearest]))
         margins = []
         for i in range(2):

@@ -1,4 +1,4 @@
-"""Rays that leave lights, and the densities with which they do."""
+"""Sampling rays that leave lights, and the densities of these rays."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ from . import light_pieces as pieces
 from .light_pieces import LightPieces, Piece
 from .stored_interaction import needs_whole_interaction
 
-#: The share of the rays of a mesh with interpolated normals that leave to the back of a triangle.
+#: The fraction of the rays of a mesh light with interpolated normals that leave to the back of a
+#: triangle.
 _TO_BACK = 1 / 16
 
-#: By how much of Mitsuba's offset rays start above a light. Connections end closer to it: with the
-#: whole offset, light paths miss more of what is near, far from the origin.
+#: Rays start above a light by this fraction of Mitsuba's ray offset. Shadow rays end closer to the
+#: light than the whole offset; with it, light paths would miss more of the surfaces near the light,
+#: in scenes far from the origin.
 _OFFSET = 0.05
 
-#: The radius of the disks on which paths from infinity begin, in units of that of the scene.
+#: The radius of the disks on which paths from lights at infinity begin, in units of the radius of
+#: the scene's bounding sphere.
 _MARGIN = 1.001
 
 #: Words of an emitter in the table of densities.
@@ -36,19 +39,19 @@ class EmittedRay:
 
     Attributes:
         ray: The ray; its origin is offset from the surface.
-        start: The point of the light, as a ray would find it (normals, ``uv``, triangle, shape;
-            ``wi`` is the direction of emission). For lights without surface only ``p``, time and
+        start: The interaction at the point on the light (normals, ``uv``, triangle, shape), with
+            the direction of emission as ``wi``. For lights without surface only ``p``, time and
             wavelengths are meaningful.
         weight: Radiance · cosine / density.
         emitter, index: The emitter, and its number in ``scene.emitters()``.
-        probability: With which the emitter was chosen.
-        pdf_position: Of the point per area (of the light; of the disk at right angles to the ray,
-            for lights at infinity); 1 where the position is a point.
-        pdf_direction: Of the direction per solid angle; 1 where there is only one; see
-            :meth:`LightEmission.densities`.
+        probability: Probability with which the emitter was chosen.
+        pdf_position: Density of the point per area (of the light; for lights at infinity, of the
+            disk perpendicular to the ray); 1 if the light is a point.
+        pdf_direction: Density of the direction per solid angle; 1 if the light has only one
+            direction; see :meth:`LightEmission.densities`.
         cosine: Between the ray and the geometric normal, not negative; 1 for lights without
             surface.
-        is_delta_position, is_delta_direction, is_infinite: What kind of light it is.
+        is_delta_position, is_delta_direction, is_infinite: The kind of light.
     """
 
     ray: mi.Ray3f
@@ -68,20 +71,21 @@ class EmittedRay:
 class LightEmission:
     """Samples rays that leave the lights of a scene.
 
-    It is right for all emitters of Mitsuba 3.9.1, also where ``sample_ray`` errs (turned spheres
-    and environment maps, textures on turned spheres and on meshes, interpolated normals, bounds of
-    merged rectangles: ``docs/mitsuba_faults.md``). What leaves a surface is what ``emitter.eval``
-    says of a ray that hits it. Points of surfaces are uniformly distributed, also of textured ones.
+    It is correct for all emitters of Mitsuba 3.9.1, also where ``sample_ray`` is wrong (rotated
+    spheres and environment maps, textures on rotated spheres and on meshes, interpolated normals,
+    bounds of merged rectangles: ``docs/mitsuba_faults.md``). The radiance that leaves a surface is
+    the value of ``emitter.eval`` for a ray that hits it. Points on a surface are uniformly
+    distributed, even if it has a texture.
 
     Parameters:
         scene: A scene with at least one emitter.
 
     Attributes:
-        needs_whole_interaction (bool): What stored vertices have to hold
-            (``stored_interaction.py``).
-        probability (numpy.ndarray): With which each emitter is chosen; shape [emitters].
+        needs_whole_interaction (bool): Must stored vertices hold all fields of the interaction
+            (``stored_interaction.py``)?
+        probability (numpy.ndarray): Probability of choosing each emitter; shape [emitters].
         has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
-        radius (mi.Float): Of the scene, about.
+        radius (mi.Float): Approximate radius of the scene.
 
     Raises:
         NotImplementedError: Paths cannot start from one of the emitters.
@@ -89,7 +93,7 @@ class LightEmission:
 
     def __init__(self, scene: mi.Scene) -> None:
         emitters = scene.emitters()
-        # Found here, once for a render: all shapes are asked
+        # Computed once for a render, since it visits all shapes
         self.needs_whole_interaction = needs_whole_interaction(scene)
         self._pieces = LightPieces(scene)
         self.probability = self._pieces.probability
@@ -119,15 +123,15 @@ class LightEmission:
         self._centre, self._radius = mi.Point3f(sphere.center), mi.Float(_MARGIN * sphere.radius)
         dr.make_opaque(self._centre, self._radius)
         self.radius = self._radius
-        # Paths start from no other emitters
+        # No paths start from emitters of probability 0
         density = (self.probability > 0) / np.maximum(self._pieces.area, 1e-300)
         density[self._infinite] = 1 / (np.pi * (_MARGIN * sphere.radius) ** 2)
         density[self._delta_position] = 1
         self._tabulate(density)
 
     def _tabulate(self, density: np.ndarray) -> None:
-        """One row for each emitter: probability, density of the position, kind and ways, parameter,
-        axis."""
+        """Makes the table, a row for each emitter: probability, density of the position, kind and
+        ``way``, parameter, axis."""
         count = len(density)
         table = np.zeros((count, _WORDS), dtype=np.float32)
         table[:, 0], table[:, 1] = self.probability, density
@@ -149,10 +153,10 @@ class LightEmission:
         wavelengths: mi.Spectrum,
         active: mi.Bool,
     ) -> EmittedRay:
-        """Samples a ray. It takes three times two numbers, whatever the light is.
+        """Samples a ray. It draws three pairs of random numbers, for any kind of light.
 
         Parameters:
-            numbers: Where random numbers come from.
+            numbers: The source of random numbers.
             time, wavelengths: Of the ray.
         """
         piece = self._pieces.choose(numbers.next_2d(), active)
@@ -193,8 +197,9 @@ class LightEmission:
         )  # fmt: skip
 
     def _leave_surface(self, piece: Piece, emitter, ray, u, v, active):
-        """A point of an area light and a direction there: the point as a ray would find it, the
-        direction, radiance · cosine / density of the direction, this density, and the cosine."""
+        """Samples a point of an area light and a direction. Returns the interaction at the point,
+        the direction, radiance · cosine / density of the direction, this density, and the
+        cosine."""
         p, prim_uv = self._point(piece, u)
         si = self._found(piece, emitter, ray, p, prim_uv, active)
         is_back = mi.Bool(False)
@@ -219,8 +224,9 @@ class LightEmission:
             pdf = dr.select(is_beam, 1, pdf)
             density = self._row(piece.emitter, active).density
             for index, light in self._beams:
-                # Its radiance is not to be asked for, but the weight is that times the area. Not
-                # by a pointer: the textures of other lights may be unable to do this
+                # A beam has no radiance to evaluate; the weight of ``sample_ray`` is radiance ·
+                # area. This is no call of an ``EmitterPtr``, since other lights may have textures
+                # that cannot be sampled
                 mine = active & (piece.emitter == index)
                 beam = light.sample_ray(ray.time, mi.Float(0.5), u, v, mine)[1]
                 weight = dr.select(mine, beam * density, weight)
@@ -252,19 +258,19 @@ class LightEmission:
         return mi.Point3f(piece.point(x, y, z)), prim_uv
 
     def _found(self, piece, emitter, ray, p, prim_uv, active) -> mi.SurfaceInteraction3f:
-        """The interaction of a ray that ends in a point of a light."""
+        """The interaction of a ray that hits this point of a light."""
         pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(p))
         pi.prim_uv, pi.prim_index = prim_uv, piece.prim_index
         pi.shape, pi.valid = emitter.get_shape(), mi.Bool(active)
         pi.t = dr.select(active, mi.Float(0), dr.inf)
         ray = mi.Ray3f(ray)
-        # Any direction will do
+        # The interaction does not depend on the direction, except ``wi``, which is set later
         ray.o, ray.d = p, mi.Vector3f(0, 0, 1)
         return pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
 
     def _leave_nothing(self, piece: Piece, emitter, start, u, v, active):
-        """A ray that leaves a point or comes from infinity: where it starts, its direction,
-        radiance / density of the direction, and this density."""
+        """Samples a ray of a light without surface. Returns its origin, its direction, radiance /
+        density of the direction, and this density."""
         ref = mi.Interaction3f(start)
         p, d, pdf = mi.Point3f(piece.vector(0)), mi.Vector3f(0, 0, 1), mi.Float(1)
         is_infinite = piece.kind == pieces.INFINITE
@@ -280,12 +286,12 @@ class LightEmission:
         if pieces.PROJECTOR in self._kinds:
             is_projector = piece.kind == pieces.PROJECTOR
             through = piece.direction(2 * v.x - 1, 2 * v.y - 1, mi.Float(1))
-            # The axis has the length 1: the cosine with it is 1 / distance
+            # The axis has length 1, so that the cosine with it is 1 / distance
             distance = dr.norm(dr.select(is_projector, through, mi.Vector3f(0, 0, 1)))
             d = dr.select(is_projector, through / distance, d)
             area = dr.select(is_projector, piece.parameter, 1)
             pdf = dr.select(is_projector, distance**3 / area, pdf)
-        # Seen from afar, so that rounding does not turn the direction
+        # The reference point is far away, so that rounding does not change the direction
         ref.p = dr.select(is_infinite, self._centre, p + self._radius * d)
         ds, weight = emitter.sample_direction(ref, v, active)
         weight = dr.select(is_infinite, weight, weight * (dr.square(ds.dist) / pdf))
@@ -309,16 +315,16 @@ class LightEmission:
         active: mi.Bool,
         knows_normal: bool = False,
     ) -> tuple[mi.Float, mi.Float]:
-        """With what densities :meth:`sample` finds a ray that another technique has found, as
-        MIS weights see it: where normals are interpolated, both sides of a triangle count as its
-        front, since connections do not know its normal.
+        """The densities with which :meth:`sample` finds a ray that another technique has found, for
+        MIS weights. Where normals are interpolated, both sides of a triangle have the density of
+        its front, since next event estimation does not know the triangle's normal.
 
         Parameters:
             emitter: The light.
             d: The direction of emission.
             n: Geometric normal of the light where the ray leaves it.
-            ref: A point that the light shines at; only lights at infinity are asked about it.
-            knows_normal: Is ``n`` the normal of the triangle in any case? Then densities are those
+            ref: A point that the light illuminates; used for lights at infinity only.
+            knows_normal: Is ``n`` always the normal of the triangle? Then the densities are those
                 of :meth:`sample` itself.
 
         Returns:
@@ -360,13 +366,13 @@ class LightEmission:
         return dr.gather(mi.UInt32, self._index, id, active & (id < len(self._index)))
 
     def _cosine_density(self, cosine: mi.Float, way: mi.Float) -> mi.Float:
-        """Of a direction that leaves a surface under this cosine."""
+        """The density of a direction of emission that has this cosine with the normal."""
         front = dr.maximum(cosine, 0) * dr.inv_pi
         both = dr.select(cosine < 0, -_TO_BACK, 1 - _TO_BACK) * cosine * dr.inv_pi
         return dr.select(way == float(pieces.TO_BOTH_SIDES), both, front)
 
     def _weighing_density(self, cosine: mi.Float, way: mi.Float) -> mi.Float:
-        """The same, for MIS weights."""
+        """As :meth:`_cosine_density`, for MIS weights: see :meth:`densities`."""
         is_smooth = self.has_smooth_meshes & (way == float(pieces.TO_BOTH_SIDES))
         return self._cosine_density(dr.select(is_smooth, dr.abs(cosine), cosine), way)
 
@@ -387,7 +393,7 @@ class LightEmission:
 
 @dataclass
 class _Row:
-    """What the table knows of an emitter."""
+    """The row of an emitter in the table."""
 
     probability: mi.Float
     density: mi.Float

@@ -1,4 +1,4 @@
-"""From which emitters light paths start."""
+"""The probabilities with which light paths choose the emitter that they start from."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ import numpy as np
 
 from ..lights.power import emitter_powers
 
-#: The share of light paths that choose their emitter by power; the others choose it by its
-#: ``sampling_weight``, as Mitsuba does. So neither choice has more than twice the density of this
-#: one: a sky that sends most of its power past a room does not take all paths from the lamp in it.
+#: The fraction of light paths that choose their emitter by power; the others choose it by its
+#: ``sampling_weight``, as Mitsuba does. Each probability is thus at least half of that of either
+#: choice: a sky that sends most of its power past a room does not take all paths from a lamp in it.
 _BY_POWER = 0.5
 
 
 def emitter_probabilities(scene: mi.Scene, can_emit: np.ndarray) -> np.ndarray:
-    """With which each emitter is chosen, of those that ``can_emit``. One that a camera path can hit
-    is chosen even where its ``sampling_weight`` is 0: such a path shows it too."""
+    """The probability of choosing each emitter; 0 for those that are not set in ``can_emit``. An
+    emitter that a camera path can hit is chosen even if its ``sampling_weight`` is 0, since camera
+    paths that hit it count its light too."""
     emitters = scene.emitters()
     delta = int(mi.EmitterFlags.DeltaPosition) | int(mi.EmitterFlags.DeltaDirection)
     can_be_hit = np.array([not int(e.flags()) & delta for e in emitters])

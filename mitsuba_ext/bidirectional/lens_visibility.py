@@ -1,5 +1,5 @@
-"""Points of the aperture by visibility: light paths are connected to the part of the lens that, by
-depth maps, nothing hides."""
+"""Choosing points of the aperture by visibility: light paths are connected to the part of the lens
+that is not occluded according to depth maps."""
 
 from __future__ import annotations
 
@@ -14,41 +14,42 @@ from ..transport.path_decisions import SceneQuery
 from .depth_maps import DepthMaps
 from .sensor import UniformLens
 
-#: Pieces along each edge of a square, and pixels along the longer edge of the maps at most: where
-#: the lens blurs little, and where it blurs much.
+#: Pieces of the aperture along each edge of a square, and largest number of pixels along the longer
+#: edge of a map: for a lens that blurs little, and for one that blurs much.
 _SHARP, _BLURRED = (4, 256), (8, 128)
 
-#: Parallax, in units of the film's longer edge, from which on the lens blurs much.
+#: A lens with more parallax than this, in units of the film's longer edge, blurs much.
 _MUCH_PARALLAX = 0.1
 
-#: Cells · pieces, and slices, at most. A cell takes 4 bytes, and one that holds surfaces a byte
-#: more for each piece, and 5 while the table is computed: 100 MiB in the worst case.
+#: Largest number of cells · pieces, and of slices. A cell takes 4 bytes. A cell that holds surfaces
+#: takes one more byte for each piece, and 5 more while the table is computed: 100 MiB in the worst
+#: case.
 _MOST_ENTRIES, _MOST_SLICES = 1 << 24, 64
 
-#: Slices for each pixel of a map by which the lens moves the nearest thing more than the farthest.
+#: Slices for each pixel of parallax, in pixels of a map.
 _SLICES_PER_PIXEL = 2.0
 
-#: Places around a cell, along each edge of a square, at which the maps are looked up for a piece;
-#: and by how much this square is larger than the cell.
+#: Lookups in the maps for each cell and piece, along each edge of a square around the cell; and the
+#: size of this square in units of the cell.
 _TAPS, _WIDTH = 3, 2.0
 
-#: The powers of its inverse are the steps of a point set that is even in five dimensions (the root
-#: of x⁶ = x + 1; M. Roberts, *The Unreasonable Effectiveness of Quasirandom Sequences*, 2018).
+#: The powers of its inverse are the steps of a low-discrepancy sequence in five dimensions (the
+#: root of x⁶ = x + 1; M. Roberts, *The Unreasonable Effectiveness of Quasirandom Sequences*, 2018).
 _STEP = 1.1347241384015194
 
-#: What is added to the number of these places that are seen: so few may err.
+#: Added to the number of these lookups that see the point, since so few lookups may miss it.
 _PRIOR = 0.3
 
-#: The table ends so far outside of the film, in units of its size.
+#: Largest distance by which the table extends beyond the film, in units of the film's size.
 _WIDEST_MARGIN = 1.0
 
-#: With less parallax, in pixels of the film, all of the lens sees the same.
+#: With less parallax than this, in pixels of the film, points of the aperture are chosen uniformly.
 _LEAST_PARALLAX = 2.0
 
 
 def visibility_lens(scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery) -> UniformLens:
-    """Chooses points of the aperture of a ``thinlens`` by visibility; uniformly, where nothing that
-    the sensor sees can hide something from a part of the lens only."""
+    """The choice of points of the aperture of a ``thinlens``: by visibility, or uniformly if the
+    visible surfaces have so little parallax that all of the lens sees the same."""
     parallax = DepthMaps(scene, sensor, query, pieces=2, most_pixels=64).parallax
     if parallax * max(sensor.film().crop_size()) < _LEAST_PARALLAX:
         return UniformLens()
@@ -59,22 +60,23 @@ def visibility_lens(scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery) -> Un
 
 
 class VisibilityLens(UniformLens):
-    """Chooses points of the aperture by a table of what depth maps let through.
+    """Chooses points of the aperture by a table of visibilities, which is computed from depth maps.
 
-    The view of the lens' middle is divided into cells: rectangles of the film, and slices of the
-    inverse depth, in which parallax is uniform. For each cell that holds surfaces, the table has
-    the probabilities with which its points are connected to each piece of the aperture. They are
-    positive: the maps may err, and the estimate stays unbiased.
+    The view from the middle of the lens is divided into cells: rectangles of the film, times slices
+    of the inverse depth. Equal steps of the inverse depth have equal parallax. For each cell that
+    holds surfaces, the table has the probabilities with which its points are connected to each
+    piece of the aperture. These are never zero, so that the estimate is unbiased even where the
+    maps are wrong.
 
-    A piece of which the share v is seen has a probability in proportion to √v. If it is chosen with
-    the probability q, its part of the estimate's second moment is v / q, and the sum of these is
-    least with √v.
+    A piece of which the fraction v is visible has a probability proportional to √v. If it is chosen
+    with the probability q, it contributes v / q to the second moment of the estimate. The sum of
+    these is smallest with √v.
 
-    Source: J. J. Guo, PhD thesis, TU Delft, section 5.3.3, Algorithm 5. It looks into the
-    depth maps for each point, and takes v for the probability.
+    Source: J. J. Guo, PhD thesis, TU Delft, section 5.3.3, Algorithm 5. The algorithm there reads
+    the depth maps for each point, and uses v as the probability.
 
     Attributes:
-        shape (tuple[int, int, int]): Cells along x and y of the film, and slices.
+        shape (tuple[int, int, int]): Number of cells along x and y of the film, and of slices.
         bytes (int): Memory of the table.
     """
 
@@ -104,14 +106,14 @@ class VisibilityLens(UniformLens):
             start = dr.select(is_reached, before, start)
             chosen = dr.select(is_reached, weight, chosen)
             before += weight
-        # What is left of the number
+        # Reuse the number: it is uniform within the chosen interval
         x = (x - mi.Float(start)) / mi.Float(chosen)
         numbers = self._maps.lens_numbers(piece, mi.Point2f(x, sample.y))
         return numbers, mi.Float(total) / mi.Float(self._count * chosen)
 
     def _weights(self, p: mi.Point3f, active: mi.Bool) -> tuple[list[mi.UInt32], mi.UInt32]:
-        """The probabilities of the pieces for the point ``p``, times their sum: positive integers;
-        and the sum."""
+        """Positive integers in proportion to the probabilities of the pieces for the point ``p``;
+        and their sum."""
         place = self._maps.place(p)
         cell, inside = self._cell(place)
         active = active & (place.z > 0) & inside
@@ -127,8 +129,8 @@ class VisibilityLens(UniformLens):
         return weights, sum(weights[1:], weights[0])
 
     def _cell(self, place: mi.Point3f, shift: mi.Point3f = 0) -> tuple[mi.Vector3u, mi.Bool]:
-        """The cell of a place, which is moved by ``shift`` cells, and whether it is in the table.
-        The first and the last slice reach to infinity and to the lens."""
+        """The cell of a place that is moved by ``shift`` cells, and whether it is in the table.
+        The first slice reaches to infinity, the last one to the lens."""
         cell = (place - self._offset) * self._scale + shift
         last = mi.Point3f(self._size - 1)
         cell.z = dr.clip(cell.z, 0, last.z)
@@ -139,10 +141,10 @@ class VisibilityLens(UniformLens):
         return (cell.z * self._size.y + cell.y) * self._size.x + cell.x
 
     def _occupied(self) -> mi.UInt32:
-        """By cell, 1 + the row of the table for those that hold surfaces, and 0 for others."""
+        """For each cell, 1 + its row of the table if it holds surfaces, and 0 if it does not."""
         count = self.shape[0] * self.shape[1] * self.shape[2]
         rows = dr.zeros(mi.UInt32, count)
-        # Surfaces may pass between two rays
+        # Neighbouring cells count as well: rays of the maps may miss a surface there
         for shift in itertools.product((-0.5, 0.5), repeat=3):
             cell, inside = self._cell(self._maps.places, mi.Point3f(*shift))
             dr.scatter(rows, mi.UInt32(1), self._index(cell), inside)
@@ -171,18 +173,18 @@ class VisibilityLens(UniformLens):
         return table
 
     def _seen(self) -> mi.UInt32:
-        """At how many places of a cell, and around it, points are seen from each piece:
-        [cell, piece]."""
+        """For each cell and piece of the aperture, [cell, piece]: how many of the ``_TAPS``² places
+        in and around the cell are seen from the piece."""
         lane = dr.arange(mi.UInt32, len(self._cells) * self._count)
         piece = lane % self._count
         index = dr.gather(mi.UInt32, self._cells, lane // self._count)
         x, rest = index % self._size.x, index // self._size.x
         cell = mi.Point3f(x, rest % self._size.y, rest // self._size.y)
-        # What is nearer than the next slice hides the cell; its own surface does not
+        # Surfaces nearer than the next slice hide the cell; surfaces in the cell itself do not
         nearest = (cell.z + 2) / self._scale.z + self._offset.z
         seen, random = mi.UInt32(0), hashed(lane, 5)
         for tap in range(_TAPS**2):
-            # Random, and spread evenly over the places
+            # Points of a randomly shifted low-discrepancy sequence
             numbers = [x + tap * _STEP**-i for i, x in enumerate(random, 1)]
             numbers = [x - dr.floor(x) for x in numbers]
             jitter = mi.Point2f(tap % _TAPS + numbers[0], tap // _TAPS + numbers[1]) / _TAPS
@@ -196,7 +198,8 @@ class VisibilityLens(UniformLens):
 
 
 def _cells(shape: tuple[int, int], margins: list[float], most: int) -> tuple[int, int]:
-    """Cells along x and y: as large as pixels of the maps, or larger if there are too many."""
+    """Number of cells along x and y. A cell is as large as a pixel of the maps, or larger if there
+    would be more than ``most`` of them."""
     sizes = [n * (1 + 2 * margin) for n, margin in zip(shape, margins)]
     shrink = min(1.0, math.sqrt(most / (sizes[0] * sizes[1])))
     return max(1, int(sizes[0] * shrink)), max(1, int(sizes[1] * shrink))

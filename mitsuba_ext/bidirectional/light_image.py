@@ -19,28 +19,28 @@ from .technique_observer import TechniqueObserver
 
 
 class LightImage:
-    """Connects vertices of light paths to the sensor: in a kernel of its own, which has a lane for
-    each vertex.
+    """Connects vertices of light paths to the sensor. It uses a kernel of its own, which has a lane
+    for each vertex.
 
-    There must be as many light paths as camera paths. Then what a pixel's splats bring, divided by
-    the number of its camera samples, is their share of the pixel's radiance.
+    There must be as many light paths as camera paths. The sum of a pixel's splats, divided by the
+    number of its camera samples, is then their contribution to the pixel's radiance.
 
-    It draws one number where the sensor has an aperture, and no other.
+    It draws one random number if the sensor has an aperture, and none otherwise.
 
     Parameters:
         scene: The scene.
-        sensor: What the vertices are connected to.
-        numbers: Where random numbers come from.
-        rays: The camera rays of the pass: a light path's splats are weighed as the sensor weighs
-            the radiance of the ray in its lane.
-        sums: Computes MIS weights; without, all paths come from here.
-        query: How a ray meets the scene.
-        hides_emitters: Does the sensor look through area lights?
-        least_depth: Segments of a light path from which on it is connected.
-        observer: Is told what is found.
+        sensor: The sensor to which the vertices are connected.
+        numbers: The source of random numbers.
+        rays: The camera rays of the pass. A light path's splats are multiplied by the importance of
+            the camera ray in its lane.
+        sums: Computes MIS weights. If it is ``None``, the weights are 1.
+        query: Intersects rays with the scene.
+        hides_emitters: Are area lights invisible to the sensor?
+        least_depth: Least number of segments between the light and a vertex that is connected.
+        observer: Is told the splats.
 
     Attributes:
-        shadow_count: Shadow rays traced.
+        shadow_count: Number of shadow rays traced.
     """
 
     def __init__(
@@ -60,7 +60,8 @@ class LightImage:
         self._scene, self._sensor, self._importance = scene, sensor, rays.importance
         self._sums, self._query = sums, query or SceneQuery()
         self._hides_emitters = hides_emitters
-        # With the depth of a vertex, it makes the numbers that choose a point of the aperture
+        # Hashed with the depth of a vertex, it gives the numbers that choose a point of the
+        # aperture
         self._seed = None
         if sensor.needs_aperture_sample:
             self._seed = mi.UInt32(numbers.next_1d() * 4294967040.0)
@@ -70,16 +71,16 @@ class LightImage:
         self.shadow_count = mi.UInt32(0)
 
     def kernel_state(self) -> tuple:
-        """What kernels depend on."""
+        """The objects and constants that kernels depend on."""
         return (
             self._least_depth, self._scene, self._sensor, self._importance, self._sums,
             self._query, self._hides_emitters, self._seed,
         )  # fmt: skip
 
     def add(self, vertices: LightVertices) -> None:
-        """Connects these vertices, of which there is at least one. It evaluates the result, so that
-        nothing needs them any more."""
-        # Observers rebind attributes when they are told something
+        """Connects these vertices, at least one. It evaluates the result, so that the vertices'
+        memory can be freed."""
+        # Observers rebind attributes when they are called, so that the kernel cannot be frozen
         connect = self._connect_frozen if self._observer is None else self._connect
         found, tested = connect(vertices, *vertices.lanes())
         dr.eval(found, tested)
@@ -87,8 +88,9 @@ class LightImage:
         self.shadow_count += dr.sum(tested)
 
     def splats(self) -> list[Splats]:
-        """What was found, as one set: however many there were, the film adds it by the same kernel.
-        It evaluates the result: whoever read it later would evaluate what waits until then."""
+        """All splats in one list, so that the film adds them by the same kernel for any number of
+        rounds. They are evaluated: otherwise the first reader would evaluate them together with
+        everything else that is scheduled."""
         if len(self._found) < 2:
             return self._found
         return [joined(self._found)]
@@ -96,7 +98,7 @@ class LightImage:
     def _connect(
         self, vertices: LightVertices, slot: mi.UInt32, active: mi.Bool
     ) -> tuple[Splats, mi.UInt32]:
-        """The splats, and the shadow rays of each vertex."""
+        """The splats, and the number of shadow rays of each vertex."""
         vertex = vertices.at(slot, active)
         si = vertex.si
         sample = mi.Point2f(0.5)
@@ -118,8 +120,8 @@ class LightImage:
         value *= vertex.β * importance
         mis, by_camera = mi.Float(1), ()
         if self._sums is not None:
-            # The density with which a camera ray finds the vertex, per area, in units of the
-            # density of this point of the aperture
+            # The density per area with which a camera ray finds the vertex, divided by the density
+            # of this point of the aperture
             found = importance * geometric_cosine(si, to_camera)
             mis = weight(self._sums.others(found, vertex.sums, reverse_pdf))
             by_camera = self._sums.by_camera(

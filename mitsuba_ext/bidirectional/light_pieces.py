@@ -1,5 +1,5 @@
-"""The table of what light paths start from: triangles and whole shapes of area lights, points from
-which light leaves, and lights at infinity.
+"""The table from which light paths choose where they start: triangles and whole shapes of area
+lights, point-like lights, and lights at infinity.
 
 Each piece is an affine image of a set that is simple to sample: a triangle, a disk, a sphere, a
 cylinder. Points are sampled here and not by ``emitter.sample_position``, which returns
@@ -25,39 +25,41 @@ from .emitter_choice import emitter_probabilities
 # Kinds of pieces
 TRIANGLE, DISK, SPHERE, CYLINDER, POINT, SPOT, PROJECTOR, INFINITE = range(8)
 
-#: How light leaves a surface: by a cosine to the front; to both sides (interpolated normals let a
-#: surface also emit to the back of its triangles); or at right angles to it.
+#: The directions in which light leaves a surface: cosine-distributed to the front; to both sides
+#: (with interpolated normals, a mesh also emits to the back of its triangles); or along the normal.
 TO_FRONT, TO_BOTH_SIDES, AS_BEAM = range(3)
 
 #: Words of a piece in its table.
 WORDS = 16
 
-#: No paths start from lights with less area than this: the density of their points is no float.
+#: No paths start from lights with less area than this: the density of their points would overflow
+#: a single-precision number.
 _LEAST_AREA = 1e-37
 
-#: So much larger is the image plane of a projector than what its ``str()`` says in six digits.
+#: Factor by which the image plane of a projector is made larger: the field of view is read from its
+#: ``str()``, which has six digits.
 _MARGIN = 1 + 1e-5
 
 
 class LightPieces:
-    """The pieces of a scene's lights, each with its probability. The triangles of an emitter are
-    chosen in proportion to their area.
+    """The pieces of a scene's lights, each with its probability. The triangles of an emitter have
+    probabilities in proportion to their areas.
 
     Parameters:
         scene: A scene with at least one emitter.
 
     Attributes:
-        probability (numpy.ndarray): With which each emitter is chosen; shape [emitters].
-        area (numpy.ndarray): The area of each emitter's surface; 1 for those without surface.
-        way (numpy.ndarray): How light leaves each emitter's surface.
+        probability (numpy.ndarray): Probability of choosing each emitter; shape [emitters].
+        area (numpy.ndarray): The area of each emitter's surface; 1 for emitters without surface.
+        way (numpy.ndarray): ``TO_FRONT``, ``TO_BOTH_SIDES`` or ``AS_BEAM`` for each emitter.
         kind (numpy.ndarray): The kind of each emitter's pieces.
-        parameter (numpy.ndarray): Of each emitter without surface: cosine of the cutoff angle of a
-            spot, area of the image at the distance 1 of a projector.
+        parameter (numpy.ndarray): For spots the cosine of the cutoff angle; for projectors the area
+            of the image at distance 1; 0 for other emitters.
         axis (numpy.ndarray): The direction in which each spot and projector shines; [emitters, 3].
 
     Raises:
-        NotImplementedError: Points on the shape of an area light cannot be sampled, or a light
-            moves.
+        NotImplementedError: Light paths cannot start from one of the emitters (a shape or emitter
+            of an unsupported type), or a light moves.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -131,7 +133,7 @@ class LightPieces:
             radius = 0.5 * (high - low).max()
             row = _row(SPHERE, 0.5 * (low + high), *(radius * np.eye(3)))
             area = np.array([4 * np.pi * radius**2])
-        elif shape.is_mesh():  # rectangles too
+        elif shape.is_mesh():  # Rectangles are meshes too
             row, area = self._mesh(index, shape)
         else:
             raise NotImplementedError(
@@ -183,14 +185,14 @@ class LightPieces:
 
 
 class Piece:
-    """A piece of each lane: its words, as the table holds them."""
+    """A piece in each lane: its row of the table."""
 
     def __init__(self, words: mi.ArrayXf) -> None:
         self._words = words
         self.kind, self.emitter, self.prim_index = (
             dr.reinterpret_array(mi.UInt32, words[i]) for i in (12, 13, 14)
         )
-        #: ``way``, or the parameter of an emitter without surface.
+        #: ``way`` of a surface, or ``parameter`` of an emitter without surface.
         self.parameter = words[15]
 
     def vector(self, column: int) -> mi.Vector3f:
@@ -198,7 +200,8 @@ class Piece:
         return mi.Vector3f(*(self._words[3 * column + i] for i in range(3)))
 
     def point(self, x: mi.Float, y: mi.Float, z: mi.Float) -> mi.Vector3f:
-        """The image of a point of the simple set."""
+        """The image of a point of the simple set: of the unit triangle, disk, sphere or
+        cylinder."""
         return self.vector(0) + self.direction(x, y, z)
 
     def direction(self, x: mi.Float, y: mi.Float, z: mi.Float) -> mi.Vector3f:

@@ -18,13 +18,13 @@ from .sensor import ConnectableSensor
 
 @dataclass
 class LightTracer:
-    """Traces a light path for each camera ray; it is an :class:`Estimator`. The camera rays see
-    emitters; light paths find everything else.
+    """Traces a light path for each camera ray; it is an :class:`Estimator`. Camera rays only add
+    the emitters that they hit directly; light paths add everything else.
 
     Parameters:
-        directly: The walk of the camera rays, which ends where they meet something.
-        light_walk: The walk of the light paths; ``None`` where there is no light.
-        sensor: What the paths are connected to.
+        directly: The walk of the camera rays, which ends at the first intersection.
+        light_walk: The walk of the light paths; ``None`` if the scene has no light.
+        sensor: The sensor to which the light paths are connected.
     """
 
     directly: Walk
@@ -42,7 +42,7 @@ class LightTracer:
             scene, self.sensor, sampler, rays, query=walk.query,
             hides_emitters=self.directly.hide_emitters,
         )  # fmt: skip
-        # What the rest of the pass reads again
+        # Evaluated now, since later kernels of the pass read them again
         dr.schedule(sample, rays.ray.wavelengths)
         numbers = light_numbers(sampler, dr.width(rays.ray))
         scatter_count = walk.run(

@@ -11,13 +11,14 @@ import mitsuba as mi
 from .partial_sums import Sums
 from .stored_interaction import as_float, from_words, interaction_words, to_words
 
-#: Bit of the word of depth and region: only the hero wavelength is left of the path.
+#: A bit of the word that holds depth and region. It is set where only the hero wavelength of the
+#: path is left.
 _HERO_IS_ALONE = 1 << 31
 
-#: Dr.Jit reads and writes so many words at once: the number of a vertex's words is a multiple.
+#: Words that Dr.Jit reads and writes at once. A vertex takes a multiple of this number of words.
 _PACKET = 8
 
-#: Bits of that word that hold the depth, where the region follows.
+#: Bits of that word that hold the depth, in layouts that store the region behind it.
 _DEPTH_BITS = 15
 
 
@@ -28,8 +29,8 @@ class Layout:
     Attributes:
         spectrum: Words of a spectrum.
         sums: Words of the partial sums of MIS weights: 0, 2, or 4 (``Sums.by_camera``).
-        is_whole: Is all that an interaction holds stored?
-        has_region: Are vertices chosen by the region in which they lie?
+        is_whole: Are all fields of the interaction stored?
+        has_region: Is the region stored in which the vertex lies?
     """
 
     spectrum: int
@@ -44,17 +45,18 @@ class Layout:
 
     @property
     def mark(self) -> int:
-        """The place of the word that holds depth and region: it follows spectrum and sums."""
+        """Index of the word that holds depth and region: it follows spectrum and sums."""
         return self.spectrum + self.sums
 
 
 class VertexStore:
-    """Where a light walk writes its vertices: ``stride`` places for each path, one after the other.
+    """The memory that a light walk writes its vertices to: ``stride`` consecutive places for each
+    path.
 
     Parameters:
-        layout: Of the words.
+        layout: The words of a vertex.
         lanes: Number of paths.
-        stride: Vertices of a path, at most.
+        stride: Largest number of vertices of a path.
     """
 
     def __init__(self, layout: Layout, lanes: int, stride: int) -> None:
@@ -64,7 +66,7 @@ class VertexStore:
 
     @property
     def bytes(self) -> int:
-        """Memory of the store."""
+        """Memory of the store, in bytes."""
         return self.lanes * self.stride * bytes_per_vertex(self.layout)
 
     def write(
@@ -91,7 +93,7 @@ class VertexStore:
 
 
 def bytes_per_vertex(layout: Layout) -> int:
-    """Memory that a place in the store takes: the words, and a flag."""
+    """Bytes of a place in the store: the words, and a flag."""
     return 4 * layout.words + 1
 
 
@@ -100,7 +102,7 @@ class LightVertex:
     """A stored vertex, in each lane.
 
     Attributes:
-        si: The interaction there, as the light walk saw it: ``wi`` is where light comes from.
+        si: The interaction there. ``wi`` points to where the light path came from.
         β: Radiance · throughput / density of the path up to the vertex.
         sums: Partial sums of the MIS weights (0 if none are stored).
         depth: Segments between the light and the vertex; at least 1.
@@ -121,13 +123,13 @@ class LightVertices:
     along each path. All of them can be connected: their BSDFs have a smooth part.
 
     Parameters:
-        store: What the light walk has written.
+        store: The store that the light walk has written.
         time, wavelengths: Of each path.
-        disperses: Are there vertices of which only the hero is left?
+        disperses: May vertices have only the hero wavelength left?
 
     Attributes:
-        count (int): How many there are.
-        slot (mi.UInt32): The place of each in the store: path · stride + place along the path.
+        count (int): Number of vertices.
+        slot (mi.UInt32): The place of each in the store: path · stride + index along the path.
         stride (int): Places of each path.
         bytes (int): Memory that the vertices take.
     """
@@ -144,14 +146,15 @@ class LightVertices:
         self.bytes = store.bytes + 4 * self.count
 
     def kernel_state(self) -> tuple:
-        """What kernels depend on."""
+        """The arrays and constants that kernels depend on."""
         return (
             self._layout, self._words, self._time, self._wavelengths, self._disperses, self._lane,
             self.stride,
         )  # fmt: skip
 
     def lanes(self) -> tuple[mi.UInt32, mi.Bool]:
-        """The place in the store of each vertex, in ``room`` lanes, and which of these have one."""
+        """For ``room`` lanes: the place of a vertex in the store, and whether the lane has a
+        vertex."""
         index = dr.arange(mi.UInt32, self.room)
         active = index < dr.opaque(mi.UInt32, self.count)
         slot = dr.gather(mi.UInt32, self.slot, index, active)
@@ -159,7 +162,7 @@ class LightVertices:
         return slot, active
 
     def at(self, slot: mi.UInt32, active: mi.Bool) -> LightVertex:
-        """The vertices at these places of the store, which must be taken."""
+        """The vertices at these places of the store. A vertex must have been written to each."""
         layout, n = self._layout, self._layout.spectrum
         w = dr.gather(
             mi.ArrayXf, self._words, slot, active, shape=(layout.words, dr.width(slot))
@@ -197,11 +200,11 @@ class LightVertices:
 
 
 class PackedVertices(LightVertices):
-    """Vertices without the gaps of a store, which take most of the memory. Their places are their
-    numbers.
+    """Vertices without the gaps of a store, which take most of the memory. The place of a vertex
+    is its index.
 
     Parameters:
-        vertices: What is packed. Their memory is given back.
+        vertices: The vertices to pack. Their memory is given back.
     """
 
     def __init__(self, vertices: LightVertices) -> None:
@@ -228,14 +231,14 @@ class PackedVertices(LightVertices):
 
 
 class VertexCache(PackedVertices):
-    """The vertices of some rounds of a light walk: those of a path follow each other.
+    """The vertices of some rounds of a light walk. The vertices of a path follow each other.
 
     Parameters:
         rounds: The vertices of each round. Their memory is given back.
         lanes: Number of paths.
 
     Attributes:
-        first, number (mi.UInt32): Of each path: its first vertex, and how many it has.
+        first, number (mi.UInt32): Of each path: index of its first vertex, and how many it has.
     """
 
     def __init__(self, rounds: list[LightVertices], lanes: int) -> None:
@@ -255,7 +258,7 @@ class VertexCache(PackedVertices):
         self._lane = dr.empty(mi.UInt32, self.room)
         before = mi.UInt32(self.first)
         for vertices, lane, number in zip(rounds, owners, numbers):
-            # The first of this path in this round
+            # The first vertex of this path in this round
             begin = dr.cumsum(number) - number
             index = dr.arange(mi.UInt32, vertices.count)
             place = index - dr.gather(mi.UInt32, begin, lane) + dr.gather(mi.UInt32, before, lane)
@@ -274,7 +277,7 @@ class VertexCache(PackedVertices):
 
     @property
     def region(self) -> mi.UInt32:
-        """The region in which each vertex lies, where the layout has it."""
+        """The region in which each vertex lies. Only for layouts with ``has_region``."""
         layout = self._layout
         index = dr.arange(mi.UInt32, self.count) * layout.words + layout.mark
         mark = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, index))
@@ -282,14 +285,15 @@ class VertexCache(PackedVertices):
 
 
 def room_for(count: int) -> int:
-    """A number of lanes or places for so many vertices, and a few more: many passes have the same,
-    and so the same kernels. 16 at least, since very few would need others."""
+    """The number of lanes or places for ``count`` vertices. It is rounded up, so that many passes
+    have the same number and share kernels. It is at least 16: very small widths would need kernels
+    of their own."""
     step = max(16, 1 << max(0, count.bit_length() - 4))
     return -(-count // step) * step
 
 
 def _widened(values: mi.UInt32, width: int) -> mi.UInt32:
-    """With zeros behind."""
+    """The values, followed by zeros up to ``width``."""
     index = dr.arange(mi.UInt32, width)
     result = dr.gather(mi.UInt32, values, index, index < dr.opaque(mi.UInt32, len(values)))
     dr.eval(result)
@@ -297,12 +301,12 @@ def _widened(values: mi.UInt32, width: int) -> mi.UInt32:
 
 
 def _numbers(lane: mi.UInt32, lanes: int) -> mi.UInt32:
-    """How many vertices each path has."""
+    """The number of vertices of each path. ``lane`` is the path of each vertex."""
     number = dr.zeros(mi.UInt32, lanes)
     dr.scatter_add(number, mi.UInt32(1), lane)
     return number
 
 
 def _depth_and_region(mark: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-    """Of the word that holds both, with 16 bits for the region."""
+    """Depth and region from the word that holds both, with 16 bits for the region."""
     return mark & ((1 << _DEPTH_BITS) - 1), (mark & (_HERO_IS_ALONE - 1)) >> _DEPTH_BITS

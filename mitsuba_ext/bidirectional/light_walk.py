@@ -21,29 +21,29 @@ from .light_vertices import Layout, LightVertices, VertexStore, bytes_per_vertex
 from .partial_sums import PartialSums, Sums
 from .scattering import delta_correction, evaluate, geometric_cosine
 
-#: Vertices of a path that are stored at a time. Most paths have fewer. Films of many pixels store
-#: fewer at a time: one sample of each pixel must fit into this memory.
+#: Vertices of a path that are stored in a round; most paths have fewer. Fewer are stored if those
+#: of all paths would take more than this number of bytes.
 STRIDE, _STORE_BYTES = 4, 1 << 29
 
-#: Rounds of a path, at most: it has been stuck where nothing absorbs light.
+#: Largest number of rounds: a path that is still alive is stuck where nothing absorbs light.
 _MOST_ROUNDS = 1 << 12
 
 
 @dataclass
 class LightPaths:
-    """Light paths on their way, one in each lane, at a vertex that is not stored yet.
+    """The state of the light paths, one in each lane, at a vertex that is not stored yet.
 
     Attributes:
         ray, pi: The ray that led to the vertex, and its intersection.
         emitted: Radiance / density of the emitted ray.
-        β: Throughput up to the vertex, emission not included.
+        β: Throughput up to the vertex, without emission.
         sampling_weight: See :class:`~mitsuba_ext.transport.vertex.PathState`.
-        sums: Partial sums of the MIS weights: at the first vertex for the vertex, later for the
-            direction that led to it.
+        sums: Partial sums of the MIS weights: at the first vertex, those of the vertex; later,
+            those of the direction that led to it (:meth:`PartialSums.leave`).
         depth: Segments between the light and the vertex.
         hero_is_alone: Is only the first wavelength left? ``()`` where nothing disperses light.
-        scatter_count: Rays traced in directions that a BSDF chose.
-        active: Which paths are on their way.
+        scatter_count: Rays traced in directions that were sampled from a BSDF.
+        active: Paths that have not ended.
     """
 
     ray: mi.Ray3f
@@ -62,20 +62,20 @@ class LightPaths:
 class LightWalk:
     """Traces light paths: the mirror image of :class:`~mitsuba_ext.transport.walk.Walk`.
 
-    Its vertices come in rounds: :meth:`begin` emits rays, each :meth:`advance` walks so many
-    vertices on and returns them; :meth:`run` walks to the ends of all paths.
+    It works in rounds: :meth:`begin` emits rays; each :meth:`advance` walks a limited number of
+    vertices and returns them; :meth:`run` walks until all paths have ended.
 
-    A path draws 6 numbers for the ray and 4 for each bounce.
+    A path draws 6 random numbers for the emitted ray and 4 for each bounce.
 
     Parameters:
-        emission: Where paths begin.
+        emission: Samples the rays with which paths begin.
         max_depth: Longest path from light to sensor, in segments: vertices up to the depth
             ``max_depth`` − 1 are stored, since one segment more leads to the sensor.
         rr_depth: Depth at which Russian roulette begins.
-        sums: Computes partial sums of MIS weights; ``None`` where nobody asks for them.
-        roulette: Which paths go on. It is told the throughput without the light's power: dim lights
-            are sampled rarely enough.
-        query: How a ray meets the scene.
+        sums: Computes partial sums of MIS weights; ``None`` if they are not needed.
+        roulette: The Russian roulette. It is given the throughput without the light's power, since
+            dim lights are already chosen rarely.
+        query: Intersects rays with the scene.
     """
 
     emission: LightEmission
@@ -87,7 +87,7 @@ class LightWalk:
 
     @property
     def layout(self) -> Layout:
-        """Of the stored vertices."""
+        """The layout of the stored vertices."""
         sums, spectrum = self.sums, dr.size_v(mi.Spectrum)
         is_whole = self.emission.needs_whole_interaction
         if sums is None:
@@ -106,8 +106,8 @@ class LightWalk:
         """Emits a ray in each lane, and traces it.
 
         Parameters:
-            time, wavelengths: Of each path; those of the camera path in the same lane.
-            active: Which lanes emit.
+            time, wavelengths: Of each path: those of the camera path in the same lane.
+            active: Lanes that emit.
         """
         paths, place = self._begin(scene, numbers, time, wavelengths, active)
         go_to(numbers, place)
@@ -139,11 +139,11 @@ class LightWalk:
     def advance(
         self, scene: mi.Scene, numbers: Numbers, paths: LightPaths, stride: int
     ) -> tuple[LightVertices, LightPaths]:
-        """Walks up to ``stride`` vertices on. It evaluates ``paths``, so that rounds share a
+        """Walks up to ``stride`` more vertices. It evaluates ``paths``, so that rounds share a
         kernel.
 
         Returns:
-            The vertices whose BSDF has a smooth part, and the paths that are still on their way.
+            The vertices whose BSDF has a smooth part, and the new state of the paths.
         """
         schedule_state(numbers)
         # Fresh copies: kernels would otherwise differ in which of the inputs are the same array
@@ -153,7 +153,7 @@ class LightWalk:
         time, wavelengths = paths.ray.time, paths.ray.wavelengths
         paths, place = self._go_on(scene, numbers, paths, store)
         go_to(numbers, place)
-        # With the rest: the walk would be traced again for where the sampler has got to
+        # In the same kernel: evaluating the sampler's state later would trace the walk again
         schedule_state(numbers)
         dr.eval(paths, store.words, store.is_taken)
         disperses = not isinstance(paths.hero_is_alone, tuple)
@@ -168,12 +168,12 @@ class LightWalk:
         active: mi.Bool,
         take: Callable[[LightVertices], None],
     ) -> mi.UInt32:
-        """Traces light paths to their ends. ``take`` is given the vertices of each round, unless
-        there is none: ``STRIDE`` of a path at most. The other parameters are those of
+        """Traces light paths until all have ended. ``take`` is called with the vertices of each
+        round that has any: ``STRIDE`` of a path at most. The other parameters are those of
         :meth:`begin`.
 
         Returns:
-            Rays traced in directions that a BSDF chose, by each path.
+            For each path, the rays traced in directions that were sampled from a BSDF.
         """
         paths = self.begin(scene, numbers, time, wavelengths, active)
         dr.eval(paths)
@@ -211,7 +211,7 @@ class LightWalk:
             bsdf = si.bsdf(paths.ray)
             sums = self._arrive(paths, si)
 
-            # ----- Store what can be connected -----
+            # ----- Store the vertex if it can be connected -----
             connectable = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             store.write(
                 place, si, paths.emitted * paths.β, sums, paths.depth, paths.hero_is_alone,
@@ -219,7 +219,7 @@ class LightWalk:
             )  # fmt: skip
             place += 1
 
-            # ----- Choose where to scatter -----
+            # ----- Sample the BSDF -----
             active_next = active & (paths.depth < last_depth)
             sample_1, sample_2 = numbers.next_1d(), numbers.next_2d()
             bs, weight = sample_bsdf(bsdf, ctx, si, sample_1, sample_2, active_next)
@@ -230,7 +230,7 @@ class LightWalk:
             sampling_weight = paths.sampling_weight * hero_count
 
             # ----- Russian roulette -----
-            carries = dr.max(β) != 0  # Dr.Jit says no to NaN
+            carries = dr.max(β) != 0  # False for NaN in Dr.Jit
             depth = paths.depth + 1
             rr_active = depth >= rr_depth
             survival = self._survival(paths, si, bsdf, β, sampling_weight, depth, hero_is_alone,
@@ -266,7 +266,8 @@ class LightWalk:
         )
 
     def _scatter(self, heroes, paths, bsdf, si, bs, weight, sums, active):
-        """The weight of a BSDF sample, and the partial sums behind it."""
+        """The weight of a BSDF sample, the partial sums behind it, the factor of the sampling
+        weight (:meth:`Heroes.scatter`), and whether only the hero wavelength is left."""
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         weight, hero_count, hero_is_alone = heroes.scatter(
             paths.hero_is_alone, weight, bsdf, si, bs
@@ -284,8 +285,8 @@ class LightWalk:
         return dr.select(active, weight, 0), sums, hero_count, hero_is_alone
 
     def _survival(self, paths, si, bsdf, β, sampling_weight, depth, hero_is_alone, active):
-        """The probability with which a path goes on. Importance is not scaled by refraction: the
-        index of refraction is left out."""
+        """The survival probability of Russian roulette. η is 1, since refraction does not scale
+        the flux that light paths carry."""
         arrival = Arrival(mi.Interaction3f(si), mi.Float(1), mi.Bool(False))
         path = PathState(β, mi.Float(1), sampling_weight, depth, arrival, hero_is_alone)
         return self.roulette.survival((), Vertex(si, bsdf, path), path, active)[0]

@@ -1,9 +1,9 @@
-"""What a subpath has to know of itself for the MIS weights of all techniques that could have made
-the path that it becomes a part of.
+"""Partial sums that a subpath carries along, from which the MIS weights of complete paths are
+computed: weights over all bidirectional techniques.
 
 Source: I. Georgiev, *Implementing Vertex Connection and Merging*, technical report, 2012: the
-quantities dVCM and dVC, without merging. All ratios of densities are raised to the heuristic's
-exponent.
+quantities dVCM and dVC, without merging. All ratios of densities are raised to the exponent of the
+MIS heuristic.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ class Sums:
     """The partial sums of a subpath at its last vertex (Eqs. 31 to 36 of the report).
 
     Attributes:
-        dVCM: 1 / density of the last vertex, times the count of the technique that connects the
-            last two; at the first vertex, times the ratio of the densities with which a connection
-            and emission find the point of the light.
+        dVCM: 1 / density of the last vertex, times the number of samples of the technique that
+            connects the last two vertices. At the first vertex, instead, times the ratio of the
+            densities with which next event estimation and emission sample the point on the light.
         dVC: The sum over the techniques that connect earlier vertices of the subpath.
-        by_camera: For light paths, from the second vertex on, where :class:`PartialSums` follows
-            it: the two terms of dVC in which a camera path finds the whole path (s = 0 and 1), not
-            raised to the exponent.
-        region, count: Where the vertices that are connected are chosen by regions (elsewhere
-            ``()``): the region of the last vertex; and what multiplies ``dVCM`` where the
-            technique that connects the last two is such a connection.
+        by_camera: Only for light paths, from the second vertex on, and if :class:`PartialSums`
+            computes it: the two terms of dVC in which a camera path finds the whole path (s = 0 and
+            1), not raised to the exponent.
+        region, count: Only if the light path vertices for connections are chosen by regions
+            (otherwise ``()``): the region of the last vertex; and the factor of ``dVCM`` where the
+            technique that connects the last two vertices is such a connection.
     """
 
     dVCM: mi.Float
@@ -46,23 +46,23 @@ class Sums:
 
     @property
     def last(self) -> mi.Float:
-        """``dVCM``, times the count of connections that are chosen by regions."""
+        """``dVCM``, times ``count`` if vertices are chosen by regions."""
         return self.dVCM if isinstance(self.count, tuple) else self.dVCM * self.count
 
 
 class PartialSums:
-    """Computes the sums along light paths.
+    """Computes the sums along light paths and camera paths.
 
     Parameters:
-        next_event: The decision with which the other end's vertices are connected to points of
-            lights.
-        connections: To how many of the vertices of a light path a vertex of a camera path is
-            connected (s, t ≥ 2), on average, in units of all of them. All other techniques are used
-            once for each pair of paths.
+        next_event: The decision that samples points on lights for next event estimation at the
+            vertices of camera paths.
+        connections: The average fraction of the vertices of a light path to which a vertex of a
+            camera path is connected (s, t ≥ 2). All other techniques are used once for each pair of
+            paths.
         exponent: 1 for the balance heuristic, 2 for the power heuristic.
-        follows_camera: Is ``by_camera`` of :class:`Sums` wanted?
-        selection: Chooses the vertices of light paths by regions; what it expects for a pair of
-            regions multiplies ``connections``. ``None`` where all vertices are alike.
+        follows_camera: Is ``by_camera`` of :class:`Sums` computed?
+        selection: Chooses the vertices of light paths by regions; its ``expected`` for a pair of
+            regions multiplies ``connections``. ``None`` if the choice is uniform.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class PartialSums:
     ) -> None:
         self._next_event, self.exponent, self.selection = next_event, exponent, selection
         self.follows_camera = follows_camera
-        #: The count of the connections, in weights.
+        #: ``connections``, raised to the exponent.
         self.count = self.ratio(mi.Float(connections))
 
     def ratio(self, x: mi.Float) -> mi.Float:
@@ -92,7 +92,7 @@ class PartialSums:
         """At the first vertex after the light, ``si``."""
         is_delta = emitted.is_delta_position | emitted.is_delta_direction
         chosen = emitted.probability * emitted.pdf_position * emitted.pdf_direction
-        # Per area at the vertex; per area at the light
+        # Densities per area, at the vertex (``arrives``) and at the light (``leaves``)
         arrives = chosen * _cosine(si) / dr.select(emitted.is_infinite, 1, dr.square(si.t))
         connected = self._connection_density(scene, emitted, si, active)
         leaves = dr.select(emitted.is_infinite, 1, emitted.cosine / dr.square(si.t))
@@ -115,24 +115,27 @@ class PartialSums:
         return Sums(dVCM, dVC, region=region, count=count)
 
     def others(self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float) -> mi.Float:
-        """Where a subpath's last vertex is connected to something: the ratios, to that technique,
-        of all techniques that find this vertex from the other side, summed.
+        """For a technique that connects a subpath's last vertex to something: the sum over all
+        techniques that sample this vertex from the other side, of the ratio of their density to
+        that of the technique.
 
         Parameters:
-            density: With which the other side finds the vertex, in units of the technique's density
-                (per area, where the technique itself has density 1).
-            reverse_pdf: Of going on from there to the subpath's vertex before, per solid angle.
+            density: Density with which the other side samples the vertex, divided by the density
+                of the technique (per area, where the technique itself has density 1).
+            reverse_pdf: Density, per solid angle, of continuing from there to the previous vertex
+                of the subpath.
         """
         return self.ratio(density) * (sums.last + self.ratio(reverse_pdf) * sums.dVC)
 
     def _connection_density(self, scene, emitted, si, active) -> mi.Float:
-        """With which a connection from ``si`` finds the point of the light: per solid angle, or
-        the probability of choosing the light if it is a point or a direction."""
+        """The density with which next event estimation at ``si`` samples the point on the light:
+        per solid angle, or the probability of choosing the light if it is a point or a
+        direction."""
         place = self._next_event.visit(
             self._next_event.begin(None, emitted.ray), scene, si, active
         )
-        # With what density scattering finds the light is not known here: decisions that ask for it
-        # have no place beside light paths
+        # The density of the BSDF sample is not known here: decisions that use it cannot be combined
+        # with light paths
         d = -emitted.ray.d
         state = self._next_event.remember(place, scene, d, mi.Float(0), active)
         start, ds = emitted.start, dr.zeros(mi.DirectionSample3f, dr.width(si))
@@ -162,11 +165,12 @@ class PartialSums:
         is_first: mi.Bool,
         by_light: bool,
     ) -> Sums:
-        """From a vertex to the next one, ``si``, at this distance: solid angles become areas.
+        """The sums at the next vertex, ``si``, at this distance: densities per solid angle become
+        densities per area.
 
         Parameters:
-            is_first: Is it the first vertex of the subpath?
-            by_light: Is the subpath that of a light?
+            is_first: Is ``si`` the first vertex of the subpath?
+            by_light: Is it a light path?
         """
         inverse = dr.rcp(dr.maximum(_cosine(si), 1e-12))
         region, count = (), ()
@@ -174,7 +178,7 @@ class PartialSums:
             region = self.selection.region(from_both_ends(si), si.is_valid())
             ends = (region, sums.region) if by_light else (sums.region, region)
             expected = self.selection.expected(*ends, si.is_valid() & ~is_first)
-            # What connects the first vertex to the end of the path is no such connection
+            # The first vertex is connected to the light or the sensor, which has no region
             count = dr.select(is_first, 1, self.ratio(expected))
         return Sums(
             sums.dVCM * self.ratio(squared_distance * inverse),
@@ -193,18 +197,18 @@ class PartialSums:
         is_delta: mi.Bool,
         is_first: mi.Bool | bool = False,
     ) -> Sums:
-        """A direction was sampled.
+        """The sums behind a vertex, after a direction was sampled there.
 
         Parameters:
-            cosine: Between it and the geometric normal, not negative.
-            pdf, reverse_pdf: Its density, and that of the opposite way through the vertex, per
-                solid angle.
-            is_delta: Did a discrete distribution choose it? Then no other technique connects here.
+            cosine: Between the direction and the geometric normal, not negative.
+            pdf, reverse_pdf: Density of the direction, and of the reverse direction through the
+                vertex, per solid angle.
+            is_delta: Was the direction sampled from a delta lobe? Then no technique connects here.
             is_first: Is this the first vertex after the light?
         """
         leaves = cosine * dr.select(pdf > 0, dr.rcp(pdf), 0)
         smooth = self.others(leaves, sums, reverse_pdf)
-        # The technique that connects behind a vertex has other vertices on both sides
+        # The technique that connects the segment behind this vertex is one with s, t ≥ 2
         dVCM = self.count * self.ratio(dr.select(pdf > 0, dr.rcp(pdf), 0))
         return Sums(
             dr.select(is_delta, 0, dVCM),
@@ -217,9 +221,10 @@ class PartialSums:
     def by_camera(
         self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float, is_first: mi.Bool | bool
     ) -> mi.Vector2f | tuple[()]:
-        """The ratios of the densities with which a camera path finds everything by itself (s = 0
-        and 1) to that of connecting to a light path's last vertex, as :meth:`others`, but not
-        raised to the exponent; ``()`` where they are not followed."""
+        """The densities with which a camera path alone finds the whole path (s = 0 and 1), each
+        divided by that of connecting to the last vertex of the light path. The parameters are those
+        of :meth:`others`; the ratios are not raised to the exponent. ``()`` if ``follows_camera``
+        is not set."""
         if isinstance(sums.by_camera, tuple):
             return ()
         first = mi.Vector2f(reverse_pdf * self.root(sums.dVC), self.root(sums.dVCM))
@@ -236,7 +241,7 @@ class PartialSums:
 
 
 def weight(others: mi.Float) -> mi.Float:
-    """The weight of a technique, from the sum of the others' ratios to it."""
+    """The MIS weight of a technique, from the sum of the other techniques' density ratios to it."""
     return dr.select(dr.isfinite(others), dr.rcp(1 + others), 0)
 
 

@@ -1,4 +1,4 @@
-"""What ``path`` would make of a scene, from the samples of bidirectional path tracing."""
+"""The variance that ``path`` would have, estimated from samples of bidirectional path tracing."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from .technique_observer import TechniqueObserver
 
 
 class Estimate(NamedTuple):
-    """What is known of an image, [pixel] each.
+    """Estimates of mean and variance for each pixel, [pixel] each.
 
     Attributes:
         mean: Radiance.
         bidirectional, by_camera: Variance of one sample of each pixel, with all techniques, and
-            with those of ``path`` alone. They may be negative where there are few samples.
+            with those of ``path`` alone. They may be negative if there are few samples.
     """
 
     mean: np.ndarray
@@ -28,27 +28,28 @@ class Estimate(NamedTuple):
 
 
 class PathMoments(TechniqueObserver):
-    """Estimates the variance of ``path`` from what all techniques find.
+    """Estimates the variance of ``path`` from the samples of all techniques.
 
-    Light that camera paths find rarely is hardly ever in their samples: their own variance would
-    be underestimated where it is largest. But the second moment of ``path`` is an integral over
-    paths, and light paths find these often. Let ``path`` find a path of contribution f with the
-    densities q₀ and q₁ (s = 0 and 1); by the power heuristic, its second moment is the integral of
-    f² (q₀³ + q₁³) / (q₀² + q₁²)². A technique of density p that finds such a path adds the
-    integrand / p to it, times its MIS weight. Products of what a camera path brings at several
-    vertices, and squared means, come from the camera paths as they are.
+    Light that camera paths find rarely is hardly ever in their samples. Their sample variance would
+    therefore be too small where the true variance is largest. But the second moment of ``path`` is
+    an integral over paths, and light paths find these often. Let ``path`` find a path of
+    contribution f with the densities q₀ and q₁ (s = 0 and 1). With the power heuristic, the second
+    moment of ``path`` is the integral of f² (q₀³ + q₁³) / (q₀² + q₁²)². A technique of density p
+    that finds such a path adds the integrand / p, times its MIS weight, to the estimate of this
+    integral. Products of the contributions at different vertices of a camera path, and squared
+    means, are estimated from camera paths alone.
 
     Source: P. Grittmann, I. Georgiev, P. Slusallek, *Efficiency-Aware Multiple Importance Sampling
     for Bidirectional Rendering Algorithms*, ACM TOG 41(4), 2022 (second moments of one set of
     techniques from samples of another).
 
     Parameters:
-        film: Of the sensor.
+        film: Film of the sensor.
         width, height: Its sampled pixels.
 
     Attributes:
-        samples: Camera samples that were seen.
-        unreachable: Samples of light that ``path`` finds in no way.
+        samples: Number of camera samples.
+        unreachable: Number of samples of paths that ``path`` cannot find.
         rays: Rays traced for all techniques, and for those of ``path``.
     """
 
@@ -59,8 +60,8 @@ class PathMoments(TechniqueObserver):
         self._offset = mi.Vector2f(mi.ScalarVector2f(film.crop_offset()))
         self.samples = self.unreachable = 0
         self.rays = np.zeros(2)
-        # Of each pixel: samples; sums of what a sample brings, of its square, of the second
-        # moment of ``path``; sums of splats, and of their squares
+        # For each pixel: number of samples; sums of the samples' values, of their squares, and of
+        # the second moment of ``path``; sums of splats, and of their squares
         self._sums = np.zeros((6, self._pixels))
 
     # ---- Observer ----
@@ -69,7 +70,8 @@ class PathMoments(TechniqueObserver):
         self._pixel, self._importance = rays.pixel, rays.importance
         lanes = dr.width(rays.pixel)
         self._lane = dr.arange(mi.UInt32, lanes)
-        # What ``path`` would have brought, the squares of its parts, and the second moment
+        # For each camera path: its value with the techniques of ``path`` alone, the squares of the
+        # terms of this sum, and the second moment
         self._path, self._squares, self._moment = (dr.zeros(mi.Float, lanes) for _ in range(3))
         self._shadow_count = dr.zeros(mi.UInt32, lanes)
         self._missed = dr.zeros(mi.UInt32, 1)
@@ -96,8 +98,9 @@ class PathMoments(TechniqueObserver):
         dr.scatter_add(self._shadow_count, mi.UInt32(1), self._lane, tested)
 
     def _add_own(self, brought, mis, other, active) -> None:
-        """What ``path`` finds by one technique as well; ``other`` is the ratio of the other one's
-        density to its own."""
+        """Adds a contribution that ``path`` finds too, by BSDF sampling or by next event
+        estimation. ``other`` is the density of the other of these two, divided by that of the one
+        that found it."""
         active = active & (mis > 0)
         whole = brought / mis
         part = whole * power_heuristic(mi.Float(1), other)
@@ -132,12 +135,12 @@ class PathMoments(TechniqueObserver):
 
     def traced(self, camera: Sample, whole: Sample) -> None:
         brought = self._brightness(camera.L)
-        # All of it, since the film reads it too
+        # The whole sample, since the film reads it too
         dr.eval(camera, brought)
         pixel = self._pixel.numpy()
 
         def per_pixel(values: np.ndarray) -> np.ndarray:
-            # NumPy adds one after the other: equal seeds make equal sums
+            # NumPy adds in a fixed order: equal seeds give equal sums
             values = np.where(np.isfinite(values), values, 0).astype(np.float64)
             return np.bincount(pixel, values, self._pixels)
 
@@ -158,15 +161,16 @@ class PathMoments(TechniqueObserver):
             lanes + _total(camera.scatter_count) + tested,
         )
 
-    # ---- What was learned ----
+    # ---- After the passes ----
 
     def estimate(self) -> Estimate:
-        """Of all passes."""
+        """The estimate from all passes."""
         n, x, x2, moment, splats, splats2 = self._sums
         n = np.maximum(n, 1)
-        # Of a few samples: the squared mean is too large by the variance of the mean
+        # The unbiased estimate: with few samples, the square of the sample mean is too large, by
+        # the variance of the mean
         of_camera = np.where(n > 1, (x2 - x**2 / n) / np.maximum(n - 1, 1), x2)
-        # A pixel gets splats from few light paths: their squares are their variance
+        # Few of all light paths splat to a pixel: the sum of their squares is about their variance
         bidirectional = of_camera + splats2 / n
         mean = (x + splats) / n
         squared_mean = np.where(n > 1, mean**2 - bidirectional / n, 0)

@@ -28,26 +28,26 @@ from .technique_observer import TechniqueObserver
 from .vertex_choice import OwnVertexChoice, RegionChoice, VertexChoice
 from .weights import BidirectionalWeights
 
-#: Vertices of a light path, about, for MIS weights. The true number would make the weights depend
-#: on the samples (door_ajar: 11 % less variance than with 1).
+#: The number of vertices of a light path that MIS weights assume. The true number would make the
+#: weights depend on the samples. (door_ajar: 11 % less variance than with 1.)
 _VERTICES = 2.5
 
 
 @dataclass
 class BidirectionalPathTracer:
     """Traces a camera path and a light path in each lane; it is an :class:`Estimator`. The camera
-    path is that of a :class:`Walk` with whatever decisions.
+    path is traced by a :class:`Walk`, with any decisions.
 
     Parameters:
-        walk: That of the camera paths.
-        emission: Where light paths begin.
-        sensor: What light paths are connected to; ``None`` if they are not.
-        connections: To how many vertices of light paths each vertex of a camera path is connected.
-        selection: Chooses these vertices, or the regions in which they lie. A path of other
-            wavelengths, or of another time, cannot be connected to: where such differ, the choice
-            is always uniform, among the vertices of the light path in the same lane.
-        observer: Is told what each technique finds, by the walk as well.
-        is_alone: Must the sample in a lane not depend on other lanes? Then camera paths are
+        walk: Traces the camera paths.
+        emission: Samples the rays with which light paths begin.
+        sensor: The sensor to which light paths are connected; ``None`` to leave out this technique.
+        connections: Number of light path vertices to which each camera path vertex is connected.
+        selection: Chooses the regions from which these vertices are taken. Paths of different
+            wavelengths or times cannot be connected. Where these differ between lanes, the choice
+            is always uniform among the vertices of the light path in the same lane.
+        observer: Is told the contributions of each technique, also by the walk.
+        is_alone: Must the sample in a lane not depend on other lanes? If so, camera paths are
             connected to the light path in the same lane only.
         skips_direct: Are paths of one and two segments left out?
     """
@@ -67,7 +67,8 @@ class BidirectionalPathTracer:
         walk = self.walk
         own_lane = self.is_alone or mi.is_spectral or bool(movers(scene))
         selection = self.selection if self.selection.count > 0 and not own_lane else None
-        # Per vertex where a selection says how often that is chosen
+        # Connections per vertex of a light path. A selection divides by the number of vertices
+        # itself, in ``expected``
         count = self.connections if selection else self.connections / _VERTICES
         observer, follows_camera = self.observer, False
         if observer is not None:
@@ -87,7 +88,7 @@ class BidirectionalPathTracer:
         light_walk = LightWalk(
             self.emission, walk.max_depth, walk.rr_depth, sums, query=walk.query
         )
-        # What the rest of the pass reads again
+        # Evaluated now, since later kernels of the pass read the rays again
         dr.schedule(rays)
         lanes = dr.width(rays.ray)
         rounds: list[LightVertices] = []
@@ -123,7 +124,7 @@ class BidirectionalPathTracer:
         )
         shadow_count = sample.shadow_count
         if image is not None:
-            # Counted as if the first lane had traced them
+            # The first lane counts all shadow rays of the light image
             is_first = dr.arange(mi.UInt32, lanes) == 0
             shadow_count = shadow_count + dr.select(is_first, image.shadow_count, 0)
         scatter_count += sample.scatter_count

@@ -1,9 +1,10 @@
-"""BSDFs at vertices of light paths, evaluated so that the integrand is that of ``path``.
+"""BSDFs at vertices of light paths, evaluated such that light paths and ``path`` have the same
+integrand.
 
 ``path`` evaluates BSDFs with ``wi`` towards the camera. Some are not reciprocal (normal and bump
 maps, hair, thin transmission), so light paths evaluate them in the same way, although they travel
-in the other direction. Cosines of geometry are those of geometric normals; the BSDF brings along
-that of its own frame.
+in the other direction. The geometric cosines use the geometric normal; the value of a BSDF includes
+the cosine with its shading normal.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ def evaluate(
     to_camera: mi.Vector3f,
     active: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Float]:
-    """What a vertex does to light that arrives from ``si.wi`` and leaves ``to_camera`` (local),
-    where it is not connected to another path.
+    """The BSDF of a vertex for light that arrives from ``si.wi`` and leaves to ``to_camera``
+    (local). Not for connections to camera paths, which combine the wavelengths of two paths.
 
     Returns:
         BSDF · geometric cosine of ``to_camera``, which multiplies flux per solid angle; and the
-        density with which a camera path that arrives there samples ``si.wi``.
+        density with which a camera path that arrives from ``to_camera`` samples ``si.wi``.
     """
     value, pdf = adjoint_value(heroes.context(), bsdf, si, to_camera, active)
     return heroes.connect(hero_is_alone, value, bsdf, si, to_camera), pdf
@@ -43,7 +44,8 @@ def adjoint_value(
     to_camera: mi.Vector3f,
     active: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Float]:
-    """The same for all wavelengths."""
+    """As :func:`evaluate`, but not restricted to the hero wavelength where dispersive interfaces
+    refract."""
     reversed_si = mi.SurfaceInteraction3f(si)
     reversed_si.wi = to_camera
     value, pdf = eval_bsdf(bsdf, ctx, reversed_si, si.wi, active)
@@ -53,23 +55,23 @@ def adjoint_value(
 
 
 def delta_correction(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Float:
-    """What multiplies the weight of a sample of a discrete direction, drawn with the mode
-    ``Importance``, for the integrand to be that of ``path`` (Veach, PhD thesis, section 5.3.2).
+    """The factor of the weight of a sample from a delta lobe, drawn with the mode ``Importance``,
+    that makes the integrand that of ``path`` (Veach, PhD thesis, section 5.3.2).
 
-    The BSDF may have turned its frame (normal maps): its normal is that about which the sample was
-    reflected or refracted, since its tangential part obeys Snell's law.
+    The BSDF may have turned its frame (normal maps). Its normal follows from the directions, by
+    Snell's law: it is parallel to wi + η wo.
     """
     normal = si.wi + bs.eta * bs.wo
     arrives, leaves = dr.abs(dr.dot(normal, si.wi)), dr.abs(dr.dot(normal, bs.wo))
     geometric = geometric_cosine(si, bs.wo) / geometric_cosine(si, si.wi)
     factor = geometric * arrives / leaves
-    # What passes straight on has no such normal, and no correction
+    # A direction that passes straight through has no such normal, and needs no correction
     passes = dr.squared_norm(si.wi + bs.wo) < 1e-8
     return dr.select(passes, 1, dr.select(dr.isfinite(factor), factor, 0))
 
 
 def geometric_cosine(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
-    """Between the geometric normal and a local direction, not negative."""
+    """The cosine between the geometric normal and a local direction, not negative."""
     return dr.abs(dr.dot(si.n, si.to_world(d)))
 
 

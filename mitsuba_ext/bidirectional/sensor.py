@@ -17,17 +17,17 @@ _CONNECTABLE = ("PerspectiveCamera", "ThinLensCamera")
 
 @dataclass
 class SensorConnection:
-    """A point of the scene, seen by the sensor.
+    """A connection of a point of the scene to the sensor.
 
     Attributes:
         d, dist: Direction to the point of the aperture, and the distance.
-        target: Where the sensor's rays begin on this line (at the near clip plane): nothing behind
-            it can be in between.
-        position: Where on the film, in pixels of its crop window plus that window's offset.
+        target: End of the shadow ray: the point of this line on the near clip plane, where camera
+            rays begin.
+        position: Position on the film: pixels in the crop window, plus the window's offset.
         pdf: Density with which the sensor, from this point of the aperture, would send a camera
             ray here, per solid angle; it integrates to 1 over the crop window.
-        importance: ``pdf`` / ``dist``²: what multiplies flux per solid angle.
-        active: Which points are seen, if nothing is in between.
+        importance: ``pdf`` / ``dist``², the factor of flux per solid angle.
+        active: Points that are seen unless they are occluded.
     """
 
     d: mi.Vector3f
@@ -40,26 +40,26 @@ class SensorConnection:
 
 
 class UniformLens:
-    """Chooses points of the aperture: uniformly."""
+    """Chooses points of the aperture uniformly."""
 
     def sample(
         self, sample: mi.Point2f, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[mi.Point2f, mi.Float | float]:
-        """The numbers that choose a point of the aperture for a connection to ``si`` (in the frame
-        in which the sensor rests), and the weight of the connection (1 / density of the
+        """The random numbers that choose a point of the aperture for a connection to ``si`` (in the
+        frame in which the sensor rests), and the weight of the connection (1 / density of these
         numbers)."""
         return sample, 1.0
 
 
 class ConnectableSensor:
-    """A sensor that can be connected to.
+    """A sensor to which points of the scene can be connected.
 
-    Mitsuba's ``sample_direction`` is only asked for positions. Its importance is 0 on a part of the
+    Mitsuba's ``sample_direction`` is used for positions only. Its importance is 0 on a part of the
     film of a ``perspective`` with a shifted principal point, and it returns points behind a
     ``thinlens``.
 
     Parameters:
-        sensor: Passes :meth:`can_connect`.
+        sensor: A sensor for which :meth:`can_connect` is true.
         lens: Chooses the points of the aperture.
     """
 
@@ -68,7 +68,8 @@ class ConnectableSensor:
         film = sensor.film()
         width, height = (int(n) for n in film.size())
         crop_width, crop_height = (int(n) for n in film.crop_size())
-        # Not its methods: integrators of Mitsuba that nest ours pass a sensor without its class
+        # By parameters, not by methods of the class: Mitsuba's integrators that nest ours pass the
+        # sensor as a plain ``mi.Sensor``
         parameters = mi.traverse(sensor)
         angle = float(dr.slice(parameters["x_fov"]))
         crop = crop_width * crop_height / (width * height)
@@ -112,8 +113,8 @@ class ConnectableSensor:
         ), weight  # fmt: skip
 
     def origin(self, ray: mi.Ray3f) -> tuple[mi.Point3f, mi.Float]:
-        """The point of the aperture from which a camera ray comes (it begins at the near clip
-        plane), and the density of its direction per solid angle, as :attr:`SensorConnection.pdf`.
+        """The point of the aperture from which a camera ray comes (the ray itself begins at the
+        near clip plane), and the density of its direction, as :attr:`SensorConnection.pdf`.
         """
         axis = viewing_axis(self._sensor, ray.time)
         inverse = dr.rcp(dr.maximum(dr.dot(ray.d, axis), 1e-6))
@@ -136,8 +137,8 @@ def is_occluded(
     active: mi.Bool,
     hides_emitters: bool = False,
 ) -> mi.Bool:
-    """Is there anything between ``si`` and the sensor? With ``hides_emitters``, anything but area
-    lights."""
+    """Is the connection of ``si`` to the sensor occluded? With ``hides_emitters``, area lights do
+    not occlude."""
     ds = dr.zeros(mi.DirectionSample3f, dr.width(si))
     ds.p, ds.d, ds.dist = connection.target, connection.d, connection.dist
     if not hides_emitters:

@@ -1,8 +1,8 @@
 """How an interaction with a surface is stored in words.
 
-To find a point on its shape once more takes longer than to read a few more words: in kitchen, a
-tenth of the time of a bidirectional sample. What only some BSDFs ask for is stored where the scene
-may hold such.
+Computing a surface interaction again takes longer than reading a few more words: in kitchen, a
+tenth of the time of a bidirectional sample. Fields that only some BSDFs read are stored only if the
+scene may contain such BSDFs.
 """
 
 from __future__ import annotations
@@ -14,26 +14,28 @@ import mitsuba as mi
 
 from ..scene.movers import movers
 
-#: BSDFs that know of the surface no more than ``wi`` and ``uv``, what is nested in them aside.
+#: BSDFs that read no more of the interaction than ``wi`` and ``uv``. BSDFs and textures nested in
+#: them may read more.
 _PLAIN_BSDFS = frozenset({
     "SmoothDiffuse", "SmoothDielectric", "ThinDielectric", "RoughDielectric", "SmoothConductor",
     "RoughConductor", "SmoothPlastic", "RoughPlastic", "PolarizedPlastic", "Principled",
     "PrincipledThin", "TwoSidedBRDF", "MaskBSDF", "BlendBSDF", "Null",
 })  # fmt: skip
 
-#: Textures that know of the surface no more than ``uv``; names of classes begin so.
+#: Textures that read no more of the interaction than ``uv``: the beginnings of their class names.
 _PLAIN_TEXTURES = (
     "Bitmap", "Checkerboard", "UniformSpectrum", "SRGBReflectanceSpectrum", "RegularSpectrum",
     "IrregularSpectrum",
 )  # fmt: skip
 
-#: Words of an interaction that all BSDFs ask for, and of what only some do.
+#: Words of the fields that all BSDFs read, and of those that only some read.
 _WORDS, _MORE_WORDS = 15, 14
 
 
 def needs_whole_interaction(scene: mi.Scene) -> bool:
-    """May a BSDF ask for more than ``wi`` and ``uv``? Bump and normal maps do, and it is not known
-    of BSDFs that are written in Python. What an instance shows cannot be seen from outside."""
+    """May a BSDF of the scene read more than ``wi`` and ``uv``? Bump and normal maps do. BSDFs
+    written in Python may. The BSDFs of instanced shapes cannot be inspected, so that they count as
+    if they did."""
     shapes = scene.shapes()
     if movers(scene) or any(shape.class_name() == "Instance" for shape in shapes):
         return True
@@ -41,12 +43,12 @@ def needs_whole_interaction(scene: mi.Scene) -> bool:
 
 
 def interaction_words(is_whole: bool) -> int:
-    """How many words there are."""
+    """Number of words of an interaction."""
     return _WORDS + _MORE_WORDS * is_whole
 
 
 def to_words(si: mi.SurfaceInteraction3f, is_whole: bool) -> list[mi.Float]:
-    """The words of an interaction, but for its time and wavelengths."""
+    """The words of an interaction, without its time and wavelengths."""
     frame = si.sh_frame
     words = [*si.p, *si.wi, *si.uv, *_flat(si.n), *_flat(frame.n), *_flat(frame.s)]
     words.append(as_float(si.shape))
@@ -57,7 +59,7 @@ def to_words(si: mi.SurfaceInteraction3f, is_whole: bool) -> list[mi.Float]:
 
 
 def from_words(words: list[mi.Float], is_whole: bool) -> mi.SurfaceInteraction3f:
-    """The interaction that :func:`to_words` was given."""
+    """The inverse of :func:`to_words`."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(words[0]))
     si.p, si.wi = mi.Point3f(*words[0:3]), mi.Vector3f(*words[3:6])
     si.uv, si.n = mi.Point2f(*words[6:8]), mi.Normal3f(_unit(*words[8:10]))
@@ -73,19 +75,19 @@ def from_words(words: list[mi.Float], is_whole: bool) -> mi.SurfaceInteraction3f
 
 
 def as_float(value: Any) -> mi.Float:
-    """An integer, or the number of an object, as the word of a packet."""
+    """The bits of an integer, or of an object's registry index, as a ``Float``."""
     if not isinstance(value, mi.UInt32):
         value = dr.reinterpret_array(mi.UInt32, value)
     return dr.reinterpret_array(mi.Float, value)
 
 
 def as_shape(word: mi.Float) -> mi.ShapePtr:
-    """The shape that :func:`as_float` was given."""
+    """The inverse of :func:`as_float` for shapes."""
     return dr.reinterpret_array(mi.ShapePtr, dr.reinterpret_array(mi.UInt32, word))
 
 
 def _flat(v: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-    """A unit vector, on an octahedron that is folded open."""
+    """A unit vector in octahedral coordinates, two numbers in [-1, 1]."""
     scale = dr.rcp(dr.abs(v.x) + dr.abs(v.y) + dr.abs(v.z))
     x, y = v.x * scale, v.y * scale
     is_below = v.z < 0
@@ -98,7 +100,7 @@ def _flat(v: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
 def _unit(x: mi.Float, y: mi.Float) -> mi.Vector3f:
     """The inverse of :func:`_flat`."""
     z = 1 - dr.abs(x) - dr.abs(y)
-    # By how much it is below: what was folded goes back
+    # Distance below the equator: this half of the octahedron was folded outwards
     below = dr.maximum(-z, 0)
     return dr.normalize(mi.Vector3f(x - dr.mulsign(below, x), y - dr.mulsign(below, y), z))
 
@@ -107,7 +109,7 @@ def _is_plain(bsdf: mi.BSDF) -> bool:
     if bsdf.class_name() not in _PLAIN_BSDFS:
         return False
 
-    # The base class is known once a variant is selected
+    # Defined here, since the base class only exists once a variant is selected
     class Nested(mi.TraversalCallback):
         def __init__(self) -> None:
             super().__init__()

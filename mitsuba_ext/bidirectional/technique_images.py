@@ -11,34 +11,34 @@ import numpy as np
 from ..transport.estimator import CameraRays
 from .technique_observer import TechniqueObserver
 
-#: The images take so much memory at most, and paths of more segments are not told apart.
+#: Largest memory of the images in bytes, and longest paths that they show.
 _MOST_BYTES, _MOST_SEGMENTS = 1 << 29, 8
 
-#: Words of a pixel of a technique: three colours, weighted and not.
+#: Words of a pixel of a technique: three colour channels, with and without MIS weights.
 _WORDS = 6
 
 
 def technique_number(s: int | mi.UInt32, t: int | mi.UInt32) -> int | mi.UInt32:
-    """The number of a technique with s vertices on the light path and t ≥ 1 on the camera path: in
-    the order of the length of paths, s + t − 1 segments, and of s."""
+    """The index of a technique with s vertices on the light path and t ≥ 1 on the camera path.
+    Techniques are ordered by path length, s + t − 1 segments, and then by s."""
     k = s + t - 1
     return (k - 1) * (k + 2) // 2 + s
 
 
 class TechniqueImages(TechniqueObserver):
-    """Adds up what each technique brings, with its MIS weight and without.
+    """Adds up the contributions of each technique, with MIS weights and without.
 
-    The images are unfiltered: a sample counts for the pixel that it lies in. In spectral variants
-    they show means over the wavelengths.
+    The images are unfiltered: a sample is added only to the pixel that it lies in. In spectral
+    variants they show means over the wavelengths.
 
     Source: E. Veach, *Robust Monte Carlo Methods for Light Transport Simulation*, PhD thesis, 1997,
     Fig. 10.3.
 
     Parameters:
-        film: Of the sensor.
+        film: Film of the sensor.
         width, height: Its sampled pixels.
-        max_depth: Longest path in segments. Paths of more than 8 are left out, on large films those
-            of less; :attr:`segments` says how many.
+        max_depth: Longest path in segments. Paths of more than 8 segments are left out, on large
+            films shorter ones as well: :attr:`segments` is the length of the longest paths shown.
     """
 
     def __init__(self, film: mi.Film, width: int, height: int, max_depth: int) -> None:
@@ -79,7 +79,7 @@ class TechniqueImages(TechniqueObserver):
         self._add(s, mi.UInt32(1), pixel, value, mis, active)
 
     def _add_own(self, s, t, value, mis, active) -> None:
-        """Of the camera path in the same lane."""
+        """Adds to the pixel of the camera path in the same lane."""
         self._add(s, t, self._pixel, value * self._importance, mis, active)
 
     def _add(self, s, t, pixel, value, mis, active) -> None:
@@ -93,8 +93,12 @@ class TechniqueImages(TechniqueObserver):
     # ---- After the render ----
 
     def images(self, spp: int) -> dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]:
-        """By (s, t), the weighted and the unweighted image, [y, x, channel] each, of the techniques
-        that have found anything with so many samples per pixel."""
+        """For each technique (s, t) that found light: its image with and without MIS weights,
+        [height, width, channel].
+
+        Parameters:
+            spp: Number of samples per pixel that were rendered.
+        """
         count = technique_number(0, self.segments + 2)
         sums = self._sums.numpy().reshape(count, self._height, self._width, 2, 3) / spp
         found = {}

@@ -1,4 +1,4 @@
-"""What the techniques of bidirectional path tracing tell those who compare them."""
+"""Observers that are told the contributions of each technique of bidirectional path tracing."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from ..transport.observer import Observer, Observers
 
 
 class TechniqueObserver(Observer):
-    """Is told what each technique finds. What camera paths find by themselves (s = 0 and 1) the
-    walk tells by the methods of :class:`Observer`.
+    """Is told the contributions of each technique. The walk reports the contributions of camera
+    paths alone (s = 0 and 1) by the methods of :class:`Observer`.
 
     Attributes:
-        compares_with_camera: Does it want to know with what density camera paths find by themselves
-            what others find? It is :meth:`PartialSums.by_camera`, here ``by_camera``, in units of
-            the density of the technique that found it, connections counted. It costs two words of
-            each stored vertex.
+        compares_with_camera: Should the methods be given ``by_camera``? For a path that another
+            technique found, these are the densities with which a camera path alone finds it
+            (:meth:`PartialSums.by_camera`), divided by the density of that technique times its
+            number of connections. They take two words of each stored vertex.
     """
 
     compares_with_camera = False
 
     def start(self, rays: CameraRays) -> None:
-        """A pass begins, with these camera rays. What is told of camera paths is radiance, which
-        the importance of their rays multiplies; splats hold it already."""
+        """A pass begins, with these camera rays. The values reported for camera paths are radiance:
+        the importance of the rays has yet to multiply them. The values of splats include it."""
 
     def joined(
         self,
@@ -37,8 +37,8 @@ class TechniqueObserver(Observer):
         by_camera: mi.Vector2f | tuple[()],
         active: mi.Bool,
     ) -> None:
-        """The camera path of each lane was connected to a light path (s, t ≥ 2), and gains
-        ``value``, the MIS weight ``mis`` included."""
+        """The camera path in each lane was connected to a light path (s, t ≥ 2). This adds
+        ``value`` to its radiance, the MIS weight ``mis`` included."""
 
     def splatted(
         self,
@@ -49,16 +49,16 @@ class TechniqueObserver(Observer):
         by_camera: mi.Vector2f | tuple[()],
         active: mi.Bool,
     ) -> None:
-        """Vertices of light paths were connected to the sensor (t = 1), and bring ``value``, the
-        MIS weight included, to a position on the film (``Splats``)."""
+        """Vertices of light paths were connected to the sensor (t = 1). This adds ``value``, the
+        MIS weight ``mis`` included, at a position on the film (``Splats``)."""
 
     def traced(self, camera: Sample, whole: Sample) -> None:
-        """A pass has been traced: what camera paths brought, connections to light paths included,
-        and what all techniques brought."""
+        """A pass has been traced. ``camera`` holds the samples of camera paths, connections to
+        light paths included; ``whole`` those of all techniques."""
 
 
 class TechniqueObservers(Observers):
-    """Tells several observers the same."""
+    """Passes each call on to several observers."""
 
     def __init__(self, observers: Sequence[TechniqueObserver]) -> None:
         super().__init__(observers)

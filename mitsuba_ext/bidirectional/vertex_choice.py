@@ -1,4 +1,4 @@
-"""To which of the stored vertices of light paths a vertex is connected."""
+"""Choosing the stored vertices of light paths to which a camera path vertex is connected."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Chosen:
     """A vertex that was chosen.
 
     Attributes:
-        index: Its number.
+        index: Its index among the stored vertices.
         factor: The weight of the connection: 1 / (probability · number of light paths).
-        active: Where there was one to choose.
-        expected: What the selection expects, for MIS weights.
-        region, probability: That it lies in, and of choosing that; ``None`` where vertices are not
-            chosen by regions.
+        active: Lanes in which there was a vertex to choose.
+        expected: For MIS weights: :meth:`SubpathSelection.expected` for the chosen region.
+        region, probability: The region that was chosen, and the probability of choosing it;
+            ``None`` if vertices are not chosen by regions.
     """
 
     index: mi.UInt32
@@ -40,7 +40,7 @@ class VertexChoice:
     """Chooses among all vertices, uniformly.
 
     Parameters:
-        vertices: There is at least one.
+        vertices: The stored vertices, at least one.
     """
 
     def __init__(self, vertices: VertexCache) -> None:
@@ -49,13 +49,13 @@ class VertexChoice:
         self._mean = dr.opaque(mi.Float, vertices.count / len(vertices.first))
 
     def numbers(self, sampler: mi.Sampler) -> tuple[mi.Point2f, ...]:
-        """The numbers that choose a vertex."""
+        """The random numbers that choose a vertex."""
         return (sampler.next_2d(),)
 
     def choose(
         self, numbers: tuple[mi.Point2f, ...], vertex: Vertex, active: mi.Bool
     ) -> Chosen:
-        """Chooses one for each ``vertex``."""
+        """Chooses a stored vertex for each ``vertex``."""
         return Chosen(_below(self._count, numbers[0]), self._mean, active & (self._count > 0))
 
 
@@ -83,7 +83,7 @@ class RegionChoice(VertexChoice):
         super().__init__(vertices)
         self._selection = selection
         region = vertices.region
-        # Stable, and so the same in each render
+        # A stable sort, so that the order is the same in each render
         self._order = from_numpy(mi.UInt32, np.argsort(_small(region), kind="stable"))
         number = dr.zeros(mi.UInt32, selection.count)
         dr.scatter_add(number, mi.UInt32(1), region)
@@ -109,12 +109,12 @@ class RegionChoice(VertexChoice):
 
 
 def _below(number: mi.UInt32, sample: mi.Point2f) -> mi.UInt32:
-    """One of the numbers below ``number``. There may be more of them than floating point numbers of
-    24 bits, so that the choice takes two of these."""
+    """A uniformly chosen integer below ``number``. It takes two random numbers, since one has only
+    24 bits and ``number`` may be larger."""
     bits = (mi.UInt32(sample.x * 65536) << 16) | mi.UInt32(sample.y * 65536)
     return mi.UInt32((mi.UInt64(bits) * mi.UInt64(number)) >> 32)
 
 
 def _small(region: mi.UInt32) -> np.ndarray:
-    """Numbers of 16 bits, which NumPy sorts digit by digit."""
+    """The regions as 16-bit integers, which NumPy sorts by a fast radix sort."""
     return region.numpy().astype(np.uint16)

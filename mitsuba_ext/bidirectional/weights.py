@@ -1,4 +1,4 @@
-"""MIS weights of what camera paths find, beside what light paths find."""
+"""MIS weights of the techniques of camera paths (s = 0 and 1), in combination with light paths."""
 
 from __future__ import annotations
 
@@ -15,18 +15,17 @@ from .sensor import ConnectableSensor
 
 
 class BidirectionalWeights(Weights):
-    """Weights of all techniques that make a path of vertices from a light to the sensor: with s
-    vertices by a light path (0: a camera path runs into the light; 1: a connection to a point that
-    was chosen on the light), and t by a camera path (1: a light path's vertex is connected to the
-    sensor).
+    """MIS weights over all bidirectional techniques: s vertices come from a light path (0: a camera
+    path hits the light; 1: next event estimation), and t from a camera path (1: a light path's
+    vertex is connected to the sensor).
 
     Source: I. Georgiev, *Implementing Vertex Connection and Merging*, technical report, 2012.
 
     Parameters:
         scene: The scene.
         sums: Computes the partial sums.
-        emission: Where light paths begin.
-        sensor: What light paths are connected to; ``None`` if they are not (t = 1 is no technique).
+        emission: Gives the densities of the rays with which light paths begin.
+        sensor: The sensor to which light paths are connected; ``None`` to leave out t = 1.
     """
 
     def __init__(
@@ -41,14 +40,14 @@ class BidirectionalWeights(Weights):
         self._origin = mi.Point3f(0)
 
     def kernel_state(self) -> tuple:
-        """What kernels depend on."""
+        """The objects that kernels depend on."""
         return self.sums, self._emission, self._sensor
 
     def begin(self, ray: mi.Ray3f) -> Sums:
         if self._sensor is None:
             return self.sums.begin(mi.Float(0), mi.Float(0))
         self._origin, pdf = self._sensor.origin(ray)
-        # As many light paths as camera paths
+        # One light path is traced for each camera path: the technique t = 1 has the count 1
         return self.sums.begin(self.sums.ratio(dr.rcp(pdf)), dr.zeros(mi.Float, dr.width(pdf)))
 
     def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Sums:
@@ -57,7 +56,7 @@ class BidirectionalWeights(Weights):
         later = self.sums.arrive(
             path.sums, si, dr.squared_norm(si.p - ref), is_first, by_light=False
         )
-        # Where nothing was hit, densities stay those of directions
+        # A ray that hits nothing keeps its density per solid angle
         return Sums(
             dr.select(si.is_valid(), later.dVCM, path.sums.dVCM),
             dr.select(si.is_valid(), later.dVC, path.sums.dVC),
@@ -70,14 +69,14 @@ class BidirectionalWeights(Weights):
         position, direction = self._emission.densities(
             scene, ds.emitter, -ds.d, si.n, path.arrival.ref, active
         )
-        # The point's density by a connection: per area on surfaces
+        # The density of next event estimation: per area for lights with a surface
         found = pdf * dr.select(
             si.is_valid(), dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist), 1
         )
-        # One connection to a light, instead of those to light paths
+        # dVCM holds the count of connections to light paths, but there is one to a light
         others = self.sums.ratio(found) * path.sums.dVCM / self.sums.count
         others += self.sums.ratio(position * direction) * path.sums.dVC
-        # What the sensor sees directly is found in no other way
+        # No other technique finds lights that the sensor sees directly
         return dr.select(path.depth == 0, 1, weight(others))
 
     def connection(self, scene, vertex, ds, pdf, scattering_pdf) -> mi.Float:
@@ -89,7 +88,8 @@ class BidirectionalWeights(Weights):
         flags = ds.emitter.flags()
         is_point = mi.has_flag(flags, mi.EmitterFlags.DeltaPosition)
         has_area = ~is_point & ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
-        # Both ways to find this segment from the light, in the measure of connections
+        # The density with which a light path samples this segment, in the measure of next event
+        # estimation
         emitted = position * direction * geometric_cosine(si, wo)
         emitted *= dr.select(is_point, dr.rcp(dr.square(ds.dist)), 1)
         emitted *= dr.select(has_area, dr.rcp(dr.abs(dr.dot(ds.n, ds.d))), 1)

@@ -1,4 +1,4 @@
-"""``mitsuba-ext compare``: speed against error."""
+"""``mitsuba-ext compare``: measures the time and the error of integrators."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--workers", type=click.IntRange(1, 1024), metavar="N",
-    help="Render references in N processes of this machine. What is measured is rendered by one.",
+    help="Render references in N processes of this machine. Measured runs use one process.",
 )
 @click.option(
     "--dask", metavar="ADDRESS",
@@ -185,7 +185,7 @@ def compare(
 def _reference_workers(
     executors: contextlib.ExitStack, workers: int | None, dask: str | None, plugins: tuple[str, ...]
 ) -> ReferenceWorkers | None:
-    """Those who render references, whose executor ends with ``executors``."""
+    """The workers that render references. ``executors`` shuts them down."""
     from ..long_renders.dask_cluster import dask_cluster
     from ..long_renders.divided_references import ReferenceWorkers
     from ..long_renders.workers import Workers, threads_of_each
@@ -209,7 +209,8 @@ def _has_trouble(scene: Mapping[str, Any]) -> bool:
 
 
 def _sort_out(names: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """Which of the arguments are scenes: XML files, unless an <integrator> is their root."""
+    """Divides the arguments into scenes and integrators. XML files are scenes, unless their root is
+    an <integrator>."""
     from ..inputs.specifications import is_fragment
 
     paths = [Path(name) for name in names]

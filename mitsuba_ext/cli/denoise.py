@@ -1,4 +1,4 @@
-"""``mitsuba-ext denoise``: an image without its noise."""
+"""``mitsuba-ext denoise``: denoises an image."""
 
 from __future__ import annotations
 

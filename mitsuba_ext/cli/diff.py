@@ -1,4 +1,4 @@
-"""``mitsuba-ext diff``: how far one image is from another."""
+"""``mitsuba-ext diff``: measures how far one image is from another."""
 
 from __future__ import annotations
 
@@ -123,12 +123,12 @@ def _compare(image: _Image, reference: _Image) -> _Difference:
     differing = int(signed.any(axis=2).sum())
     y, x, channel = np.unravel_index(np.argmax(np.abs(signed)), signed.shape)
     if differing == 0:
-        # Also if both are black. Between an image and itself, no variance is to be subtracted.
+        # Also if both are black. The reference's variance must not be subtracted from an error of 0
         errors = metrics.Errors(**dict.fromkeys(_FIGURES, 0.0))
     else:
         try:
             errors = metrics.errors(image.pixels, reference.pixels, reference.variance)
-        except ValueError as error:  # black
+        except ValueError as error:  # the reference is black
             raise InputError(f"{reference.path}: {error}") from error
     return _Difference(
         errors=errors,

@@ -17,7 +17,8 @@ class FrameParameters(NamedTuple):
 
     Attributes:
         definitions: Values of the scene file's ``$name`` parameters.
-        values: Of the loaded scene, as JSON; see :func:`~mitsuba_ext.inputs.scene_values.as_text`.
+        values: Values of parameters of the loaded scene, as JSON; see
+            :func:`~mitsuba_ext.inputs.scene_values.as_text`.
     """
 
     definitions: dict[str, str]
@@ -25,15 +26,15 @@ class FrameParameters(NamedTuple):
 
 
 def load_function(text: str) -> Callable[[int], FrameParameters]:
-    """A function of the number of a frame.
+    """Loads the user's function, and wraps it into one from a frame's number to its parameters.
 
     Args:
         text: ``file.py:function`` or ``module:function``. The function returns a dict: keys with a
             dot are those of ``mi.traverse``, others are ``<default>``s of the scene.
 
     Raises:
-        InputError: There is no such file or function. The function that is returned raises it if
-            the user's function fails, or returns something else.
+        InputError: There is no such file or function. The wrapper raises it if the user's function
+            fails, or does not return such a dict.
     """
     source, colon, name = text.rpartition(":")
     if not colon or not source or not name.isidentifier():
@@ -52,7 +53,7 @@ def load_function(text: str) -> Callable[[int], FrameParameters]:
 
         try:
             found = function(frame)
-        except Exception as error:  # so may the function
+        except Exception as error:  # the function may raise anything too
             raise InputError(f"{text}: frame {frame}: {type(error).__name__}: {error}") from error
         if not isinstance(found, Mapping) or not all(isinstance(key, str) for key in found):
             raise InputError(f"{text}: frame {frame}: must return a dict by names")

@@ -1,4 +1,4 @@
-"""Which images a call of ``render`` makes: of several frames, by several sensors."""
+"""Which images a call of ``render`` makes: one for each frame and sensor."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import click
 from ..errors import InputError
 from .common import MAX_SEED
 
-#: What expressions know, besides the number of the frame.
+#: The functions and constants of expressions, besides the number of the frame.
 _FUNCTIONS = {
     **{name: value for name, value in vars(math).items() if not name.startswith("_")},
     "abs": abs, "min": min, "max": max, "round": round, "int": int,
@@ -52,9 +52,9 @@ class Picture(NamedTuple):
         output: Its file.
         definitions: Values of the scene's ``$name`` parameters.
         sensor: The number of the sensor; ``None`` for the first.
-        seed: Of the random numbers.
+        seed: Seed of the random numbers.
         frame: The number of the frame; ``None`` if there are none.
-        name: Among the images of the call; empty if it is the only one.
+        name: The part of the file's name for its frame and sensor; empty for a single image.
     """
 
     output: Path
@@ -79,12 +79,12 @@ def pictures(
     Args:
         output: The file, with ``#`` for each digit of the frame.
         definitions: Values; with frames, ``{…}`` in a value is an expression of ``frame``.
-        sensors: Their numbers. If there are several, the names of files tell which.
-        seed: Of frame 0. Each frame has the next one: noise that stays in place is seen.
+        sensors: Their indices. If there are several, file names contain them.
+        seed: Seed of frame 0. Frame n adds n: with equal seeds, noise would visibly stay in place.
         frames: Their numbers; ``None`` for a single image.
 
     Raises:
-        InputError: The file has no place for the frame, or an expression is none.
+        InputError: The file has no place for the frame, or an expression cannot be evaluated.
     """
     if frames is not None and len(re.findall("#+", output.name)) != 1:
         raise InputError(f"{output}: needs a place for the number of the frame: image.####.exr")

@@ -1,4 +1,5 @@
-"""A render that can be gone on with, divided, and ended when it is good enough."""
+"""A render in batches, which can be continued, divided among processes, and ended at a given error.
+"""
 
 from __future__ import annotations
 
@@ -29,16 +30,16 @@ from .reports import Report
 
 @dataclass(frozen=True)
 class LongOptions:
-    """What a long render is asked for, besides what to render.
+    """How to render in batches.
 
     Attributes:
-        folder: Where it is kept; ``None`` for nowhere.
-        every: How often.
-        add: Samples per pixel besides those that are there; ``None`` for none.
+        folder: The folder in which the render is saved; ``None`` for none.
+        every: How often it is saved.
+        add: Samples per pixel in addition to those in the folder; ``None`` for none.
         until: The relative error at which it ends; ``None`` for none.
-        workers: Processes that render; 0 for this one.
+        workers: Number of processes that render; 0 for this one.
         dask: The address of a Dask scheduler whose workers render; empty for none.
-        has_preview: Is the image to be shown while it grows, also if no folder keeps it?
+        has_preview: Is the unfinished image shown every so often, also without a folder?
     """
 
     folder: Path | None = None
@@ -58,8 +59,8 @@ class LongJob:
         scene, sensor: What it renders.
         film: The film that holds the image.
         is_interrupted: Did a signal or a failure end the render before its goal was reached?
-        failure: What went wrong after there was an image; ``None`` if nothing did.
-        seconds: Wall clock of the render.
+        failure: The error that ended the render after its first batch; ``None`` if there was none.
+        seconds: Wall clock time of the render.
     """
 
     def __init__(
@@ -67,8 +68,8 @@ class LongJob:
     ) -> None:
         """
         Args:
-            request, options: What to render, and how long.
-            scenes: Keeps the scene for the next image.
+            request, options: What to render, and how.
+            scenes: Keeps the loaded scene for the next image.
 
         Raises:
             InputError: The scene, the integrator or the sensor cannot be used.
@@ -89,20 +90,20 @@ class LongJob:
         self._state, self._render = RenderState(), None
 
     def remarks(self, is_sensor_chosen: bool) -> list[str]:
-        """Warnings about what the image will not show."""
+        """Warnings about parts of the scene that the image will not show."""
         return self._renderer.chosen.remarks(is_sensor_chosen)
 
     def run(
         self, spp: int | None, seconds: float | None, write: Callable[[bool], None], report: Report
     ) -> None:
-        """Goes on with what is in the folder.
+        """Renders, beginning with the samples that the folder holds.
 
         Args:
             spp: Samples per pixel of the whole image. Default: the number of the sampler, if
                 nothing else ends the render.
-            seconds: Of this call.
-            write: Shows the image of the film. Its argument says whether a signal asked for it.
-            report: Is told how far it is.
+            seconds: Time limit of this call.
+            write: Writes the image of the film. Its argument is true if a signal asked for it.
+            report: Shows the progress.
 
         Raises:
             InputError: The folder holds another render, or the integrator cannot render the scene.
@@ -163,9 +164,9 @@ class LongJob:
                         return interrupt.is_set()
 
                     is_reached = self._render.run(goal, is_stopped, executor, n)
-                if not state.done:  # stopped before others had finished a batch
+                if not state.done:  # stopped before a worker had finished a batch
                     raise KeyboardInterrupt
-            except InputError as error:  # the scheduler or too many workers are gone
+            except InputError as error:  # the scheduler or too many workers were lost
                 if not state.done:
                     raise
                 self.failure = error
@@ -179,15 +180,15 @@ class LongJob:
             try:
                 self._folder.save(state)
             except OSError as problem:
-                # The image may have room
+                # Go on: the disk may have room for the image, which is smaller
                 report.warn(f"the render could not be kept: {problem}")
 
     @contextlib.contextmanager
     def _executor(
         self,
     ) -> Iterator[tuple[Executor | None, Callable[[], int], Callable[[], None]]]:
-        """Who renders, how many batches at a time (which may change), and a function that fails if
-        these are gone."""
+        """The executor that renders, the number of its workers (which may change), and a function
+        that fails if they were lost."""
         if self._options.dask:
             with dask_cluster(self._options.dask) as (executor, check):
                 yield executor, executor.count, check
@@ -200,7 +201,7 @@ class LongJob:
         else:
             yield None, lambda: 1, lambda: None
 
-    # ---- How far it got ----
+    # ---- The state of the render ----
 
     @property
     def spp(self) -> int:
@@ -212,7 +213,7 @@ class LongJob:
         return f"after {self.spp} of {goal} spp" if goal else f"after {self.spp} spp"
 
     def has_image(self) -> bool:
-        """Are there samples?"""
+        """Are there samples in the image?"""
         return bool(self._state.done)
 
     def is_complete(self) -> bool:
@@ -228,7 +229,7 @@ class LongJob:
         return {f"variance.{name}": variance[..., n] for n, name in enumerate(colours)}
 
     def about(self) -> Mapping[str, Any]:
-        """What the metadata of the image say besides."""
+        """Further metadata of the image."""
         return {"batches": len(self._state.done), "seeds": self.seeds}
 
     @property
@@ -238,14 +239,14 @@ class LongJob:
 
     @property
     def totals(self) -> RenderTotals:
-        """The cost of these samples, whoever rendered them."""
+        """The cost of the samples in the image, in whichever process they were rendered."""
         return self._state.totals
 
 
 @contextlib.contextmanager
 def _asked_to_keep() -> Iterator[Callable[[], bool]]:
-    """While active, SIGUSR1 asks to keep the render after the running batch, and to go on. Yields a
-    function that says whether that was asked since the last time."""
+    """While active, SIGUSR1 asks to save the render after the running batch, and to go on. Yields a
+    function that returns whether it was received since the last call."""
     asked: list[int] = []
 
     def take() -> bool:

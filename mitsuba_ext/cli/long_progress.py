@@ -1,4 +1,4 @@
-"""What a render in batches shows while it runs."""
+"""Shows the progress of a render in batches."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from .reports import Report, Speed, time_left
 
 
 class LongProgress:
-    """Samples, their speed, the error that the batches announce, and the time left.
+    """Shows the samples, their speed, the error estimated from the batches, and the time left.
 
     Parameters:
-        report: Is told all of it.
+        report: Receives it as events.
         bars: Show it on a terminal.
-        name: Of the integrator.
-        pixel_count: Of the image.
+        name: Name of the integrator.
+        pixel_count: Pixels of the image.
     """
 
     def __init__(self, report: Report, bars: Progress, name: str, pixel_count: int) -> None:
@@ -27,7 +27,7 @@ class LongProgress:
         self._begin, self._speed = time.perf_counter(), Speed()
 
     def __call__(self, render: LongRender) -> None:
-        """To be called after each batch."""
+        """Call it after each batch."""
         spp, error = render.state.spp, render.error
         text, samples, left = f"{self._name}, {spp} spp", None, None
         if (per_second := self._speed(spp)) is not None:

@@ -1,4 +1,4 @@
-"""``mitsuba-ext list``: the plugins and their pages."""
+"""``mitsuba-ext list``: shows the plugins and their pages."""
 
 from __future__ import annotations
 

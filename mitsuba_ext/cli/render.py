@@ -1,4 +1,4 @@
-"""``mitsuba-ext render``: a scene to an image."""
+"""``mitsuba-ext render``: renders a scene to an image."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from .frames import FrameRange, Sensors, pictures
 )
 @click.option(
     "--time", "seconds", type=click.FloatRange(min=0, min_open=True), metavar="S",
-    help="Take as many samples as fit into S seconds of rendering. The first samples tell the "
+    help="Take as many samples as fit into S seconds of rendering. The first samples measure the "
     "speed; with our integrators and with structured samplers, a few short renders do, which take "
     "additional time.",
 )
@@ -68,12 +68,12 @@ from .frames import FrameRange, Sensors, pictures
 )
 @click.option(
     "--checkpoint", type=FilledPath(), metavar="DIR", shell_complete=candidates.folders,
-    help="A folder that keeps the render. The same command goes on from there. Of several frames "
+    help="A folder in which the render is saved. The same command continues it. Of several frames "
     "or sensors, each has a folder in it.",
 )
 @click.option(
     "--every", type=Every(), default="60s", metavar="TIME", show_default=True,
-    help="How often --checkpoint keeps the render and writes FILE, and --preview is written: 60s, "
+    help="How often --checkpoint saves the render and writes FILE, and --preview is written: 60s, "
     "10m, 2h or 100spp.",
 )
 @click.option(
@@ -84,11 +84,11 @@ from .frames import FrameRange, Sensors, pictures
 )
 @click.option(
     "--add", type=click.IntRange(1, MOST_SPP), metavar="N",
-    help="With --checkpoint: samples per pixel, besides those that are there.",
+    help="With --checkpoint: samples per pixel, in addition to those in the folder.",
 )
 @click.option(
     "--until", type=click.FloatRange(min=0, min_open=True), metavar="RELMSE",
-    help="End when the relative error, as the variance of the batches announces it, is RELMSE. "
+    help="End when the relative error, estimated from the variance of the batches, is RELMSE. "
     "--spp and --time limit it.",
 )
 @click.option(
@@ -153,8 +153,8 @@ def render(
 
     With --checkpoint, --until, --workers, --dask or --preview, all integrators render in batches:
     independent renders with seeds of their own. An EXR then holds the variance of the image too.
-    What an integrator learns in the first batch, the others use. SIGUSR1 keeps the render after the
-    running batch.
+    The other batches use what an integrator learns in the first one. SIGUSR1 saves the render after
+    the running batch.
     """
     if specification and not plugins:
         check_integrator(specification)
@@ -190,7 +190,7 @@ def render(
         raise click.UsageError("--add is for one image: give --spp, the number that all shall have")
     if parameters is not None and frames is None:
         raise click.UsageError("--parameters needs --frames")
-    # Before the first batch and after the last one, there is nothing to keep
+    # Before the first batch and after the last one, SIGUSR1 is ignored: there is nothing to save
     ignored = requests_to_keep(signal.SIG_IGN) if is_long else contextlib.nullcontext()
     with report.only_events(), ignored:
         function = None
@@ -217,7 +217,7 @@ def render(
 
 
 def _all_sensors(scene, definitions, variant, plugins, frames, function) -> list[int]:
-    """The numbers of a scene's sensors, in the first of the frames."""
+    """The indices of the scene's sensors, as they are in the first of the frames."""
     from ..inputs.scenes import load_scene
 
     select_variant(variant, plugins)

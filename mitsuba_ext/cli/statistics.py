@@ -1,4 +1,4 @@
-"""What a render cost and learned, for people."""
+"""Describes in sentences what a render cost and learned."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def lines(
     """The sentences that follow "image.exr: 64 spp in 1.0 s".
 
     Args:
-        seeds: Those of the samples in the image.
+        seeds: The seeds of the samples in the image.
         versions: See :func:`~mitsuba_ext.startup.machine.versions`.
     """
     names = ", ".join(map(str, seeds[:4])) + (", …" if len(seeds) > 4 else "")

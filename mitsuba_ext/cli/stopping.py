@@ -16,8 +16,8 @@ from .common import INTERRUPTED, say
 
 class Stop(interrupts.InterruptHandler):
     """Handles the first signal, and remembers it. Later signals are handled by the thread of
-    :func:`_watching`, which sees them at once. (Python calls this handler only after the native
-    code that is running.)"""
+    :func:`_watching`, which receives them at once. (Python calls this handler only after the native
+    code that is running has returned.)"""
 
     is_writing = False
 
@@ -42,8 +42,8 @@ class Stop(interrupts.InterruptHandler):
 
 @contextlib.contextmanager
 def stopping() -> Iterator[Stop]:
-    """While active, the first signal raises ``KeyboardInterrupt`` (during passes: after the running
-    one). A second signal ends the process at once, whatever code is running, but not after
+    """While active, the first signal raises ``KeyboardInterrupt``; during passes, after the running
+    one. A second signal ends the process at once, whatever code is running, but not after
     :meth:`Stop.wait`. Signals within half a second count as one. Signals that were ignored before,
     such as SIGHUP under ``nohup``, stay ignored."""
     stop = Stop()

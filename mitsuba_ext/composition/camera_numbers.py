@@ -1,5 +1,5 @@
-"""The slots ``aperture``, ``time`` and ``wavelength``: where these numbers of a camera ray come
-from."""
+"""The slots ``aperture``, ``time`` and ``wavelength``: what generates the primary samples that
+choose these of a camera ray."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from ..pointsets import PATTERNS
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 from .swarm import check_has_wavelengths
 
-#: Points of a set, at most, and with a timeout.
+#: The most points of a set, without and with a timeout.
 _MOST_POINTS, _MOST_POINTS_TIMED = 1024, 64
 
 
 @dataclass(frozen=True)
 class Purpose:
-    """What numbers are for.
+    """What the numbers of a point set choose.
 
     Attributes:
-        index: Each purpose has sets of its own.
-        dimension: Of the sets.
+        index: Part of the seed, so that each purpose has sets of its own.
+        dimension: Dimension of the sets.
         periods: See :class:`WeightedSets`.
-        weights: Those that are accepted.
+        weights: The values of the parameter ``weights`` that are accepted.
     """
 
     index: int
@@ -42,7 +42,7 @@ PURPOSES = {
 
 
 class WeightedNumbers(DecisionParameters):
-    """Numbers from weighted sets. The attributes are the parameters of the plugin
+    """Numbers from weighted point sets. The attributes are the parameters of the plugin
     ``weighted_numbers``; see there.
 
     Raises:
@@ -68,7 +68,8 @@ class WeightedNumbers(DecisionParameters):
             check_has_wavelengths(plugin)
 
     def numbers(self, plugin: str, slot: str, setting: Setting) -> PixelSets | None:
-        """The numbers of a render; ``None``, with a warning, where they do not matter."""
+        """The numbers of a render; ``None``, with a warning, if the image does not depend on them.
+        """
         reason = _reason_to_do_nothing(slot, setting.sensor)
         if reason is not None:
             mi.Log(mi.LogLevel.Warn, f'"{plugin}" reweights nothing: {reason}')
@@ -83,13 +84,13 @@ class WeightedNumbers(DecisionParameters):
 
 
 def samples_per_set(spp: int, is_timed: bool) -> int:
-    """The points of a set, of which each sample of a pixel uses one."""
+    """The number of points of a set: each sample of a pixel uses one."""
     most = _MOST_POINTS_TIMED if is_timed else _MOST_POINTS
     return -(-spp // -(-spp // most))
 
 
 def _reason_to_do_nothing(slot: str, sensor: mi.Sensor) -> str | None:
-    """Why the numbers do not matter, and what to do about it; ``None`` if they do."""
+    """Why the image does not depend on the numbers, and what to change; ``None`` if it does."""
     if slot == "aperture" and not sensor.needs_aperture_sample():
         return 'the sensor has no aperture; use a "thinlens".'
     if slot == "time" and sensor.shutter_open_time() <= 0:

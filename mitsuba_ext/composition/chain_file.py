@@ -1,4 +1,4 @@
-"""The state of a render with chains, in a file."""
+"""Saves the state of a render with Markov chains to a file."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _PART = "chains"
 
 
 class ChainFile:
-    """A file from which a render goes on, and which it writes.
+    """The file that a render continues from, and to which it saves its state.
 
     Parameters:
-        path: The file. It need not be there yet.
+        path: The file. It need not exist yet.
         scene, sensor, seed: What is rendered.
-        parameters: Of the integrator, as far as the image depends on them.
-        where: What errors call the parameter that names the file.
+        parameters: The parameters of the integrator on which the image depends.
+        where: The name, in error messages, of the parameter that names the file.
     """
 
     def __init__(
@@ -38,22 +38,22 @@ class ChainFile:
         self._made_by = ", ".join(f"{k} = {' '.join(str(v).split())}" for k, v in described.items())
 
     def load(self) -> dict[str, np.ndarray] | None:
-        """What was saved; ``None`` if there is no file.
+        """The saved state; ``None`` if the file does not exist.
 
         Raises:
-            ValueError: It is no such file, has been damaged, or belongs to another render.
+            ValueError: The file is of another kind, damaged, or of another render.
         """
         if not self._path.exists():
             return None
         return learned_file.load(self._path, self._scene, self._made_by, self._where)[_PART]
 
     def save(self, arrays: dict[str, np.ndarray]) -> None:
-        """Writes the file, or replaces it."""
+        """Writes or replaces the file."""
         learned_file.save(self._path, self._scene, self._made_by, {_PART: arrays})
 
 
 def _digest(sensor: mi.Sensor) -> str:
-    """Of the parameters that it has by name, of its class, and of its motion."""
+    """A hash of the sensor's class, its motion, and the parameters that it exposes by name."""
     values = mi.traverse(sensor)
     motion = getattr(sensor, "motion", "")
     text = "".join(f"{key}={values[key]}" for key in sorted(values.keys()))

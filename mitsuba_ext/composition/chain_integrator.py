@@ -1,4 +1,4 @@
-"""The base class of integrators with chains.
+"""The base class of integrators with Markov chains.
 
 This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
 """
@@ -39,7 +39,7 @@ _CAMERA_SAMPLES, _DIRECT_SHARE = 16, 0.25
 
 @dataclass
 class _OnlyAlpha:
-    """Camera samples without radiance."""
+    """Camera samples whose radiance is set to zero."""
 
     estimator: Estimator
 
@@ -51,7 +51,7 @@ class _OnlyAlpha:
 
 
 class ChainIntegrator(WalkIntegrator):
-    """An integrator that renders direct light with camera samples, and the rest with chains.
+    """An integrator that renders direct light with camera samples, and the rest with Markov chains.
 
     .. pluginparameters::
 
@@ -62,11 +62,11 @@ class ChainIntegrator(WalkIntegrator):
          leaves all light to the chains. (Default: 0)
      * - chain_file
        - |string|
-       - A file. If it is not there, the state of the chains and what they have found is saved to it
-         in the end, also after Ctrl-C or a time limit. If it is there, the same render (scene,
-         sensor, seed, parameters) goes on from it, up to ``spp``, which may be higher than before.
-         Where chains find the whole image (:class:`pssmlt`, :class:`mlt`), its brightness stays
-         known as well as the first render found it. (Default: none)
+       - A file. If it does not exist, the state of the chains and the image that they have found
+         are saved to it in the end, also after Ctrl-C or a time limit. If it exists, the same
+         render (scene, sensor, seed, parameters) continues from it, up to ``spp``, which may be
+         higher than before. Where chains find the whole image (:class:`pssmlt`, :class:`mlt`), the
+         estimate of its mean brightness is that of the first render. (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
@@ -74,16 +74,16 @@ class ChainIntegrator(WalkIntegrator):
 
     Attributes:
         missing_in_samples: Why its camera samples alone are not its image.
-        chain_file: Where the state of a render is kept; empty for nowhere.
-        direct_samples: Camera samples per pixel; 0 for as many as suit the render, −1 where chains
-            find all light.
+        chain_file: The file in which the state of a render is saved; empty for none.
+        direct_samples: Camera samples per pixel; 0 for a number that depends on ``spp``, −1 where
+            chains find all light.
     """
 
     missing_in_samples = "its chains find the rest"
 
     sees_media = False
 
-    #: The weights in the film count its camera samples, and not its mutations.
+    #: False, as the weights in the film count its camera samples, and not its mutations.
     film_counts_samples = False
 
     def __init__(self, props: mi.Properties) -> None:
@@ -99,21 +99,21 @@ class ChainIntegrator(WalkIntegrator):
             )
 
     def read_luminance_samples(self, props: mi.Properties) -> int:
-        """The parameter ``luminance_samples``."""
+        """Reads the parameter ``luminance_samples``."""
         return self.parameter(props, "luminance_samples", 100_000, minimum=1, maximum=1 << 26)
 
     def chain_render(
         self, target: ImageTarget | PathTarget, seed: int, *render: Any
     ) -> ChainRender:
-        """The render of the chains, of which the parameters are those of :class:`ChainRender`, but
-        for the integrator."""
+        """Makes the render of the chains. ``target``, ``seed`` and ``render`` are the parameters of
+        :class:`ChainRender` after the integrator."""
         raise NotImplementedError
 
     def state_file(self, target: ImageTarget | PathTarget, seed: int) -> ChainFile | None:
-        """Where the state of a render is kept, if that is wanted.
+        """The file for the state of a render; ``None`` without the parameter ``chain_file``.
 
         Raises:
-            ValueError: It cannot be kept there.
+            ValueError: The file cannot be written.
         """
         if not self.chain_file:
             return None
@@ -128,7 +128,7 @@ class ChainIntegrator(WalkIntegrator):
         )
 
     def target(self, setting: Setting) -> ImageTarget | PathTarget | None:
-        """What chains sample; ``None`` where they have nothing to find."""
+        """The target distribution of the chains; ``None`` if no path is left for them to find."""
         raise NotImplementedError
 
     def parameters(self) -> dict[str, Any]:
@@ -141,7 +141,7 @@ class ChainIntegrator(WalkIntegrator):
         return self.direct_samples >= 0
 
     def schedule(self, scene, sensor, samples, seed) -> OneStage:
-        """Of the camera samples."""
+        """The stage of the camera samples."""
         setting = self.setting(scene, sensor, samples, seed)
         if self.finds_direct:
             return OneStage(self.composed_walk(setting, min(self.max_depth, 2)))
@@ -150,13 +150,14 @@ class ChainIntegrator(WalkIntegrator):
     def setting(
         self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
     ) -> Setting:
-        """Of the camera samples."""
+        """The setting of the camera samples."""
         return Setting(
             scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), 0, self.timeout > 0
         )
 
     def composed_walk(self, setting: Setting, max_depth: int, **decisions: Any) -> Walk:
-        """A walk with this integrator's decisions, and others."""
+        """A walk with this integrator's decisions; ``decisions`` fill the slots that it leaves to
+        Mitsuba's choice."""
         chosen = {slot: p.decision(setting) for slot, p in self.slots.items()}
         decisions.update({slot: decision for slot, decision in chosen.items() if decision})
         return replace(self.walk(query=self.query(setting.scene), **decisions),
@@ -183,7 +184,7 @@ class ChainIntegrator(WalkIntegrator):
         return image
 
     def _render_all(self, scene, sensor, seed: int, spp: int, start: float) -> bool:
-        """Leaves the image in the film. Was the render interrupted?"""
+        """Renders the image into the film. Returns True if the render was interrupted."""
         setting = Setting(scene, sensor, seed, self.max_depth, self.rr_depth, spp)
         target = self.target(setting)
         self._render_camera_samples(scene, sensor, seed, spp, target is not None)
@@ -204,8 +205,8 @@ class ChainIntegrator(WalkIntegrator):
         return spp or sample_count(sensor, 0)
 
     def _render_camera_samples(self, scene, sensor, seed, spp: int, has_chains: bool) -> None:
-        """Leaves them in the film, and their statistics in ``self.statistics``; ``spp`` is that of
-        the render."""
+        """Renders them into the film, and sets ``self.statistics``; ``spp`` is the number of
+        samples of the whole render, chains included."""
         report, timeout = self.progress, self.timeout
         if has_chains:
             self.progress = None

@@ -1,4 +1,4 @@
-"""The slot ``connections``: to how many points of lights a vertex is connected."""
+"""The slot ``connections``: to how many points on lights a vertex is connected."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from ..maps.weighted_sets import MOST_SLOW_POINTS, SLOW_PATTERN, WEIGHTS, Weight
 from ..pointsets import PATTERNS
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 
-#: Connections of a vertex, at most.
+#: The most connections of a vertex.
 _MOST = 4096
 
-#: Connections that take as long as a path, about.
+#: Number of connections that take about as long as a path.
 _PER_PATH = 16
 
 
 class Connections(DecisionParameters):
-    """How many connections there are, and which numbers choose them. The attributes are the
-    parameters of the plugin ``weighted_connections``; see there.
+    """The number of connections of a vertex, and the point sets that choose them. The attributes
+    are the parameters of the plugin ``weighted_connections``; see there.
 
     Raises:
         TypeError, ValueError: A parameter has a wrong type or value.

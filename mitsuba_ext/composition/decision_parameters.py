@@ -1,4 +1,5 @@
-"""The parameters of a decision: what a scene says of it, and what that means for one render."""
+"""The parameters of a decision, as the scene gives them, and the decision or learner that they make
+for one render."""
 
 from __future__ import annotations
 
@@ -16,14 +17,14 @@ from ..rendering.camera import film_extent
 
 @dataclass(frozen=True)
 class Setting:
-    """What a decision has to suit.
+    """The render for which a decision is made.
 
     Attributes:
         scene, sensor: What is rendered.
-        seed: Of the render.
+        seed: The seed of the render.
         max_depth, rr_depth: Longest path in segments, and depth at which roulette begins.
         spp: Samples per pixel of the render.
-        pilot_spp: Of these, in pilots.
+        pilot_spp: How many of these are pilot samples.
         is_timed: Can a timeout end the render before it has all samples?
     """
 
@@ -49,12 +50,12 @@ class Setting:
 
 
 class ParameterReader:
-    """Reads the parameters of a plugin for those who use them.
+    """Reads the parameters of a decision from those of a plugin.
 
     Parameters:
-        plugin: What errors call the plugin.
-        props: The parameters of the scene.
-        names: What the plugin calls a parameter, where that differs.
+        plugin: The plugin's name in error messages.
+        props: The parameters that the scene gives.
+        names: The plugin's name of a parameter, by the decision's name, where they differ.
         defaults: The plugin's own defaults.
     """
 
@@ -69,7 +70,7 @@ class ParameterReader:
         self._names, self._defaults = names or {}, defaults
 
     def __call__(self, key: str, default: Any, **accepted: Any) -> Any:
-        """A parameter, checked: see :func:`mitsuba_ext.parameters.read_parameter`."""
+        """Reads and checks a parameter: see :func:`mitsuba_ext.parameters.read_parameter`."""
         name = self._names.get(key, key)
         default = self._defaults.get(key, default)
         return read_parameter(self.plugin, self._props, name, default, **accepted)
@@ -78,18 +79,18 @@ class ParameterReader:
     def of_defaults(
         cls, plugin: str, names: Mapping[str, str] | None = None, **defaults: Any
     ) -> ParameterReader:
-        """One for which the scene gives no parameters."""
+        """A reader without parameters of the scene: it returns the defaults."""
         return cls(plugin, mi.Properties(plugin), names, **defaults)
 
     def is_given(self, key: str) -> bool:
-        """Does the scene say anything?"""
+        """Does the scene give this parameter?"""
         return self._names.get(key, key) in self._props
 
     def refuse_without_effect(self, conditions: Mapping[str, str]) -> None:
-        """Refuses parameters that nobody has read until now.
+        """Refuses parameters that the plugin has not read until now.
 
         Parameters:
-            conditions: By name, what a parameter needs to have an effect.
+            conditions: What each parameter needs to have an effect, by name.
 
         Raises:
             ValueError: The scene gives such a parameter.
@@ -106,21 +107,23 @@ Slots = Mapping[str, "DecisionParameters"]
 
 
 class DecisionParameters:
-    """The parameters of what can take over one decision of the walk. One object serves all renders:
-    it holds nothing that belongs to one.
+    """The parameters of something that can replace one decision of the walk. One object serves all
+    renders: it holds no state of any of them.
 
     Attributes:
-        name: What a scene calls it: a plugin, or a word.
+        name: Its name in scenes: a plugin, or a word.
         slots: The slots of an integrator that it can fill.
-        pilot_spp: Samples per pixel from which it would learn, by default; 0 if it does not learn.
-        pilot_paths: So many samples of the whole film are enough for it; 0 if it can use all.
-        doubles: Is one sample enough to begin with? Each pilot then has as many as all before.
+        pilot_spp: Pilot samples per pixel from which it learns, by default; 0 if it does not learn.
+        pilot_paths: How many samples of the whole film are enough to learn from; 0 if more are
+            always better.
+        doubles: Can it learn from one sample per pixel? Each pilot then has as many samples as all
+            before it.
         tries: Does what it learns in a first pilot make the next ones better?
-        camera_paths_only: Does it ask what only camera paths know of a vertex (from where it is
-            seen, its depth, with what density scattering finds a light)?
-        sees_media: Can it decide at vertices in participating media? False where it needs a normal
+        camera_paths_only: Does it need what only camera paths store at a vertex (from where it is
+            seen, its depth, the density with which BSDF sampling finds a light)?
+        sees_media: Can it decide at vertices in participating media? False if it needs a normal
             or a BSDF.
-        sample_cost: The time of a sample in units of that of a path, about.
+        sample_cost: The approximate time of a sample in units of that of a path.
     """
 
     name = ""
@@ -147,7 +150,7 @@ class DecisionParameters:
     def check_together(self, plugin: str, slots: Slots) -> None:
         """
         Raises:
-            ValueError: One of these parameters has no effect beside what fills the other slots.
+            ValueError: One of these parameters has no effect with what fills the other slots.
         """
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
@@ -155,21 +158,22 @@ class DecisionParameters:
         return False
 
     def decision(self, setting: Setting) -> Any | None:
-        """What is decided without learning; ``None`` for the decision of Mitsuba's ``path``."""
+        """The decision without learning; ``None`` for that of Mitsuba's ``path``."""
         return None
 
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
-        """Who learns, if anyone does; ``others`` are the learners of earlier slots."""
+        """The learner of this decision, or ``None`` if it does not learn. ``others`` maps the slots
+        before this one to their learners."""
         return None
 
     def parameters(self, slots: Slots = MappingProxyType({})) -> dict[str, Any]:
-        """Names and values for ``str()``, of the parameters that are not empty and have an effect
-        beside what fills ``slots``."""
+        """Names and values, for ``str()``, of the parameters that are not empty and have an effect
+        with what fills ``slots``."""
         own = {key: value for key, value in vars(self).items() if not key.startswith("_")}
         return {key: value for key, value in own.items() if value != ""}
 
     def describe(self, slots: Slots = MappingProxyType({})) -> str:
-        """Name and parameters beside what fills ``slots``, in one line."""
+        """Name and :meth:`parameters`, in one line."""
         values = ", ".join(f"{key} = {value}" for key, value in self.parameters(slots).items())
         return f"{self.name}[{values}]" if values else self.name
 

@@ -11,18 +11,18 @@ from .decision_parameters import DecisionParameters, ParameterReader
 
 
 class DecisionPlugin(mi.Sampler):
-    """A decision of the walk, with its parameters. To Mitsuba it is a sampler, which may be nested
+    """A decision of the walk, with its parameters. For Mitsuba it is a sampler, which can be nested
     in an integrator; it cannot be the sampler of a sensor.
 
     Attributes:
-        kind: Reads the parameters of the scene.
-        decision_parameters: What was read.
+        kind: The class that reads the parameters of the scene.
+        decision_parameters: The parameters that were read.
     """
 
     kind: type[DecisionParameters]
 
     def __init__(self, props: mi.Properties) -> None:
-        # Nothing for the base class to read: what it would accept has no effect here
+        # The base class reads no parameters, as those that it accepts have no effect here
         super().__init__(mi.Properties("independent"))
         self.name = props.plugin_name()
         self.decision_parameters = self.kind(ParameterReader(self.name, props))

@@ -13,13 +13,13 @@ from ..learning.learner import Learner
 from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 
-#: Samples that a region of surfaces has in the pilots, at least.
+#: The fewest pilot samples that a region of surfaces should have.
 _REGION_SAMPLES = 64
 
 
 class Guided(DecisionParameters):
-    """Directions that are guided in primary sample space. The attributes are the parameters of the
-    plugin ``guided_directions``; see there.
+    """Guides directions in primary sample space. The attributes are the parameters of the plugin
+    ``guided_directions``; see there.
 
     Raises:
         TypeError, ValueError: A parameter has a wrong type or value.
@@ -40,8 +40,8 @@ class Guided(DecisionParameters):
         self.max_memory = read("max_memory", 512.0, minimum=1e-3)
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
-        # The first pilot teaches what the second one tests; the third is drawn from the better
-        # trees of both
+        # Trees are built from the first pilot and tested in the second; the third one is drawn from
+        # better trees, built from both
         return spp >= 3 and bool(scene.emitters())
 
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:

@@ -1,4 +1,4 @@
-"""What guides a denoiser, for scenes with or without shapes that move."""
+"""Renders the auxiliary images of a denoiser, for scenes with or without moving shapes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from ..rendering import guides
 
 
 def render_guides(scene: mi.Scene, sensor: mi.Sensor, seed: int = 0) -> dict[str, np.ndarray]:
-    """Albedo and shading normal of what the camera sees, in mirrors and through glass too. Replaces
-    the contents of the film.
+    """Renders the albedo and the shading normal of what the camera sees, in mirrors and through
+    glass too. Replaces the contents of the film.
 
     Returns:
-        Arrays (height, width) by the names of channels: ``albedo.R``, …, ``normal.Z``.
+        Arrays [height, width] by channel name: ``albedo.R``, …, ``normal.Z``.
     """
     return guides.render_guides(scene, sensor, scene_query(scene), seed)

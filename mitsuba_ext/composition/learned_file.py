@@ -1,4 +1,4 @@
-"""What a render has learned, as a whole, in a file."""
+"""Files with everything that a render has learned."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 from ..files import replacing
 from ..maps.light_map_file import fingerprint
 
-#: Number of the format of these files.
+#: Version of the format of these files.
 _FORMAT = 2
 
-#: By slot, what the decision of the last stage is made of.
+#: For each slot, the arrays from which the decision of the last stage is made.
 States = dict[str, dict[str, np.ndarray]]
 
 
@@ -24,9 +24,9 @@ def save(path: Path, scene: mi.Scene, made_by: str, states: Mapping[str, Mapping
 
     Parameters:
         path: The file.
-        scene: For which it was learned.
-        made_by: The parameters of those who learned, and the size of the film.
-        states: By slot, from ``Learner.state``.
+        scene: The scene for which it was learned.
+        made_by: The parameters of the decisions that learned, and the size of the film.
+        states: For each slot, the result of ``Learner.state``.
     """
     arrays = {
         f"{slot}/{name}": array for slot, state in states.items() for name, array in state.items()
@@ -45,13 +45,12 @@ def load(path: Path, scene: mi.Scene, made_by: str, parameter: str) -> States:
     """Reads what :func:`save` has written.
 
     Parameters:
-        path, scene, made_by: See there.
-        parameter: What errors call the parameter that names the file.
+        path, scene, made_by: As for :func:`save`.
+        parameter: The name, in error messages, of the parameter that names the file.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is no such file, has been damaged, or belongs to another scene or other
-            parameters.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is of another kind, damaged, or of another scene or other parameters.
     """
     if not path.exists():
         raise FileNotFoundError(
@@ -61,7 +60,7 @@ def load(path: Path, scene: mi.Scene, made_by: str, parameter: str) -> States:
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
-    except Exception:  # NumPy, zipfile and zlib raise a dozen kinds
+    except Exception:  # NumPy, zipfile and zlib raise many kinds of exceptions
         raise ValueError(f'{parameter} names "{path}", which is damaged, or no such file') from None
     header = {key: str(arrays.pop(key, "")) for key in ("format", "scene", "made_by", "digest")}
     if header["format"] != str(_FORMAT) or header["digest"] != _digest(arrays):

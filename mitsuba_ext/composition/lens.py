@@ -8,7 +8,7 @@ from ..bidirectional.lens_visibility import visibility_lens
 from ..bidirectional.sensor import ConnectableSensor
 from ..transport.path_decisions import SceneQuery
 
-#: What the parameter can be.
+#: The values of the parameter.
 LENS_SAMPLING = ("uniform", "visibility")
 
 
@@ -18,7 +18,7 @@ def connectable_sensor(
     """The sensor of a render, to which light paths are connected.
 
     Parameters:
-        plugin: What warnings call the plugin.
+        plugin: The plugin's name in warnings.
         lens_sampling: One of ``LENS_SAMPLING``.
     """
     if lens_sampling == "uniform":

@@ -1,4 +1,4 @@
-"""The slot ``light_paths``: whether paths are traced from lights at all."""
+"""The slot ``light_paths``: whether paths are traced from lights."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from ..learning.pixel_estimates import relative_scale
 from ..rendering.camera import film_extent
 from .decision_parameters import DecisionParameters, Setting
 
-#: The time of a ray of a bidirectional sample, in units of that of a ray of ``path``: both ends of
-#: a connection are evaluated, forth and back. ``benchmarks/bidirectional.py`` measures 1.5 in
-#: door_ajar, 1.6 to 1.8 in seven other scenes, and 2.2 in caustic. A clock would make equal seeds
+#: The time of a ray of a bidirectional sample, in units of that of a ray of ``path``: BSDFs are
+#: evaluated at both ends of a connection, and densities in both directions.
+#: ``benchmarks/bidirectional.py`` measures 1.5 in door_ajar, 1.6 to 1.8 in seven other scenes, and
+#: 2.2 in caustic. It is a constant, because with measured times two renders of the same seed could
 #: choose differently.
 _TIME_OF_A_RAY = 1.5
 
-#: Samples from which the choice is made, unless the pilots have less.
+#: Number of samples from which the choice is made, unless the pilots have fewer.
 _ENOUGH = 1 << 16
 
 
 @dataclass(frozen=True)
 class LightPathChoice:
-    """Whether light paths are traced, and who is told what they find."""
+    """Whether light paths are traced, and the observer of their contributions."""
 
     are_traced: bool
     observer: TechniqueObserver | None = None
@@ -42,7 +43,7 @@ class LightPathsWhereTheyPay(DecisionParameters):
     pilot_spp, pilot_paths = 8, _ENOUGH
 
     def can_learn(self, scene: mi.Scene, spp: int) -> bool:
-        # Beams that leave a surface are found by light paths only
+        # Only light paths find the light of beams that a surface emits in one direction
         beam = int(mi.EmitterFlags.Surface) | int(mi.EmitterFlags.DeltaDirection)
         emitters = scene.emitters()
         return spp > 0 and bool(emitters) and all(int(e.flags()) & beam != beam for e in emitters)
@@ -57,14 +58,14 @@ class LightPathTrial(Learner):
     """Compares the variance of all techniques, times the time that they take, with that of camera
     paths alone. The time is estimated from the number of rays.
 
-    Variance is relative to the square of what a pixel shows, its neighbours included.
+    The variance of a pixel is divided by the square of its value, averaged with its neighbours.
 
     Parameters:
-        film: Of the sensor.
+        film: The film of the sensor.
 
     Attributes:
-        estimate: Of the image and its variance, once the choice has been made.
-        variance, cost: Of all techniques, in units of those of camera paths.
+        estimate: Estimate of the image and its variance, once the choice has been made.
+        variance, cost: Variance and time of all techniques, relative to those of camera paths.
     """
 
     def __init__(self, film: mi.Film) -> None:
@@ -87,7 +88,7 @@ class LightPathTrial(Learner):
         whole, by_camera = (
             variance * weight for variance in (estimate.bidirectional, estimate.by_camera)
         )
-        # Pixels take the place of paths
+        # Here the batches are of pixels, not of paths
         gain, error = gain_of(trimmed_batches(whole, by_camera - whole))
         self.cost = _TIME_OF_A_RAY * float(moments.rays[0] / max(moments.rays[1], 1))
         self.variance = 1 - gain

@@ -16,13 +16,15 @@ from .next_event import sampling_weights
 
 @dataclass
 class LightSide:
-    """The light's end of paths.
+    """What bidirectional methods need at the light's end of paths.
 
     Attributes:
-        emission: Where light paths begin.
-        sensor: What they are connected to; ``None`` if they are not.
-        correct: The choice of lights for camera paths in the place of Mitsuba's own, whose density
-            of points is wrong on meshes with interpolated normals; ``None`` where it is right.
+        emission: Samples the emitted rays with which light paths begin.
+        sensor: The sensor to which light paths are connected; ``None`` if they are not connected
+            to it.
+        correct: The light sampling of camera paths that replaces Mitsuba's, whose density of
+            points is wrong on meshes with interpolated normals; ``None`` in scenes without such
+            lights.
     """
 
     emission: LightEmission
@@ -33,10 +35,10 @@ class LightSide:
     def of(
         cls, plugin: str, scene: mi.Scene, sensor: mi.Sensor, has_image: bool = True
     ) -> LightSide:
-        """Of a scene with lights.
+        """The light side of a scene that has lights.
 
         Parameters:
-            plugin: What errors call the plugin.
+            plugin: The plugin's name in error messages.
             has_image: Are light paths connected to the sensor, if it and its film allow that?
 
         Raises:
@@ -51,7 +53,8 @@ class LightSide:
         return cls(emission, target, correct)
 
     def next_event(self, chosen: EmitterSampling | None) -> EmitterSampling | None:
-        """How camera paths choose lights, beside light paths; ``None`` for Mitsuba's choice."""
+        """How camera paths choose lights where there are light paths too; ``None`` for Mitsuba's
+        choice. ``chosen`` is what the scene asks for."""
         return self.correct if chosen is None else FromBothEnds(chosen)
 
 

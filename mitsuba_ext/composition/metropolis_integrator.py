@@ -1,4 +1,4 @@
-"""The base class of integrators with chains of primary samples.
+"""The base class of integrators with Markov chains in primary sample space.
 
 This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
 """
@@ -22,14 +22,14 @@ from .slots import read_slot
 
 
 class MetropolisIntegrator(ChainIntegrator):
-    """An integrator with chains that change the random numbers of paths.
+    """An integrator with Markov chains that mutate the primary samples of paths.
 
     .. pluginparameters::
 
      * - next_event
        - |string| or |decision|
-       - How points on lights are chosen, as in :class:`composed_path`; by a choice that learns
-         nothing. (Default: that of :monosp:`path`)
+       - How points on lights are chosen, as in :class:`composed_path`. Choices that learn are not
+         accepted. (Default: that of :monosp:`path`)
      * - (Common parameters)
        - |several|
        - Those of :class:`ChainIntegrator`: direct_samples, chain_file, max_depth, rr_depth,
@@ -37,7 +37,7 @@ class MetropolisIntegrator(ChainIntegrator):
 
     Attributes:
         bidirectional: Do chains sample paths from both ends?
-        is_bidirectional: Do they, by default?
+        is_bidirectional: The default of ``bidirectional``.
     """
 
     is_bidirectional = True
@@ -58,10 +58,10 @@ class MetropolisIntegrator(ChainIntegrator):
         return parameters
 
     def read_steps(self, props: mi.Properties) -> SmallSteps:
-        """The parameters ``mutation_size_low`` and ``mutation_size_high``.
+        """Reads the parameters ``mutation_size_low`` and ``mutation_size_high``.
 
         Raises:
-            ValueError: The lowest is larger than the highest.
+            ValueError: The first is larger than the second.
         """
         low = self.parameter(props, "mutation_size_low", 1 / 1024, minimum=1e-6, maximum=0.5)
         high = self.parameter(props, "mutation_size_high", 1 / 64, minimum=1e-6, maximum=0.5)
@@ -79,7 +79,7 @@ class MetropolisIntegrator(ChainIntegrator):
         }
 
     def target(self, setting: Setting) -> ImageTarget | None:
-        """What chains sample; ``None`` where they have nothing to find."""
+        """The target distribution of the chains; ``None`` if no path is left for them to find."""
         scene, sensor = setting.scene, setting.sensor
         least = 3 if self.finds_direct else 1
         if not scene.emitters() or self.max_depth < least:

@@ -1,5 +1,5 @@
-"""The slot ``mis``: how light that connections find is weighed against light that a path runs
-into."""
+"""The slot ``mis``: the MIS weights of next event estimation and of lights that BSDF samples hit.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ HEURISTICS = tuple(_MAKERS)
 
 
 class MisHeuristic(DecisionParameters):
-    """The weights of connections and of BSDF samples. The attributes are the parameters of the
+    """The MIS weights of connections and of BSDF samples. The attributes are the parameters of the
     plugin ``mis_heuristic``; see there.
 
     Raises:
@@ -51,7 +51,7 @@ class MisHeuristic(DecisionParameters):
 
     @classmethod
     def named(cls, heuristic: str) -> Callable[[ParameterReader], MisHeuristic]:
-        """Makes one with the defaults of a heuristic."""
+        """Returns a function that makes one with the default parameters of a heuristic."""
         return lambda read: cls(ParameterReader.of_defaults(read.plugin, heuristic=heuristic))
 
     def decision(self, setting: Setting) -> Any | None:

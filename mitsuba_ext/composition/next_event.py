@@ -30,7 +30,7 @@ from ..scene.bounds import scene_bounds
 from ..scene.portals import portals
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 
-#: Candidates that take as long as a path, about.
+#: Number of candidates that take about as long as a path.
 _CANDIDATES_PER_PATH = 32
 
 #: Voxels along each axis for ``spatial``, where the scene's author does not say.
@@ -38,7 +38,7 @@ _SPATIAL_GRID = 32
 
 
 class PowerLights(DecisionParameters):
-    """Lights by their power."""
+    """Chooses lights by their power."""
 
     name = "power"
     slots = ("next_event",)
@@ -51,8 +51,8 @@ class PowerLights(DecisionParameters):
 
 
 def sampling_weights(scene: mi.Scene) -> LightTable:
-    """The choice of ``path``, but with the true densities of points on meshes with interpolated
-    normals."""
+    """The light sampling of ``path``, but with the true densities of points on meshes with
+    interpolated normals."""
     cells = LightCells(scene, None)
     number = from_numpy(mi.UInt32, cells.emitter_index)
     probability = np.broadcast_to(scene.pdf_emitter(number).numpy(), cells.count)
@@ -60,7 +60,7 @@ def sampling_weights(scene: mi.Scene) -> LightTable:
 
 
 class LinearLights(DecisionParameters):
-    """Lights by an estimate of what each contributes to the vertex."""
+    """Chooses lights by an estimate of what each contributes to the vertex."""
 
     name = "linear"
     slots = ("next_event",)
@@ -71,8 +71,8 @@ class LinearLights(DecisionParameters):
 
 
 class SpatialLights(DecisionParameters):
-    """Lights by what they contribute to a voxel if nothing is in between. The attributes are the
-    parameters of the plugin ``spatial_lights``; see there."""
+    """Chooses lights by their unoccluded contribution to a voxel. The attributes are the parameters
+    of the plugin ``spatial_lights``; see there."""
 
     name = "spatial_lights"
     slots = ("next_event",)
@@ -91,7 +91,7 @@ class SpatialLights(DecisionParameters):
         return LightTable(rows, cells, spatial_weights(scene, rows, cells))
 
     def voxel_rows(self, scene: mi.Scene, cells: int, times: ShutterTimes) -> VoxelRows:
-        """Voxels, not more than there is memory for."""
+        """The voxels, at most as many as ``max_memory`` allows."""
         rows = VoxelRows(VoxelGrid(scene, self.grid or _SPATIAL_GRID), times)
         limit = self.max_memory * 2**20 / (cells * TABLE_BYTES)
         while rows.count > limit and rows.resolution > 1:
@@ -109,8 +109,8 @@ class SpatialLights(DecisionParameters):
 
 
 class LearnedLights(DecisionParameters):
-    """Lights by what pilots saw of them. The attributes are the parameters of the plugin
-    ``learned_lights``; see there.
+    """Chooses lights by what the pilots' samples found. The attributes are the parameters of the
+    plugin ``learned_lights``; see there.
 
     Raises:
         TypeError, ValueError: A parameter has a wrong type or value.
@@ -137,7 +137,7 @@ class LearnedLights(DecisionParameters):
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
         """
         Raises:
-            ValueError: The map that is going to be learned cannot be written.
+            ValueError: The file ``save_map`` cannot be written.
         """
         if self.save_map:
             try:
@@ -166,8 +166,8 @@ class LearnedLights(DecisionParameters):
 
 
 class ResampledLightsChoice(DecisionParameters):
-    """Lights among candidates, by what each would bring. The attributes are the parameters of the
-    plugin ``resampled_lights``; see there."""
+    """Chooses one of several candidate lights by what each would contribute. The attributes are the
+    parameters of the plugin ``resampled_lights``; see there."""
 
     name = "resampled_lights"
     slots = ("next_event",)
@@ -187,14 +187,15 @@ class ResampledLightsChoice(DecisionParameters):
         return ResampledLights(setting.scene, self.candidates)
 
 
-#: What two-stage sampling can learn of visibility, the default first, and the pilots for it.
+#: What two-stage sampling can learn about visibility, the default first; and the pilots' samples
+#: per pixel for it.
 VISIBILITIES = ("unknown", "primary", "world")
 _PILOT_SPP = 4
 
 
 class TwoStageLights(DecisionParameters):
-    """Directions of the environment by the product of BSDF and light. The attributes are the
-    parameters of the plugin ``two_stage_lights``; see there."""
+    """Samples directions of the environment by the product of BSDF and light. The attributes are
+    the parameters of the plugin ``two_stage_lights``; see there."""
 
     name = "two_stage_lights"
     slots = ("next_event",)
@@ -211,7 +212,7 @@ class TwoStageLights(DecisionParameters):
 
     @property
     def learns(self) -> bool:
-        """Does it learn what is visible?"""
+        """Does it learn the visibility?"""
         return self.visibility != "unknown"
 
     @property
@@ -233,13 +234,13 @@ class TwoStageLights(DecisionParameters):
         if setting.scene.environment() is None or setting.max_depth < 2:
             return None
         if self.can_learn(setting.scene, setting.pilot_spp):
-            return None  # the learner has all decisions
+            return None  # the learner makes the decisions of all stages
         return TwoStage(setting.scene, self.splits, self.vertices == "all")
 
 
 class PortalLights(DecisionParameters):
-    """Directions of the environment through portals. The attributes are the parameters of the
-    plugin ``portal_lights``; see there."""
+    """Samples directions of the environment through portals. The attributes are the parameters of
+    the plugin ``portal_lights``; see there."""
 
     name = "portal_lights"
     slots = ("next_event",)
@@ -255,10 +256,10 @@ class PortalLights(DecisionParameters):
         return PortalSampling(scene, self.share)
 
 
-#: What lights can be learned for, the default first.
+#: What the map of :class:`LearnedLights` can learn of each light, the default first.
 TARGETS = ("contribution", "visibility")
 
-#: Ways to choose a light, and who reads the parameters of each; ``None`` for that of ``path``.
+#: Ways to choose a light, and what reads the parameters of each; ``None`` for that of ``path``.
 METHODS: dict[str, Callable[[ParameterReader], DecisionParameters] | None] = {
     "uniform": None,
     "power": lambda read: PowerLights(),
@@ -268,7 +269,7 @@ METHODS: dict[str, Callable[[ParameterReader], DecisionParameters] | None] = {
     "contribution": lambda read: LearnedLights(read, "contribution"),
 }
 
-#: Those that an integrator of camera paths can have besides.
+#: Further ways, for integrators without light paths.
 CAMERA_METHODS: dict[str, Callable[[ParameterReader], DecisionParameters]] = {
     "resampled": ResampledLightsChoice,
     "two_stage": TwoStageLights,
@@ -278,5 +279,5 @@ CAMERA_METHODS: dict[str, Callable[[ParameterReader], DecisionParameters]] = {
 
 
 def _grid(read: ParameterReader) -> int:
-    """Voxels along each axis; 0 where the scene's author leaves the choice to us."""
+    """Voxels along each axis; 0 if the scene does not give a number."""
     return read("grid", 1, minimum=1, maximum=1024) if read.is_given("grid") else 0

@@ -1,4 +1,4 @@
-"""What integrators with chains of light paths have in common."""
+"""What integrators with Markov chains of light paths have in common."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..transport.without_lengths import WithoutLengths
 from .decision_parameters import Setting
 from .light_side import LightSide
 
-#: Segments of paths that chains sample, at most: memory of each chain grows with it.
+#: Segments of the longest paths that chains sample: the memory of each chain grows with it.
 MOST = 32
 
 #: The parameters that switch mutations, and the attributes of :class:`Switches`.
@@ -28,8 +28,8 @@ _SWITCHES = {
 
 
 def read_switches(integrator: Any, props: mi.Properties, **defaults: bool) -> Switches:
-    """The parameters that switch mutations. ``defaults`` are those of the attributes of
-    :class:`Switches`, where not all are on."""
+    """Reads the parameters that switch mutations. ``defaults`` are by attribute of
+    :class:`Switches`; a mutation that is not named there is on by default."""
     chosen = {
         name: integrator.parameter(props, key, defaults.get(name, True))
         for key, name in _SWITCHES.items()
@@ -38,12 +38,12 @@ def read_switches(integrator: Any, props: mi.Properties, **defaults: bool) -> Sw
 
 
 def described(switches: Switches) -> dict[str, bool]:
-    """The parameters, by name."""
+    """The values of the parameters that switch mutations, by name."""
     return {key: getattr(switches, name) for key, name in _SWITCHES.items()}
 
 
 def path_target(integrator: Any, setting: Setting, switches: Switches) -> PathTarget | None:
-    """What chains of paths sample; ``None`` where they have nothing to find."""
+    """The target distribution of chains of paths; ``None`` if no path is left for them to find."""
     scene, sensor = setting.scene, setting.sensor
     least, most = _least(integrator), min(setting.max_depth, MOST)
     if not scene.emitters() or most < least:
@@ -57,7 +57,8 @@ def path_target(integrator: Any, setting: Setting, switches: Switches) -> PathTa
 
 
 def camera_samples(integrator: Any, setting: Setting) -> OneStage:
-    """Those that find direct light and, of paths that are longer than chains sample, all."""
+    """The camera samples: they find direct light, and all light on paths that are longer than
+    those that chains sample."""
     weights = WithoutLengths(Weights(), _least(integrator), MOST)
     return OneStage(integrator.composed_walk(setting, setting.max_depth, mis=weights))
 

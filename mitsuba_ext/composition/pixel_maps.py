@@ -1,5 +1,4 @@
-"""What swarm maps have learned for a pixel, as arrays: for pictures, and to see why a render is as
-it is."""
+"""What swarm maps have learned for a pixel, as arrays: for pictures, and to examine a render."""
 
 from __future__ import annotations
 
@@ -19,21 +18,22 @@ from ..rendering.camera import film_extent
 
 @dataclass
 class PixelMap:
-    """The maps of one decision that a pixel uses, with the other pixels of its tile.
+    """The maps of one decision that a pixel uses. All pixels of its tile share them.
 
     Attributes:
-        name: What summaries call the maps (``times``, ``lens``, …).
-        edges: Where cells begin and end along each axis of the numbers, increasing from 0 to 1. An
-            axis can have cells without width.
-        density: Of the numbers relative to uniform ones, [cell of axis 0, of axis 1, …]: its mean,
-            weighted by the sizes of the cells, is 1. Those of ``lobes`` come after the bounce and
-            the number of reflections before it: [bounce, reflections, cell]. For times, axis 0 is
-            the time in the shutter interval; for the lens, the two numbers that Mitsuba maps to a
-            disk; for directions, the angle around the z axis and the height, from z = 1 to z = -1,
-            as fractions; for distances and wavelengths, the number from which they are sampled; for
+        name: The name of the maps in summaries (``times``, ``lens``, …).
+        edges: Where cells begin and end along each axis of the primary samples, increasing from 0
+            to 1. An axis can have cells without width.
+        density: The density of the primary samples relative to uniform ones, [cell of axis 0, of
+            axis 1, …]: its mean, weighted by the sizes of the cells, is 1. For ``lobes``: [bounce,
+            number of reflections before it, cell]. For times, axis 0 is the time in the shutter
+            interval; for the lens, the axes are the two numbers that Mitsuba maps to a disk; for
+            directions, the angle around the z axis and the height, from z = 1 to z = -1, as
+            fractions; for distances and wavelengths, the number from which they are sampled; for
             lights, the number that chooses the light, in the order of ``scene.emitters()``, and one
             or two for the point on it.
-        tile: The pixels that share the maps: first column and row, and those behind the last ones.
+        tile: The pixels that share the maps: first column, first row, and the column and row after
+            the last ones.
     """
 
     name: str
@@ -42,7 +42,7 @@ class PixelMap:
     tile: tuple[int, int, int, int]
 
     def along(self, axis: int) -> tuple[np.ndarray, np.ndarray]:
-        """Edges and density of one number, whatever the others are."""
+        """The edges of one axis, and the marginal density along it."""
         axes = self.density.ndim - len(self.edges)
         result = self.density
         for other in reversed(range(len(self.edges))):
@@ -55,15 +55,15 @@ class PixelMap:
 def pixel_maps(
     learners: Mapping[str, Learner], sensor: mi.Sensor, x: int, y: int
 ) -> dict[str, PixelMap]:
-    """The maps that the last render has used for a pixel.
+    """The maps that the last render used for a pixel.
 
     Parameters:
-        learners: Those of the render: ``integrator.learners``.
-        sensor: What was rendered.
+        learners: The learners of the render: ``integrator.learners``.
+        sensor: The sensor that was rendered.
         x, y: Column and row of the pixel, in the image (the crop window).
 
     Returns:
-        By slot, what is used: decisions for which maps did not pay are missing.
+        The maps in use, by slot: a decision is missing if its maps did not pay off.
 
     Raises:
         ValueError: There is no such pixel.
@@ -87,7 +87,7 @@ def _map(learner: MapLearner, pixel: int, place: tuple[int, int], border: int) -
     edges = [np.linspace(0, 1, (1 << b) + 1) for b in bits]
     if cells.bounds is not None:
         edges[0] = cells.bounds.numpy().astype(np.float64)
-    # The index of a cell from its place along each axis, as `Cells.find` has it
+    # The index of a cell from its position along each axis, as in `Cells.find`
     index = np.zeros([1 << b for b in bits], np.uint32)
     left = list(bits)
     for axis in cells.axes:
@@ -116,7 +116,7 @@ def light_probabilities(scene: mi.Scene, lights: PixelMap) -> np.ndarray:
     nothing else chooses among them (``next_event`` is ``uniform`` or ``power``).
 
     Parameters:
-        scene: What was rendered.
+        scene: The scene that was rendered.
         lights: The map in the slot ``light_numbers``.
     """
     count = len(scene.emitters())
@@ -125,5 +125,5 @@ def light_probabilities(scene: mi.Scene, lights: PixelMap) -> np.ndarray:
     ends = np.concatenate([[0], ends / ends[-1]])
     edges, density = lights.along(0)
     cumulative = np.concatenate([[0], np.cumsum(density * np.diff(edges))])
-    # Cells without width are steps of no height
+    # Cells without width add nothing to the cumulative distribution
     return np.diff(np.interp(ends, edges, cumulative / cumulative[-1]))

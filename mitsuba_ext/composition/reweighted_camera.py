@@ -1,4 +1,4 @@
-"""The base class of integrators that take one number of the camera rays from weighted sets.
+"""The base class of integrators that take one number of camera rays from weighted point sets.
 
 This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
 """
@@ -18,11 +18,11 @@ from .wrapping_integrator import WrappingIntegrator
 
 
 class ReweightedCamera(WrappingIntegrator):
-    """Renders with a nested integrator, for camera rays of which one number (or two) comes from
-    weighted sets.
+    """Renders with a nested integrator. One or two of the numbers that choose a camera ray come
+    from weighted point sets.
 
-    A subclass says what the numbers are for. Nested in each other, subclasses do their work
-    together.
+    A subclass sets what the numbers choose. Different subclasses can be nested in each other, to
+    combine their effects.
 
     .. pluginparameters::
 
@@ -38,15 +38,15 @@ class ReweightedCamera(WrappingIntegrator):
          :monosp:`unbiased` or :monosp:`voronoi` (slightly biased). (Default: none)
      * - timeout
        - |float|
-       - Seconds after which to stop, 0 or less for no limit; kept as by :monosp:`composed_path`.
+       - Seconds after which to stop, 0 or less for no limit; see :monosp:`composed_path`.
          With a limit, sets have at most 64 points, and the render ends after a whole set.
          (Default: -1)
      * - checkpoint
        - |string|
-       - A folder that keeps the render; see :class:`composed_path`. (Default: none)
+       - A folder in which the render is saved; see :class:`composed_path`. (Default: none)
      * - checkpoint_every
        - |string|
-       - How often it is kept, such as :monosp:`60s` or :monosp:`100spp`. Only with
+       - How often it is saved, such as :monosp:`60s` or :monosp:`100spp`. Only with
          :monosp:`checkpoint`. (Default: 60s)
      * - (Nested plugin)
        - |integrator|
@@ -54,7 +54,7 @@ class ReweightedCamera(WrappingIntegrator):
          :monosp:`path`, :monosp:`volpath` or one of ours without chains.
 
     Attributes:
-        purpose: The attribute of :class:`CameraSamples` that is taken over.
+        purpose: The attribute of :class:`CameraSamples` that the point sets replace.
     """
 
     purpose: str
@@ -67,7 +67,7 @@ class ReweightedCamera(WrappingIntegrator):
     def accepts(self, nested: mi.SamplingIntegrator) -> bool:
         return self.purpose not in _purposes(nested)
 
-    # ---- What the base class asks for ----
+    # ---- What the base class calls ----
 
     def samples_per_set(self, spp: int) -> int:
         return samples_per_set(spp, self.timeout > 0)
@@ -92,7 +92,7 @@ class ReweightedCamera(WrappingIntegrator):
 
 
 def _purposes(integrator: mi.Integrator) -> list[str]:
-    """What an integrator, and those that are nested in it, take from weighted sets."""
+    """The purposes for which an integrator, and those nested in it, use weighted sets."""
     nested = getattr(integrator, "nested", None)
     own = [integrator.purpose] if hasattr(integrator, "purpose") else []
     return own + (_purposes(nested) if nested is not None else [])
@@ -102,8 +102,8 @@ class _Reweighted:
     """A schedule whose camera rays take some numbers from weighted sets.
 
     Parameters:
-        nested: The schedule whose stages these are.
-        purpose: What the numbers are for.
+        nested: The schedule that makes the stages.
+        purpose: What the numbers choose: an attribute of :class:`CameraSamples`.
         numbers: The numbers.
     """
 

@@ -1,4 +1,4 @@
-"""The slot ``roulette``: which paths go on."""
+"""The slot ``roulette``: which paths Russian roulette continues."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from .decision_parameters import DecisionParameters, Setting
 
 
 class GuidedRoulette(DecisionParameters):
-    """Roulette by what a path is expected to bring, where directions are guided by regions of
-    surfaces; elsewhere that of Mitsuba's ``path``."""
+    """Russian roulette by the radiance that a path is expected to add to its pixel, where
+    directions are guided by regions of surfaces; elsewhere the roulette of Mitsuba's ``path``."""
 
     name = "automatic"
     slots = ("roulette",)
 
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
         guide = others.get("directions")
-        # Tiles know nothing of where a bounce is
+        # A guide by tiles of the film learns nothing about the position of a bounce
         if not isinstance(guide, GuideLearner) or not guide.wants_scout:
             return None
         if setting.rr_depth >= setting.max_depth:

@@ -20,14 +20,16 @@ from .decision_parameters import DecisionParameters, Setting
 from .learned_file import States
 from .swarm import Swarm, doubling_pilots, first_parts, stage_weights
 
-#: Where pilots double, from so many samples on they may have half of all: they cost little then.
+#: Where each pilot has as many samples as all before it, pilots may have half of all samples from
+#: this number of samples per pixel on, as they then cost little; below, a quarter.
 _MANY_SAMPLES = 8
 
-#: Samples of a pass from which maps are learned, at most: the learners of all maps together record
-#: about 150 bytes of each.
+#: The most samples in a pass from which maps are learned: the learners of all maps together record
+#: about 150 bytes for each sample.
 _MAP_LANES = 1 << 21
 
-#: Paths of each of the first two pilots, about: they show what learning is worth.
+#: Approximate number of paths of each of the first two pilots, which measure the benefit of
+#: learning.
 _TRIAL_PATHS = 1 << 17
 
 
@@ -38,18 +40,19 @@ def pilot_samples(
     spp: int,
     pilot_spp: int,
 ) -> list[int]:
-    """The samples per pixel of each pilot: at most a quarter of all, as beyond that there is little
-    left to gain.
+    """The samples per pixel of each pilot.
 
-    The first two are short trials: who finds that learning does not pay has spent little. What is
-    learned from all up to then makes the later ones better.
+    Pilots have at most a quarter of all samples, as more of them gain little; half where each pilot
+    doubles the samples (``DecisionParameters.doubles``). The first two pilots are short trials: if
+    learning does not pay off, little time has been spent. The later pilots already use what was
+    learned from all before them.
 
     Parameters:
-        slots: Whose parameters say what they would learn from.
+        slots: What fills the slots of the walk.
         scene: The scene.
         pixel_count: Sampled pixels of the film.
         spp: Samples per pixel of the render.
-        pilot_spp: Those of the pilots that the scene wants.
+        pilot_spp: Samples per pixel of all pilots, as the scene asks for them.
     """
     samples = min(pilot_spp, spp // 4)
     learning = [p for p in slots.values() if p.pilot_spp and p.can_learn(scene, samples)]
@@ -57,7 +60,7 @@ def pilot_samples(
         return []
     if all(parameters.pilot_paths for parameters in learning):
         enough = max(parameters.pilot_paths for parameters in learning)
-        # Two of a pixel show their variance
+        # At least two samples of a pixel, to estimate their variance
         samples = min(samples, max(2, -(-enough // pixel_count)))
     if all(parameters.doubles for parameters in learning):
         return doubling_pilots(min(pilot_spp, spp // 2 if spp >= _MANY_SAMPLES else spp // 4))
@@ -72,23 +75,24 @@ def pilot_samples(
 
 
 class Schedule:
-    """One render. All learners watch the same pilots; each returns the decision of its own slot.
+    """Makes the stages of one render. All learners observe the same pilots; each returns the
+    decision of its own slot.
 
     Parameters:
-        plugin: What errors and warnings call the integrator.
+        plugin: The integrator's name in errors and warnings.
         slots: What fills the slots of the walk.
         setting: What is rendered.
         stages: Samples per pixel of each stage: pilots, and the last one.
         estimator: Makes the estimator of a stage, with the integrator's parameters, from the
             decisions that differ from those of ``path``.
-        query: How rays meet the scene.
-        restored: What an earlier render has learned (``Learner.state``, by slot): there is no
-            pilot then. ``None`` to learn.
-        learned: Is called with what was learned, before the last stage.
+        query: How rays are intersected with the scene.
+        restored: What an earlier render has learned (``Learner.state``, by slot): there are then
+            no pilots. ``None`` to learn.
+        learned: Called with what was learned, before the last stage.
 
     Attributes:
-        learners: Who learns, by slot.
-        decisions: Those of the next stage, by slot, where they are not those of ``path``.
+        learners: The learners, by slot.
+        decisions: The decisions of the next stage that differ from those of ``path``, by slot.
     """
 
     def __init__(
@@ -120,7 +124,7 @@ class Schedule:
                     self.learners[slot] = learner
         learns_maps = [isinstance(slots[slot], Swarm) for slot in self.learners]
         self._learns_maps, self._learns_only_maps = any(learns_maps), all(learns_maps)
-        #: How many samples of the last stage a sample of each stage counts for
+        #: For each stage, the weight of its samples relative to those of the last stage
         self._weights = stage_weights(stages) if self._learns_maps else [1.0] * len(stages)
         self._restored, self._learned = restored, learned
         self._scout: Scout | None = None

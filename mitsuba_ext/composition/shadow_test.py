@@ -19,19 +19,20 @@ from .next_event import LearnedLights
 #: Voxels along each axis where the scene's author does not say.
 _GRID = 16
 
-#: Parameters of a map of its own.
+#: Parameters of the roulette's own visibility map.
 _OF_OWN_MAP = ("grid", "max_memory", "refine")
 
 
 class RejectedShadowRays(DecisionParameters):
-    """Russian roulette by learned visibility. The attributes are the parameters of the plugin
-    ``visibility_roulette``; see there.
+    """Russian roulette of shadow rays by learned visibility. The attributes are the parameters of
+    the plugin ``visibility_roulette``; see there.
 
-    Where lights are learned as well, the visibility is that of the light map.
+    Where the choice of lights is learned too, the roulette uses the visibility of the light map.
 
     Parameters:
         read: Reads the parameters.
-        has_own_map: False: lights are learned, and parameters of a map of its own have no effect.
+        has_own_map: False if the choice of lights is always learned: the roulette then has no
+            parameters of its own map.
 
     Raises:
         TypeError, ValueError: A parameter has a wrong type or value.

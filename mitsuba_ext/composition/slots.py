@@ -29,9 +29,9 @@ from .swarm import MAPS
 
 _Maker = Callable[[ParameterReader], DecisionParameters]
 
-#: By slot, what a scene can say in one word: the name of a decision, and who makes it with all
-#: defaults; ``None`` stands for what Mitsuba's ``path`` does, and comes first. The order is that in
-#: which learners are made, of which later ones can use earlier ones.
+#: For each slot, the words that a scene can give: the name of a decision, and what makes it with
+#: all defaults. ``None`` stands for what Mitsuba's ``path`` does, and comes first. Learners are
+#: made in the order of the slots: later ones can use earlier ones.
 SLOTS: dict[str, dict[str, _Maker | None]] = {
     "directions": {"uniform": None, "guided": Guided, "swarm": MAPS["directions"]},
     "scattering": {"bsdf": None, "swarm": MAPS["scattering"]},
@@ -44,7 +44,7 @@ SLOTS: dict[str, dict[str, _Maker | None]] = {
     **{slot: {"sampler": None, "swarm": MAPS[slot]} for slot in (*PURPOSES, "distance")},
 }
 
-#: The same of bidirectional integrators, which have some of the others as well.
+#: The slots that only bidirectional integrators have. They also have some of :data:`SLOTS`.
 BIDIRECTIONAL_SLOTS: dict[str, dict[str, _Maker | None]] = {
     "subpath_selection": {"uniform": None, "visibility": lambda read: LearnedSubpaths()},
     "light_paths": {"always": None, "auto": lambda read: LightPathsWhereTheyPay()},
@@ -52,7 +52,7 @@ BIDIRECTIONAL_SLOTS: dict[str, dict[str, _Maker | None]] = {
 
 _ALL_SLOTS = {**SLOTS, **BIDIRECTIONAL_SLOTS}
 
-#: What can be nested into a slot, of this package.
+#: The plugins of this package that can be nested into a slot.
 _PLUGINS: tuple[type[DecisionParameters], ...] = (
     Guided, LearnedLights, SpatialLights, ResampledLightsChoice, TwoStageLights, PortalLights,
     Connections, MisHeuristic, RejectedShadowRays, WeightedNumbers,
@@ -60,11 +60,11 @@ _PLUGINS: tuple[type[DecisionParameters], ...] = (
 
 
 def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameters | None:
-    """What the scene puts into a slot: a word, or a nested plugin; for ``connections`` a number
-    also. ``None`` for what ``path`` does.
+    """Reads what the scene puts into a slot: a word, or a nested plugin; for ``connections`` also
+    a number. ``None`` for what ``path`` does.
 
     Raises:
-        TypeError, ValueError: It is none of these, or belongs into another slot.
+        TypeError, ValueError: The value is none of these, or belongs into another slot.
     """
     words = _ALL_SLOTS[slot]
     value = props.get(slot, next(iter(words)))
@@ -89,7 +89,7 @@ def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameter
 
 
 def _accepted(slot: str, value: object) -> str:
-    """What to say of a value that a slot does not take."""
+    """The end of the error message for a value that a slot does not accept."""
     found = value.class_name() if isinstance(value, mi.Object) else repr(value)
     words = [*_ALL_SLOTS[slot], *(PATTERNS if slot in PURPOSES else ())]
     number = "a number, " if slot == "connections" else ""

@@ -1,5 +1,5 @@
-"""The base class of our integrators that render in stages: what Mitsuba calls, and errors where
-Mitsuba's are cryptic.
+"""The base class of our integrators that render in stages: the methods that Mitsuba calls, and
+errors in the place of Mitsuba's where those are cryptic.
 
 This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
 """
@@ -20,10 +20,10 @@ from ..rendering import camera
 from ..rendering import render as rendering
 from ..rendering.stages import Schedule
 
-#: What stands for "as many as there are".
+#: Stands for "no limit" in counts.
 NO_LIMIT = 0xFFFFFFFF
 
-#: Parameters on which a render that is kept does not depend.
+#: Parameters on which the image of a checkpointed render does not depend.
 _NOT_OF_THE_IMAGE = ("timeout", "checkpoint", "checkpoint_every")
 
 
@@ -38,35 +38,36 @@ class StagedIntegrator(mi.SamplingIntegrator):
          number of samples follows from the speed of the first passes (short ones, until one
          compiles nothing, and then one of a quarter of the time left), and not from the clock, so
          that stopping does not prefer fast samples. Pilots get at most a quarter of the samples
-         that fit. The time is kept as well as the speed is steady; a short pass of each pilot, and
-         one of the rest, are always taken. (Default: -1)
+         that fit. The limit is met as closely as the speed is steady; a short pass of each pilot,
+         and one of the last stage, are always rendered. (Default: -1)
 
      * - checkpoint
        - |string|
-       - A folder that keeps the render: a second one (the same scene, seed and parameters) goes on
-         from there, up to ``spp``, which may be higher than before. It renders in batches, as
-         ``mitsuba-ext render --checkpoint`` does. Only the outermost integrator can have it.
-         (Default: none)
+       - A folder in which the render is saved: a second render (of the same scene, seed and
+         parameters) continues from there, up to ``spp``, which may be higher than before. It
+         renders in batches, as ``mitsuba-ext render --checkpoint`` does. Only the outermost
+         integrator can have it. (Default: none)
      * - checkpoint_every
        - |string|
-       - How often it is kept: :monosp:`60s`, :monosp:`10m`, :monosp:`2h` or :monosp:`100spp`. Only
+       - How often it is saved: :monosp:`60s`, :monosp:`10m`, :monosp:`2h` or :monosp:`100spp`. Only
          with :monosp:`checkpoint`. (Default: 60s)
 
     Attributes:
-        sees_motion: It renders ``moving`` shapes.
+        sees_motion: True, as it renders ``moving`` shapes.
         progress: Called after each pass with the fraction done; it may raise or call ``cancel``.
-        statistics: Of the last render (:class:`~mitsuba_ext.rendering.render.RenderStatistics`).
+        statistics: The statistics of the last render
+            (:class:`~mitsuba_ext.rendering.render.RenderStatistics`).
     """
 
     sees_motion = True
 
     def __init__(self, props: mi.Properties) -> None:
         self.name = props.plugin_name()
-        # Read before the base class reads them: its errors do not name the plugin
+        # Read before the base class reads them, as its errors do not name the plugin
         self.timeout = self.parameter(props, "timeout", -1.0)
         self.parameter(props, "hide_emitters", False)
         super().__init__(props)
-        # Deprecated by Mitsuba, which says so in the log
+        # Deprecated by Mitsuba, which warns in the log
         self.samples_per_pass = self.parameter(props, "samples_per_pass", NO_LIMIT, minimum=1)
         self.checkpoint = self.parameter(props, "checkpoint", "")
         if self.checkpoint:
@@ -76,31 +77,32 @@ class StagedIntegrator(mi.SamplingIntegrator):
         self.statistics = rendering.RenderStatistics()
         self.is_cancelled = False
 
-    # ---- What a subclass says ----
+    # ---- What a subclass overrides ----
 
     def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
-        """The samples per pixel of each pilot stage, out of ``spp``; none where nothing learns."""
+        """The samples per pixel of each pilot stage, out of ``spp``; empty if nothing learns."""
         return []
 
     @property
     def sample_cost(self) -> int:
-        """The time of a sample in units of that of a path, about: passes are the shorter."""
+        """The approximate time of a sample in units of that of a path: passes take fewer samples
+        if it is larger."""
         return 1
 
     @property
     def most_lanes(self) -> int:
-        """Samples of a pass, at most, as its memory allows."""
+        """The most samples in a pass that memory allows."""
         return NO_LIMIT
 
     def samples_per_set(self, spp: int) -> int:
-        """So many samples of a pixel belong together, out of ``spp``: a timeout keeps them whole.
-        """
+        """How many of the ``spp`` samples of a pixel form a set. A timeout does not stop within
+        a set."""
         return 1
 
     @property
     def needs_equal_samples(self) -> str:
-        """Why all pixels must get the same number of samples; empty if they need not. It ends a
-        sentence in an error message, and says what to change."""
+        """Why all pixels must get the same number of samples; empty if they need not. The text
+        ends a sentence in an error message, and says what to change."""
         return ""
 
     @property
@@ -116,11 +118,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
         raise NotImplementedError
 
     def parameters(self) -> dict[str, Any]:
-        """What ``str()`` shows besides the common parameters."""
+        """The parameters that ``str()`` shows besides the common ones."""
         return {}
 
     def common_parameters(self) -> dict[str, Any]:
-        """What ``str()`` shows of all integrators of a kind."""
+        """The parameters that ``str()`` shows of all integrators with this base class."""
         if not self.checkpoint:
             return {"timeout": self.timeout}
         every = self.checkpoint_every
@@ -142,11 +144,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
         return self.render_once(scene, sensor, seed, spp, develop, evaluate)
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
-        """The render as a whole, or a batch of one that is kept."""
+        """Renders the whole image, or one batch of a checkpointed render."""
         return rendering.render(self, scene, sensor, seed, spp, develop, evaluate)
 
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
-        """The values of the channels that :meth:`aov_names` names, where the walk has none."""
+        """The values of the channels that :meth:`aov_names` names; none by default."""
         return []
 
     def cancel(self) -> None:
@@ -165,7 +167,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
         lines = ",\n".join(f"  {key} = {value}" for key, value in parameters.items())
         return f"{self.name}[\n{lines}\n]"
 
-    # ---- Renders that are kept ----
+    # ---- Checkpointed renders ----
 
     def _interval(self, props: mi.Properties) -> Interval:
         text = self.parameter(props, "checkpoint_every", "60s")
@@ -175,7 +177,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
             raise ValueError(f'"{self.name}": the parameter "checkpoint_every": {error}') from None
 
     def _render_kept(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
-        # Batches stand above a single render
+        # Imported here: the modules of batches are above this one, and import it
         from ..long_renders.kept_render import KeptRender
 
         begin = time.perf_counter()
@@ -207,7 +209,8 @@ class StagedIntegrator(mi.SamplingIntegrator):
     def check_sampled(self) -> None:
         """
         Raises:
-            ValueError: Another integrator draws samples of one that is to keep its render.
+            ValueError: Another integrator draws the samples of this one, which has the parameter
+                ``checkpoint``.
         """
         if self.checkpoint:
             raise ValueError(
@@ -218,12 +221,12 @@ class StagedIntegrator(mi.SamplingIntegrator):
     # ---- Helpers ----
 
     def parameter(self, props: mi.Properties, key: str, default: Any, **accepted: Any) -> Any:
-        """A parameter of the scene, checked: see :func:`mitsuba_ext.parameters.read_parameter`,
-        which also says what ``accepted`` can be."""
+        """Reads and checks a parameter of the scene: see
+        :func:`mitsuba_ext.parameters.read_parameter`, also for what ``accepted`` can be."""
         return read_parameter(self.name, props, key, default, **accepted)
 
     def no_gradients(self) -> NotImplementedError:
-        """What to raise where gradients are asked for."""
+        """The error for a render with gradients."""
         return NotImplementedError(
             f'"{self.name}" does not compute gradients: use an integrator made for that, such as '
             f'"prb".'

@@ -1,4 +1,4 @@
-"""The slot ``subpath_selection``: to which vertices of light paths a vertex is connected."""
+"""The slot ``subpath_selection``: to which light vertices a camera vertex is connected."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from ..rendering.camera import film_extent
 from ..scene.movers import movers
 from .decision_parameters import DecisionParameters, Setting
 
-#: Light paths that show where there are vertices.
+#: Number of light paths that show where light vertices are.
 _PATHS = 1 << 15
 
 
 class LearnedSubpaths(DecisionParameters):
-    """Light vertices in regions that pilots saw to contribute."""
+    """Chooses light vertices by how much those of their region contributed in the pilots."""
 
     name = "visibility"
     slots = ("subpath_selection",)
@@ -36,7 +36,7 @@ class LearnedSubpaths(DecisionParameters):
         return spp > 0 and is_shared and bool(scene.emitters()) and bool(scene.shapes())
 
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
-        # Shorter paths have no such connection
+        # Paths of fewer segments have no connection to a light vertex
         if setting.max_depth < 3 or not self.can_learn(setting.scene, setting.pilot_spp):
             return None
         return RegionLearner(
@@ -47,13 +47,13 @@ class LearnedSubpaths(DecisionParameters):
 
 
 def _light_vertices(setting: Setting) -> LightVertexSample:
-    """Where light paths have vertices."""
+    """Traces light paths, and returns their vertices."""
     scene = setting.scene
     walk = LightWalk(
         LightEmission(scene), setting.max_depth, setting.rr_depth, query=scene_query(scene)
     )
     numbers = mi.load_dict({"type": "independent"})
-    # The same for all seeds: what it decides changes the size of tables, and kernels
+    # The same for all seeds: the vertices decide the size of tables, and so change kernels
     numbers.seed(0, _PATHS)
     active = dr.full(mi.Bool, True, _PATHS)
     rounds: list[LightVertices] = []

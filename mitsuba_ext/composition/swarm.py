@@ -22,7 +22,7 @@ from ..rendering.camera import film_extent
 from ..scene.media import has_homogeneous_media
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 
-#: By how much unequal weights of samples may raise the variance of images in which no map helps.
+#: The largest relative rise of variance, by unequal weights of samples, where no map helps.
 _MOST_LOSS = 0.015
 
 #: Where maps help, a sample that is drawn from a map of n samples per pixel is worth about
@@ -31,20 +31,20 @@ _UNIFORM, _HALF = 0.1, 1.5
 
 
 #: The first sample of all pixels is divided into stages until the first of them takes no more than
-#: this share of all samples, as these are drawn from uniform numbers. It takes so many at least: to
-#: trace a stage takes as long.
+#: this share of all samples, as these are drawn from uniform numbers. It has at least this number
+#: of pixels: Dr.Jit's tracing of a stage takes as long as the paths of as many.
 _FIRST_SHARE, _LEAST_PIXELS = 1 / 32, 1 << 13
 
 
 class Swarm(DecisionParameters):
-    """Maps of one decision. A subclass says of which.
+    """Maps of one decision: the base class.
 
     Parameters:
-        always: Use the maps also where pilots show that they do not pay? For tests.
-        pilot_spp: Samples per pixel from which is learned.
+        always: Use the maps also where pilots show that they do not pay off? For tests.
+        pilot_spp: Samples per pixel of the pilots.
 
     Attributes:
-        summary: What the log calls the maps.
+        summary: The name of the maps in the log.
     """
 
     name = "swarm"
@@ -63,7 +63,7 @@ class Swarm(DecisionParameters):
         return spp > 0 and any(map(self.is_asked, scene.sensors()))
 
     def is_asked(self, sensor: mi.Sensor) -> bool:
-        """Does the sensor ask for such numbers?"""
+        """Does the sensor use the numbers of these maps?"""
         return True
 
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
@@ -75,11 +75,11 @@ class Swarm(DecisionParameters):
         return self.map_learner(setting, width, height)
 
     def map_learner(self, setting: Setting, width: int, height: int) -> Learner:
-        """Who learns, for a film of this size."""
+        """The learner, for a film of this size."""
         raise NotImplementedError
 
     def _how(self, setting: Setting) -> dict[str, Any]:
-        """What all learners ask."""
+        """The parameters of all learners."""
         return {"samples": setting.pilot_spp, "always": self._always}
 
 
@@ -165,7 +165,7 @@ class LobeMaps(Swarm):
 
 
 class DirectionMaps(Swarm):
-    """Maps of directions beside the BSDF."""
+    """Maps of directions, combined with BSDF sampling."""
 
     slots, summary = ("scattering",), "directions"
 
@@ -190,7 +190,7 @@ class DistanceMaps(Swarm):
         return CameraMapLearner(self.summary, numbers, width, height, **self._how(setting))
 
 
-#: By slot, the maps that it can hold.
+#: The maps that each slot can hold.
 MAPS: dict[str, type[Swarm]] = {
     "aperture": LensMaps, "time": TimeMaps, "wavelength": WavelengthMaps, "distance": DistanceMaps,
     "light_numbers": LightMapsChoice, "directions": LobeMaps, "scattering": DirectionMaps,
@@ -211,7 +211,7 @@ def check_has_wavelengths(plugin: str) -> None:
 
 
 def doubling_pilots(samples: int) -> list[int]:
-    """The samples per pixel of each pilot: one, and then as many as all before."""
+    """The samples per pixel of each pilot: one, and then as many as in all pilots before it."""
     pilots = [1]
     while 2 * sum(pilots) <= samples:
         pilots.append(sum(pilots))
@@ -220,7 +220,7 @@ def doubling_pilots(samples: int) -> list[int]:
 
 
 def first_parts(pixel_count: int, spp: int) -> int:
-    """Into how many stages the first sample of all pixels is divided, of ``spp`` ones."""
+    """Into how many stages the first of ``spp`` samples of all pixels is divided."""
     parts = 1
     while 0.5 ** (parts - 1) > _FIRST_SHARE * spp and pixel_count >> parts >= _LEAST_PIXELS:
         parts += 1
@@ -228,16 +228,16 @@ def first_parts(pixel_count: int, spp: int) -> int:
 
 
 def stage_weights(stages: Sequence[int], parts: int = 1) -> list[float]:
-    """How many samples of the last stage a sample of each stage counts for. Where maps help much,
-    samples of the first stages would make most of the noise; where they do not help, the loss is
-    1.5 % at most, which decides how unequal the weights are.
+    """For each stage, the weight of its samples relative to those of the last stage. Where maps
+    help much, equal weights would leave most of the noise to samples of the first stages. Where
+    maps do not help, unequal weights raise the variance by 1.5 % at most, which limits them.
 
     Parameters:
         stages: Samples per pixel of each stage.
         parts: Into how many stages the first one is divided.
     """
     count = len(stages) + parts - 1
-    # By part of the first stage, the share of its pixels
+    # The share of the pixels in each part of the first stage
     shares = [0.5 ** (parts - max(part, 1)) for part in range(parts)] if parts > 1 else [1.0]
     known = np.cumsum([0.0, *(stages[0] * share for share in shares), *stages[1:]])[:count]
     wanted = (known + _UNIFORM) / (known + _HALF)

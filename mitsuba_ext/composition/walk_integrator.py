@@ -35,8 +35,8 @@ from .staged_integrator import NO_LIMIT, StagedIntegrator
 class WalkIntegrator(StagedIntegrator):
     """An integrator whose samples are random walks.
 
-    A subclass reads its own parameters and says with :meth:`fill` which decisions of the walk it
-    takes over.
+    A subclass reads its own parameters and calls :meth:`fill` with the decisions of the walk that
+    it replaces.
 
     .. pluginparameters::
 
@@ -62,10 +62,10 @@ class WalkIntegrator(StagedIntegrator):
     :class:`composed_path`.
 
     Attributes:
-        has_light_paths (bool): Are there light paths beside the camera paths?
-        sees_media (bool): Does it render participating media? Else it refuses them.
+        has_light_paths (bool): Does it trace light paths besides camera paths?
+        sees_media (bool): Does it render participating media? If not, it refuses them.
         slots (dict[str, DecisionParameters]): What fills the slots of the walk.
-        learners (dict[str, Learner]): Who learned in the last render, by slot.
+        learners (dict[str, Learner]): The learners of the last render, by slot.
     """
 
     has_light_paths = False
@@ -83,21 +83,21 @@ class WalkIntegrator(StagedIntegrator):
         self._pilot_spp: int | None = None
         self.save_learned = self.load_learned = ""
 
-    # ---- What a subclass says ----
+    # ---- What a subclass calls ----
 
     def reader(
         self, props: mi.Properties, names: Mapping[str, str] | None = None, **defaults: Any
     ) -> ParameterReader:
-        """Reads parameters of a decision from those of the integrator; ``names`` are those that the
-        integrator calls differently, ``defaults`` its own."""
+        """Reads the parameters of a decision from those of the integrator. ``names`` are the
+        integrator's names where they differ, ``defaults`` the integrator's own defaults."""
         return ParameterReader(self.name, props, names, **defaults)
 
     def fill(self, props: mi.Properties, **slots: DecisionParameters | None) -> None:
-        """Fills slots of the walk; ``None`` leaves one to Mitsuba's choice. Where something learns,
-        reads the common parameter ``pilot_spp``.
+        """Fills slots of the walk; ``None`` leaves a slot to Mitsuba's choice. If a decision
+        learns, reads the common parameters ``pilot_spp``, ``save_learned`` and ``load_learned``.
 
         Raises:
-            TypeError, ValueError: Two decisions do not go together, or the parameter is wrong.
+            TypeError, ValueError: Two decisions exclude each other, or a parameter is wrong.
         """
         known = (*SLOTS, *BIDIRECTIONAL_SLOTS)
         self.slots = {slot: slots[slot] for slot in known if slots.get(slot) is not None}
@@ -138,11 +138,11 @@ class WalkIntegrator(StagedIntegrator):
         except InputError as error:
             raise ValueError(f'"{self.name}": "{key}": {error}') from None
 
-    # ---- What the render asks for ----
+    # ---- What the render calls ----
 
     @property
     def can_learn(self) -> bool:
-        """Do ``save_learned`` and ``load_learned`` mean anything?"""
+        """Do ``save_learned`` and ``load_learned`` have an effect?"""
         return bool(self._pilot_spp)
 
     def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
@@ -172,7 +172,7 @@ class WalkIntegrator(StagedIntegrator):
         self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
     ) -> Schedule:
         *pilots, _rest = samples
-        # What an earlier render has learned needs no pilots, but somebody to take it over
+        # A loaded state needs no pilots, but learners to restore it: these need a pilot_spp > 0
         pilot_spp = self._pilot_spp or 0 if self.load_learned else sum(pilots)
         setting = Setting(
             scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), pilot_spp,
@@ -197,12 +197,12 @@ class WalkIntegrator(StagedIntegrator):
         return schedule
 
     def estimators(self, scene: mi.Scene, sensor: mi.Sensor) -> Callable[..., Estimator]:
-        """What makes the estimator of a stage from its decisions: a walk."""
+        """The function that makes the estimator of a stage from its decisions: :meth:`walk`."""
         return self.walk
 
     def walk(self, **decisions: Any) -> Walk:
         """A walk with this integrator's parameters and the given decisions. If ``light_numbers`` is
-        among them, it warps the numbers of ``next_event``."""
+        among them, it warps the primary samples of ``next_event``."""
         light_numbers = decisions.pop("light_numbers", None)
         if light_numbers is not None:
             inner = decisions.get("next_event", EmitterSampling())
@@ -230,7 +230,7 @@ class WalkIntegrator(StagedIntegrator):
         """The values of the channels that :meth:`aov_names` names."""
         if self._aovs is None:
             return []
-        if movers(scene):  # Mitsuba knows no motion
+        if movers(scene):  # Mitsuba's "aov" ignores motion
             return moving_aovs(self._aovs, self.aovs, scene_query(scene), scene, sampler, ray)
         return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
 
@@ -249,10 +249,10 @@ class WalkIntegrator(StagedIntegrator):
         return {slot: decision.describe(self.slots) for slot, decision in self.slots.items()}
 
     def query(self, scene: mi.Scene) -> SceneQuery:
-        """How rays meet ``scene``.
+        """How rays are intersected with ``scene``.
 
         Raises:
-            NotImplementedError: There is something in ``scene`` that this integrator does not see.
+            NotImplementedError: This integrator does not support something in ``scene``.
         """
         self._check_media(scene)
         return scene_query(scene)

@@ -16,8 +16,8 @@ from .staged_integrator import StagedIntegrator
 
 
 class WrappingIntegrator(StagedIntegrator):
-    """An integrator whose samples are those of a nested one: ours, which may learn in pilots, or
-    Mitsuba's.
+    """An integrator that draws the samples of a nested one. The nested integrator is one of this
+    package, which may learn in pilots, or one of Mitsuba's.
 
     Attributes:
         nested: The nested integrator.
@@ -31,13 +31,13 @@ class WrappingIntegrator(StagedIntegrator):
         super().__init__(props)
         self.nested = self._nested(props)
 
-    # ---- What a subclass says ----
+    # ---- What a subclass overrides ----
 
     def accepts(self, nested: mi.SamplingIntegrator) -> bool:
         """Can this integrator be nested?"""
         return True
 
-    # ---- What the base class asks for ----
+    # ---- What the base class calls ----
 
     def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
         return self.nested.pilots(scene, pixel_count, spp) if self._is_staged else []
@@ -58,14 +58,14 @@ class WrappingIntegrator(StagedIntegrator):
         self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
     ) -> Schedule:
         if self._is_staged:
-            # Sets of all purposes must be cut alike
+            # The size of point sets depends on the timeout, and must be the same for all of them
             self.nested.timeout = self.timeout
             return self.nested.schedule(scene, sensor, samples, seed)
         check_motion_is_seen(self.nested, scene)
         return OneStage(_NestedEstimator(self.nested, sensor.get_medium()))
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """A sample of the nested integrator: the ray is another's."""
+        """A sample of the nested integrator, for a ray that another integrator has sampled."""
         self.check_sampled()
         return self.nested.sample(scene, sampler, ray, medium, active)
 
@@ -103,12 +103,12 @@ class WrappingIntegrator(StagedIntegrator):
     @property
     def _is_staged(self) -> bool:
         """Is the nested integrator one of ours, which can learn in pilots?"""
-        # Not by class: once another variant is selected, the module's name is that one's class
+        # Not `isinstance`: once another variant is selected, the module holds that variant's class
         return hasattr(self.nested, "schedule")
 
 
 class _NestedEstimator:
-    """Draws the samples of an integrator. All four wavelengths survive in it."""
+    """Draws the samples of one of Mitsuba's integrators, which keep all four wavelengths."""
 
     def __init__(self, nested: mi.SamplingIntegrator, medium: mi.Medium | None) -> None:
         self._nested, self._medium = nested, medium
