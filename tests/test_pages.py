@@ -20,6 +20,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 FOLDERS = registry.plugin_names()
 FILES = {file.stem: file for folder in FOLDERS for file in registry.plugin_files(folder)}
 README = Path(__file__).parents[1] / "README.md"
+CHOICES = Path(__file__).parents[1] / "docs" / "choose.md"
 DECISIONS = registry.decision_names()
 #: The samplers of sensors.
 SEQUENCES = sorted(set(FOLDERS["samplers"]) - set(DECISIONS))
@@ -198,9 +199,13 @@ def test_examples_of_samplers_are_the_same_as_xml_and_as_a_dict(name):
 def test_example_of_the_readme_loads():
     (xml,) = re.findall(r"```xml\n(.*?)```", README.read_text(), re.DOTALL)
     assert "bounces = 4" in str(mi.load_string(f'<scene version="3.0.0">{xml}</scene>'))
-    for name in re.findall(r"\]\((?:integrators|samplers)/(\w+)\.py\)", README.read_text()):
+
+
+def test_every_integrator_and_decision_is_on_the_page_of_choices():
+    page = CHOICES.read_text()
+    for name in re.findall(r"\]\(../(?:integrators|samplers)/(\w+)\.py\)", page):
         assert name in FILES
-    assert all(f"/{name}.py" in README.read_text() for name in FILES)
+    assert all(f"/{name}.py" in page for name in FILES)
 
 
 def test_a_decision_cannot_be_the_sampler_of_a_sensor():
