@@ -45,19 +45,19 @@ class DispersiveDielectric(mi.BSDF):
        - Factors of reflection and refraction, 0 to 1, to be left at 1 for physical results.
          (Default: 1)
 
-    **Use it when** the colours of dispersion shall be visible: prisms, gems, lenses, edges of thick
-    glass. **Not when** they would not be: a refracted path keeps one of its four wavelengths, and
-    the noise becomes coloured. The noise is least with a :monosp:`reweighted_wavelength` around the
-    integrator.
+    **Use it when** the colours of dispersion should be visible: prisms, gems, lenses, edges of
+    thick glass. **Not when** they would not be visible: a refracted path keeps only one of its four
+    wavelengths, which makes coloured noise. The noise is least with a
+    :monosp:`reweighted_wavelength` around the integrator.
 
     It needs a spectral variant (:monosp:`llvm_ad_spectral`) and an integrator of this package:
-    Mitsuba's own cannot let one wavelength go on alone. There is a warning about them, and the
-    pixels whose paths meet the glass are infinite or NaN. With a number as int_ior it works
-    everywhere, as :monosp:`dielectric` does. Light that is reflected keeps all wavelengths.
-    The normals of :monosp:`bumpmap` and :monosp:`normalmap` must be of the kind that they make
-    themselves (flip_invalid_normals). Indices of catalogues hold for 360 to 830 nm; beyond this
-    range they are those of its nearer end. The medium outside does not disperse, and the one inside
-    does not absorb (tint it by specular_transmittance). Gradients are not supported.
+    Mitsuba's own cannot continue a path with one wavelength only. With them there is a warning, and
+    pixels whose paths hit the glass are infinite or NaN. With a number as int_ior it works
+    everywhere, as :monosp:`dielectric` does. Reflected light keeps all wavelengths. A
+    :monosp:`bumpmap` or :monosp:`normalmap` around it must flip invalid normals
+    (flip_invalid_normals, true by default). Indices of catalogues hold for 360 to 830 nm; beyond
+    this range they are those of its nearer end. The medium outside does not disperse, and the one
+    inside does not absorb (tint it by specular_transmittance). Gradients are not supported.
 
     Source: A. Wilkie et al., *Hero Wavelength Spectral Sampling*, 2014. Indices: data sheets of
     Schott; I. H. Malitson 1965 (fused silica); M. Daimon and A. Masumura 2007 (water); F. Peter
@@ -100,7 +100,7 @@ class DispersiveDielectric(mi.BSDF):
         cos_θ = mi.Frame3f.cos_theta(si.wi)
         F, cos_θ_t, η_it, η_ti = mi.fresnel(cos_θ, η[0])
         if has_reflection and has_transmission:
-            # Where F is 0 nothing is reflected, also for the number 0
+            # Where F is 0, nothing is reflected, even if sample1 is 0
             reflects = (sample1 <= F) & (F > 0)
             bs.pdf = dr.select(reflects, F, 1 - F)
         else:

@@ -35,7 +35,7 @@ class DispersiveRoughDielectric(mi.BSDF):
          all wavelengths from 360 to 830 nm. (Default: int_ior bk7, ext_ior air)
      * - distribution
        - |string|
-       - Of microfacets: :monosp:`beckmann` or :monosp:`ggx`. (Default: beckmann)
+       - The distribution of microfacets: :monosp:`beckmann` or :monosp:`ggx`. (Default: beckmann)
      * - alpha
        - |float| or |texture|
        - Roughness, not negative: the root mean square slope of microfacets. (Default: 0.1)
@@ -50,7 +50,7 @@ class DispersiveRoughDielectric(mi.BSDF):
        - Factors of reflection and refraction, 0 to 1, to be left at 1 for physical results.
          (Default: 1)
 
-    **Use it when** the colours of frosted glass shall be visible. **Not when** it is so rough that
+    **Use it when** the colours of frosted glass should be visible. **Not when** it is so rough that
     the colours mix: the noise remains, and :monosp:`roughdielectric` has less.
 
     It needs a spectral variant (:monosp:`llvm_ad_spectral`) and an integrator of this package, as

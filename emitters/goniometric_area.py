@@ -1,4 +1,4 @@
-"""Area lights that shine more in some directions than in others."""
+"""Area lights whose radiance depends on the direction."""
 
 from __future__ import annotations
 
@@ -29,8 +29,9 @@ class GoniometricArea(AreaLuminaire):
 
      * - radiance
        - |spectrum| or |texture|
-       - What the profile is multiplied by, in W/(m² sr): the radiance along the normal for an
-         exponent; for a file, the largest intensity over the area of the light. (Default: 1)
+       - What the profile is multiplied by, in W/(m² sr). With an exponent, it is the radiance along
+         the normal; with a file, the largest intensity divided by the area of the light. (Default:
+         1)
      * - exponent
        - |float|
        - The radiance is proportional to this power of the cosine, 0 or more. 0 is
@@ -38,26 +39,28 @@ class GoniometricArea(AreaLuminaire):
      * - filename
        - |string|
        - Instead of exponent: a photometric file (IES LM-63, type C). Its vertical angle 0 is the
-         normal, and its horizontal angle 0 the x axis of the shape. What shines backwards
+         normal, and its horizontal angle 0 the x axis of the shape. Light that leaves backwards
          (above 90°) is left out.
      * - sampling_weight
        - |float|
-       - How often the light is chosen, in proportion to the others. (Default: 1)
+       - How often the light is chosen, relative to other lights. (Default: 1)
 
-    **Use it when** a luminaire has louvres, lenses or a reflector that need not be seen. **Not
+    **Use it when** a luminaire has louvres, lenses or a reflector that need not be modelled. **Not
     when** the beam is a few degrees wide and the light is large: connections sample all directions
-    in which it is seen, as :monosp:`solid_angle_area` does, and most of them are dark.
+    in which the light is visible, as with :monosp:`solid_angle_area`, and find most of them dark.
 
     All integrators can use it, those of Mitsuba too, and light paths start from it
     (:monosp:`sample_ray` by the profile of an exponent; integrators of this package by the cosine).
-    Intensity over the area that is seen is radiance; of this area at least a tenth is seen from
-    everywhere, so that it stays finite at 90°.
+    With a file, the radiance in a direction is the intensity divided by the projected area of the
+    light. The projected area is taken to be at least a tenth of the area, so that the radiance
+    stays finite at 90°.
 
     Errors: files that are not photometric; files whose intensities depend on the horizontal angle,
     on shapes other than :monosp:`rectangle` and :monosp:`disk`; shapes that
     :monosp:`solid_angle_area` refuses.
 
-    Source: P. Shirley's part of the course, 3.2 (luminaires that are not diffuse); IESNA LM-63.
+    Source: P. Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH 2003 course 44,
+    section 3.2 (luminaires that are not diffuse); IESNA LM-63.
 
     .. tabs::
         .. code-tab:: xml

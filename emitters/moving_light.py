@@ -20,14 +20,14 @@ class MovingLight(MovingEmitter):
     -------------------------------------
 
     Moves the point light, spot or projector that is nested in it, rigidly, while the shutter is
-    open. What a surface receives is the light from where the emitter is at the time of the path.
+    open. Each path sees the emitter in its pose at the time of the path.
 
     .. pluginparameters::
 
      * - (nested plugin)
        - |emitter|
        - The emitter that moves, exactly one: :monosp:`point`, :monosp:`spot` or
-         :monosp:`projector`. Its own place is where it rests before the motion.
+         :monosp:`projector`. It rests in its own pose before the motion.
      * - pose_0, pose_1, …
        - |transform|
        - Rotations and translations through which the emitter passes. They are applied after its own
@@ -48,12 +48,11 @@ class MovingLight(MovingEmitter):
 
     All integrators that connect paths to lights can use it, those of Mitsuba too. Those that start
     paths from lights refuse it: :monosp:`bdpt`, :monosp:`light_tracer`, :monosp:`mlt`, and
-    :monosp:`erpt` and :monosp:`pssmlt` where they are bidirectional. Choices among lights that know
-    where these are take it for where it is during an eighth of the shutter interval
-    (:monosp:`spatial_lights`), or for anywhere within the bounds of its motion
-    (:monosp:`next_event` = :monosp:`linear`). ``sampling_weight`` is that of the nested emitter,
-    and cannot be changed after loading; its other parameters are known to :monosp:`mi.traverse` by
-    their usual names.
+    :monosp:`erpt` and :monosp:`pssmlt` where they are bidirectional. Of the choices among lights
+    that use their positions, :monosp:`spatial_lights` uses its positions during each eighth of the
+    shutter interval, and :monosp:`next_event` = :monosp:`linear` the bounds of its whole motion.
+    ``sampling_weight`` is that of the nested emitter, and cannot be changed after loading;
+    :monosp:`mi.traverse` shows its other parameters under their usual names.
 
     Errors: other emitters are refused, and so are poses with scales.
 

@@ -16,9 +16,9 @@ class SolidAngleArea(AreaLuminaire):
     Area light, sampled by solid angle (:monosp:`solid_angle_area`)
     ---------------------------------------------------------------
 
-    The light of Mitsuba's :monosp:`area`, in its place on a shape, with other samples: connections
-    choose among the directions in which the light is seen from the point that they start from, not
-    among the points of its surface.
+    An area light that emits as Mitsuba's :monosp:`area`, in its place on a shape, but is sampled
+    differently: a connection samples a direction in the solid angle of the light, as seen from the
+    point that is lit, and not a point on its surface.
 
     .. pluginparameters::
 
@@ -27,18 +27,19 @@ class SolidAngleArea(AreaLuminaire):
        - Emitted radiance, in W/(m² sr). (Default: 1)
      * - sampling
        - |string|
-       - :monosp:`solid_angle`, or :monosp:`projected`: also by the cosine with the normal of the
-         surface that is lit (rectangles only). (Default: solid_angle)
+       - Directions are sampled by :monosp:`solid_angle`, or by :monosp:`projected` solid angle:
+         also by the cosine with the normal of the surface that is lit (rectangles only). (Default:
+         solid_angle)
      * - sampling_weight
        - |float|
-       - How often the light is chosen, in proportion to the others. (Default: 1)
+       - How often the light is chosen, relative to other lights. (Default: 1)
 
     **Use it when** a light is large or close, as seen from what it lights: a panel over a table, a
     strip along a wall. **Not when** its texture has a small bright part (:monosp:`area` samples the
     texture; here only directions are sampled), or when the integrator learns from parts of lights:
     :monosp:`neepp`, :monosp:`two_stage_lights`, :monosp:`learned_lights` and
-    :monosp:`resampled_lights` divide the lights of :monosp:`area`, and take this one as a whole;
-    nor for hundreds of small lights: each adds about 3 ms to every pass.
+    :monosp:`resampled_lights` divide lights of the type :monosp:`area`, but not this one; nor for
+    hundreds of small lights: each adds about 3 ms to every pass.
 
     All integrators can use it, those of Mitsuba too, and light paths start from it.
 
@@ -56,23 +57,24 @@ class SolidAngleArea(AreaLuminaire):
     :monosp:`projected` makes less noise than :monosp:`solid_angle` on surfaces that are not smooth,
     most of all where the light stands at right angles to them, but a sample takes longer; do not
     use it for distant lights. The part of the light above the horizon of the surface, and the part
-    below it (emitters do not know from which side the surface is seen), are sampled by the modulus
-    of the cosine with its geometric normal. A tenth of the samples are those of
+    below it (emitters do not know from which side the surface is seen), are sampled in proportion
+    to the absolute cosine with its geometric normal. A tenth of the samples are those of
     :monosp:`solid_angle`, so that weights are at most ten times as large as there, also where
-    shading normals or transmission let light in that the cosine does not expect. Lights whose
-    projected solid angle is less than 1e-3, and points in media, get :monosp:`solid_angle`.
+    shading normals or transmission let light in that the cosine does not expect. For lights whose
+    projected solid angle is less than 1e-3, and for points in media, :monosp:`solid_angle` is used.
 
-    Interpolated normals turn the light of a mesh as rays
-    see it, and have no part in densities. Gradients reach the radiance, but not the shape.
+    On meshes with interpolated normals, light leaves on the side of the interpolated normal, as
+    rays see it; densities do not depend on these normals. Gradients reach the radiance, but not the
+    shape.
 
     Errors: other shapes are refused in the first render, and so is :monosp:`projected` on other
     shapes than :monosp:`rectangle`.
 
-    Source: the course, J. Arvo's part, 4.3 and 4.4; C. Peters, *BRDF Importance Sampling for
-    Polygonal Lights*, ACM TOG 40(4), 2021, for a form of J. Arvo, *Stratified Sampling of Spherical
-    Triangles*, 1995, without angles; disks after I. Guillén et al., *Area-Preserving
-    Parameterizations for Spherical Ellipses*, 2017, with a closed form in the place of the elliptic
-    integral.
+    Source: J. Arvo in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH 2003 course 44,
+    sections 4.3 and 4.4; C. Peters, *BRDF Importance Sampling for Polygonal Lights*, ACM TOG 40(4),
+    2021, for a form of J. Arvo, *Stratified Sampling of Spherical Triangles*, 1995, without angles;
+    disks after I. Guillén et al., *Area-Preserving Parameterizations for Spherical Ellipses*, 2017,
+    with a closed form instead of the elliptic integral.
 
     .. tabs::
         .. code-tab:: xml

@@ -19,15 +19,15 @@ import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
 
-#: Where lights without a place are put: an environment is never the nearest light.
+#: The coordinates of lights without a position: an environment is never the nearest light.
 FAR_AWAY = 1e15
 
 
 class NearestLight:
-    """Gives each surface point the row of a table: the number of the light nearest to it.
+    """Maps each surface point to a row of the table: the index of the light nearest to it.
 
     Parameters:
-        scene: The scene; the centre of a light's bounding box is its place.
+        scene: The scene; the position of a light is the centre of its bounding box.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -52,8 +52,8 @@ class NearestLightParameters(DecisionParameters):
     """Reads the parameters, and makes the decision for a render.
 
     Attributes:
-        share: Probability of the nearest light. All lights share what is left: without that,
-            the image would lack the light of all others.
+        share: Probability of the nearest light. All lights share the rest: without it, the image
+            would lack the light of all others.
     """
 
     name = "nearest_light"
@@ -72,7 +72,7 @@ class NearestLightParameters(DecisionParameters):
 
 
 class NearestLightPlugin(DecisionPlugin):
-    """What a scene file nests into the slot ``next_event``."""
+    """The plugin that a scene file nests into the slot ``next_event``."""
 
     kind = NearestLightParameters
 

@@ -1,4 +1,4 @@
-"""A learner of one's own: choose lights by what the pilot's connections to each have brought.
+"""A learner of one's own: choose lights by the light that pilot connections to each have found.
 
     mitsuba-ext compare scenes/window.xml --plugin examples/own_learner.py --size 160x90 \\
         --spp 64 path "composed_path:next_event=[proven_lights],pilot_spp=8"
@@ -22,7 +22,8 @@ import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
 
-#: The share of the choices that stays uniform: a light that no pilot sample saw may shine too.
+#: The share of the choices that stays uniform: a light that no pilot sample saw may still
+#: contribute.
 UNIFORM_SHARE = 0.2
 
 #: Sums are integers in this unit, so that the order in which threads add does not change them.
@@ -30,7 +31,7 @@ UNIT = 2.0**20
 
 
 class ProvenLights(Learner):
-    """Sums up, for each light, what connections to it bring to the image."""
+    """Sums up, for each light, the contributions of connections to the image."""
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightTable:
         self._cells = LightCells(scene, None)
@@ -39,7 +40,7 @@ class ProvenLights(Learner):
         return self._table(np.ones(self._cells.count))
 
     def connection(self, choice, vertex, ds, contribution, value, pdf, visible, tested) -> None:
-        """The walk has traced the shadow ray of a connection, which brings ``value``."""
+        """Called for each connection whose shadow ray was traced; ``value`` is its contribution."""
         brought = dr.minimum(brightness(value), 1e3)
         dr.scatter_add(self._sums, mi.UInt64(brought * UNIT), choice.cell, visible)
 
@@ -47,7 +48,8 @@ class ProvenLights(Learner):
         return self._table(self._sums.numpy().astype(float))
 
     def state(self) -> dict[str, np.ndarray]:
-        """What a render that goes on later needs, to choose as this one does."""
+        """The arrays from which a render that is continued later restores the same
+        probabilities."""
         return {"sums": self._sums.numpy()}
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightTable:
@@ -83,7 +85,7 @@ class ProvenLightsParameters(DecisionParameters):
 
 
 class ProvenLightsPlugin(DecisionPlugin):
-    """What a scene file nests into the slot ``next_event``."""
+    """The plugin that a scene file nests into the slot ``next_event``."""
 
     kind = ProvenLightsParameters
 

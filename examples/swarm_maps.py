@@ -21,7 +21,7 @@ import mitsuba as mi  # isort: skip
 
 from mitsuba_ext.composition.pixel_maps import PixelMap, light_probabilities, pixel_maps
 
-#: Axes of the plots, by slot; the order is that of the columns.
+#: Labels of the axes of the plots, by slot, in the order of the columns.
 _LABELS = {
     "time": ("time", "density"),
     "aperture": ("first number", "second number"),
@@ -50,7 +50,7 @@ class Pixel(click.ParamType):
 
 
 def _draw_lights(axes: plt.Axes, found: PixelMap, scene: mi.Scene, most: int = 9) -> None:
-    """Bars of the lights that are chosen most often, with the probability without a map."""
+    """Draws bars for the lights that are chosen most often, and the probability without a map."""
     probability, emitters = light_probabilities(scene, found), scene.emitters()
     shown = np.sort(np.argsort(-probability, kind="stable")[:most])[::-1]
     before = 1 / len(emitters)
@@ -66,10 +66,10 @@ def _name(emitter: mi.Emitter, index: int) -> str:
 
 
 def _draw_lobes(axes: plt.Axes, found: PixelMap) -> None:
-    """A row for each bounce and number of reflections before it."""
+    """Draws a row for each bounce and number of reflections before it."""
     bounces, reflections, _ = found.density.shape
     rows = [(b, r) for b in range(bounces) for r in range(reflections)]
-    # At bounce b, at most b reflections have been before
+    # Before bounce b there were at most b reflections
     rows = [(b, r) for b, r in rows if r <= b]
     density = np.stack([found.density[b, r] for b, r in rows])
     edges = found.edges[0]
@@ -109,7 +109,7 @@ def _draw(axes: plt.Axes, slot: str, found: PixelMap, scene: mi.Scene) -> None:
 def figure_of(
     scene: mi.Scene, integrator: mi.Integrator, image: np.ndarray, pixels: list[tuple[int, int]]
 ) -> plt.Figure:
-    """The figure of a render: the image, and a row of maps for each pixel."""
+    """Draws the figure of a render: the image, and a row of maps for each pixel."""
     sensor = scene.sensors()[0]
     maps = [pixel_maps(integrator.learners, sensor, x, y) for x, y in pixels]
     slots = [slot for slot in _LABELS if any(slot in found for found in maps)]

@@ -2,8 +2,8 @@
 
     .venv/bin/python examples/technique_pyramid.py caustic --max-depth 4 --out pyramid.png
 
-A row for each length of paths; from left to right, more and more of their vertices come from the
-light. Each image is exposed like the whole one.
+Each row shows paths of one length; from left to right, more of their vertices come from the light
+path. All images have the exposure of the complete image.
 """
 
 from __future__ import annotations

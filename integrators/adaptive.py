@@ -1,4 +1,4 @@
-"""Samples where the error is."""
+"""Adaptive sampling: more samples for pixels whose error is large."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mitsuba_ext.rendering.adaptive_job import AdaptiveJob
 from mitsuba_ext.rendering.render import render
 from mitsuba_ext.startup import registry
 
-#: The channel of the sample counts.
+#: The name of the channel that holds the sample counts.
 _COUNTS = "samples"
 
 
@@ -24,7 +24,7 @@ class AdaptiveSampling(WrappingIntegrator):
     Adaptive sampling (:monosp:`adaptive`)
     --------------------------------------
 
-    Renders with a nested integrator, and takes more samples of the pixels whose error is large. The
+    Renders with a nested integrator, and takes more samples in the pixels whose error is large. The
     image is unbiased.
 
     .. pluginparameters::
@@ -39,8 +39,8 @@ class AdaptiveSampling(WrappingIntegrator):
          all samples. (Default: 0)
      * - count_samples
        - |bool|
-       - Add a channel :monosp:`samples` to the image: how many samples each pixel got? Not with
-         :monosp:`specfilm`. (Default: false)
+       - Add a channel :monosp:`samples` to the image, with the number of samples of each pixel? Not
+         available with :monosp:`specfilm`. (Default: false)
      * - (Common parameters)
        - |float|
        - Those of :class:`StagedIntegrator`: timeout, checkpoint.
@@ -50,55 +50,57 @@ class AdaptiveSampling(WrappingIntegrator):
          :monosp:`path`, :monosp:`volpath` or one of ours. A :monosp:`timeout` of its own is
          ignored.
 
-    **Use it when** the worst pixels count, some parts of the image are much noisier than others,
-    and their samples take no longer; or a :monosp:`threshold` is to end the render. **Not when**
-    the mean error counts, noise is about the same everywhere, noisy pixels are also the slow ones
-    (things before an empty background), or a stratified sampler does better than independent
-    samples. ``docs/results/adaptive.md`` has figures: in the three scenes measured, at equal time,
-    the 95th percentile of the errors was 0.93 to 1.21 of that of uniform samples, and the mean 1.06
-    to 1.31.
+    **Use it when** the error of the worst pixels matters, some parts of the image are much noisier
+    than others, and samples there take no longer than elsewhere; or when the render is to end at a
+    :monosp:`threshold`. **Not when** the mean error matters, noise is about the same everywhere,
+    noisy pixels are also the slow ones (objects before an empty background), or a stratified
+    sampler does better than independent samples. ``docs/results/adaptive.md`` has figures: in the
+    three scenes measured, at equal time, the 95th percentile of the errors was 0.93 to 1.21 times
+    that of uniform sampling, and the mean error 1.06 to 1.31 times.
 
-    The samples of the sensor (:monosp:`spp`) are the mean over all pixels. The first pass takes the
-    same number of each pixel, and so do the pilots of a nested integrator that learns. Each later
-    pass distributes its samples in proportion to the power 4/3 of each pixel's relative standard
-    deviation, estimated from all earlier passes, its eight neighbours included; the power makes
-    the sum of the fourth powers of relative errors least. Every pixel gets at least an eighth of
-    the mean in each pass. Relative errors are those of relMSE: they are relative to the square root
-    of the pixel's squared brightness plus a hundredth of the squared mean of the image.
+    The sensor's number of samples (:monosp:`spp`) is the mean over all pixels. The first pass takes
+    the same number of samples in each pixel, and so do the pilot passes of a nested integrator that
+    learns. Each later pass distributes its samples in proportion to the power 4/3 of each pixel's
+    relative standard deviation, which is estimated from all earlier passes in the pixel and its
+    eight neighbours. The power 4/3 minimises the sum of the fourth powers of the relative errors.
+    In each pass, every pixel gets at least an eighth of the mean number of samples. Relative errors
+    are those of relMSE: they are relative to the square root of the pixel's squared brightness plus
+    a hundredth of the squared mean of the image.
 
     **Why it is unbiased.** The mean over samples whose number depends on their values is biased: a
-    pixel that has not met its rare bright path yet looks converged, gets few samples and stays
+    pixel whose rare bright path no sample has found yet looks converged, gets few samples and stays
     dark. Here, each pass has a weight, and adds that weight times the mean of its own samples.
-    Weight and number of samples are decided before the pass. So the mean of each pass is right on
-    average, whatever the earlier ones were, and the weights of all passes add up to one. Below a
-    :monosp:`threshold`, likewise, a pixel ends with a pass that is known to be its last before it
-    begins: its size follows from the variance that earlier passes showed. The threshold is thus
-    met by estimates, and not for sure: a pixel whose neighbourhood has not met its bright paths
-    when that is decided stays noisier. The first pass counts half as much as its share of the
-    samples, because it gives noisy pixels no more samples than others. A bright spot of an early
-    pass stays: nothing that a pass has added is taken back. The source renders pixels anew
-    whose deviation was far above its estimate, with a bias. Here, estimates contain the pixel's own
-    earlier samples, and there are hardly any such pixels.
+    Weight and number of samples are decided before the pass. So the expected mean of each pass is
+    right, whatever the earlier passes found, and the weights of all passes add up to one. With a
+    :monosp:`threshold`, the last pass of a pixel is decided before it begins as well: its number of
+    samples follows from the variance estimated from earlier passes. A pixel can thus miss the
+    threshold: if no sample in its neighbourhood has found the bright paths when its last pass is
+    decided, it stays noisier. The weight of the first pass is half its share of the samples,
+    because it gives noisy pixels no more samples than others. A bright spot from an early pass
+    stays in the image, because nothing that a pass has added is removed. The source renders pixels
+    anew if their deviation was far above its estimate, which is biased. Here, estimates contain the
+    pixel's own earlier samples, and there are hardly any such pixels.
 
     With a reconstruction filter wider than a pixel, samples are scaled such that all parts of the
     image plane have the same density. As always, the film divides by the sum of filter weights,
-    which is a random number; with the box filter it is not.
+    which is a random number except with the box filter.
 
     With a stratified sampler, sets of a quarter of :monosp:`pass_spp` samples are stratified, each
-    by itself. Mitsuba's :monosp:`stratified` is refused: the numbers of such sets depend on each
-    other, so that images are biased (by up to 12 % in a quarter of an image), with :monosp:`path`
-    too. Use :monosp:`multijitter`.
+    by itself. Mitsuba's :monosp:`stratified` is refused: the random numbers of its sets depend on
+    each other, so that images are biased (by up to 12 % in a quarter of an image), with
+    :monosp:`path` too. Use :monosp:`multijitter`.
 
-    Integrators that bring light to other pixels than that of their camera ray are refused
-    (:monosp:`light_tracer`, chains, and :monosp:`bdpt` unless its :monosp:`light_image` is off), as
-    are weighted sets of camera numbers. Inside of :monosp:`moment` and :monosp:`aov`, samples are
-    those of the nested integrator. Gradients are not supported (use :monosp:`prb`).
+    Integrators that add light to other pixels than that of the camera ray are refused
+    (:monosp:`light_tracer`, Markov chains, and :monosp:`bdpt` unless its :monosp:`light_image` is
+    off). So are weighted point sets for camera rays (:monosp:`weighted_numbers`). Nested in
+    :monosp:`moment` or :monosp:`aov`, it returns the samples of its nested integrator, without
+    adaptive sampling. Gradients are not supported (use :monosp:`prb`).
 
     Source: D. Cline, PhD thesis, 2007, section 5.5; the parameters have the names of Mitsuba's pull
     request 1731. D. Kirk, J. Arvo, *Unbiased Sampling Techniques for Image Synthesis*, SIGGRAPH
     1991 (the bias). C. Stein, *A Two-Sample Test for a Linear Hypothesis Whose Power is Independent
     of the Variance*, Annals of Mathematical Statistics 16(3), 1945 (a last sample whose size is
-    decided before). Weights of passes are ours.
+    decided in advance). The weights of the passes are ours.
 
     .. tabs::
         .. code-tab:: xml
@@ -120,7 +122,7 @@ class AdaptiveSampling(WrappingIntegrator):
             }
     """
 
-    #: The weights of its passes add up to one in the film, and do not count samples.
+    #: The weights of its passes add up to one in the film: they are not numbers of samples.
     film_counts_samples = False
 
     def __init__(self, props: mi.Properties) -> None:
@@ -157,6 +159,7 @@ class AdaptiveSampling(WrappingIntegrator):
         return [*self.nested.aov_names(), *([_COUNTS] if self.counts_samples else [])]
 
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
-        """Counts are known after the render only."""
+        """The AOVs of the nested integrator. The sample count is 0 here: it is known after the
+        render only."""
         found = super().sample_aovs(scene, sampler, ray)
         return [*found, *([mi.Float(0)] if self.counts_samples else [])]

@@ -12,7 +12,7 @@ from mitsuba_ext.composition.swarm import MAPS
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
 
-#: The numbers of a camera ray that can have maps.
+#: The random numbers of a camera ray that can have learned maps.
 _CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
 
 
@@ -24,43 +24,46 @@ class AutoPath(WalkIntegrator):
     Self-configuring path tracer (:monosp:`auto_path`)
     --------------------------------------------------
 
-    A path tracer that tries in its first samples whether guiding directions, learning lights, and
-    learning which times, points of the lens, wavelengths and distances in fog find light pay in
-    this scene, and keeps what does. There is nothing to choose.
+    A path tracer that chooses its techniques itself. Its first samples test which of them lower the
+    noise of this scene by more than they cost: guided directions, learned lights, and maps of the
+    times, points on the lens, wavelengths and distances in fog with which paths find light. It
+    keeps those that do.
 
     .. pluginparameters::
 
      * - pilot_spp
        - |int|
-       - Samples per pixel from which is learned, at most a quarter of all. They count towards the
-         image. With 0 nothing is learned, and this is :monosp:`path`. (Default: 32)
+       - Pilot samples per pixel, from which the integrator learns; at most a quarter of all
+         samples. They count towards the image. With 0, nothing is learned, and the integrator is
+         :monosp:`path`. (Default: 32)
      * - save_learned, load_learned
        - |string|
-       - Files. The first is written: what was learned, as a whole. The second is read in place of
-         pilots: what a render of the same scene, with the same parameters and size of film, has
-         saved. (Default: none)
+       - Files. The render saves all that it has learned to :monosp:`save_learned`. With
+         :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
+         scene, with the same parameters and film size, has saved. (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
          checkpoint.
 
     **Use it when** you do not know which technique a scene needs, with 16 samples per pixel or
-    more. **Not when** an image has fewer samples (there is nothing to learn from), or when light
-    comes through glass from small lamps (no path from the camera finds it).
+    more. **Not when** an image has fewer samples (too few to learn from), or when small lamps shine
+    through glass (no path from the camera finds their light).
 
     It is a :monosp:`composed_path` with :monosp:`directions=guided`,
     :monosp:`next_event=contribution`, and the word :monosp:`swarm` in the slots :monosp:`time`,
-    :monosp:`aperture`, :monosp:`wavelength` and :monosp:`distance`; :monosp:`guided_directions`,
-    :monosp:`learned_lights` and :monosp:`swarm_path` tell what is learned, and how. Maps are for
-    scenes with an open shutter, a lens, fog, or in spectral variants, and cost nothing elsewhere.
-    The first two pilots are short: together they predict by how much each of these lowers the
-    variance of the image. What costs more time than it saves ends there. Maps of reflections and of
-    directions are not tried: guided directions have their place.
-    :monosp:`integrator.statistics.learned` says what was kept, and why.
+    :monosp:`aperture`, :monosp:`wavelength` and :monosp:`distance`; the pages of
+    :monosp:`guided_directions`, :monosp:`learned_lights` and :monosp:`swarm_path` describe what is
+    learned, and how. The maps are used in scenes with an open shutter, a lens or fog, and in
+    spectral variants; elsewhere they cost nothing. The first two pilots are short: together they
+    predict by how much each technique lowers the variance of the image. A technique that costs more
+    time than it saves is dropped there. The maps of lobes and of directions of :monosp:`swarm_path`
+    are not tried, because guided directions take their place.
+    :monosp:`integrator.statistics.learned` says which techniques were kept, and why.
 
     Participating media are rendered as by :monosp:`volpath`. Gradients are not supported (use
-    :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
-    pilot.
+    :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment`, it takes no
+    pilot samples.
 
     Sources: those of :monosp:`guided_directions`, :monosp:`learned_lights` and
     :monosp:`swarm_path`. The predictions are ours.
@@ -86,6 +89,6 @@ class AutoPath(WalkIntegrator):
             directions=Guided(read),
             next_event=LearnedLights(read),
             roulette=GuidedRoulette(),
-            # They do not ask for longer pilots
+            # Maps alone would ask for more pilot samples than guided directions
             **{slot: MAPS[slot](read, pilot_spp=Guided.pilot_spp) for slot in _CAMERA_NUMBERS},
         )

@@ -24,8 +24,8 @@ from mitsuba_ext.transport.path_decisions import NoConnections, SubpathSelection
 #: The decisions that a scene can replace, of camera paths and of light paths.
 _SLOTS = ("directions", "next_event", "roulette", "shadow_test", *BIDIRECTIONAL_SLOTS)
 
-#: Memory for what a pass stores, and about what a path takes besides the vertices that are stored
-#: at a time.
+#: Bytes for what a pass stores; and bytes, about, that a path takes besides the vertices that are
+#: stored at a time.
 _PASS_BYTES, _PATH_BYTES = 1 << 29, 640
 
 
@@ -38,7 +38,7 @@ class BidirectionalIntegrator(WalkIntegrator):
     ------------------------------------------
 
     Traces a path from the camera and a path from a light for each sample, connects their vertices,
-    and weighs what they find by multiple importance sampling.
+    and weights all contributions by multiple importance sampling.
 
     .. pluginparameters::
 
@@ -48,28 +48,28 @@ class BidirectionalIntegrator(WalkIntegrator):
          connected. (Default: 1)
      * - light_image
        - |bool|
-       - Connect light paths to the sensor as well (t = 1)? It finds caustics that are seen
+       - Connect light paths to the sensor as well (t = 1)? This finds caustics that are seen
          directly. (Default: true)
      * - subpath_selection
        - |string|
-       - Which vertices of light paths these are: :monosp:`uniform`, or :monosp:`visibility` (those
-         in regions whose vertices were seen from here, and brought light, in pilots). (Default:
-         uniform)
+       - How these vertices of light paths are chosen: :monosp:`uniform`, or by :monosp:`visibility`
+         (preferably in regions whose vertices were visible from the camera path's vertex, and
+         brought light, in the pilot samples). (Default: uniform)
      * - light_paths
        - |string|
-       - :monosp:`always`, or :monosp:`auto`: a pilot finds whether they are worth their time; if
-         not, the rest of the samples are those of :monosp:`path` with the same decisions.
-         (Default: always)
+       - Whether light paths are traced: :monosp:`always`, or :monosp:`auto`: pilot samples measure
+         whether light paths are worth their time; if not, all other samples are those of
+         :monosp:`path` with the same decisions. (Default: always)
      * - sample_direct
        - |bool|
-       - Connect camera paths to points that are chosen on lights (s = 1)? It is there to see what
-         the other techniques do alone: points and parallel light, seen in a mirror or through
-         glass, are black without. (Default: true)
+       - Connect camera paths to points that are sampled on lights (s = 1)? False shows what the
+         other techniques find alone: surfaces lit by point lights or parallel light are then black
+         where they are seen in a mirror or through glass. (Default: true)
      * - technique_images
        - |string|
-       - A file of the type OpenEXR that is to hold an image of each technique, with its weight and
-         without (layers :monosp:`weighted.s1_t2`, :monosp:`plain.s1_t2`; s vertices on the light
-         path, t on the camera path), of paths of up to 8 segments. (Default: none)
+       - An OpenEXR file to which the image of each technique is written, with and without its MIS
+         weights (layers :monosp:`weighted.s1_t2`, :monosp:`plain.s1_t2`; s vertices on the light
+         path, t on the camera path), for paths of up to 8 segments. (Default: none)
      * - next_event, directions, roulette, shadow_test
        - |string| or |decision|
        - Decisions of the camera paths, as in :class:`composed_path`. (Default: those of
@@ -79,42 +79,44 @@ class BidirectionalIntegrator(WalkIntegrator):
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
          checkpoint.
 
-    **Use it when** light reaches the scene by ways that camera paths find rarely: caustics of
-    lamps, lamps in fittings or near walls, indirect light from hidden lamps. **Not when**
-    :monosp:`path` converges well: a sample costs about three times as much.
+    **Use it when** light travels along paths that camera paths rarely find: caustics of lamps,
+    lamps in fittings or near walls, indirect light from hidden lamps. **Not when** :monosp:`path`
+    converges well: a sample costs about three times as much.
 
-    Mitsuba lets rays start above a surface, by about 1e-4 · (1 + the largest coordinate). In scenes
-    far from the origin, rays miss what is near; light paths miss other things than camera paths, so
-    that the image differs from that of :monosp:`path` (by up to 3 % in a quarter of the image, in a
-    scene moved by a thousand times its size). In scenes smaller than 0.1, rays of this package
-    start closer: all its integrators give the image of the same scene at size 1, and Mitsuba's
-    :monosp:`path` does not (2 % in a scene of a few thousandths).
+    Mitsuba offsets the origins of rays from the surface, by about 1e-4 · (1 + the largest
+    coordinate). In scenes far from the origin, rays therefore miss nearby surfaces; light paths
+    miss other ones than camera paths, so that the image differs from that of :monosp:`path` (by up
+    to 3 % in a quarter of the image, in a scene moved by a thousand times its size). In scenes
+    smaller than 0.1, rays of this package start closer to the surface: all its integrators give the
+    image of the same scene at size 1. Mitsuba's :monosp:`path` does not (2 % difference in a scene
+    of a few thousandths).
 
-    All techniques are used whose number of vertices on the light path is 0 (a camera path runs into
-    the light), 1 (a connection to a point that is chosen on a light) or more, and whose number on
-    the camera path is 1 (a vertex of a light path is connected to the sensor) or more; but light
-    paths do not run into the sensor (t = 0), which has no area, or hardly any. The weights are the
-    power heuristic over all of them; they take the number of connections into account.
+    A technique has s vertices on the light path: 0 (a camera path hits the light), 1 (a connection
+    to a point that is sampled on a light) or more. It has t vertices on the camera path: 1 (a
+    vertex of a light path is connected to the sensor) or more. All these techniques are used. Light
+    paths that hit the sensor (t = 0) do not count, because the sensor has no area, or hardly any.
+    The MIS weights are the power heuristic over all techniques, and take the number of connections
+    into account.
 
     In a pass, the vertices of all light paths are shared by all camera paths. In spectral variants
     and with moving shapes, a camera path shares wavelengths and time with one light path, and is
-    connected to that only. Light paths have independent random numbers where the sampler is
-    :monosp:`ldsampler`, whose numbers depend on each other.
+    connected to that one only. With the sampler :monosp:`ldsampler`, whose numbers depend on each
+    other, light paths draw independent random numbers instead.
 
-    **Learned selection.** Surfaces are divided into regions, the smaller the more vertices they
-    have. Pilots (:monosp:`pilot_spp`, 16 by default, at most a quarter of all samples; they count
-    towards the image) measure what connections from each region to each other one bring, relative
-    to the brightness of the pixel, and a region is chosen in proportion to the root mean square of
-    that. A tenth of the choices stays uniform. The MIS weights know how often each connection is
-    made, so that the image is unbiased. Use it where most connections are blocked: in corridors,
-    and between rooms. A sample takes about a fifth longer; where the first pilot shows that little
-    is gained, learning ends. In spectral variants and with moving shapes there is little to choose
-    from, and the selection stays uniform.
+    **Learned selection.** Surfaces are divided into regions, which are smaller where there are more
+    vertices. Pilot samples (:monosp:`pilot_spp`, 16 by default, at most a quarter of all samples;
+    they count towards the image) measure the contributions of connections between each pair of
+    regions, relative to the brightness of the pixel. A region is chosen in proportion to the root
+    mean square of these contributions. A tenth of the choices stays uniform. The MIS weights take
+    into account how often each connection is made, so that the image is unbiased. Use it where most
+    connections are blocked: in corridors, and between rooms. A sample takes about a fifth longer;
+    where the first pilot shows that little is gained, learning ends. In spectral variants and with
+    moving shapes there is little to choose from, and the selection stays uniform.
 
-    **Sensors and films.** A :monosp:`perspective` or :monosp:`thinlens` can be connected to; with
-    other sensors, and with films that sample a border, there is no light image. Lights of the type
-    :monosp:`directionalarea`, which :monosp:`path` does not find, are seen here; spectral variants
-    refuse them.
+    **Sensors and films.** Light paths can be connected to a :monosp:`perspective` or
+    :monosp:`thinlens`; with other sensors, and with films that sample a border, there is no light
+    image. Lights of the type :monosp:`directionalarea`, which :monosp:`path` does not find, are
+    rendered; spectral variants refuse them.
 
     Participating media are refused (use :monosp:`volpath` or :monosp:`composed_path`). Gradients
     are not supported (use

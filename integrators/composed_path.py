@@ -19,12 +19,12 @@ class ComposedPath(WalkIntegrator):
     Composed path tracer (:monosp:`composed_path`)
     ----------------------------------------------
 
-    A path tracer whose decisions are chosen in the scene. Each of its slots holds one decision: a
-    word, or a nested plugin that has parameters of its own. With all defaults it is Mitsuba's
-    :monosp:`path` (with the same random numbers and the same image, while one pass of two million
-    samples is enough), but traces no shadow ray for connections that cannot contribute. Where
-    Mitsuba 3.9.1 misjudges the bounds of a scene (rectangles of one material, which it merges), sky
-    and sun leak through walls in :monosp:`path`, and not here.
+    A path tracer whose sampling decisions are chosen in the scene file. Each of its slots holds one
+    decision: a word, or a nested plugin that has parameters of its own. With all defaults it is
+    Mitsuba's :monosp:`path` (with the same random numbers and the same image, as long as one pass
+    of two million samples is enough), but traces no shadow ray for connections that cannot
+    contribute. Where Mitsuba 3.9.1 computes wrong bounds for a scene (it merges rectangles of one
+    material), light of sky and sun leaks through walls in :monosp:`path`, but not here.
 
     .. pluginparameters::
 
@@ -35,9 +35,9 @@ class ComposedPath(WalkIntegrator):
          as in :monosp:`swarm_path` choose between reflection and transmission. (Default: uniform)
      * - scattering
        - |string|
-       - Where a path goes on: where the :monosp:`bsdf` sends it, or at the first vertex that is no
-         mirror also in directions of learned maps, :monosp:`swarm` (see :monosp:`swarm_path`).
-         (Default: bsdf)
+       - What samples the direction in which a path goes on: the :monosp:`bsdf`; or, with
+         :monosp:`swarm`, also learned maps, at the first vertex that is not a mirror (see
+         :monosp:`swarm_path`). (Default: bsdf)
      * - next_event
        - |string| or |decision|
        - Which light a vertex is connected to, and which point of it. Not learned: :monosp:`uniform`
@@ -59,11 +59,12 @@ class ComposedPath(WalkIntegrator):
          uniform)
      * - roulette
        - |string|
-       - Which paths go on from :monosp:`rr_depth` on. With :monosp:`automatic`, where directions
-         are guided by regions of surfaces: paths are more likely to survive the more they are
-         expected to bring, compared to their pixel, by what the guide has learned; elsewhere, and
-         where pilots show that this does not pay, as with :monosp:`throughput`: by the rule of
-         :monosp:`path`. (Default: automatic)
+       - Which paths Russian roulette continues, from :monosp:`rr_depth` on. :monosp:`throughput` is
+         the rule of :monosp:`path`. With :monosp:`automatic`, where directions are guided by
+         regions of surfaces, the survival probability grows with the radiance that the guide
+         expects the path to find, relative to the brightness of its pixel; elsewhere, and where
+         pilot samples show that this does not pay, the rule is :monosp:`throughput`. (Default:
+         automatic)
      * - connections
        - |string|, |int| or |decision|
        - To how many points of lights the first vertex of a path is connected: :monosp:`one`, a
@@ -71,7 +72,7 @@ class ComposedPath(WalkIntegrator):
          :monosp:`weighted_connections`. (Default: one)
      * - mis
        - |string| or |decision|
-       - How connections to lights and BSDF samples that run into them are weighed: :monosp:`power`,
+       - How connections to lights and BSDF samples that hit them are weighted: :monosp:`power`,
          :monosp:`balance`, :monosp:`cutoff`, :monosp:`maximum`, :monosp:`bsdf` or :monosp:`light`
          alone, or a nested :monosp:`mis_heuristic`. (Default: power)
      * - shadow_test
@@ -81,27 +82,28 @@ class ComposedPath(WalkIntegrator):
          parameters. (Default: always)
      * - aperture, time, wavelength
        - |string| or |decision|
-       - Which numbers choose the point on the aperture, the time, and the wavelengths of a camera
-         ray: those of the sensor's :monosp:`sampler`, those that maps of tiles have learned
-         (:monosp:`swarm`, see :monosp:`swarm_path`), those of sets of a pattern (:monosp:`sobol`,
-         :monosp:`lattice`, …), or those of a nested :monosp:`weighted_numbers`. wavelength needs a
-         spectral variant. (Default: sampler)
+       - Which random numbers choose the point on the aperture, the time, and the wavelengths of a
+         camera ray: those of the sensor's :monosp:`sampler`, those of learned maps of film tiles
+         (:monosp:`swarm`, see :monosp:`swarm_path`), those of point sets of a pattern
+         (:monosp:`sobol`, :monosp:`lattice`, …), or those of a nested :monosp:`weighted_numbers`.
+         The slot :monosp:`wavelength` needs a spectral variant. (Default: sampler)
      * - distance
        - |string|
-       - Which numbers choose how far a camera ray flies in a homogeneous medium: those of the
-         :monosp:`sampler`, or :monosp:`swarm` (maps, as :monosp:`swarm_path`). (Default: sampler)
+       - Which random numbers choose the distance that a camera ray travels in a homogeneous medium:
+         those of the :monosp:`sampler`, or those of learned maps, :monosp:`swarm` (see
+         :monosp:`swarm_path`). (Default: sampler)
      * - pilot_spp
        - |int|
-       - Samples per pixel from which is learned, at most a quarter of all (half, where only
-         :monosp:`swarm` learns). They count towards the image. Known only where something learns;
-         with 0 nothing is learned. A sampler that is stratified over all samples may need longer
-         pilots. (Default: 64 with :monosp:`swarm`, 32 with guided directions, 4 where only
-         :monosp:`triple_product` learns, otherwise 16)
+       - Pilot samples per pixel, from which decisions learn; at most a quarter of all samples
+         (half, where only :monosp:`swarm` learns). They count towards the image. The parameter is
+         accepted only if a decision learns. With 0, nothing is learned. With a stratified sampler,
+         pilots consist of whole passes, and can be longer. (Default: 64 with :monosp:`swarm`, 32
+         with guided directions, 4 where only :monosp:`triple_product` learns, otherwise 16)
      * - save_learned, load_learned
        - |string|
-       - Files. The first is written: what was learned, as a whole. The second is read in place of
-         pilots: what a render of the same scene, with the same parameters and size of film, has
-         saved. (Default: none)
+       - Files. The render saves all that it has learned to :monosp:`save_learned`. With
+         :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
+         scene, with the same parameters and film size, has saved. (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
@@ -111,33 +113,36 @@ class ComposedPath(WalkIntegrator):
     or progress, or to combine techniques. **Not when** you need gradients (use :monosp:`prb`), or a
     scalar or polarized variant.
 
-    Where the scene has participating media, this is :monosp:`volpath`: homogeneous and grid media,
-    all phase functions, index-matched surfaces, cameras and lights in fog. The rule of the roulette
-    is that of :monosp:`path`, the transmittance of homogeneous media for shadow rays is computed,
-    which leaves less noise, and :monosp:`hide_emitters` also hides a light that the camera sees
-    through fog. :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`,
-    :monosp:`spatial`, :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility` there; the
-    others need a surface and refuse the scene. :monosp:`directions` guided by regions of surfaces
-    are guided at surfaces, and by tiles everywhere. As with :monosp:`volpath`, distances follow one
-    of the colours: where these differ much, :monosp:`volpathmis` has less noise, and a medium that
-    has no extinction at all in some of them is refused. Light from infinity should not shine into a
-    medium without an end. Mitsuba's :monosp:`ldsampler` makes errors of 1 to 2 % in media, in
-    :monosp:`volpath` too. A medium that only an :monosp:`instance` shows is rendered, but refused
-    by none of those who do not see media.
+    In scenes with participating media, it is :monosp:`volpath`: homogeneous and grid media, all
+    phase functions, index-matched surfaces, cameras and lights in fog. There are three differences:
+    Russian roulette follows the rule of :monosp:`path`; the transmittance of homogeneous media
+    along shadow rays is computed, not estimated, which makes less noise; and
+    :monosp:`hide_emitters` also hides a light that the camera sees through fog. In such scenes,
+    :monosp:`next_event` can be :monosp:`uniform`, :monosp:`power`, :monosp:`spatial`,
+    :monosp:`portals`, :monosp:`contribution` or :monosp:`visibility`; the other choices need a
+    surface and refuse the scene. If the guide of :monosp:`directions` has regions of surfaces,
+    directions are guided at surfaces only; if it has tiles, everywhere. As in :monosp:`volpath`,
+    distances are sampled by the extinction of one colour channel. Where the channels differ much,
+    :monosp:`volpathmis` has less noise; a medium without any extinction in some channels is
+    refused. Lights at infinity should not shine into an unbounded medium. With Mitsuba's
+    :monosp:`ldsampler`, images of media have errors of 1 to 2 %, with :monosp:`volpath` too. A
+    medium that exists only inside an :monosp:`instance` is rendered, but plugins that do not
+    support media do not notice it, and so do not refuse the scene.
 
-    A scene nests a decision as a :monosp:`sampler`, which is what Mitsuba takes it for, under the
-    name of the slot. Every decision goes with every decision of the other slots, and the image
-    stays unbiased (but for :monosp:`voronoi` weights). All that learn share the same pilots: two
-    short ones, which show whether learning pays, and one or two longer ones (a single one, if only
-    :monosp:`visibility_roulette` learns). Beside learned lights, :monosp:`visibility_roulette` uses
-    their map, and knows no parameters of a map of its own. :monosp:`neepp`, :monosp:`pss_guided`
-    and :monosp:`reweighted_direct` are path tracers with some of these decisions, under one name
-    each.
+    A scene file nests a decision as a :monosp:`sampler`, under the name of the slot: to Mitsuba,
+    decisions are samplers. Every decision can be combined with every decision of the other slots,
+    and the image stays unbiased (but for :monosp:`voronoi` weights). All decisions that learn share
+    the same pilot passes: two short ones, which show whether learning pays, and one or two longer
+    ones (a single one, if only :monosp:`visibility_roulette` learns). Together with learned lights,
+    :monosp:`visibility_roulette` uses their map, and does not accept the parameters of a map of its
+    own. :monosp:`neepp`, :monosp:`pss_guided` and :monosp:`reweighted_direct` are this path tracer
+    with some of these decisions preset.
 
     Source: the algorithms are those of Mitsuba's :monosp:`path` and :monosp:`volpath`; J. T.
     Kajiya, *The Rendering Equation*, 1986; E. Veach, PhD thesis, 1997, chapter 9 (multiple
     importance sampling); P. Shirley in H. W. Jensen et al., *Monte Carlo Ray Tracing*, SIGGRAPH
-    2003 course 44, section 3.4 (:monosp:`linear`). The pages of the decisions name theirs.
+    2003 course 44, section 3.4 (:monosp:`linear`). The pages of the decisions name their own
+    sources.
 
     .. tabs::
         .. code-tab:: xml

@@ -1,4 +1,4 @@
-"""Depth of field by a filter of what the middle of the lens sees."""
+"""Depth of field by filtering an image that is rendered from the middle of the lens."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mitsuba_ext.scene.movers import is_moving_camera
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.path_decisions import SceneQuery
 
-#: The sensors whose rays begin in the middle of a lens, or can.
+#: The sensors whose rays begin in the middle of a lens, or can begin there.
 _SENSORS = ("ThinLensCamera", "PerspectiveCamera")
 
 
@@ -34,10 +34,10 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
     Effective circle of confusion (:monosp:`ecoc_dof`)
     --------------------------------------------------
 
-    Renders with a nested integrator from the middle of the lens, and makes depth of field of that
-    by a filter. It is biased: an approximation, in a fraction of the samples. What a near, blurred
-    object hides of the lens makes far things behind its edge sharper and shifted; the filter shows
-    that.
+    Renders with a nested integrator from the middle of the lens, and computes depth of field from
+    that image with a filter. It is a biased approximation, which needs a fraction of the samples. A
+    near, blurred object hides a part of the lens from the objects behind its edge, which makes
+    these sharper and shifted; the filter reproduces that.
 
     .. pluginparameters::
 
@@ -47,19 +47,19 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
          :monosp:`thinlens`. (Default: 0)
      * - filter
        - |string|
-       - :monosp:`lens`: by points of the lens, what hides what. :monosp:`effective`: the source's,
-         a separable filter of what is near, and a smaller and shifted circle of confusion for the
-         rest. To compare with: :monosp:`gather` and :monosp:`one_pass`, of the picture alone.
-         (Default: lens)
+       - :monosp:`lens` computes, for each of several points of the lens, which layer hides which.
+         :monosp:`effective` is the filter of the source: a separable filter for near surfaces, and
+         a smaller and shifted circle of confusion for all others. For comparisons, :monosp:`gather`
+         and :monosp:`one_pass` filter the image without layers. (Default: lens)
      * - hidden_spp
        - |int|
-       - Samples per pixel of what is hidden, and of what lies around the film, where the lens sees
-         it; 0 for half of the samples per pixel. (Default: 0)
+       - Samples per pixel for hidden surfaces, and for surfaces outside of the film, where a part
+         of the lens sees them; 0 for half of the image's samples per pixel. (Default: 0)
      * - denoise
        - |bool|
-       - Denoises the layers before they are filtered (Open Image Denoise, from the package
-         :monosp:`mitsuba-oidn`), but for pixels that show a light. They are collected with a box
-         filter then. (Default: false)
+       - Denoise the layers before they are filtered (Open Image Denoise, from the package
+         :monosp:`mitsuba-oidn`), except for pixels that show a light? The layers then have a box
+         filter as their reconstruction filter. (Default: false)
      * - (Common parameters)
        - |float|
        - Those of :class:`StagedIntegrator`: timeout, checkpoint.
@@ -69,47 +69,48 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
          :monosp:`path`, :monosp:`volpath` or one of ours. A :monosp:`timeout` of its own is
          ignored.
 
-    **Use it when** a preview, an animation or a look is wanted, and defocus makes the noise.
-    **Not when** the image must be right: use :monosp:`path` with a :monosp:`thinlens`.
-    ``docs/results/ecoc_dof.md`` has figures, and pictures that show where it errs.
+    **Use it when** you want a preview, an animation or a look, and most noise comes from defocus.
+    **Not when** the image must be correct: use :monosp:`path` with a :monosp:`thinlens`.
+    ``docs/results/ecoc_dof.md`` has figures, and pictures that show where it is wrong.
 
-    **Layers.** There are up to five: two before the focus, one in focus, two behind; fewer where
-    all things are blurred alike. One ray for each pixel tells where the limits between them are.
-    Each sample of the nested integrator belongs to the layer of the surface that it meets first.
-    Around edges, more samples begin behind that surface, where the blur is half as large (behind
-    the focus, half of the way to that of the sky), and go on past the back of the same shape. Where
-    nothing was found, colours from around are filled in. Layers share surfaces near the limits
-    between them.
+    **Layers.** There are up to five: two before the focus, one in focus, two behind it; fewer where
+    all surfaces are blurred alike. One ray for each pixel determines the limits between them. Each
+    sample of the nested integrator belongs to the layer of the first surface that its ray hits.
+    Around edges, further samples find what this surface hides: their rays begin behind it, where
+    the blur is half as large (behind the focus: halfway to the blur of the sky), and pass through
+    the back of the same shape. Gaps that remain are filled with the colours around them.
+    Neighbouring layers share the surfaces near the limit between them.
 
-    **The filter** :monosp:`lens` looks, for each pixel and 48 points of the lens, into each layer
-    at the place where that point sees it; what is nearer covers what is behind it. It uses copies
-    of lower resolution where the blur is large, and fewer points where all circles are small. What
-    is small and bright, such as a lamp at night, is spread over its circle instead, where nearer
-    layers let it through. The time does not depend on the samples. With :monosp:`effective` there
-    are three layers. The near one is blurred with one radius, the median of those of its surfaces.
+    **The filter** :monosp:`lens` looks up each layer, for each pixel and 48 points of the lens, at
+    the position where that point sees it; nearer layers cover those behind them. It uses copies of
+    lower resolution where the blur is large, and fewer points where all circles of confusion are
+    small. Small bright spots, such as a lamp at night, are instead spread over their circle, where
+    nearer layers let their light through. The time of the filter does not depend on the number of
+    samples. With :monosp:`effective` there are three layers. The near one is blurred with one
+    radius, the median of those of its surfaces.
 
-    **Where it errs.** What is seen in mirrors and through glass is blurred as the mirror and the
-    glass are. Surfaces that let most light through (:monosp:`mask`, :monosp:`thindielectric`) are
-    not there for the layers. Of what is hidden, the first surface only is known. Highlights depend
-    on the direction, and the lens sees them from its middle only. Layers are cut where blurs have a
-    gap; in a hedge there is none. Samples outside of the film reach a quarter of its longer edge;
-    beyond, all is as it is there. Noise of the nested integrator in what is in focus stays as it
-    is.
+    **Where it errs.** Objects seen in mirrors and through glass are blurred as the mirror and the
+    glass are. The layers ignore surfaces that let most light through (:monosp:`mask`,
+    :monosp:`thindielectric`). Of hidden surfaces, only the first is known. Highlights depend on the
+    direction, and are rendered from the middle of the lens only. Limits between layers lie where
+    blurs have a gap; in a hedge there is none. Samples outside of the film reach as far as a
+    quarter of its longer edge; beyond, the filter repeats what is there. Where the image is in
+    focus, the noise of the nested integrator stays.
 
     The sensor must be a :monosp:`thinlens`, or a :monosp:`perspective` with both parameters given.
     The film is any but a :monosp:`specfilm`, with any filter and crop window. Output variables
-    (:monosp:`aovs`) are those from the middle of the lens, and not blurred. The samples of the
-    sensor (:monosp:`spp`) are those of the image; those of ``hidden_spp`` come besides, after the
-    :monosp:`timeout`. Integrators that bring light to other pixels than that of their camera ray
-    are refused (:monosp:`light_tracer`, chains, and :monosp:`bdpt` unless its :monosp:`light_image`
-    is off). It cannot be nested in another integrator of ours but :monosp:`variance`; inside of
-    :monosp:`moment` and :monosp:`aov`, samples are those of the nested integrator, not filtered.
-    Gradients are not supported (use :monosp:`prb`).
+    (:monosp:`aovs`) are rendered from the middle of the lens, and not blurred. The sensor's samples
+    (:monosp:`spp`) are those of the image; those of ``hidden_spp`` are additional, and are taken
+    after the :monosp:`timeout`. Integrators that add light to other pixels than that of the camera
+    ray are refused (:monosp:`light_tracer`, Markov chains, and :monosp:`bdpt` unless its
+    :monosp:`light_image` is off). Of our integrators, only :monosp:`variance` can nest it. Nested
+    in :monosp:`moment` or :monosp:`aov`, it returns the samples of its nested integrator, not
+    filtered. Gradients are not supported (use :monosp:`prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 5, Eqs. 5.1 to 5.5 (:monosp:`effective`). The
-    filter :monosp:`lens`, more than three layers and what is hidden in them are ours. The source
-    shifts by α times the effective radius; the geometry demands α times the whole one, which is
-    what :monosp:`effective` does.
+    filter :monosp:`lens`, more than three layers and hidden surfaces in them are ours. The source
+    shifts the circle by α times the effective radius. By geometry, the shift is α times the whole
+    radius, which is what :monosp:`effective` uses.
 
     .. tabs::
         .. code-tab:: xml
@@ -146,7 +147,8 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
             )
 
     def accepts(self, nested: mi.SamplingIntegrator) -> bool:
-        # Not by class: once another variant is selected, the module's name is that one's class
+        # Not ``EffectiveCircleOfConfusion``, which is another class once another variant is
+        # selected
         return not isinstance(nested, type(self))
 
     @property
@@ -184,19 +186,20 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
         """The lens of a sensor.
 
         Raises:
-            ValueError: It has none, and none is given; or it focuses at infinity.
-            NotImplementedError: Its rays do not begin in a point, or it moves.
+            ValueError: The sensor has no lens and the scene gives none, or it focuses at infinity.
+            NotImplementedError: The sensor's rays do not begin in a point, or it moves.
         """
         if is_moving_camera(sensor):
             raise NotImplementedError(
-                f'"{self.name}": the sensor moves, and nothing has one depth: use "composed_path"'
+                f'"{self.name}": the sensor moves, so that a pixel has no single depth: use '
+                f'"composed_path"'
             )
         if sensor.class_name() not in _SENSORS:
             raise NotImplementedError(
                 f'"{self.name}": the sensor "{sensor.class_name()}" has no lens: use a "thinlens", '
                 f'or a "perspective"'
             )
-        # Not its methods: integrators of Mitsuba that nest ours pass a sensor without its class
+        # Not its methods: Mitsuba's integrators that nest ours pass a sensor without its own class
         parameters = mi.traverse(sensor)
         own = {"aperture_radius": self.aperture_radius, "focus_distance": self.focus_distance}
         for key, value in own.items():
@@ -207,7 +210,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
                 )
             own[key] = value or float(dr.slice(parameters[key]))
         if not math.isfinite(own["focus_distance"]):
-            # Mitsuba's sensor makes rays of NaN of it
+            # Mitsuba's sensor would make rays of NaN from it
             raise ValueError(
                 f'"{self.name}": the sensor "{sensor.class_name()}" has the "focus_distance" '
                 f'{own["focus_distance"]}: give a finite one, as large as you like'
@@ -216,11 +219,12 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
         return ThinLens(**own, fov=angle, film_width=int(sensor.film().size()[0]))
 
     def scene_query(self, scene: mi.Scene) -> SceneQuery:
-        """How the rays meet the scene."""
+        """How rays are intersected with the scene, moving shapes included."""
         return scene_query(scene)
 
     def hidden_samples(self, spp: int) -> int:
-        """Samples per pixel of what the image does not show."""
+        """Samples per pixel for surfaces that the image does not show: hidden, or outside of the
+        film."""
         return self.hidden_spp or max(1, spp // 2)
 
 

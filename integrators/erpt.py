@@ -24,7 +24,7 @@ from mitsuba_ext.metropolis.chains.small_steps import SmallSteps
 from mitsuba_ext.metropolis.chains.target import ImageTarget
 from mitsuba_ext.startup import registry
 
-#: Parameters for chains of primary samples alone.
+#: The parameters that only chains of primary samples have.
 _PRIMARY = (
     "bidirectional", "next_event", "mutation_size_low", "mutation_size_high", "proposal_filter",
     "most_consecutive",
@@ -39,60 +39,62 @@ class EnergyRedistribution(MetropolisIntegrator):
     Energy redistribution path tracing (:monosp:`erpt`)
     ---------------------------------------------------
 
-    Takes independent samples, and spreads what outliers among them have too much by short Markov
+    Takes independent samples, and spreads the excess energy of outliers among them by short Markov
     chains.
 
     .. pluginparameters::
 
      * - mutations
        - |string|
-       - What chains change: :monosp:`primary`, the random numbers of a sample, or :monosp:`path`,
-         the vertices of a light path (:class:`mlt`). Samples then are single paths, each made in
-         one of the ways in which :class:`bdpt` makes it. (Default: primary)
+       - What the chains mutate: :monosp:`primary`, the random numbers of a sample, or
+         :monosp:`path`, the vertices of a light path (:class:`mlt`). With :monosp:`path`, each
+         sample is a single path, made by one of the techniques of :class:`bdpt`. (Default: primary)
      * - bidirectional
        - |bool|
-       - Do chains sample the paths of :class:`bdpt`, else those of :monosp:`path`? A mutation of
-         the former takes about three times as long, and finds caustics of small lamps.
-         (Default: false)
+       - Do chains sample the paths of :class:`bdpt`? If not, they sample those of :monosp:`path`. A
+         mutation of :class:`bdpt` takes about three times as long, and finds caustics of small
+         lamps. (Default: false)
      * - outliers
        - |float|
-       - Samples so many times as bright as their part of the image are outliers: what they have
-         beyond that goes to chains; everything else is plain Monte Carlo. 0 gives all energy to
-         chains, as the original does. (Default: 10; with paths 0)
+       - A sample is an outlier if it is more than this many times as bright as its part of the
+         image. Its energy beyond that goes to chains; all other energy is added to the film as in
+         plain Monte Carlo. 0 gives all energy to chains, as the original does. (Default: 10; with
+         paths 0)
      * - mutations_per_pixel
        - |int|
-       - Mutations per pixel, if all energy were redistributed; of the share that is, the same
-         share of mutations is made. 0 stands for ``spp``. (Default: 0)
+       - Mutations per pixel if all energy is redistributed. If a share of it is, the number of
+         mutations is that share of this number. 0 stands for ``spp``. (Default: 0)
      * - chain_length
        - |int|
-       - Mutations of a chain. (Default: 100)
+       - Number of mutations of each chain. (Default: 100)
      * - luminance_samples
        - |int|
-       - Independent samples, at least, that measure the brightness of the image and of its parts
-         first. (Default: 100000)
+       - Number of independent samples, at least, that first measure the brightness of the image and
+         of its parts. (Default: 100000)
      * - mutation_size_low
        - |float|
-       - By how much mutations change a number, at least. (Default: 1/1024)
+       - Smallest change of a random number by a mutation. (Default: 1/1024)
      * - mutation_size_high
        - |float|
-       - By how much mutations change a number, at most. (Default: 1/64)
+       - Largest change of a random number by a mutation. (Default: 1/64)
      * - proposal_filter
        - |int|
        - Makes the noise of the chains' light more even, but is **biased**: each pixel is multiplied
-         by the number of proposed mutations that is expected there, and divided by that of those
-         that were made. The expected number is the mean of a square so many pixels wide; the thesis
-         has 7. 0 stands for no filter. (Default: 0)
+         by the expected number of mutations that are proposed there, and divided by their actual
+         number. The expected number is the mean over a square that is this many pixels wide; the
+         thesis uses 7. 0 stands for no filter. (Default: 0)
      * - most_consecutive
        - |int|
-       - Removes specks, but is **biased**, towards black: of the visits of a chain to a pixel, one
-         after the other, only so many are added to the image. The thesis has 10 or 20. 0 stands for
-         all. (Default: 0)
+       - Removes specks, but is **biased** towards black: of the consecutive visits of a chain to a
+         pixel, only this many are added to the image. The thesis uses 10 or 20. 0 stands for all.
+         (Default: 0)
      * - bidirectional_mutation
        - |bool|
-       - With paths: replace a part of the path by a random walk from both sides? (Default: false)
+       - With :monosp:`mutations=path`: replace a part of the path by a random walk from both sides?
+         (Default: false)
      * - lens_perturbation, multi_chain_perturbation, caustic_perturbation
        - |bool|
-       - With paths: as in :class:`mlt`. (Default: true)
+       - With :monosp:`mutations=path`: as in :class:`mlt`. (Default: true)
      * - (Common parameters)
        - |several|
        - Those of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
@@ -102,17 +104,18 @@ class EnergyRedistribution(MetropolisIntegrator):
 
     **Use it when** an image of :monosp:`path` is fine but for bright spots that need very many
     samples: caustics that are seen through water or glass, light through a small hole; with
-    ``bidirectional``, when that is so of :class:`bdpt`. With ``mutations=path``, also for caustics
-    of small lamps, and light through gaps. **Not when** there are no bright spots: it then is
-    :monosp:`path` at a somewhat higher price.
+    ``bidirectional``, when the same holds for :class:`bdpt`. With ``mutations=path``, also for
+    caustics of small lamps, and light through gaps. **Not when** there are no bright spots: it then
+    is :monosp:`path` at a somewhat higher cost.
 
     Chains change the random numbers of a sample by small steps (:class:`pssmlt`), and deposit the
-    same energy at each place that they visit. They begin at independent samples, so that there is
-    no start-up bias, whatever their length.
+    same energy at each visit. They begin at independent samples, so that there is no start-up bias,
+    whatever their length.
 
-    Chains of paths have lens and caustic perturbations. Their paths have up to 32 segments; camera
-    samples find longer ones. Then :monosp:`bidirectional`, :monosp:`next_event`, the sizes of
-    mutations and the filters must not be given. Participating media are refused.
+    With :monosp:`mutations=path`, chains use lens and caustic perturbations. They sample paths of
+    up to 32 segments; camera samples find longer ones. The parameters :monosp:`bidirectional` and
+    :monosp:`next_event`, the sizes of mutations and the filters must not be given then.
+    Participating media are refused.
 
     Source: D. Cline, PhD thesis, 2007, chapter 8; D. Cline, J. Talbot, P. Egbert, *Energy
     Redistribution Path Tracing*, ACM Transactions on Graphics 24(3), 2005; B. Bitterli, W. Jarosz,

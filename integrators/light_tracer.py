@@ -19,7 +19,7 @@ from mitsuba_ext.scene.movers import sensor_at_rest
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.walk import Walk
 
-#: Memory for the vertices of a pass, and about what a path takes besides.
+#: Bytes for the vertices of a pass; and bytes, about, that a path takes besides.
 _PASS_BYTES, _PATH_BYTES = 1 << 29, 256
 
 
@@ -31,8 +31,8 @@ class LightTracerIntegrator(WalkIntegrator):
     Light tracer (:monosp:`light_tracer`)
     -------------------------------------
 
-    Traces paths from the lights and connects each of their vertices to the sensor. It shows the
-    same image as :monosp:`path`, but for what it cannot see, and finds caustics that
+    Traces paths from the lights and connects each of their vertices to the sensor. It renders the
+    image of :monosp:`path`, except for what it cannot see (below), and finds caustics that
     :monosp:`path` hardly ever finds.
 
     .. pluginparameters::
@@ -40,8 +40,8 @@ class LightTracerIntegrator(WalkIntegrator):
      * - lens_sampling
        - |string|
        - How a connection to a :monosp:`thinlens` chooses the point of the aperture:
-         :monosp:`uniform`, or by :monosp:`visibility`, from the parts of the lens that nothing
-         hides. (Default: uniform)
+         :monosp:`uniform`, or by :monosp:`visibility`, in the parts of the lens that nothing
+         occludes. (Default: uniform)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
@@ -56,29 +56,30 @@ class LightTracerIntegrator(WalkIntegrator):
 
     **What it cannot see.** A vertex cannot be connected to the sensor by way of a mirror, or
     through glass, masks and null surfaces. Whatever the camera sees in a smooth mirror, through
-    smooth glass, through a hole of a mask or through a null surface, is black; it warns where the
-    scene has such materials. Emitters that the camera sees directly are there. Lights of the type
-    :monosp:`directionalarea`, which :monosp:`path` does not find, are seen here (in spectral
-    variants they are refused).
+    smooth glass, through a hole of a mask or through a null surface, is black; a warning says so if
+    the scene has such materials. Emitters that the camera sees directly are rendered. So are lights
+    of the type :monosp:`directionalarea`, which :monosp:`path` does not find (spectral variants
+    refuse them).
 
     **Sensors and films.** The sensor must be a :monosp:`perspective` or :monosp:`thinlens`; the
     film any :monosp:`hdrfilm`, with any filter and crop window, but without
     :monosp:`sample_border`.
 
     **lens_sampling.** With :monosp:`visibility`, depth maps from 16 or 64 pieces of the aperture
-    are traced at the start of a render (600 000 rays at most), and a table (20 MiB at most) tells
-    from which pieces a place is seen. Connections prefer these; the mean stays the same. It helps
-    where things near the lens, out of focus, hide a part of it, and costs the time of the maps
-    elsewhere; with too little parallax to see it falls back to :monosp:`uniform`. With a sensor
-    that has no aperture it has no effect, and a warning says so.
+    are traced at the start of a render (600 000 rays at most), and a table (20 MiB at most) stores
+    from which pieces each part of the scene is visible. Connections prefer these pieces; the
+    expected image stays the same. It helps where objects near the lens, out of focus, hide a part
+    of it; elsewhere, it only costs the time of the maps. If the parallax is too small to be
+    visible, it falls back to :monosp:`uniform`. With a sensor that has no aperture it has no
+    effect, and a warning says so.
 
     For each sample of a pixel there is one camera ray, which sees emitters, and one light path. The
     emitter of a light path is chosen by power and by :monosp:`sampling_weight`, half of the paths
-    each. Surface and sky emit as :monosp:`path` sees it, also where Mitsuba's :monosp:`ptracer`
-    errs: for turned spheres and environment maps, lights with interpolated normals, textured
-    lights, merged rectangles, normal and bump maps, filters at the film's edges. The paths have
-    independent random numbers where the sampler is :monosp:`ldsampler`, whose numbers depend on
-    each other.
+    each. Surfaces and sky emit what :monosp:`path` sees, also where Mitsuba's :monosp:`ptracer` is
+    wrong: for turned spheres and environment maps, lights with interpolated normals, textured
+    lights, merged rectangles, normal and bump maps, filters at the film's edges. With the sampler
+    :monosp:`ldsampler`, whose numbers depend on each other, light paths draw independent random
+    numbers instead.
 
     Alpha and output variables are those of the camera rays. Participating media are refused (use
     :monosp:`volpath` or :monosp:`composed_path`). Gradients are not supported (use :monosp:`prb`),
@@ -159,7 +160,8 @@ class LightTracerIntegrator(WalkIntegrator):
         )
 
     def _warn_of_hidden(self, scene: mi.Scene) -> None:
-        """Once: a time limit is kept by many renders."""
+        """Warns of surfaces that are black; only once, because this is called for every batch of a
+        render."""
         hidden = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
         is_there = any(s.bsdf() and int(s.bsdf().flags()) & hidden for s in scene.shapes())
         if is_there and not self._has_warned:

@@ -28,55 +28,57 @@ class PathMetropolis(ChainIntegrator):
     Path space Metropolis light transport (:monosp:`mlt`)
     -----------------------------------------------------
 
-    Markov chains change light paths vertex by vertex, and stay where much light is found.
+    Markov chains mutate light paths vertex by vertex, and stay longer at paths that carry much
+    light.
 
     .. pluginparameters::
 
      * - p_large
        - |float|
-       - The probability of a new path. Of the rest, perturbations take most. (Default: 0.2)
+       - The probability of a new, independent path. Most of the other mutations are perturbations.
+         (Default: 0.2)
      * - bidirectional_mutation
        - |bool|
        - Replace a part of the path by a random walk from both sides? (Default: true)
      * - lens_perturbation
        - |bool|
-       - Move the place on the film, and all up to the first two vertices in a row that are neither
-         mirrors nor smooth glass? (Default: true)
+       - Perturb the position on the film, and the path up to its first two consecutive vertices
+         that are neither mirrors nor smooth glass? (Default: true)
      * - multi_chain_perturbation
        - |bool|
-       - The same, where the path is scattered by other surfaces in between? (Default: true)
+       - The same for paths that other surfaces scatter in between? (Default: true)
      * - caustic_perturbation
        - |bool|
-       - Move the direction in which light leaves its source, or the last diffuse surface before
-         the one that the camera sees? It needs a sensor that light paths can be connected to.
+       - Perturb the direction in which light leaves its source, or the last diffuse surface before
+         the one that the camera sees? This needs a sensor that light paths can be connected to.
          (Default: true)
      * - luminance_samples
        - |int|
-       - Independent paths, at least, that estimate the brightness of the image, and from which
-         chains start; a quarter of all mutations if that is more, or with a time limit as many as
-         take a fifth of the time. (Default: 100000)
+       - Number of independent paths, at least, that estimate the brightness of the image, and from
+         which chains start. It is a quarter of the number of mutations if that is more; with a time
+         limit, as many as take a fifth of the time. (Default: 100000)
      * - chains
        - |int|
-       - Chains, which run in parallel; there are no more than mutations. 0 stands for as many as
-         suit the render: 1024, and more if each then makes 1024 mutations. (Default: 0)
+       - Number of chains, which run in parallel; at most the number of mutations. 0 stands for
+         1024, or for more if each of them still makes 1024 mutations. (Default: 0)
      * - two_stage
        - |bool|
-       - Estimate the brightness of parts of the image first, and spread mutations evenly over them
-         instead of by brightness? (Default: false)
+       - First estimate the brightness of parts of the image, and spread mutations evenly over these
+         parts instead of in proportion to their brightness? (Default: false)
      * - (Common parameters)
        - |several|
        - Those of :class:`ChainIntegrator`: direct_samples, chain_file, max_depth, rr_depth,
          hide_emitters, timeout, aovs, checkpoint.
 
-    ``spp`` is the number of mutations per pixel. New paths are independent samples besides, and
-    count as such. Chains sample paths of up to 32 segments; camera samples find longer ones, if
-    ``max_depth`` allows them.
+    ``spp`` is the number of mutations per pixel. New paths are also used as independent samples.
+    Chains sample paths of up to 32 segments; camera samples find longer ones, if ``max_depth``
+    allows them.
 
-    **Use it when** most light comes by ways that few random walks take: caustics, also behind
-    glass and in mirrors; light through a gap. **Not when** :monosp:`path` or :class:`bdpt`
-    converge well, or for noise that must look even (:class:`pssmlt`).
+    **Use it when** most light takes paths that random walks rarely find: caustics, also behind
+    glass and in mirrors; light through a gap. **Not when** :monosp:`path` or :class:`bdpt` converge
+    well, or when noise must look even (see :class:`pssmlt`).
 
-    The statistics hold the rates of acceptance. Participating media are refused.
+    The statistics contain the acceptance rates. Participating media are refused.
 
     Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997; D. Cline, PhD thesis,
     2007, section 7.12. Parameters: Mitsuba 0.6.

@@ -1,4 +1,5 @@
-"""NEE++: next event estimation that learns which lights to choose, and what to test."""
+"""NEE++: next event estimation that learns which lights to choose and which shadow rays to
+trace."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from mitsuba_ext.startup import registry
 _LEARNING = "lights that are chosen by what was learned (visibility or contribution)"
 _REJECTING = "shadow rays that are rejected"
 
-#: What parameters need to have an effect.
+#: What each parameter needs to have an effect, for error messages.
 _CONDITIONS = {
     "grid": f"{_LEARNING} or spatially, or {_REJECTING}",
     "max_memory": f"{_LEARNING} or spatially, or {_REJECTING}",
@@ -34,7 +35,7 @@ class NEEPlusPlus(WalkIntegrator):
     Next event estimation++ (:monosp:`neepp`)
     -----------------------------------------
 
-    A path tracer that learns from its first samples which lights reach which surfaces. It chooses
+    A path tracer that learns from its first samples which lights reach which surfaces. It samples
     lights accordingly, also parts of large lights and directions of the sky, and can reject most of
     the shadow rays that would be blocked. Both are unbiased. It is :monosp:`composed_path` with
     :monosp:`learned_lights`, and with :monosp:`visibility_roulette` if asked for; their pages say
@@ -49,9 +50,9 @@ class NEEPlusPlus(WalkIntegrator):
          :monosp:`power`, :monosp:`spatial`, :monosp:`linear`. (Default: contribution)
      * - rejection
        - |bool|
-       - Reject shadow rays by learned visibility. It saves time where lights are not chosen by what
-         was learned; otherwise those that are hidden are hardly chosen any more, and rejection
-         costs more error than it saves time. (Default: false)
+       - Reject shadow rays by learned visibility? This saves time if :monosp:`light_sampling` is
+         not learned. If it is, hidden lights are hardly ever chosen, and rejection costs more error
+         than it saves time. (Default: false)
      * - grid
        - |int|
        - Voxels along each axis of the region in which paths scatter (of the scene's bounding box,
@@ -62,15 +63,15 @@ class NEEPlusPlus(WalkIntegrator):
        - Memory for what is learned, and for the table of :monosp:`spatial`, in MiB. (Default: 512)
      * - pilot_spp
        - |int|
-       - Samples per pixel from which is learned, at most a quarter of all. They count towards the
-         image. With 0 nothing is learned: lights are chosen as by :monosp:`path`, and every shadow
-         ray is traced. A sampler that is stratified over all samples may need longer pilots.
-         (Default: 16)
+       - Pilot samples per pixel, from which the integrator learns; at most a quarter of all
+         samples. They count towards the image. With 0, nothing is learned: lights are chosen as by
+         :monosp:`path`, and every shadow ray is traced. With a stratified sampler, pilots consist
+         of whole passes, and can be longer. (Default: 16)
      * - save_learned, load_learned
        - |string|
-       - Files. The first is written: what was learned, as a whole. The second is read in place of
-         pilots: what a render of the same scene, with the same parameters and size of film, has
-         saved. (Default: none)
+       - Files. The render saves all that it has learned to :monosp:`save_learned`. With
+         :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
+         scene, with the same parameters and film size, has saved. (Default: none)
      * - law, slope, floor
        - |several|
        - With :monosp:`rejection`: the law of :monosp:`visibility_roulette`. (Default: affine, 10,
@@ -81,8 +82,8 @@ class NEEPlusPlus(WalkIntegrator):
          tests of :monosp:`visibility_roulette`. (Default: 16)
      * - save_map, load_map
        - |string|
-       - Where light sampling is learned: files of a map to write, and of one to begin with.
-         (Default: none)
+       - If :monosp:`light_sampling` is learned: the file to which the map is written, and the file
+         of a map to start from. (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
@@ -90,18 +91,18 @@ class NEEPlusPlus(WalkIntegrator):
 
     **Use it when** there are many lights, when most of them are hidden from most places (rooms, a
     sky seen through windows, lamps behind walls), or when large lights are partly covered. **Not
-    when** one small light lights an open scene, or when the difficulty lies elsewhere, in indirect
-    or glossy light: it then costs the pilots' bookkeeping.
+    when** one small light lights an open scene, or when most noise comes from indirect or glossy
+    light: it then costs the time of learning.
 
-    A first sample per pixel, which is not added to the film, finds the region and the surfaces.
-    Each pilot but the first chooses its lights by what those before it have learned. If they show
-    that little is to gain, learning ends there, unless :monosp:`grid`, :monosp:`rejection` or a
-    file of a map is given.
+    A first sample per pixel, which is not added to the film, finds the surfaces and the region in
+    which paths scatter. Each pilot but the first chooses its lights by what the earlier pilots have
+    learned. If they show that the gain is small, learning ends there, unless :monosp:`grid`,
+    :monosp:`rejection` or a file of a map is given.
 
-    Participating media are rendered as by :monosp:`volpath`; lights are learned in them as for
-    surfaces (but :monosp:`light_sampling=linear` refuses them). Gradients are not supported (use
-    :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
-    pilot.
+    Participating media are rendered as by :monosp:`volpath`; lights are learned for points in them
+    as for surfaces (but :monosp:`light_sampling=linear` refuses them). Gradients are not supported
+    (use :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment`, it takes
+    no pilot samples.
 
     Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
     Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, sections 3 to 4.2.

@@ -22,43 +22,43 @@ class PSSGuided(WalkIntegrator):
     Path guiding in primary sample space (:monosp:`pss_guided`)
     -----------------------------------------------------------
 
-    A path tracer that learns from its first samples which random numbers choose directions from
-    which light comes, and draws these more often. It is unbiased, knows nothing of materials or of
-    lights, and guides all BSDFs alike. It is :monosp:`composed_path` with
-    :monosp:`guided_directions`, whose page says how it learns.
+    A path tracer that learns from its first samples which random numbers make the BSDF sample
+    directions from which light comes, and draws these numbers more often. It is unbiased, needs no
+    knowledge of materials and lights, and guides all BSDFs in the same way. It is
+    :monosp:`composed_path` with :monosp:`guided_directions`, whose page says how it learns.
 
     .. pluginparameters::
 
      * - regions
        - |string|
-       - What has a tree of samples: :monosp:`surfaces`, or :monosp:`tiles` of the film, as in the
-         thesis. (Default: surfaces)
+       - What a tree of samples belongs to: a region of :monosp:`surfaces`, or one of the
+         :monosp:`tiles` of the film, as in the thesis. (Default: surfaces)
      * - tile
        - |int|
-       - Edge of a tile in pixels; known only with :monosp:`tiles`. (Default: 16)
+       - Edge of a tile in pixels; accepted only with :monosp:`tiles`. (Default: 16)
      * - bounces
        - |int|
-       - How many directions of a path are guided, at most; those that do not pay are left out.
-         (Default: 6; 2 with tiles)
+       - How many directions of a path are guided, at most. Later bounces that are not worth the
+         time are not guided. (Default: 6; 2 with tiles)
      * - nee_first_bounce
        - |bool|
-       - Connect the first vertex of a path to lights? False is the setting in which the thesis
-         measures, for comparisons; lights without extent are connected to all the same. (Default:
-         true)
+       - Connect the first vertex of a path to lights? False is the setting of the measurements in
+         the thesis, for comparisons; point lights and parallel light are connected to anyway.
+         (Default: true)
      * - pilot_spp
        - |int|
-       - Samples per pixel from which is learned, at most a quarter of all. They count towards the
-         image. With 0, or where they are fewer than 3, nothing is guided. A sampler that is
-         stratified over all samples may need longer pilots. (Default: 32)
+       - Pilot samples per pixel, from which the integrator learns; at most a quarter of all
+         samples. They count towards the image. With fewer than 3, nothing is guided. With a
+         stratified sampler, pilots consist of whole passes, and can be longer. (Default: 32)
      * - save_learned, load_learned
        - |string|
-       - Files. The first is written: what was learned, as a whole. The second is read in place of
-         pilots: what a render of the same scene, with the same parameters and size of film, has
-         saved. (Default: none)
+       - Files. The render saves all that it has learned to :monosp:`save_learned`. With
+         :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
+         scene, with the same parameters and film size, has saved. (Default: none)
      * - always_guide
        - |bool|
-       - Guide all :monosp:`bounces`, also where the pilots show that it does not pay? (Default:
-         false)
+       - Guide all :monosp:`bounces`, also where the pilots show that guiding does not pay?
+         (Default: false)
      * - max_memory
        - |float|
        - Memory for what is recorded and learned, in MiB. (Default: 512)
@@ -67,18 +67,17 @@ class PSSGuided(WalkIntegrator):
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
          checkpoint.
 
-    **Use it when** light comes by way of other surfaces: through doors, windows and gaps, from lit
-    corners, along mirrors and glossy things. **Not when** most light is direct (use :monosp:`neepp`
-    to choose among many lights), when an image has fewer than 16 samples per pixel, or for caustics
-    of small lights seen through glass, which paths from the camera do not find.
+    **Use it when** light arrives by way of other surfaces: through doors, windows and gaps, from
+    lit corners, along mirrors and glossy things. **Not when** most light is direct (use
+    :monosp:`neepp` to choose among many lights), when an image has fewer than 16 samples per pixel,
+    or for caustics of small lights seen through glass, which paths from the camera do not find.
 
-    After a render, :monosp:`integrator.statistics.learned` tells what was found, and
-    :monosp:`integrator.guide` holds it (see examples/learned_samples.py).
+    After a render, :monosp:`integrator.statistics.learned` describes what was learned, and
+    :monosp:`integrator.guide` is the learned guide (see examples/learned_samples.py).
 
     Participating media are rendered as by :monosp:`volpath`; in them, directions are guided by
-    tiles only. Gradients are not supported (use
-    :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment` there is no
-    pilot.
+    tiles only. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized
+    variants. Nested in :monosp:`moment`, it takes no pilot samples.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of
     film tiles. Regions of surfaces, the estimates, and the measurement of the gain are ours.
@@ -109,11 +108,10 @@ class PSSGuided(WalkIntegrator):
 
     @property
     def learner(self) -> GuideLearner | None:
-        """Who learned in the last render, with what it measured; ``None`` where there was no
-        pilot."""
+        """The learner of the last render, with its measurements; ``None`` if there was no pilot."""
         return self.learners.get("directions")
 
     @property
     def guide(self) -> GuidedDirections | None:
-        """What the last render has learned; ``None`` where nothing was guided."""
+        """The guide that the last render has learned; ``None`` if nothing was guided."""
         return self.learner.guide if self.learner is not None else None

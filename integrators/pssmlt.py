@@ -20,43 +20,43 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
     Primary sample space Metropolis light transport (:monosp:`pssmlt`)
     ------------------------------------------------------------------
 
-    Markov chains change the random numbers of a bidirectional path tracer (or of :monosp:`path`),
-    and stay where much light is found.
+    Markov chains mutate the random numbers of a bidirectional path tracer (or of :monosp:`path`),
+    and stay longer at numbers with which much light is found.
 
     .. pluginparameters::
 
      * - bidirectional
        - |bool|
-       - Do chains sample the paths of :class:`bdpt`, else those of :monosp:`path`? A mutation of
-         the former takes about three times as long, and finds caustics of small lamps.
-         (Default: true)
+       - Do chains sample the paths of :class:`bdpt`? If not, they sample those of :monosp:`path`. A
+         mutation of :class:`bdpt` takes about three times as long, and finds caustics of small
+         lamps. (Default: true)
      * - p_large
        - |float|
-       - The probability of a large step, which draws all numbers anew. (Default: 0.3)
+       - The probability of a large step, which draws all random numbers anew. (Default: 0.3)
      * - luminance_samples
        - |int|
-       - Independent samples, at least, that estimate the brightness of the image, and from which
-         chains start; a quarter of all mutations if that is more, or with a time limit as many as
-         take a fifth of the time. (Default: 100000)
+       - Number of independent samples, at least, that estimate the brightness of the image, and
+         from which chains start. It is a quarter of the number of mutations if that is more; with a
+         time limit, as many as take a fifth of the time. (Default: 100000)
      * - mutation_size_low
        - |float|
-       - By how much small steps change a number, at least. (Default: 1/1024)
+       - Smallest change of a random number by a small step. (Default: 1/1024)
      * - mutation_size_high
        - |float|
-       - By how much small steps change a number, at most. (Default: 1/64)
+       - Largest change of a random number by a small step. (Default: 1/64)
      * - kelemen_style_weights
        - |bool|
-       - Use large steps as independent samples besides, weighted by the balance heuristic: it
+       - Use large steps also as independent samples, weighted by the balance heuristic? This
          reduces the noise of dark pixels. (Default: true)
      * - chains
        - |int|
-       - Chains, which run in parallel; there are no more than mutations. 0 stands for as many as
-         suit the render: 1024, and more if each then makes 1024 mutations (with light paths 65536,
-         and more if each then makes 64). (Default: 0)
+       - Number of chains, which run in parallel; at most the number of mutations. 0 stands for
+         1024, or for more if each of them still makes 1024 mutations (with light paths for 65536,
+         or for more if each still makes 64). (Default: 0)
      * - two_stage
        - |bool|
-       - Estimate the brightness of parts of the image first, and spread mutations evenly over them
-         instead of by brightness? (Default: false)
+       - First estimate the brightness of parts of the image, and spread mutations evenly over these
+         parts instead of in proportion to their brightness? (Default: false)
      * - (Common parameters)
        - |several|
        - Those of :class:`MetropolisIntegrator`: direct_samples, chain_file, next_event,
@@ -64,13 +64,13 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
 
     ``spp`` is the number of mutations per pixel.
 
-    **Use it when** light comes by ways that few paths take, but where paths that take them have
-    neighbours that do: caustics of lamps that are not too small, light through a gap. **Not when**
-    :monosp:`path` converges well, or for noise that must look even: neighbouring pixels depend on
-    each other, and a chain that has found a rare bright path stays there for long, which shows as a
-    spot. Errors between renders of different seeds tell the truth (:class:`variance`).
+    **Use it when** light takes paths that are rarely sampled, but whose neighbouring paths carry
+    light too: caustics of lamps that are not too small, light through a gap. **Not when**
+    :monosp:`path` converges well, or when noise must look even: neighbouring pixels depend on each
+    other, and a chain that has found a rare bright path stays there for long, which shows as a
+    spot. Only renders with different seeds show the true error (see :class:`variance`).
 
-    The statistics hold the rates of acceptance. Participating media are refused.
+    The statistics contain the acceptance rates. Participating media are refused.
 
     Source: C. Kelemen, L. Szirmay-Kalos, G. Antal, F. Csonka, *A Simple and Robust Mutation
     Strategy for the Metropolis Light Transport Algorithm*, Eurographics 2002; D. Cline, PhD thesis,

@@ -19,7 +19,7 @@ class ReweightedDirect(WalkIntegrator):
     Reweighted light samples (:monosp:`reweighted_direct`)
     ------------------------------------------------------
 
-    A path tracer that connects the first vertex of each path to many points of the lights. They
+    A path tracer that connects the first vertex of each path to many points on lights. The points
     come from well distributed point sets. Each connection can be weighted by the Voronoi cell of
     its point. Later vertices of a path are connected to one point each, as by :monosp:`path`. It is
     :monosp:`composed_path` with :monosp:`weighted_connections`, whose page says more.
@@ -28,12 +28,13 @@ class ReweightedDirect(WalkIntegrator):
 
      * - light_samples
        - |int|
-       - Points of a set: connections of the first vertex, at most 4096 (1024 with
-         :monosp:`poisson_disk`): beyond that, the time serves more camera samples better. With 0,
-         the first vertex finds light by BSDF samples only. (Default: 256)
+       - Points of a set, which is the number of connections of the first vertex; at most 4096 (1024
+         with :monosp:`poisson_disk`), because beyond that, more camera samples are a better use of
+         the time. With 0, the first vertex finds light by BSDF samples only. (Default: 256)
      * - vertices
        - |string|
-       - Which vertices have so many: the :monosp:`first`, or :monosp:`all`. (Default: first)
+       - Which vertices have this many connections: the :monosp:`first`, or :monosp:`all`. (Default:
+         first)
      * - pattern
        - |string|
        - How the points of a set are distributed: :monosp:`independent`, :monosp:`stratified`,
@@ -45,9 +46,9 @@ class ReweightedDirect(WalkIntegrator):
          :monosp:`voronoi` (slightly biased). (Default: none)
      * - camera_samples
        - |int|
-       - Samples per pixel, where :monosp:`render` is not told how many; 0 for as many as the
-         sensor's sampler takes, which are 4 if it does not say either. Not where it is nested in
-         another integrator. (Default: 0)
+       - Samples per pixel of a render without :monosp:`spp`; 0 for the number of the sensor's
+         sampler, which is 4 by default. It has no effect where this integrator is nested in another
+         one. (Default: 0)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,

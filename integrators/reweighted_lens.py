@@ -14,9 +14,9 @@ class ReweightedLens(ReweightedCamera):
     Reweighted lens samples (:monosp:`reweighted_lens`)
     ---------------------------------------------------
 
-    Renders depth of field with the nested integrator, but takes the points on the aperture from
-    :monosp:`weighted_numbers`: well distributed point sets, with which each sample can be weighted
-    by the Voronoi cell of its point. Each pixel uses one set for all of its samples.
+    Renders depth of field with the nested integrator, but takes the points on the aperture from the
+    well distributed point sets of :monosp:`weighted_numbers`, where each sample can be weighted by
+    the Voronoi cell of its point. Each pixel uses one set for all of its samples.
 
     .. pluginparameters::
 
@@ -30,10 +30,10 @@ class ReweightedLens(ReweightedCamera):
     improve. For a sensor without an aperture (such as :monosp:`perspective`), the nested integrator
     renders as usual, with a warning.
 
-    The page of :monosp:`weighted_numbers` says more about sets and weights. The sensor's sampler
-    provides the other dimensions of a sample. A nested integrator of this package learns as usual;
-    its own timeout is ignored. Inside of :monosp:`moment`, nothing is reweighted. Gradients are not
-    supported (use :monosp:`prb`).
+    The page of :monosp:`weighted_numbers` says more about sets and weights. The other dimensions of
+    a sample come from the sensor's sampler. A nested integrator of this package learns as usual;
+    its own timeout is ignored. Where it is nested in :monosp:`moment`, nothing is reweighted.
+    Gradients are not supported (use :monosp:`prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.3. Periodic cells, and the fact
     that they are unbiased, are our addition.

@@ -15,7 +15,7 @@ class ReweightedTime(ReweightedCamera):
     --------------------------------------------
 
     Renders motion blur with the nested integrator, but takes the times in the shutter interval from
-    :monosp:`weighted_numbers`: well distributed point sets, with which each sample can be weighted
+    the well distributed point sets of :monosp:`weighted_numbers`, where each sample can be weighted
     by the Voronoi cell of its time. Each pixel uses one set for all of its samples.
 
     .. pluginparameters::
@@ -41,8 +41,8 @@ class ReweightedTime(ReweightedCamera):
     The page of :monosp:`weighted_numbers` says more about sets and weights. The other dimensions of
     a sample come from the sensor's sampler, or from a nested :monosp:`reweighted_lens` or
     :monosp:`reweighted_wavelength`. A nested integrator of this package learns as usual; its own
-    timeout is ignored. Inside of :monosp:`moment`, nothing is reweighted. Gradients are not
-    supported (use :monosp:`prb`).
+    timeout is ignored. Where it is nested in :monosp:`moment`, nothing is reweighted. Gradients are
+    not supported (use :monosp:`prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.1. Periodic cells, and the fact
     that they are unbiased, are our addition.

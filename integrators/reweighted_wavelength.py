@@ -16,10 +16,10 @@ class ReweightedWavelength(ReweightedCamera):
     Reweighted wavelengths (:monosp:`reweighted_wavelength`)
     --------------------------------------------------------
 
-    Renders in spectral variants with the nested integrator, but takes the numbers that choose the
-    wavelengths from :monosp:`weighted_numbers`: well distributed point sets, with which each sample
-    can be weighted by the Voronoi cell of its number. Each pixel uses one set for all of its
-    samples.
+    Renders in spectral variants with the nested integrator, but takes the random numbers that
+    choose the wavelengths from the well distributed point sets of :monosp:`weighted_numbers`, where
+    each sample can be weighted by the Voronoi cell of its number. Each pixel uses one set for all
+    of its samples.
 
     .. pluginparameters::
 
@@ -43,8 +43,8 @@ class ReweightedWavelength(ReweightedCamera):
     The page of :monosp:`weighted_numbers` says more about sets and weights. The other dimensions of
     a sample come from the sensor's sampler, or from a nested :monosp:`reweighted_lens` or
     :monosp:`reweighted_time`. A nested integrator of this package learns as usual; its own timeout
-    is ignored. Inside of :monosp:`moment`, nothing is reweighted. Gradients are not supported (use
-    :monosp:`prb`).
+    is ignored. Where it is nested in :monosp:`moment`, nothing is reweighted. Gradients are not
+    supported (use :monosp:`prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.2. Periodic cells, the fact that
     they are unbiased, and cells modulo 1/4 are our addition.

@@ -22,8 +22,8 @@ class TwoStage(WalkIntegrator):
     ---------------------------------------------------
 
     A path tracer that connects the first vertex of each path to several directions of the
-    environment. It chooses them by what the map emits times what the BSDF reflects of it. It is
-    :monosp:`composed_path` with :monosp:`two_stage_lights`, whose page says more, and
+    environment. It samples them in proportion to an estimate of the product of environment map and
+    BSDF. It is :monosp:`composed_path` with :monosp:`two_stage_lights`, whose page says more, and
     :monosp:`weighted_connections`.
 
     .. pluginparameters::
@@ -34,38 +34,39 @@ class TwoStage(WalkIntegrator):
          (Default: 16)
      * - splits
        - |int|
-       - How often a vertex divides rectangles of the map, at most, besides the first eight.
-         (Default: 16)
+       - How often a vertex divides rectangles of the map, at most, in addition to the first
+         division into eight rectangles. (Default: 16)
      * - vertices
        - |string|
-       - Which vertices divide the map and have so many connections: the :monosp:`first`, or
+       - Which vertices divide the map and have this many connections: the :monosp:`first`, or
          :monosp:`all`. (Default: first)
      * - visibility
        - |string|
-       - What first vertices know of what is in between: nothing (:monosp:`unknown`), or what a
-         pilot has learned in maps of random numbers (:monosp:`primary`) or of directions
-         (:monosp:`world`). (Default: unknown)
+       - How connections of first vertices take occlusion into account: not at all
+         (:monosp:`unknown`), or by visibility maps that a pilot has learned, over random numbers
+         (:monosp:`primary`) or over directions (:monosp:`world`). (Default: unknown)
      * - reallocated
        - |float|
-       - With maps: the share of the connections that follows them, 0 to 0.99. (Default: 0.9)
+       - With visibility maps: the share of the connections that are sampled by them, 0 to 0.99.
+         (Default: 0.9)
      * - pilot_spp
        - |int|
-       - With maps: samples per pixel of the pilot, at most a quarter of all. They count towards the
-         image. (Default: 4)
+       - With visibility maps: pilot samples per pixel, at most a quarter of all samples. They count
+         towards the image. (Default: 4)
      * - save_learned, load_learned
        - |string|
-       - With maps: as in :class:`composed_path`. (Default: none)
+       - With visibility maps: as in :class:`composed_path`. (Default: none)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
          checkpoint.
 
-    **Use it when** you compare methods, or the light of an uneven map on rough metal makes the
-    noise, and the number of camera samples is limited by something else.
-    **Not when** time counts: samples have less error than most of those of :monosp:`path`, but take
-    longer by more than that, in all eleven scenes that were measured with indirect light. Nor for
-    narrow lobes under an even sky, which BSDF samples find better. Where the light comes through a
-    small opening, :monosp:`visibility` helps, but :monosp:`composed_path` with
+    **Use it when** you compare methods, or when most noise comes from an uneven map that lights
+    rough metal, and the number of camera samples is limited for another reason. **Not when** time
+    counts: in all eleven scenes that were measured with indirect light, it was less efficient than
+    :monosp:`path`; its samples mostly have less error, but take longer by a larger factor. Nor for
+    narrow lobes under an even sky, for which BSDF samples are better. Where the light comes through
+    a small opening, :monosp:`visibility` helps, but :monosp:`composed_path` with
     :monosp:`next_event=contribution` and :monosp:`connections=16` was seven times as efficient.
 
     Participating media are refused (use :monosp:`volpath` or :monosp:`composed_path`). Gradients

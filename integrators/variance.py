@@ -56,10 +56,10 @@ class Variance(mi.AdjointIntegrator):
 
     **Meaning of the variance.** It is the variance of the image, which is the mean of all samples,
     not that of one sample (for an independent sampler and the box filter, that is variance · spp).
-    A variance that is estimated from n batches has itself a relative standard error of about
-    √(2 / (n - 1)): 37 % from 16 batches, 13 % from 128; more where the noise has heavy tails.
-    Average it over pixels before relying on it. With a reconstruction filter wider than a pixel,
-    the errors of neighbouring pixels are correlated: a mean over pixels then has more variance than
+    A variance that is estimated from n batches has itself a relative standard error of about √(2 /
+    (n - 1)): 37 % from 16 batches, 13 % from 128; more where the noise has heavy tails. Average it
+    over pixels before you rely on it. With a reconstruction filter wider than a pixel, the errors
+    of neighbouring pixels are correlated: a mean over pixels then has more variance than
     independent pixels would give it. Each batch divides by the filter weights of its own samples.
     This biases pixels at an edge, with one sample per batch by up to 1 % of its contrast, with four
     by a quarter of that. Filters with negative lobes, such as :monosp:`lanczos`, need at least four
@@ -108,7 +108,7 @@ class Variance(mi.AdjointIntegrator):
             }
     """
 
-    #: Each render asks the nested integrator whether it does.
+    #: True, because each render checks whether the nested integrator supports motion.
     sees_motion = True
 
     #: Each pixel of its film has the weight one, and not the number of samples.
@@ -180,8 +180,8 @@ class Variance(mi.AdjointIntegrator):
         return develop_film(film, develop, evaluate)
 
     def aov_names(self) -> list[str]:
-        """The names for the film of the last render; before the first, for an RGB (or monochrome)
-        film."""
+        """The channel names for the film of the last render; before the first render, those for an
+        RGB (or monochrome) film."""
         return self._aov_names
 
     def cancel(self) -> None:

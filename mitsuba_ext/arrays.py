@@ -1,4 +1,4 @@
-"""Arrays of Dr.Jit."""
+"""Makes and joins arrays of Dr.Jit."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-#: Bytes at whose multiples Dr.Jit's own arrays begin.
+#: Alignment of Dr.Jit's own arrays, in bytes.
 _ALIGNMENT = 64
 
 T = TypeVar("T")
 
 
 def from_numpy(kind: type[T], values: Any) -> T:
-    """The numbers of ``values``, an array of NumPy or what can be made one, in one row.
+    """Copies ``values``, an array of NumPy or something that can be converted to one, to a flat
+    array of Dr.Jit.
 
-    Dr.Jit uses NumPy's memory as it is, and kernels contain whether it is aligned, which would be
-    left to chance: every other process, and every other render, would compile kernels of its own.
+    Dr.Jit itself uses NumPy's memory without a copy, and its kernels depend on whether that memory
+    is aligned. As this varies by chance, every other process, and every other render, would compile
+    kernels of its own.
 
     Parameters:
         kind: The type of the result, such as ``mi.Float``.
@@ -35,8 +37,8 @@ def from_numpy(kind: type[T], values: Any) -> T:
 
 
 def joined(parts: Sequence[T]) -> T:
-    """One after the other: arrays, vectors of arrays, or dataclasses of these or of ``None``, all
-    of one type. It evaluates the result. (``dr.concat`` compiles kernels for each size.)"""
+    """Concatenates arrays, vectors of arrays, or dataclasses of these or of ``None``, all of one
+    type, and evaluates the result. (``dr.concat`` compiles kernels for each size.)"""
     widths = [dr.width(part) for part in parts]
     indices, offset = [], 0
     for width in widths:

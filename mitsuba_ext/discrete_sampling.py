@@ -1,4 +1,4 @@
-"""Choosing an entry of a table by its weight: binary search in running sums, and alias tables."""
+"""Chooses entries of tables by weight: binary search in running sums, and alias tables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import mitsuba as mi
 #: The largest number below one.
 ONE_MINUS_EPSILON = 1 - 2**-24
 
-#: The weight 1 in the fixed point of an alias table.
+#: The fixed-point number that stands for the weight 1 in an alias table.
 _ONE = 2.0**32
 
 
@@ -22,8 +22,8 @@ def first_above(
     reaches: bool = False,
 ) -> mi.UInt32:
     """The first index of [first, last] whose entry exceeds ``x`` (``reaches``: or equals it);
-    ``last`` if none does. No range has more than ``longest`` entries: that fixes the number of
-    steps, all of them without a branch.
+    ``last`` if none does. No range has more than ``longest`` entries, which sets the number of
+    steps; the steps have no branches.
     """
     index = mi.UInt32(first)
     step = 1 << max(0, (longest - 1).bit_length() - 1) if longest > 1 else 0
@@ -50,12 +50,12 @@ def alias_tables(
     Args:
         relative: The weights of all entries, in units of the mean of their group; shape [n].
         first, last: Where the group of each entry begins and ends; shape [n].
-        longest: No group has more entries.
+        longest: The largest number of entries of a group.
 
     Returns:
         The threshold of each entry, in [0, 1], and the index of its alias, in its group.
     """
-    # In fixed point: sums are exact, in whatever order they are taken, and never decrease
+    # In fixed point, sums are exact in any order of addition, and running sums never decrease
     relative = mi.UInt64(relative * _ONE + 0.5)
     one = dr.opaque(mi.UInt64, int(_ONE))
     excess = _running_sum(dr.maximum(relative, one) - one, first)
@@ -69,14 +69,14 @@ def alias_tables(
     final = first_above(lack, first, last, excess, is_heavy, longest, reaches=True)
     given = dr.gather(mi.UInt64, lack, final, is_heavy)
     threshold = dr.select(is_heavy, one + excess - dr.minimum(given, one + excess), relative)
-    # Excess and lack of a group are equal but for rounding: the last entries keep the difference
+    # Excess and lack of a group differ by rounding: the last entries may find no alias
     found = dr.gather(mi.UInt64, excess, alias) > served
     threshold = dr.minimum(mi.Float(mi.Float64(threshold) / _ONE), 1)
     return dr.select(found, threshold, 1), dr.select(found, alias, entry)
 
 
 def _running_sum(values: mi.UInt64, first: mi.UInt32) -> mi.UInt64:
-    """The sum of all values from the ``first`` of the group to each entry itself."""
+    """For each entry, the sum of the values from the ``first`` of its group to its own."""
     total = dr.cumsum(values)
     total -= dr.gather(mi.UInt64, total, first - 1, first > 0)
     dr.eval(total)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-#: Where Mitsuba quotes the error of a plugin that is written in Python.
+#: The text before the traceback in Mitsuba's message for an error in a plugin written in Python.
 _TRACEBACK = "Traceback (most recent call last):\n"
 
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from .errors import InputError
 
-#: Processes have numbers on their own machine only, and folders may be those of several.
+#: The name of this machine: a process id is valid on one machine only, and several machines may
+#: share a folder.
 _HOST = re.sub(r"\W", "_", platform.node())
 
 
@@ -63,8 +64,8 @@ def _is_alive(process: int) -> bool:
 def replacing(path: Path) -> Iterator[Path]:
     """Yields a temporary path to write to; the finished file then replaces ``path`` in one step.
 
-    After an exception, ``path`` is unchanged. What processes of this machine have left that were
-    killed while they wrote to it is removed.
+    After an exception, ``path`` is unchanged. Removes temporary files for ``path`` of processes on
+    this machine that were killed while they wrote.
     """
     before, after = f".{path.stem}.{_HOST}-", path.suffix
     temporary = path.with_name(f"{before}{os.getpid()}{after}")

@@ -81,8 +81,8 @@ def running(folder: Path, process: int) -> set[Path]:
 
 
 def begun(folder: Path, process: int) -> set[tuple[Path, int]]:
-    """The marks of :func:`running`, each with a number that is another one for each render. (A
-    reference takes as long as it takes: it is left out.)"""
+    """The marks of :func:`running`, each with a number that differs from render to render. Marks of
+    references are left out, as these have no time limit."""
     found = set()
     for mark in running(folder, process):
         if mark.parent.name != REFERENCES:
@@ -92,7 +92,7 @@ def begun(folder: Path, process: int) -> set[tuple[Path, int]]:
 
 
 def renew(mark: Path) -> None:
-    """Says that another render of the integrator begins."""
+    """Changes the mark's number for :func:`begun`, as another render of the integrator begins."""
     with contextlib.suppress(FileNotFoundError):
         os.utime(mark)
 
@@ -116,9 +116,9 @@ def forgive(folder: Path) -> None:
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """Locks ``folder``, which is made if it is missing, against other comparisons: they would slow
-    each other down. The lock ends with the process, however that ends. Marks of earlier processes
-    are removed. In a worker, this does nothing, because its supervisor holds the lock.
+    """Locks ``folder`` against other comparisons, as they would slow each other down; makes it if
+    it is missing. The lock ends with the process, in whichever way that ends. Marks of earlier
+    processes are removed. In a worker, this does nothing, because its supervisor holds the lock.
 
     Raises:
         InputError: Another comparison is running there, or the folder cannot be made.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Largest number of samples per pixel: structured samplers cannot count further.
+#: Largest number of samples per pixel: structured samplers cannot count more.
 MOST_SPP = 2**30
 
 
@@ -22,7 +22,7 @@ def read_parameter(
     maximum: float | None = None,
     choices: Sequence[str] = (),
 ) -> Any:
-    """A parameter of the scene, checked. Its type is that of ``default``.
+    """Reads and checks a parameter of the scene. Its type is that of ``default``.
 
     Args:
         plugin: Name of the plugin, for error messages.

@@ -53,7 +53,7 @@ def progress_bars(*columns: ProgressColumn, is_shown: bool = True) -> Iterator[P
     Args:
         columns: Columns after the label, the bar and the elapsed time. Default: rich's estimate of
             the remaining time.
-        is_shown: ``False`` for bars that nobody sees.
+        is_shown: ``False`` hides the bars.
     """
     from rich import progress as bars
     from rich.console import Console

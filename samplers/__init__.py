@@ -1,2 +1,2 @@
-"""The samplers that a scene can name: those of sensors, and decisions of the walk, which are nested
-in an integrator."""
+"""The samplers that a scene can name: samplers of sensors, and decisions of the random walk, which
+are nested in an integrator."""

@@ -17,8 +17,9 @@ class FaureSampler(SequenceSampler):
     Faure sequence (:monosp:`faure`)
     --------------------------------
 
-    Points of the Faure sequence: of all projections on any of its dimensions, as many samples as a
-    power of its base (2, 5, 7 or 11 for 2, 4, 6 or 8 dimensions) are stratified as well as can be.
+    Points of the Faure sequence. If the number of samples is a power of its base (2, 5, 7 or 11 for
+    2, 4, 6 or 8 dimensions), they are stratified as well as possible in all projections onto any of
+    its dimensions.
 
     .. pluginparameters::
 
@@ -31,10 +32,11 @@ class FaureSampler(SequenceSampler):
          further random copies of the sequence. (Default: 4)
 
     **Use it when** the number of samples is a power of the base, 25 for example. **Not when** it is
-    another: :monosp:`sobol_owen` then has less error.
+    any other number: :monosp:`sobol_owen` then has less error.
 
-    Each pixel has points of its own, each seed has others. For any integrator; those of Mitsuba
-    that split a render into passes (:monosp:`samples_per_pass`) stratify over passes only in part.
+    Each pixel and each seed has points of its own. All integrators can use it. If an integrator of
+    Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are stratified over
+    all passes only in part.
 
     Source: H. Faure, *Discrépance de suites associées à un système de numération (en dimension s)*,
     Acta Arithmetica 41, 1982.

@@ -30,11 +30,11 @@ class HaltonSampler(SequenceSampler):
        - Dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more of them gets
          further random copies of the sequence. (Default: 4)
 
-    **Use it when** you compare sequences. **Not when** time counts: :monosp:`sobol_owen` takes
-    less.
+    **Use it when** you compare sequences. **Not when** time counts: :monosp:`sobol_owen` is faster.
 
-    Each pixel has points of its own, each seed has others. For any integrator; those of Mitsuba
-    that split a render into passes (:monosp:`samples_per_pass`) stratify over passes only in part.
+    Each pixel and each seed has points of its own. All integrators can use it. If an integrator of
+    Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are stratified over
+    all passes only in part.
 
     Source: J. H. Halton, *On the Efficiency of Certain Quasi-random Sequences of Points in
     Evaluating Multi-dimensional Integrals*, Numerische Mathematik 2, 1960.

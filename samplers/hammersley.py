@@ -33,8 +33,9 @@ class HammersleySampler(SequenceSampler):
     **Use it when** you compare sequences. **Not when** a render may be cut short by
     :monosp:`timeout`: the first samples alone are not spread evenly.
 
-    Each pixel has points of its own, each seed has others. For any integrator; those of Mitsuba
-    that split a render into passes (:monosp:`samples_per_pass`) stratify over passes only in part.
+    Each pixel and each seed has points of its own. All integrators can use it. If an integrator of
+    Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are stratified over
+    all passes only in part.
 
     Source: J. M. Hammersley, *Monte Carlo Methods for Solving Multivariable Problems*, Annals of
     the New York Academy of Sciences 86, 1960.

@@ -17,8 +17,8 @@ class LatinHypercubeSampler(SequenceSampler):
     Latin hypercube (:monosp:`latin_hypercube`)
     -------------------------------------------
 
-    Each number of a path is stratified on its own: there is one in each of as many intervals as
-    there are samples.
+    Each random number of a path is stratified on its own: [0, 1) is divided into as many intervals
+    as there are samples, and each interval gets one number.
 
     .. pluginparameters::
 
@@ -29,8 +29,9 @@ class LatinHypercubeSampler(SequenceSampler):
     **Use it when** you compare sequences. **Not when** you want the least error:
     :monosp:`sobol_owen` stratifies pairs of numbers as well.
 
-    Each pixel has points of its own, each seed has others. For any integrator; those of Mitsuba
-    that split a render into passes (:monosp:`samples_per_pass`) stratify over passes only in part.
+    Each pixel and each seed has points of its own. All integrators can use it. If an integrator of
+    Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are stratified over
+    all passes only in part.
 
     Source: M. D. McKay, R. J. Beckman, W. J. Conover, *A Comparison of Three Methods for Selecting
     Values of Input Variables in the Analysis of Output from a Computer Code*, Technometrics 21(2),

@@ -30,11 +30,12 @@ class LatticeSampler(SequenceSampler):
        - Dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more of them gets
          further random copies of the sequence. (Default: 4)
 
-    **Use it when** what a pixel sees is smooth. **Not when** edges cross most pixels: points of a
-    lattice lie in rows.
+    **Use it when** radiance is smooth within a pixel. **Not when** edges cross most pixels: points
+    of a lattice lie in rows.
 
-    Each pixel has points of its own, each seed has others. For any integrator; those of Mitsuba
-    that split a render into passes (:monosp:`samples_per_pass`) stratify over passes only in part.
+    Each pixel and each seed has points of its own. All integrators can use it. If an integrator of
+    Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are stratified over
+    all passes only in part.
 
     Source: R. Cools, F. Y. Kuo, D. Nuyens, *Constructing Embedded Lattice Rules for Multivariate
     Integration*, SIAM J. Sci. Comput. 28(6), 2006.

@@ -1,4 +1,4 @@
-"""Lights that are chosen by what was learned of them."""
+"""Lights that are chosen by learned visibility or contribution."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class LearnedLightsPlugin(DecisionPlugin):
     -----------------------------------------
 
     A decision for the slot :monosp:`next_event` of :monosp:`composed_path`. It learns from the
-    first samples which lights reach which surfaces, and chooses lights accordingly, also parts of
+    first samples which lights reach which surfaces, and samples lights accordingly, also parts of
     large lights and directions of the sky. It is unbiased. :monosp:`neepp` is a path tracer with
     this decision.
 
@@ -24,9 +24,9 @@ class LearnedLightsPlugin(DecisionPlugin):
 
      * - target
        - |string|
-       - What a light is chosen by, at each voxel and side of a surface: :monosp:`contribution` (by
-         what arrived from it), or :monosp:`visibility` (by how often it was visible, times what it
-         would contribute unoccluded). (Default: contribution)
+       - What decides the probability of a light, for each voxel and side of a surface: its
+         :monosp:`contribution` (the light that arrived from it), or its :monosp:`visibility` (how
+         often it was visible, times its unoccluded contribution). (Default: contribution)
      * - grid
        - |int|
        - Voxels along each axis of the region in which paths scatter, 1 to 1024. (Default: 16, or
@@ -37,28 +37,29 @@ class LearnedLightsPlugin(DecisionPlugin):
          used, with a warning. (Default: 512)
      * - save_map
        - |string|
-       - File to which the learned map is written; its folder must be there. (Default: none)
+       - File to which the learned map is written; its folder must exist. (Default: none)
      * - load_map
        - |string|
-       - File of a map to begin with, from this view of the scene or another one; the pilots add to
-         it. A map of another scene is refused. (Default: none)
+       - File of a map to start from, learned from this view of the scene or another one; the pilots
+         add to it. A map of another scene is refused. (Default: none)
 
     **Use it when** there are many lights, when most of them are hidden from most places (rooms, a
     sky seen through windows, lamps behind walls), or when large lights are partly covered. **Not
-    when** one small light lights an open scene, or when the difficulty lies elsewhere, in indirect
-    or glossy light: it then costs the pilots' bookkeeping.
+    when** one small light lights an open scene, or when most noise comes from indirect or glossy
+    light: it then costs the time of learning.
 
-    A first sample per pixel, which is not added to the film, finds the region and the surfaces.
-    Each pilot but the first chooses its lights by what those before it have learned. All samples
-    weigh the same, and none teaches a stage that it is part of, so that the image is unbiased. A
-    tenth of the choices does not depend on what was learned. The second pilot and the third show by
-    how much the variance of the image is lower than with :monosp:`path`'s choice. If that is less
-    than about 15 %, the time for looking lights up is not worth it, and learning ends there, unless
-    :monosp:`grid`, a file of a map, or a :monosp:`visibility_roulette` beside it is given.
+    A first sample per pixel, which is not added to the film, finds the surfaces and the region in
+    which paths scatter. Each pilot but the first chooses its lights by what the earlier pilots have
+    learned. All samples have the same weight, and no stage uses what its own samples teach, so that
+    the image is unbiased. A tenth of the choices does not depend on what was learned. The second
+    and the third pilot measure by how much the variance of the image is lower than with the choice
+    of :monosp:`path`. If it is lower by less than about 15 %, the table is not worth the time of
+    its look-ups, and learning ends there, unless :monosp:`grid`, a file of a map, or a
+    :monosp:`visibility_roulette` beside it is given.
 
     Lights on meshes with interpolated normals are sampled by the area of their triangles;
-    :monosp:`path` is biased there, by a fault in Mitsuba. Nested in :monosp:`moment` there is no
-    pilot, and lights are chosen as by :monosp:`path`.
+    :monosp:`path` is biased there, by a fault in Mitsuba. Nested in :monosp:`moment`, the
+    integrator takes no pilot samples, and lights are chosen as by :monosp:`path`.
 
     Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
     Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, section 4.2

@@ -16,8 +16,8 @@ class MisHeuristicPlugin(DecisionPlugin):
     -------------------------------------------------------------------
 
     A decision for the slot :monosp:`mis` of :monosp:`composed_path`. Two techniques find the same
-    light: connections to it, and directions sampled by the BSDF that run into it. The heuristic
-    weighs both by their densities, so that the image has the right mean.
+    light: connections to it, and BSDF samples that hit it. The heuristic weights both by their
+    densities, so that the image is unbiased.
 
     .. pluginparameters::
 
@@ -37,12 +37,12 @@ class MisHeuristicPlugin(DecisionPlugin):
        - Of :monosp:`cutoff`: a density below this share of the other one has no weight, 0 to 1.
          (Default: 0.1)
 
-    **Use it when** you compare heuristics, or teach. **Not when** you want the least noise without
-    trying: :monosp:`power` with the exponent 2, which is what :monosp:`path` does, is seldom much
+    **Use it when** you compare heuristics, or teach. **Not when** you want low noise without
+    experiments: :monosp:`power` with the exponent 2, which :monosp:`path` uses, is seldom much
     worse than any other.
 
-    Connections whose weight is 0 trace no shadow ray. Paths still go on in the directions of their
-    BSDF samples, whichever technique has the weight.
+    Connections whose weight is 0 trace no shadow ray. Paths continue in the directions of their
+    BSDF samples, also if these have the weight 0.
 
     Source: E. Veach, PhD thesis, 1997, section 9.2; H. W. Jensen et al., *Monte Carlo Ray Tracing*,
     SIGGRAPH 2003 course 44, sections 5.3 and 5.4.

@@ -17,30 +17,32 @@ class PortalLightsPlugin(DecisionPlugin):
 
     A decision for the slot :monosp:`next_event` of :monosp:`composed_path`. From each vertex, it
     samples the part of the environment that is seen through the openings that shapes of the type
-    :monosp:`portal` mark, in proportion to what is emitted there.
+    :monosp:`portal` mark, in proportion to its radiance.
 
     .. pluginparameters::
 
      * - share
        - |float|
-       - Of the connections to the environment, those that go through portals, 0 to 0.99. The others
-         are those of :monosp:`path`, which find what no portal shows. (Default: 0.9)
+       - The share of the connections to the environment that are sampled through portals, 0 to
+         0.99. The others are sampled as by :monosp:`path`, and find light that no portal shows.
+         (Default: 0.9)
 
     **Use it when** a room is lit through windows by a sky (:monosp:`envmap`, :monosp:`sunsky`,
-    :monosp:`constant`). **Not when** a sun shines in: the light of its patch makes most of
-    the noise, which portals do not reduce, and a sample takes two to four times as long; or when
-    most of the picture is outdoors. Not for :monosp:`bdpt` and other integrators with light paths.
+    :monosp:`constant`). **Not when** a sun shines in: most noise then comes from the light that its
+    patch reflects, which portals do not reduce, and a sample takes two to four times as long; or
+    when most of the picture is outdoors. Not for :monosp:`bdpt` and other integrators with light
+    paths.
 
-    For each orientation of portals, the environment is stored in coordinates in which what is seen
-    through a portal, from any point, is an axis-aligned rectangle, with a summed-area table in
-    double precision: as many texels along half a turn as the map has columns, 256 to 2048 (12 bytes
-    each). A portal is chosen by the sum over its rectangle. Only the edges of the portal count:
-    what stands in the opening or before it is not known. The part of a portal that lies below the
-    surface at a vertex is sampled in vain.
+    For each orientation of portals, the environment is stored in coordinates in which the part that
+    is seen through a portal, from any point, is an axis-aligned rectangle, with a summed-area table
+    in double precision. Each axis covers 180° with as many texels as the map has columns, 256 to
+    2048 (12 bytes for each texel). A portal is chosen by the sum over its rectangle. Only the edges
+    of the portal are known, not objects in the opening or before it. The part of a portal that lies
+    below the surface at a vertex is sampled in vain.
 
     The density is exact and known in every direction, so that BSDF samples take part by MIS. Where
-    no portal is seen from inside, and for lights other than the environment, the choice is that of
-    :monosp:`path`. So it is in scenes without portals or environment.
+    no portal is seen from inside, for lights other than the environment, and in scenes without
+    portals or environment, lights are sampled as by :monosp:`path`.
 
     Source: B. Bitterli, J. Novák, W. Jarosz, *Portal-Masked Environment Map Sampling*, Computer
     Graphics Forum 34(4), 2015. The share of ordinary samples is ours.

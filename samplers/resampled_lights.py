@@ -1,4 +1,4 @@
-"""Lights that are chosen among candidates by what each would bring."""
+"""Lights that are chosen among candidates by their unoccluded contributions."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class ResampledLightsPlugin(DecisionPlugin):
     ---------------------------------------------
 
     A decision for the slot :monosp:`next_event` of :monosp:`composed_path`: resampled importance
-    sampling. Each connection takes several candidates, half of them light samples as of
-    :monosp:`path` and, where there is an environment, half of them BSDF samples that are looked up
-    in it. It evaluates BSDF and light for all of them, chooses one in proportion to what it would
-    bring if nothing were in between, and traces one shadow ray.
+    sampling. Each connection takes several candidates: light samples as of :monosp:`path`; where
+    there is an environment, half of the candidates are BSDF samples, which are looked up in it. It
+    evaluates BSDF and light for all of them, chooses one in proportion to its unoccluded
+    contribution, and traces one shadow ray.
 
     .. pluginparameters::
 
@@ -28,12 +28,12 @@ class ResampledLightsPlugin(DecisionPlugin):
        - Candidates of a connection, 1 to 1024. (Default: 8)
 
     **Use it when** lights are many, large or unlike each other, or glossy things reflect an
-    environment, and most of the light is seen. **Not when** walls hide most of it: the candidates
-    know nothing of what is in between (:monosp:`learned_lights` does).
+    environment, and most of the light is visible. **Not when** walls hide most of it: the choice
+    ignores occlusion (:monosp:`learned_lights` does not).
 
     MIS with BSDF samples uses the density of all candidates together, times their number. The image
-    is unbiased. Not for :monosp:`bdpt` and other integrators with light paths, which do not know
-    with what density a BSDF would have found the light.
+    is unbiased. Not for :monosp:`bdpt` and other integrators with light paths: these do not provide
+    the density with which the BSDF would have sampled the light.
 
     Source: J. Talbot, D. Cline, P. Egbert, *Importance Resampling for Global Illumination*, EGSR
     2005; D. Cline, PhD dissertation, BYU, 2007, section 4.4.4. That MIS may use the density of the

@@ -17,9 +17,9 @@ class SobolSampler(SequenceSampler):
     Sobol' sequence with Owen scrambling (:monosp:`sobol_owen`)
     -----------------------------------------------------------
 
-    Points of the Sobol' sequence. Their digits and their order are scrambled as Owen does: all
-    numbers of samples that are powers of two, and every aligned range of so many samples, are
-    stratified in each pair of dimensions that a path draws at once.
+    Points of the Sobol' sequence, with Owen scrambling of their digits and of their order. If the
+    number of samples is a power of two, they are stratified in each pair of dimensions that a path
+    draws at once; so is every aligned range of a power of two of samples.
 
     .. pluginparameters::
 
@@ -33,29 +33,32 @@ class SobolSampler(SequenceSampler):
      * - blue_noise
        - |bool|
        - Whether the pixels share the points of one sequence, so that the errors of neighbouring
-         pixels cancel: what is left is fine-grained noise, which blurs away. (Default: false)
+         pixels cancel: the noise that remains is fine-grained, and disappears when the image is
+         blurred. (Default: false)
      * - film_width
        - |int|
        - Width of the image in pixels (of the crop window, with the border where that is sampled),
-         for :monosp:`blue_noise` with :monosp:`mi.render` and an integrator of Mitsuba. Those of
-         this package, :monosp:`mitsuba-ext render` and comparisons find it out. (Default: 0, not
-         known)
+         for :monosp:`blue_noise` with :monosp:`mi.render` and an integrator of Mitsuba. Integrators
+         of this package, :monosp:`mitsuba-ext render` and comparisons set it themselves. (Default:
+         0, not known)
 
-    **Use it when** you would use :monosp:`multijitter`, above all if time, aperture and film make
-    the noise together, if the number of samples is no square, or if pilots learn: they are the
-    first samples of the same sequence. **Not when** the integrator is :monosp:`reweighted_time` or
-    another one that gives independent samples weights.
+    **Use it when** you would use :monosp:`multijitter`, above all if time, aperture and film
+    together make the noise, if the number of samples is not a square, or if the integrator learns
+    from pilot samples, which are the first samples of the same sequence. **Not when** the
+    integrator is :monosp:`reweighted_time` or another one that weights independent samples.
 
-    Each pixel has points of its own, each seed has others. For any integrator; those of Mitsuba
-    that split a render into passes (:monosp:`samples_per_pass`) stratify over passes only in part.
+    Each pixel and each seed has points of its own. All integrators can use it. If an integrator of
+    Mitsuba splits a render into passes (:monosp:`samples_per_pass`), samples are stratified over
+    all passes only in part.
 
     With :monosp:`blue_noise`, the pixels are put in a Z-order in which the quarters of each square
-    are shuffled, and each takes the next points of one sequence, as many as it has samples. So
+    are shuffled. Each pixel takes the next points of one sequence, one for each of its samples. So
     squares of 2^k x 2^k pixels are stratified together, up to 128 x 128. Each pixel is unbiased by
     itself. **Use it for** previews of few samples, and for images that are scaled down, blurred or
-    looked at from afar. Powers of two are the best numbers of samples: with others, a pixel has
-    more error by itself. **Not when** neighbouring pixels must be independent, as for error bars
-    that come from their scatter. :monosp:`adaptive` leaves pixels independent.
+    looked at from afar. Use a power of two as the number of samples: with other numbers, the error
+    of each single pixel is larger. **Not when** neighbouring pixels must be independent, as for
+    error bars that are computed from their scatter. :monosp:`adaptive` ignores this parameter: its
+    pixels are independent.
 
     Source: direction numbers of S. Joe and F. Y. Kuo, *Constructing Sobol Sequences with Better
     Two-dimensional Projections*, SIAM J. Sci. Comput. 30(5), 2008; A. B. Owen, *Randomly Permuted

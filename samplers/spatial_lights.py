@@ -15,9 +15,9 @@ class SpatialLightsPlugin(DecisionPlugin):
     Spatial light distribution (:monosp:`spatial_lights`)
     -----------------------------------------------------
 
-    A decision for the slot :monosp:`next_event` of :monosp:`composed_path`. It chooses a light by
-    what each would contribute to the voxel of the vertex if nothing were in between. These
-    contributions are computed before the first sample, and nothing is learned.
+    A decision for the slot :monosp:`next_event` of :monosp:`composed_path`. It chooses a light in
+    proportion to its unoccluded contribution to the voxel of the vertex. These contributions are
+    computed before the first sample, and nothing is learned.
 
     .. pluginparameters::
 
@@ -30,9 +30,9 @@ class SpatialLightsPlugin(DecisionPlugin):
        - Memory for the table of probabilities, in MiB. Where :monosp:`grid` needs more, a coarser
          grid is used, with a warning. (Default: 512)
 
-    **Use it when** there are many lights, and most places see those that are near. **Not when**
-    walls hide most of them: :monosp:`learned_lights` knows of walls, and also divides large lights
-    and the sky. With a single light it changes nothing.
+    **Use it when** there are many lights, and most places see the lights near them. **Not when**
+    walls hide most of them: :monosp:`learned_lights` takes walls into account, and also divides
+    large lights and the sky. With a single light it changes nothing.
 
     Points outside of all voxels with geometry share one row of the table. No light has less than a
     thousandth of the mean of its row, so that a wrong estimate cannot rule it out.

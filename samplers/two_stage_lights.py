@@ -15,52 +15,55 @@ class TwoStageLightsPlugin(DecisionPlugin):
     Two-stage importance sampling (:monosp:`two_stage_lights`)
     ----------------------------------------------------------
 
-    A decision for the slot :monosp:`next_event` of :monosp:`composed_path`. It chooses directions
-    of the environment (:monosp:`envmap`, :monosp:`sunsky`, :monosp:`constant`) by what the map
-    emits times what the BSDF reflects of it. Each vertex divides the map into rectangles, the
-    smaller the more the BSDF varies there, and knows the BSDF at their corners. Sums of the map
-    over rectangles come from a summed-area table. Samples are warped down to the texel.
+    A decision for the slot :monosp:`next_event` of :monosp:`composed_path`. It samples directions
+    of the environment (:monosp:`envmap`, :monosp:`sunsky`, :monosp:`constant`) in proportion to an
+    estimate of the product of map and BSDF. Each vertex divides the map into rectangles, which are
+    smaller where the BSDF varies more, and evaluates the BSDF at their corners. Sums of the map
+    over rectangles come from a summed-area table. Within a rectangle, samples are warped by the
+    texels of the map.
 
     .. pluginparameters::
 
      * - splits
        - |int|
-       - How often a vertex divides rectangles, at most, besides the first eight of them, 0 to 1024.
-         The source divides as often as there are connections of a vertex. (Default: 16)
+       - How often a vertex divides rectangles, at most, in addition to the first division into
+         eight, 0 to 1024. The source makes as many divisions as a vertex has connections. (Default:
+         16)
      * - vertices
        - |string|
        - Which vertices of a path divide the map: the :monosp:`first`, or :monosp:`all`. At the
          others, lights are chosen as by :monosp:`path`. (Default: first)
      * - visibility
        - |string|
-       - What first vertices know of what is in between: nothing (:monosp:`unknown`), or what a
-         pilot has learned in maps of random numbers (:monosp:`primary`) or of directions
-         (:monosp:`world`). (Default: unknown)
+       - How connections of first vertices take occlusion into account: not at all
+         (:monosp:`unknown`), or by visibility maps that a pilot has learned, over random numbers
+         (:monosp:`primary`) or over directions (:monosp:`world`). (Default: unknown)
      * - reallocated
        - |float|
-       - With maps: the share of the connections that follows them, 0 to 0.99. The others know
-         nothing of visibility. (Default: 0.9)
+       - With visibility maps: the share of the connections that are sampled by them, 0 to 0.99. The
+         others ignore visibility. (Default: 0.9)
 
-    **Use it when** rough metal reflects an uneven map of which it sees most, and each vertex has
-    several :monosp:`connections`, which share its partition: that takes longer than a path.
-    **Not when** walls or other things hide the bright parts of the map, unless
-    :monosp:`visibility` is learned (the word :monosp:`triple_product` stands for this decision with
-    maps in primary space); or for lobes that are nearly those of mirrors, which BSDF samples find
-    better.
+    **Use it when** rough metal reflects an uneven map, most of which is not hidden from it, and
+    each vertex has several :monosp:`connections`. These share the partition of the vertex, which
+    takes longer to make than a path. **Not when** walls or other objects hide the bright parts of
+    the map, unless :monosp:`visibility` is learned (the word :monosp:`triple_product` stands for
+    this decision with maps in primary space); or for lobes that are nearly those of mirrors, which
+    BSDF samples find better.
 
     With :monosp:`visibility`, the integrator takes a pilot of :monosp:`pilot_spp` samples per pixel
-    (by default 4, at most a quarter of all; they count towards the image). It counts, for
-    each tile of 8 pixels (larger ones where there would be more than 8192), which shadow rays of
-    first vertices arrive: in 16 x 16 cells of the two random numbers that choose a direction, or in
-    32 x 16 cells of the map. A cell without samples is expected to be like the same cell of the
-    tiles around, and that like its tile. In primary space, the numbers of later samples are
-    distributed in proportion to the root of the visibility. In the world, the rectangles of the
-    partition count by it, and are divided where it varies; give it more :monosp:`splits` then.
-    Densities stay exact and positive, so the image is unbiased whatever the maps say. There is
-    nothing to correct or to make on demand: a map is an array of counters, and shadow rays decide.
+    (by default 4, at most a quarter of all; they count towards the image). It counts, for each tile
+    of 8 pixels (larger ones where there would be more than 8192), which shadow rays of first
+    vertices are unoccluded: in 16 x 16 cells of the two random numbers that choose a direction, or
+    in 32 x 16 cells of the map. The prior of a cell is the same cell of the surrounding tiles,
+    whose prior is the mean over these tiles. In primary space, the random numbers of later samples
+    are distributed in proportion to the square root of the visibility. With :monosp:`world`, the
+    rectangles of the partition are weighted by it, and divided where it varies; use more
+    :monosp:`splits` then. Densities stay exact and positive, so the image is unbiased whatever the
+    maps contain. Maps need no correction, and are not made on demand: a map is an array of
+    counters, and every connection still traces its shadow ray.
 
-    Lights other than the environment are chosen as by :monosp:`path`. Without an environment this
-    is what :monosp:`path` does. BSDF samples take part by MIS; lobes that are thinner than a texel
+    Lights other than the environment are sampled as by :monosp:`path`, and so are all lights of a
+    scene without an environment. BSDF samples take part by MIS; lobes that are thinner than a texel
     are left to them. The density is positive wherever the map is defined: a hundredth of it follows
     the map alone. The table of the map takes 12 bytes for each of its texels. Not for
     :monosp:`bdpt` and other integrators with light paths.

@@ -1,4 +1,4 @@
-"""Connections of a vertex to many points of lights, from weighted sets."""
+"""Connections of a vertex to many points on lights, from weighted sets."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class WeightedConnectionsPlugin(DecisionPlugin):
     -----------------------------------------------------
 
     A decision for the slot :monosp:`connections` of :monosp:`composed_path`. It connects a vertex
-    to many points of lights. Their random numbers come from well distributed point sets. Each
+    to many points on lights. Their random numbers come from well distributed point sets. Each
     connection can be weighted by the Voronoi cell of its point. :monosp:`reweighted_direct` is a
     path tracer with this decision.
 
@@ -24,12 +24,12 @@ class WeightedConnectionsPlugin(DecisionPlugin):
 
      * - count
        - |int|
-       - Points of a set: connections of a vertex, at most 4096 (1024 with :monosp:`poisson_disk`).
-         With 0, light is found by BSDF samples only; lights without extent are connected to all the
-         same. (Default: 16)
+       - Points of a set, which is the number of connections of a vertex; at most 4096 (1024 with
+         :monosp:`poisson_disk`). With 0, light is found by BSDF samples only; point lights and
+         parallel light are connected to anyway. (Default: 16)
      * - vertices
        - |string|
-       - Which vertices of a path have so many connections: the :monosp:`first` (later ones have
+       - Which vertices of a path have this many connections: the :monosp:`first` (later ones have
          one), or :monosp:`all`. (Default: first)
      * - pattern
        - |string|
@@ -50,11 +50,10 @@ class WeightedConnectionsPlugin(DecisionPlugin):
     sampler of the sensor, which is hard to beat.
 
     Each vertex shifts its set around the torus at random (not with :monosp:`voronoi` weights), so
-    that errors of neighbouring pixels are independent. The BSDF sample of the vertex has its share
-    in direct light by multiple importance sampling, as one sample beside so many. It can be
-    combined with every :monosp:`next_event`: if that chooses the light by numbers of its own, these
-    come from a lattice, and the set chooses points on the lights. 16 connections take about as long
-    as a path.
+    that errors of neighbouring pixels are independent. Multiple importance sampling combines these
+    :monosp:`count` connections with one BSDF sample. They can be combined with every
+    :monosp:`next_event`: if it chooses the light by additional random numbers, these come from a
+    lattice, and the set chooses points on the lights. 16 connections take about as long as a path.
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.4. Periodic cells, and the fact
     that they are unbiased, are our addition.

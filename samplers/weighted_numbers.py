@@ -16,10 +16,10 @@ class WeightedNumbersPlugin(DecisionPlugin):
     ---------------------------------------------
 
     A decision for the slots :monosp:`aperture`, :monosp:`time` and :monosp:`wavelength` of
-    :monosp:`composed_path`. It takes the numbers that choose the point on the aperture, the time,
-    or the wavelengths of a camera ray from well distributed point sets. Each sample can be weighted
-    by the Voronoi cell of its point. Each pixel uses one set for all of its samples, chosen and
-    shifted at random.
+    :monosp:`composed_path`. It takes the random numbers that choose the point on the aperture, the
+    time, or the wavelengths of a camera ray from well distributed point sets. Each sample can be
+    weighted by the Voronoi cell of its point. Each pixel uses one set for all of its samples,
+    chosen and shifted at random.
 
     .. pluginparameters::
 
@@ -33,9 +33,9 @@ class WeightedNumbersPlugin(DecisionPlugin):
        - |string|
        - Weights of the points: :monosp:`none` (all equal), :monosp:`torus` (areas or lengths of
          periodic Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points mapped by 1 -
-         |2u - 1|, which removes discontinuities at the border; not for wavelengths, which have
-         none, because both ends of the spectrum are dark), or :monosp:`voronoi` (cells that end at
-         the border, as in the thesis: slightly biased). (Default: none)
+         |2u - 1|, which removes discontinuities at the border; not for wavelengths, which have no
+         discontinuity there, because both ends of the spectrum are dark), or :monosp:`voronoi`
+         (cells that end at the border, as in the thesis: slightly biased). (Default: none)
 
     **Use it when** the sensor's sampler is :monosp:`independent`, and the noise comes from defocus
     (aperture) or motion (time), or is coloured (wavelength). **Not when** the noise comes from
@@ -55,7 +55,7 @@ class WeightedNumbersPlugin(DecisionPlugin):
     :monosp:`poisson_disk`); with :monosp:`voronoi` weights they are not shifted. The weights apply
     to all channels, including alpha and AOVs. Use a :monosp:`box` filter for the film: a wider
     filter gives samples random weights, whose noise remains however well the points are
-    distributed. Inside of :monosp:`moment`, nothing is reweighted.
+    distributed. Where the integrator is nested in :monosp:`moment`, nothing is reweighted.
 
     Around integrators of Mitsuba, use :monosp:`reweighted_lens`, :monosp:`reweighted_time` and
     :monosp:`reweighted_wavelength`.

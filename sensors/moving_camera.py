@@ -9,7 +9,7 @@ from mitsuba_ext.motion.rigid_motion import Motion, PoseTable
 from mitsuba_ext.scene.nesting import class_name
 from mitsuba_ext.startup import registry
 
-#: Sensors of Mitsuba that a motion cannot be given to, and why.
+#: Sensors of Mitsuba that cannot move, and why.
 _REFUSED = {
     "DistantSensorImpl": "it has no place that could move",
     "IrradianceMeter": "it belongs to a shape",
@@ -25,7 +25,8 @@ class MovingCamera(mi.Sensor):
     ---------------------------------------
 
     Moves the sensor that is nested in it, rigidly, while its shutter is open: a pan, a tracking
-    shot, a shaken camera. Each ray is that of the nested sensor, at the pose of the ray's time.
+    shot, a shaken camera. Each ray is that of the nested sensor, in its pose at the time of the
+    ray.
 
     .. pluginparameters::
 
@@ -38,33 +39,32 @@ class MovingCamera(mi.Sensor):
      * - pose_0, pose_1, …
        - |transform|
        - Rotations and translations through which the sensor passes. They are applied after its own
-         :monosp:`to_world`: a sensor without that is at the poses themselves, such as
-         :monosp:`lookat`. In between, positions of the origin are interpolated linearly, rotations
-         by slerp (the shorter way).
+         :monosp:`to_world`: a sensor without :monosp:`to_world` is in the poses themselves, which
+         can be a :monosp:`lookat`. In between, positions of the origin are interpolated linearly,
+         rotations by slerp (the shorter way).
      * - time_0, time_1, …
        - |float|
        - The times of the poses: one for each, in increasing order, in the units of the shutter
          interval.
      * - translate, axis, angle, center, begin, end
        - |vector|, |float|
-       - In place of poses: a displacement and a turn at constant speed, from the place of the
-         sensor's own :monosp:`to_world`; see :monosp:`moving`.
+       - In place of poses: a displacement and a turn at constant speed, which begin at the sensor's
+         own :monosp:`to_world`; see :monosp:`moving`.
 
     **Use it when** the camera moves or turns visibly between :monosp:`shutter_open` and
     :monosp:`shutter_close`, which must be set: both are 0 by default, and such a sensor sees the
     scene from where it is at time 0. Before the motion and after it, the camera rests at its two
-    ends.
-    **Not when** lens or focus change meanwhile: that is not supported.
+    ends. **Not when** the lens or its focus changes during that time: that is not supported.
 
     All integrators can use it, those of Mitsuba too, with any film, crop window and sampler, also
     next to :monosp:`moving` shapes. Light paths are connected to the lens at the time of the path,
-    wherever the nested sensor can be connected to: :monosp:`light_tracer`, :monosp:`bdpt` and
-    :monosp:`mlt` render with a :monosp:`perspective` or :monosp:`thinlens` that moves.
-    Mitsuba's :monosp:`ptracer` does so as well. :monosp:`ecoc_dof`, which needs one depth for each
-    pixel, refuses moving cameras.
+    if the nested sensor can be connected to: :monosp:`light_tracer`, :monosp:`bdpt` and
+    :monosp:`mlt` render with a :monosp:`perspective` or :monosp:`thinlens` that moves. Mitsuba's
+    :monosp:`ptracer` does so as well. :monosp:`ecoc_dof`, which needs one depth for each pixel,
+    refuses moving cameras.
 
-    A camera ray costs a look-up in a small table and a rotation more; nothing of it is in the
-    kernels of other sensors. Parameters of the nested sensor are known to :monosp:`mi.traverse` by
+    A camera ray costs an additional look-up in a small table and a rotation; kernels of other
+    sensors are not affected. :monosp:`mi.traverse` shows the parameters of the nested sensor under
     their usual names. Its shutter interval cannot be changed after loading.
 
     Errors: other sensors are refused, and so are poses with scales.
@@ -96,9 +96,9 @@ class MovingCamera(mi.Sensor):
             'what': {'type': 'perspective', 'shutter_close': 1.0}
 
     Attributes:
-        nested (mi.Sensor): The sensor in the frame in which it rests.
-        motion (Motion): How that frame moves.
-        poses (PoseTable): The same on the device.
+        nested (mi.Sensor): The nested sensor, in its rest frame.
+        motion (Motion): The motion of this frame.
+        poses (PoseTable): The motion as a table on the device.
     """
 
     def __init__(self, props: mi.Properties) -> None:

@@ -21,29 +21,29 @@ class Moving(mi.Mesh):
     --------------------------------
 
     Moves the shapes that are nested in it, rigidly and together, while the shutter is open. The
-    integrators of this package show their motion blur, also in shadows, reflections and indirect
+    integrators of this package render their motion blur, also in shadows, reflections and indirect
     light.
 
     .. pluginparameters::
 
      * - (nested plugin)
        - |shape|
-       - The shapes that move, one or more, of any type, with their materials. Their own place is
-         where they rest before the motion. Next to an :monosp:`instance`, nest its
-         :monosp:`shapegroup` (or a :monosp:`ref` to it) as well.
+       - The shapes that move, one or more, of any type, with their materials. They rest in their
+         own pose before the motion. Next to an :monosp:`instance`, nest its :monosp:`shapegroup`
+         (or a :monosp:`ref` to it) as well.
      * - translate
        - |vector|
        - The total displacement, at constant velocity. (Default: 0, 0, 0)
      * - axis
        - |vector|
-       - The axis about which they turn, at constant speed; it needs not be of unit length.
-         (Default: none)
+       - The axis about which they turn, at constant speed; it need not be of unit length. (Default:
+         none)
      * - angle
        - |float|
        - The total rotation in degrees; it may exceed 360. Required with :monosp:`axis`.
      * - center
        - |point|
-       - A point of the axis, before the motion; it is displaced with the shapes. Known only with
+       - A point of the axis, before the motion; it is displaced with the shapes. Accepted only with
          :monosp:`axis`. (Default: 0, 0, 0)
      * - begin, end
        - |float|
@@ -66,27 +66,28 @@ class Moving(mi.Mesh):
     :monosp:`moving_camera`; for lights without a surface, :monosp:`moving_light`.
 
     **Lights.** One of the nested shapes may be an area light, of any type of emitter and shape.
-    Connections sample it at the pose of the path's time, and MIS weights have the densities of that
-    time. A second light gets a :monosp:`moving` of its own, with the same motion. Choices among
-    lights take it as a whole. :monosp:`spatial_lights` takes it for where it is during an eighth of
-    the shutter interval, :monosp:`next_event` = :monosp:`linear` for anywhere within the bounds of
-    its motion. Integrators that start paths from lights refuse lights that move: :monosp:`bdpt`,
-    :monosp:`light_tracer`, :monosp:`mlt`, and :monosp:`erpt` and :monosp:`pssmlt` where they are
-    bidirectional.
+    Connections sample it in its pose at the time of the path, and MIS weights use the densities of
+    that time. A second light needs a :monosp:`moving` of its own, with the same motion. The choice
+    among lights does not divide it into parts. :monosp:`spatial_lights` has probabilities for each
+    eighth of the shutter interval, and uses the light's positions in it; :monosp:`next_event` =
+    :monosp:`linear` uses the bounds of its whole motion. Integrators that start paths from lights
+    refuse lights that move: :monosp:`bdpt`, :monosp:`light_tracer`, :monosp:`mlt`, and
+    :monosp:`erpt` and :monosp:`pssmlt` where they are bidirectional.
 
-    Only integrators of this package see these shapes. **Mitsuba's own**, such as :monosp:`path` or
-    :monosp:`aov`, **render the scene without them, and there is no way to stop them** (a light
-    among them still lights connections, with a wrong weight); use :monosp:`composed_path`, which is
-    :monosp:`path` otherwise.
+    Only integrators of this package render these shapes. **Mitsuba's own**, such as :monosp:`path`
+    or :monosp:`aov`, **render the scene without them, and we cannot make them refuse it**
+    (connections still sample a light among them, with a wrong weight); use :monosp:`composed_path`,
+    which is :monosp:`path` otherwise.
 
-    The parameter :monosp:`aovs` of our integrators sees them at the time of each ray, in the world
-    (:monosp:`shape_index` is the number of the nested shape), and so the mean over the shutter
-    interval is in the film. For one time, close the shutter there.
+    The parameter :monosp:`aovs` of our integrators evaluates them at the time of each ray, in world
+    space (:monosp:`shape_index` is the number of the nested shape), so that the film gets the mean
+    over the shutter interval. For the values at one time, open and close the shutter at that time.
 
-    Every motion costs time: its shapes have an acceleration structure of their own, which all rays
-    traverse that hit the bounding box of the motion. Compared with the same shapes at rest, one
-    motion took 1.15 to 1.3 times as long and four took 1.3 to 1.6 times (less where boxes are small
-    in the view, more where they fill it). Put shapes that move together into one :monosp:`moving`.
+    Every motion costs time: its shapes have an acceleration structure of their own, which is
+    traversed by all rays that hit the bounding box of the motion. Compared with the same shapes at
+    rest, one motion took 1.15 to 1.3 times as long and four took 1.3 to 1.6 times (less where boxes
+    are small in the view, more where they fill it). Put shapes that move together into one
+    :monosp:`moving`.
 
     A nested shape may be nowhere else in the scene. Sensors, and meshes with vertex attributes,
     cannot be nested, and a medium in moving shapes must be homogeneous. The scene's
@@ -118,7 +119,7 @@ class Moving(mi.Mesh):
             'what': {'type': 'cube'}
     """
 
-    #: The name of the module is the class of the variant that was selected last
+    #: Kept here, because the module's name becomes the class of the variant that was selected last
     _emitter = MovingEmitter
 
     def __init__(self, props: mi.Properties) -> None:
@@ -195,7 +196,8 @@ class Moving(mi.Mesh):
             attributes = [key for key in mi.traverse(child).keys() if key.startswith("vertex_")]
             attributes = [key for key in attributes if key not in reserved]
             if attributes:
-                # Mitsuba interpolates them at the point in the world, where the vertices are not
+                # Mitsuba interpolates them at the point in world space, but the vertices are at
+                # rest
                 raise self._error(
                     f'the vertex attribute "{attributes[0]}" of a nested mesh does not work on '
                     f"what moves: use a texture"
@@ -206,7 +208,8 @@ class Moving(mi.Mesh):
         return np.array([list(box.corner(i)) for box in boxes for i in range(8)], dtype=np.float64)
 
     def _span(self, low: np.ndarray, high: np.ndarray) -> None:
-        """Makes the bounds known to the scene: two triangles without area, which no ray can hit."""
+        """Gives the scene the bounds of the motion: two triangles without area, which no ray can
+        hit."""
         parameters = mi.traverse(self)
         # Rounded outwards
         low = np.nextafter(low.astype(np.float32), np.float32(-np.inf))
@@ -222,5 +225,5 @@ class Moving(mi.Mesh):
 
 
 def _has_extent(shape: mi.Shape) -> bool:
-    """Does the shape occupy space itself? A shapegroup does only by its instances."""
+    """Does the shape itself occupy space? A shapegroup does so only through its instances."""
     return shape.class_name() != "ShapeGroupPlugin" and shape_bounds(shape).valid()

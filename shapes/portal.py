@@ -32,10 +32,10 @@ class PortalShape(mi.Mesh):
     **Use it when** a closed room is lit through it by an :monosp:`envmap`, a :monosp:`sunsky` or a
     :monosp:`constant` environment. **Not when** the camera is outdoors.
 
-    It is not a surface: no ray meets it, and images of all other integrators stay the same. Place
-    it onto the opening, or a little larger: the environment that is seen past its edge is still
-    found, but with few samples. In a thick wall, place it at the outer edge. Panes of glass in the
-    opening block connections to the environment, as always.
+    It is not a surface: no ray hits it, and it does not change the images of other integrators.
+    Make it as large as the opening, or a little larger: the environment that is seen past its edge
+    is still found, but with few samples. In a thick wall, place it at the outer edge. Panes of
+    glass in the opening block connections to the environment, as always.
 
     Source: B. Bitterli, J. Novák, W. Jarosz, *Portal-Masked Environment Map Sampling*, Computer
     Graphics Forum 34(4), 2015.
@@ -71,7 +71,7 @@ class PortalShape(mi.Mesh):
         own = mi.Properties(name)
         own.set_id(props.id())
         super().__init__(name, vertex_count=4, face_count=2, props=own)
-        # Two triangles without area, which no ray can hit, tell the scene where it is
+        # Two triangles without area, which no ray can hit, give the scene its bounds
         parameters = mi.traverse(self)
         parameters["vertex_positions"] = mi.Float(self.portal.corners.ravel().astype(np.float32))
         parameters["faces"] = mi.UInt32([0, 2, 2, 1, 3, 3])

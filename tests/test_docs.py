@@ -1,4 +1,4 @@
-"""The pages of the documentation: their links lead somewhere, and they are as short as they should be."""
+"""The pages of the documentation: their links lead somewhere, and they are not too long."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ class LightEmission:
 
         Parameters:
             numbers: The source of random numbers.
-            time, wavelengths: Of the ray.
+            time, wavelengths: Time and wavelengths of the ray.
         """
         piece = self._pieces.choose(numbers.next_2d(), active)
         u, v = numbers.next_2d(), numbers.next_2d()

@@ -124,7 +124,7 @@ class LightVertices:
 
     Parameters:
         store: The store that the light walk has written.
-        time, wavelengths: Of each path.
+        time, wavelengths: Time and wavelengths of each path.
         disperses: May vertices have only the hero wavelength left?
 
     Attributes:

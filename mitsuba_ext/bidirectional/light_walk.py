@@ -106,7 +106,7 @@ class LightWalk:
         """Emits a ray in each lane, and traces it.
 
         Parameters:
-            time, wavelengths: Of each path: those of the camera path in the same lane.
+            time, wavelengths: Time and wavelengths of each path: as the camera path in its lane.
             active: Lanes that emit.
         """
         paths, place = self._begin(scene, numbers, time, wavelengths, active)

@@ -1,5 +1,5 @@
-"""What a shell offers to complete: scenes, folders, variants, integrators and their parameters.
-Nothing here imports Mitsuba, which would take a second."""
+"""Candidates for the shell's completion: scenes, folders, variants, integrators and their
+parameters. Nothing here imports Mitsuba, which would take a second."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _WITHOUT_SETTINGS = ("aov", "depth", "direct", "direct_projective", "moment", "s
 
 
 def integrators(_context: click.Context, _option: Any, text: str) -> list[CompletionItem]:
-    """Integrators, ``NAME:key=value,…``, and files: those that hold one, and scenes."""
+    """Integrators, ``NAME:key=value,…``, and files that contain an integrator or a scene."""
     return _items([*_files(text, (".xml", ".json")), *_specifications(text)])
 
 
@@ -46,7 +46,7 @@ def folders(_context: click.Context, _option: Any, text: str) -> list[Completion
 
 
 def plugins(_context: click.Context, _option: Any, text: str) -> list[CompletionItem]:
-    """Plugins of ours, of any kind."""
+    """Plugins of this package, of any kind."""
     found = sorted(name for of_kind in registry.plugin_names().values() for name in of_kind)
     return _items((name, "plain") for name in found if name.startswith(text))
 
@@ -68,7 +68,7 @@ def _items(found: Iterable[tuple[str, str]]) -> list[CompletionItem]:
 
 
 def _files(text: str, suffixes: tuple[str, ...]) -> list[tuple[str, str]]:
-    """The folders and the files that a path can begin with."""
+    """The folders and files whose paths begin with ``text``."""
     folder, slash, begin = text.rpartition("/")
     base = Path(folder + slash).expanduser() if slash else Path()
     try:
@@ -88,7 +88,7 @@ def _files(text: str, suffixes: tuple[str, ...]) -> list[tuple[str, str]]:
 
 
 def _specifications(text: str) -> list[tuple[str, str]]:
-    """What ``NAME:key=value,key=[NAME:…],…`` can go on with."""
+    """The possible continuations of ``NAME:key=value,key=[NAME:…],…``."""
     before, inner = _innermost(text)
     name, colon, rest = inner.partition(":")
     if not colon:

@@ -1,7 +1,7 @@
-"""Completion for shells: the scripts, and how shells ask.
+"""Completion for shells: their scripts, and the answers to them.
 
 It is click's, with two additions: candidates that no space follows, and integrators with ``:`` and
-``=`` in bash, which takes these for the ends of words.
+``=`` in bash, which splits words at these characters.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from click.shell_completion import (
     split_arg_string,
 )
 
-#: The variable by which a shell asks. Its name follows from that of the command.
+#: The environment variable by which a shell asks for candidates, named after the command.
 VARIABLE = "_MITSUBA_EXT_COMPLETE"
 
 _BASH = """\
@@ -103,10 +103,10 @@ class _Bash(BashComplete):
 
 
 def _cut(line: str, incomplete: str) -> str:
-    """The part of the last word that bash takes for a word of its own."""
+    """The part of the last word that bash treats as a separate word."""
     try:
         shlex.split(line)
-    except ValueError:  # in quotes, it is whole
+    except ValueError:  # within quotes, bash does not split words
         return ""
     ends = [letter for letter in ":=" if letter in os.environ.get("COMP_WORDBREAKS", ":=")]
     return incomplete[: 1 + max((incomplete.rfind(letter) for letter in ends), default=-1)]
@@ -124,7 +124,7 @@ _SHELLS: dict[str, type[ShellComplete]] = {"bash": _Bash, "zsh": _Zsh, "fish": _
 
 
 def register() -> None:
-    """Lets click answer shells by what is here."""
+    """Makes click use the completion classes of this module."""
     for name, shell in _SHELLS.items():
         add_completion_class(shell, name)
 

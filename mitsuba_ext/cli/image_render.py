@@ -27,7 +27,7 @@ from .stopping import stopping
 
 
 class Order(NamedTuple):
-    """What all images of a call have in common; see the options."""
+    """The options that all images of a call have in common."""
 
     scene: Path
     specification: str | None
@@ -50,7 +50,7 @@ def is_finished(order: Order, picture: Picture) -> bool:
     long = order.long
     if long is None or long.folder is None:
         return True
-    # More may be asked of it than last time. Whether an error is reached, its state must say
+    # This call may ask for more samples than the last one. For an error, the state must be loaded
     if long.until is not None:
         return False
     return not order.spp or CheckpointFolder(long.folder / picture.name).load().spp >= order.spp
@@ -63,16 +63,16 @@ def render_image(
     """Renders an image and returns the exit code.
 
     Args:
-        order: What all images of the call have in common.
-        picture: Which one it is.
+        order: The options that all images of the call have in common.
+        picture: The image to render.
         plugins: Modules to import, which register other plugins.
-        report: Is told how far it is, and how it ended.
-        scenes: Keeps the scene for the next image.
-        function: Of the number of the frame: what it changes in the scene.
+        report: Shows the progress and the end of the render.
+        scenes: Keeps the loaded scene for the next image.
+        function: Returns, for the number of a frame, what the frame changes in the scene.
 
     Raises:
-        InputError: Something cannot be read, used or written. If that happened when there were
-            samples, the image of these is written.
+        InputError: Something cannot be read, used or written. If there are samples already, their
+            image is written.
     """
     output, definitions, sensor_index, seed = picture[:4]
     values, long = None, order.long
@@ -108,12 +108,12 @@ def render_image(
         target: Path, others: Mapping[str, np.ndarray] | None = None, is_final: bool = True
     ) -> None:
         layers = {**job.variance(), **(others or {})}
-        # The render waits for an image that is soon replaced
+        # The render waits while an unfinished image is written: do not compress it
         image_files.write_film(target, job.film, metadata(), layers, is_compressed=is_final)
 
     def show(is_asked: bool) -> None:
         if is_asked or (long and long.folder):
-            # A frame that is there counts as finished
+            # The file of a frame counts as finished if it exists, so this one has another name
             write(picture.unfinished if order.is_one_of_many else output, is_final=False)
         if order.preview:
             image_files.write_film(order.preview, job.film, metadata())

@@ -1,4 +1,4 @@
-"""``mitsuba-ext merge``: the samples of several renders in one image."""
+"""``mitsuba-ext merge``: merges the samples of several renders."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
     from ..long_renders.state import RenderState
 
 
-@click.command(short_help="Merge renders that --checkpoint has kept.")
+@click.command(short_help="Merge renders that --checkpoint has saved.")
 @click.option(
     "-o", "--output", type=FilledPath(), required=True, metavar="DIR",
-    help="The folder to make; render --checkpoint DIR goes on with it, and writes the image.",
+    help="The folder to make; render --checkpoint DIR continues it, and writes the image.",
 )
 @click.argument(
     "folders", type=FilledPath(), nargs=-1, required=True, metavar="DIR…",
     shell_complete=candidates.folders,
 )
 def merge(folders: Sequence[Path], output: Path) -> int:
-    """Merge the samples of renders that ``render --checkpoint DIR`` has kept: of the same scene, by
-    the same integrator, with different seeds. Each counts by its samples."""
+    """Merge the samples of renders that ``render --checkpoint DIR`` has saved: of the same scene,
+    by the same integrator, with different seeds. Each render is weighted by its samples."""
     from ..errors import InputError
     from ..files import make_folder
     from ..long_renders.folder import CheckpointFolder, check_same
@@ -46,7 +46,7 @@ def merge(folders: Sequence[Path], output: Path) -> int:
             state = state.plus(_loaded(other))
         except InputError as error:
             raise InputError(f"{first.path} and {other.path}: {error}") from None
-    # Made beside it: a folder that is half made would pass for the beginning of a render
+    # Made under another name first: an unfinished folder could be taken for the start of a render
     make_folder(output.parent)
     try:
         with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as made:

@@ -29,7 +29,7 @@ class RenderJob:
         film: The film that holds the image.
         is_interrupted: Did a signal end the render before all samples were taken?
         failure: Always ``None``: after a failure, there is no image.
-        seconds: Wall clock of the render.
+        seconds: Wall clock time of the render.
     """
 
     def __init__(self, chosen: Chosen, seed: int) -> None:
@@ -40,19 +40,19 @@ class RenderJob:
         self.scene, self.sensor, self.film = chosen.scene, chosen.sensor, chosen.sensor.film()
         self.is_interrupted, self.seconds, self.failure = False, 0.0, None
         self._chosen, self._seed = chosen, seed
-        self._wanted: int | None = None  # samples per pixel, where it is known
+        self._wanted: int | None = None  # samples per pixel to render, if known
         self._is_measuring = False
         self._passes: SeedPasses | None = None
 
     def remarks(self, is_sensor_chosen: bool) -> list[str]:
-        """Warnings about what the image will not show."""
+        """Warnings about parts of the scene that the image will not show."""
         return self._chosen.remarks(is_sensor_chosen)
 
     def run(
         self, spp: int | None, seconds: float | None, _write: Callable[[bool], None], report: Report
     ) -> None:
         """Renders ``spp`` samples per pixel (by default, the number of the sampler), or as many as
-        fit into ``seconds``, and tells ``report`` how far it is. After Ctrl-C, passes end with
+        fit into ``seconds``, and reports the progress. After Ctrl-C, a render in passes ends with
         :attr:`is_interrupted` set; integrators that do not handle it raise ``KeyboardInterrupt``.
 
         Raises:
@@ -128,11 +128,11 @@ class RenderJob:
         )
 
     def variance(self) -> dict[str, np.ndarray]:
-        """Channels with the variance of the image: it is not known."""
+        """Channels with the variance of the image: none, as it is not known."""
         return {}
 
     def about(self) -> dict[str, Any]:
-        """What the metadata of the image say besides."""
+        """Further metadata of the image: none."""
         return {}
 
     @property
@@ -142,10 +142,10 @@ class RenderJob:
 
     @property
     def totals(self) -> RenderTotals:
-        """What the render cost."""
+        """The cost of the render."""
         return RenderTotals.of(self.integrator, self.film, self.spp or 0, self.seconds)
 
-    # ---- How far it got ----
+    # ---- The state of the render ----
 
     @property
     def spp(self) -> int | None:

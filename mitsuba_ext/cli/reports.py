@@ -1,4 +1,4 @@
-"""What a render tells while it runs, and in the end: to people, or to scripts."""
+"""The output of a render while it runs, and in the end: for people, or for scripts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PERIOD = 1.0
 
 
 class Report:
-    """Sentences and bars on the terminal, or events: JSON objects on stdout, one a line.
+    """Sentences and progress bars on the terminal, or events: JSON objects on stdout, one a line.
 
     Parameters:
         is_quiet: Only warnings and errors.
@@ -32,11 +32,11 @@ class Report:
         self._is_quiet, self._as_json = is_quiet, as_json
         self._last = -_PERIOD
         self._events = sys.stdout
-        #: Of which image progress is reported; empty if there is only one.
+        #: The image whose progress is reported; empty if there is only one.
         self.image: dict[str, Any] = {}
 
     def note(self, text: str) -> None:
-        """Says something that needs no attention, on stderr."""
+        """Prints a sentence that needs no attention, on stderr."""
         if not self._is_quiet and not self._as_json:
             say(text)
 
@@ -55,7 +55,7 @@ class Report:
     def end(
         self, text: str, details: Sequence[str] = (), is_interrupted: bool = False, **figures: Any
     ) -> None:
-        """The last sentence or event. The details are left out where nothing is to be said."""
+        """Prints the last sentence or event. A quiet report leaves out the details."""
         if self._as_json:
             self._event("end", interrupted=is_interrupted, **figures)
         elif is_interrupted or not self._is_quiet:
@@ -63,16 +63,16 @@ class Report:
 
     @contextlib.contextmanager
     def bars(self) -> Iterator[Progress]:
-        """Bars, if a terminal shows them. A task has the field ``left``: :func:`time_left`."""
+        """Progress bars, if a terminal shows them. Their tasks have the field ``left``, which is
+        the text of :func:`time_left`."""
         column = TextColumn("{task.fields[left]}", markup=False)
         with progress_bars(column, is_shown=not self._is_quiet and not self._as_json) as bars:
             yield bars
 
     @contextlib.contextmanager
     def only_events(self) -> Iterator[None]:
-        """A context in which nothing else gets among the events on stdout: Mitsuba's warnings are
-        events, and what modules of the user print goes to stderr. Without events, it does
-        nothing."""
+        """A context in which stdout has only events: Mitsuba's warnings become events, and the
+        output of the user's modules goes to stderr. Without events, it does nothing."""
         if not self._as_json:
             yield
             return
@@ -111,19 +111,19 @@ class Report:
 
 
 def time_left(seconds: float | None) -> str:
-    """A remaining time for people; empty if it is unknown."""
+    """The remaining time as text; empty if it is unknown."""
     return "" if seconds is None else f"about {datetime.timedelta(seconds=round(seconds))} left"
 
 
 class Speed:
-    """The speed of a render that has done something in between two calls, and the time left. The
-    first part is not counted, because it may compile kernels."""
+    """Measures the speed of a render, from one call to the next. The part before the first call is
+    not counted, because it may compile kernels."""
 
     def __init__(self) -> None:
         self._first: tuple[float, float] | None = None
 
     def __call__(self, done: float) -> float | None:
-        """What is done per second; ``None`` while it is unknown.
+        """The progress per second; ``None`` while it is unknown.
 
         Args:
             done: How much is done, in any unit.

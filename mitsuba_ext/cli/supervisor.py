@@ -1,8 +1,8 @@
 """Runs a comparison in a worker process, because an integrator can crash its process.
 
 Python cannot catch a lack of memory, a fault in native code, or an abort of LLVM. The supervisor
-records which integrator was rendering when the worker died, and starts another worker. This one
-finds the finished runs in the folder, reports that integrator as failed, and goes on with the rest.
+records which integrator was rendering when the worker died, and starts another worker. The new
+worker finds the finished runs in the folder, reports that integrator as failed, and runs the rest.
 
 An integrator can hang, too: with a limit, the supervisor kills a worker whose render takes longer.
 
@@ -41,7 +41,7 @@ MEASURE, STORED = JOBS = ("measure", "stored")
 #: to 30 seconds, and the report takes a few.
 GRACE = 3.0
 
-#: Exit codes of a worker that did not crash: finished, with failures, bad input, interrupted.
+#: Exit codes of a worker that did not crash: success, failed integrators, bad input, interrupted.
 _IN_ORDER = (0, 1, 2, INTERRUPTED)
 
 #: Seconds between two checks for received signals.
@@ -174,7 +174,8 @@ def _work(
 @contextlib.contextmanager
 def _collected_signals() -> Iterator[list[int]]:
     """Collects the numbers of received signals in a list; of signals within half a second, only the
-    first. (An exception instead could be raised at any time, even while another one is handled.)"""
+    first. (If a signal raised an exception instead, this could happen at any time, even while
+    another one is handled.)"""
     received: list[int] = []
     first = -math.inf
 

@@ -1,4 +1,4 @@
-"""Comparing integrators by speed and error, from a notebook as from ``mitsuba-ext compare``::
+"""Compares integrators by speed and error. A notebook does what ``mitsuba-ext compare`` does with::
 
     import mitsuba_ext
     import mitsuba as mi

@@ -14,7 +14,7 @@ _FIRST_SPP = 8
 
 @dataclass(frozen=True)
 class Budget:
-    """Made by :func:`equal_samples`, :func:`equal_time`, :func:`sweep` or :func:`until`.
+    """A budget, made by :func:`equal_samples`, :func:`equal_time`, :func:`sweep` or :func:`until`.
 
     Attributes:
         kind: ``spp``, ``time``, ``sweep`` or ``until``.

@@ -1,5 +1,5 @@
-"""Several scenes with several integrators: references, runs, ``results.json`` and report in one
-folder. A comparison that is started again in its folder renders only what is missing."""
+"""Compares several integrators on several scenes: references, runs, ``results.json`` and report in
+one folder. A comparison that is started again in its folder renders only what is missing."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ _REFERENCE_FACTOR = 16
 
 @dataclass(frozen=True)
 class SceneSetup:
-    """A scene of a comparison, and what applies to it alone.
+    """A scene of a comparison, with the settings that apply to it alone.
 
     Attributes:
         source: An XML file, or a dict as ``mi.load_dict`` takes it. Its integrator is replaced.
         size: Width and height that replace those of the film.
         parameters: Values for the ``$name`` placeholders of the file.
-        reference: A file to measure against. Default: render a reference.
+        reference: The file of its reference. Default: render a reference.
     """
 
     source: SceneSource
@@ -71,9 +71,9 @@ class Comparison:
             longest run. With a time budget: as many as take 16 times that long. With ``until``:
             enough for a relMSE of 1/16 of the target.
         reference_integrator: The integrator that renders references.
-        reference_workers: Those who render references. What is measured is rendered here, one
-            render at a time, because times on other machines or shared cores tell nothing.
-            Default: this process.
+        reference_workers: The workers that render references. Default: this process. Measured runs
+            are rendered in this process, one at a time, because times on other machines or shared
+            cores cannot be compared.
         command: The command line, for the report.
         only_stored: Render nothing; make figures and report from the runs in the folder.
 
@@ -110,7 +110,7 @@ class Comparison:
                 f"the budget must be made by equal_samples(64), equal_time(10), sweep([4, 16, 64]) "
                 f"or until(0.01) of mitsuba_ext.compare, found {budget!r}"
             )
-        make_all(integrators)  # reports an unknown name before a reference is rendered
+        make_all(integrators)  # to report an unknown name before a reference is rendered
         if not all(setup.reference for setup in self.scenes):
             make_named(reference_integrator)
         self.integrators = integrators
@@ -138,13 +138,12 @@ class Comparison:
 
         Args:
             progress: ``True`` shows a bar on a terminal, and elsewhere writes a line to stderr
-                every half minute; ``False`` shows nothing; a function is called before each piece
-                of work.
+                every half minute; ``False`` shows nothing; a function is called before each step.
 
         Raises:
-            InputError: The only scene, or its reference, cannot be used. (With several scenes, the
-                results record the error instead.) Or another comparison is running in the folder,
-                or the folder cannot be made.
+            InputError: The only scene, or its reference, cannot be used (with several scenes, the
+                results record the error instead); another comparison is running in the folder; or
+                the folder cannot be made.
         """
         self._records, self.is_finished = [], False
         with in_use(self.folder), reporting(progress) as report_step:
@@ -240,7 +239,8 @@ class Comparison:
             folder,
             self._reference_integrator,
             lambda done: progress(Step(f"reference {done:.0%}", 0.0, None)),
-            # A derived number varies with the measurement: a stored reference with half will do
+            # A derived number varies with the measured speed or noise: accept a stored reference
+            # with half as many samples
             enough=asked or spp // 2,
             workers=self._reference_workers,
         )

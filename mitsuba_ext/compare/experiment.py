@@ -1,14 +1,15 @@
-"""Speed against error: one scene with several integrators, under equal conditions.
+"""Measures the time and error of several integrators on one scene, under equal conditions.
 
 - Every integrator gets the settings of the scene's own (``max_depth``, ``rr_depth``,
   ``hide_emitters``) unless its specification sets them, so that all solve the same problem.
 - Small renders compile the kernels beforehand. A measured run that compiled a kernel after all
   (for a size of pass that the small renders did not have) is discarded and repeated.
-- The integrators take turns (A B C A B C …), round by round: a machine that slows down slows all of
-  them down. Each round and each level has its own seed, which the integrators share.
+- The integrators take turns (A B C A B C …), round by round, so that a machine that slows down
+  affects all of them. Each round and each level has its own seed, which the integrators share.
 - Times are compared within one session only. A stored run of an earlier session is timed again (its
   image is kept) when a run of this session is compared with it.
-- The measured time covers the whole of ``render()``, learning included, until the image is there.
+- The measured time covers the whole of ``render()``, learning included, until the image is in
+  memory.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ from .runs import Run, RunFolder
 from .zero_radiance import zero_radiance_share
 
 #: With a time budget, a run that misses its time by more than this fraction is repeated with a
-#: corrected number of samples, up to so many attempts in all.
+#: corrected number of samples, up to this number of attempts in all.
 TIME_TOLERANCE = 0.05
 _TIME_ATTEMPTS = 3
 
-#: Most samples per pixel of ``until`` where the file of the reference does not give its own number.
+#: Most samples per pixel of ``until`` if the file of the reference does not give its own number.
 _MAX_UNTIL_SPP = 1 << 16
 
 
@@ -51,8 +52,8 @@ class Contender:
         runs: In the order in which they were measured.
         compile_seconds: Time to compile or to load the kernels, without tracing.
         error: Why there are no (more) runs; empty if all went well.
-        traceback: Where the error came from, for those who write the integrator.
-        notes: What a reader of the figures should know.
+        traceback: The error's traceback, for authors of integrators.
+        notes: Sentences that a reader of the figures should know.
     """
 
     named: NamedIntegrator
@@ -61,7 +62,7 @@ class Contender:
     error: str = ""
     traceback: str = ""
     notes: list[str] = field(default_factory=list)
-    _zero_radiance: float | None = None  # where the integrator does not count it
+    _zero_radiance: float | None = None  # measured here if the integrator does not count it
     _pace: float | None = None  # seconds per sample per pixel
     _is_prepared: bool = False
 
@@ -82,7 +83,7 @@ class Experiment:
     """Renders one scene with several integrators and measures them against a reference.
 
     Args:
-        scene: The scene; its own integrator matters only for the settings that others take over.
+        scene: The scene. Of its own integrator, only the settings are used.
         integrators: Specifications (:func:`mitsuba_ext.inputs.specifications.make_named`), or a
             mapping of labels to them. Figures are given relative to the first.
         budget: Samples, seconds or error of each run.
@@ -131,7 +132,7 @@ class Experiment:
         """Measures everything. The results are in :attr:`contenders`, also after an interruption.
 
         Args:
-            reference: What the errors are measured against.
+            reference: The image against which errors are measured.
             progress: Called before each run.
         """
         self.reference = reference
@@ -145,7 +146,7 @@ class Experiment:
     def _schedule_levels(self) -> Iterator[tuple[Contender, int, int]]:
         indices = range(len(self.budget.values))
         for contender in self.contenders:
-            # Measure all speeds before the first long run, to estimate the time that is left
+            # Measure all speeds before the first long run, to estimate the remaining time
             paths = (self._path(contender, i, r) for i in indices for r in range(self.rounds))
             is_complete = all(self._folder.load(path) for path in paths)
             if not (is_complete or has_crashed(self._mark(contender)) or self.only_stored):
@@ -182,7 +183,7 @@ class Experiment:
     # ---- One run ----
 
     def _attempt(self, contender: Contender, action: Callable[[], object]) -> None:
-        """Calls ``action`` and records an error of the integrator; the others go on."""
+        """Calls ``action`` and records an error of the integrator, so that the others go on."""
         try:
             action()
         except (Exception, SystemExit) as error:  # an integrator may raise anything
@@ -209,8 +210,8 @@ class Experiment:
             self._share_session(contender, run)
 
     def _share_session(self, contender: Contender, run: Run) -> None:
-        """Times a run, and the first integrator's run of that round, again in this session where
-        they have no time of a common session."""
+        """If a run and the first integrator's run of the same round were never timed in the same
+        session, times them again in this one."""
         first = self.contenders[0]
         partner = next((r for r in first.at(run.level) if r.round == run.round), run)
         if partner.times.keys() & run.times.keys():
@@ -290,7 +291,7 @@ class Experiment:
         integrator = contender.named.integrator
         counts = () if self.budget.is_time else self._counts()
         # One sample per pixel, powers of two and other counts have different kernels (Mitsuba
-        # divides the index of a sample by the count): compile those that occur.
+        # divides the index of a sample by the count): compile each kind that occurs.
         for spp in sorted({1 if n == 1 else 2 if n & (n - 1) == 0 else 3 for n in counts}):
             self._timed(contender, spp, seed=0)
         if self.budget.is_time:

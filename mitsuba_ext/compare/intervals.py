@@ -1,8 +1,8 @@
 """Estimates with their 95 % confidence intervals over independent runs.
 
-Errors and times are positive and vary by factors. So their interval is that of the mean of the
-logarithms (Student's t), applied as a factor around the estimate. With three runs t is 4.3, and the
-interval is wide.
+Errors and times are positive and vary by factors. Their interval is therefore that of the mean of
+the logarithms (Student's t), applied as a factor around the estimate. With three runs t is 4.3, and
+the interval is wide.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ CONFIDENCE = 0.95
 
 
 class Estimate(NamedTuple):
-    """A value and its confidence interval; the bounds are ``None`` where they are unknown, as for a
+    """A value and its confidence interval; the bounds are ``None`` if they are unknown, as for a
     single run."""
 
     value: float
@@ -65,9 +65,9 @@ def slope(x: Sequence[float], y: Sequence[float]) -> Estimate | None:
 
 
 def cost_of(target: float, x: Sequence[float], y: Sequence[float]) -> Estimate | None:
-    """The ``x`` at which the line through log y against log x reaches ``target`` (inverse
+    """The ``x`` at which the line fitted to log y against log x reaches ``target`` (inverse
     prediction, by the delta method). ``None`` if the slope is not negative; without an interval if
-    the slope may be positive within its own interval."""
+    the confidence interval of the slope includes positive values."""
     fit = _log_fit(x, y)
     if fit is None or not fit.slope < 0:
         return None
@@ -84,8 +84,8 @@ def cost_of(target: float, x: Sequence[float], y: Sequence[float]) -> Estimate |
 
 
 def follow(at: Estimate | None, x: Sequence[float], y: Sequence[float]) -> Estimate | None:
-    """The y at an estimated x, by the line through log y against log x. The line maps the interval
-    of x to that of y; the uncertainty of the line itself is ignored."""
+    """The y at an estimated x, on the line fitted to log y against log x. The line maps the
+    interval of x to that of y; the uncertainty of the line itself is ignored."""
     fit = _log_fit(x, y)
     if at is None or fit is None:
         return None
@@ -125,8 +125,8 @@ def _around(center, values: Sequence[float]) -> Estimate | None:
         return None
     value = float(center(values))
     if min(values) <= 0:
-        # A value has no logarithm (a share, a count, an error after a subtraction): take the
-        # interval of the values themselves
+        # Zero and negative values (a share, a count, an error after a subtraction) have no
+        # logarithm: take the interval of the values themselves
         half = _half_width(values)
         return Estimate(value) if half is None else Estimate(value, value - half, value + half)
     return _with_factor(value, values)

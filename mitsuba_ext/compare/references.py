@@ -1,4 +1,4 @@
-"""References, which errors are measured against: read from files, or rendered once and stored.
+"""Reference images for measuring errors: read from files, or rendered once and stored.
 
 A rendered reference is the mean of independent batches, so that the variance of this mean is known.
 On disk it is an EXR with the channels ``mean.R/G/B`` and ``variance.R/G/B`` (variance of the mean).
@@ -35,7 +35,7 @@ from ..startup.machine import versions
 if TYPE_CHECKING:
     from ..long_renders.divided_references import ReferenceWorkers
 
-#: Number of batches of a rendered reference, from whose spread its variance is estimated.
+#: Number of batches of a rendered reference. Their sample variance gives that of the reference.
 BATCH_COUNT = 16
 MIN_BATCH_COUNT = 8
 
@@ -50,10 +50,10 @@ _RGB = ("R", "G", "B")
 
 @dataclass
 class Reference:
-    """An image that stands for the exact solution.
+    """An image that is used as the exact solution.
 
     Attributes:
-        mean: Array (height, width, 3).
+        mean: The image, array (height, width, 3).
         variance: Variance of ``mean``, same shape; ``None`` if unknown.
         path: The file that holds it.
         metadata: The metadata of that file.
@@ -131,7 +131,7 @@ def render_reference(
         integrator: The integrator that renders it; it must be unbiased.
         progress: Called after each batch with the fraction that is done.
         enough: A stored reference with at least so many samples is used. Default: ``spp``.
-        workers: Those who render it. Default: this process.
+        workers: The workers that render it. Default: this process.
 
     Raises:
         InputError: ``spp`` is below 8, the integrator fails, or the image is black or holds NaN or

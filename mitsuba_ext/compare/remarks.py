@@ -1,4 +1,4 @@
-"""Remarks for the reader of the figures: which could not be measured, and which may mislead."""
+"""Remarks for the reader of the figures: those that could not be measured, or may mislead."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from .experiment import TIME_TOLERANCE, Contender, Experiment
 from .references import Reference
 from .runs import Run
 
-#: A reference is too noisy to measure an error if its own relMSE is more than this share of it.
+#: A reference is too noisy to measure an error if its own relMSE is more than this share of that
+#: error.
 _NOISE_LIMIT = 0.5
 
-#: Where relMSE is more than so many times the trimmed relMSE, a note names fireflies as the cause.
+#: If relMSE is more than this multiple of the trimmed relMSE, a note warns of fireflies.
 _FIREFLIES = 1.5
 
 
@@ -38,7 +39,7 @@ def refusal(reference: Reference | None, runs: Sequence[Run]) -> str:
     text = f"the reference is too noisy: its own relMSE is {noise:.2g}, "
     text += f"the error {error:.2g}" if error > 0 else "the error less than that"
     if reference.spp:
-        # So many that the noise is 1/16 of the error, but at most 256 times as many as now
+        # Samples for a noise of 1/16 of the error, but at most 256 times as many as now
         needed = reference.spp * 16 * noise / max(error, noise / 16)
         text += f"; needs --reference-spp {1 << math.ceil(math.log2(needed))}"
     return text

@@ -94,7 +94,7 @@ def scene_record(experiment: Experiment, folder: Path) -> dict[str, object]:
 
 
 def clean(value: object) -> object:
-    """``value`` in types that JSON has; NaN and infinity, which it has not, become ``None``."""
+    """Converts ``value`` to types that JSON has. NaN and infinity become ``None``."""
     if isinstance(value, Estimate):
         return clean(value._asdict())
     if isinstance(value, dict):
@@ -137,7 +137,7 @@ def _contender_record(
         "runs": [_run_record(run, folder) for run in contender.runs],
         "levels": levels,
         "slopes": {
-            # Within one level, samples and times differ by chance only: they have no slope
+            # Within one level, samples and times differ by chance only: no slope can be fitted
             name: intervals.slope(values, errors) if len(levels) > 1 else None
             for name, values in efforts.items()
         },
@@ -148,7 +148,7 @@ def _contender_record(
 def _target_record(
     experiment: Experiment, trusted: Sequence[Run], levels: Sequence[Mapping[str, Any]]
 ) -> dict[str, Estimate | None] | None:
-    """What reaching the error of ``until`` costs; ``None`` if it was not reached."""
+    """The cost of reaching the error of ``until``; ``None`` if it was not reached."""
     target = experiment.budget.target
     errors = [level["figures"]["relmse"] for level in levels]
     if not target or not any(error and error.value <= target for error in errors):
@@ -162,7 +162,7 @@ def _target_record(
     cost = intervals.cost_of(target, spp, [run.errors.relmse for run in last])
     return {
         "spp": cost,
-        # From the samples: a line of error against time would add the noise of the times
+        # Derived from the samples: a line of error against time would add the noise of the times
         "seconds": intervals.follow(cost, spp, [run.seconds for run in last]),
     }
 

@@ -1,9 +1,9 @@
-"""Measured renders, and the folder that keeps them.
+"""Measured renders, and the folder that stores them.
 
-Every run is one EXR: its image, and a header with its cost. The file name holds a hash of all that
-the run depends on: a comparison that is started again uses the stored runs, but never those of
-another scene, integrator, version or machine. A run that was timed again in another session has a
-JSON file with these times beside it.
+Every run is one EXR: its image, and a header with its cost. The file name contains a hash of
+everything that the run depends on: a comparison that is started again uses the stored runs, but
+never those of another scene, integrator, version or machine. A run that was timed again in another
+session has a JSON file with these times beside it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..files import replacing
 from ..images import image_files
 from ..images.metrics import Errors
 
-#: The file beside a run's that holds its times in other sessions.
+#: Suffix of the file with a run's times in other sessions.
 _TIMES = ".times.json"
 
 
@@ -35,7 +35,7 @@ class Run:
         round: Index of the repetition, from 0 on.
         seed: Its seed.
         spp: Samples per pixel that were taken.
-        seconds: Wall clock of the render, learning included, compilation excluded.
+        seconds: Wall clock time of the render, learning included, compilation excluded.
         rays: Rays traced by kind (``camera``, ``scatter``, ``shadow``), empty if not known.
         connections: Connections to lights that were considered (``path`` traces a shadow ray for
             each), ``None`` if not known.
@@ -45,7 +45,7 @@ class Run:
         session: The session in which it was measured. Integrators take turns within a session only.
         timed_again: Seconds that the same render took in later sessions, by session.
         path: The EXR that holds the image.
-        errors: Against the reference of the experiment.
+        errors: Its errors against the reference of the experiment.
     """
 
     level: float
@@ -74,7 +74,7 @@ class Run:
 
     @property
     def shadow_share(self) -> float | None:
-        """Shadow rays traced, of those that ``path`` would trace."""
+        """Shadow rays traced, as a fraction of those that ``path`` would trace."""
         return self.rays["shadow"] / self.connections if self.connections else None
 
     @property
@@ -97,7 +97,7 @@ class RunFolder:
     """The runs of one scene on disk.
 
     Args:
-        folder: Where the EXRs are; made when the first one is written.
+        folder: The folder of the EXRs; made when the first one is written.
         identity: What all runs of the scene depend on: scene, versions, machine.
     """
 
@@ -110,9 +110,9 @@ class RunFolder:
 
         Args:
             label: The integrator's label, which makes the name readable.
-            integrator: The integrator's identity: all that its images depend on.
+            integrator: The integrator's identity: everything that its images depend on.
             level: The level with its unit (``64spp``, ``10s``).
-            round, seed: Of the run.
+            round, seed: Round and seed of the run.
         """
         identity = {**self._identity, "integrator": integrator, "level": level, "round": round,
                     "seed": seed}
@@ -142,7 +142,7 @@ class RunFolder:
         return replace(run, path=path)
 
     def add_time(self, run: Run, seconds: float) -> None:
-        """Keeps the seconds that a run took when it was repeated in this session."""
+        """Stores the seconds that a run took when it was repeated in this session."""
         run.timed_again[marks.SESSION] = seconds
         with replacing(run.path.with_suffix(_TIMES)) as temporary:
             temporary.write_text(json.dumps(run.timed_again), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The results of a comparison on the terminal."""
+"""Prints the results of a comparison on the terminal."""
 
 from __future__ import annotations
 
@@ -104,8 +104,8 @@ def _columns(scene: Mapping[str, Any], budget: Mapping[str, Any]) -> list[_Colum
 def _in_groups(
     columns: Sequence[_Column], labels: Sequence[str], width: int
 ) -> Iterator[list[_Column]]:
-    """The columns of each table: all if they fit beside the labels; else errors and costs in
-    separate tables, split further where needed."""
+    """The columns of each table: one table if all columns fit beside the labels; else separate
+    tables for errors and for costs, split further where needed."""
     room = width - min(_LABEL_WIDTH, max(map(cell_len, labels), default=0))
     if sum(column.width for column in columns) <= room:
         yield list(columns)
@@ -135,7 +135,7 @@ def _table(labels: Sequence[str], columns: Sequence[_Column], width: int) -> Tab
 
 
 def _broken(label: str, width: int) -> Iterator[str]:
-    """The lines of a label, broken behind commas and brackets where possible."""
+    """The lines of a label, broken after commas and brackets where possible."""
     line = ""
     for piece in re.split(r"(?<=[,\[])", label):
         if line and cell_len(line + piece) > width:

@@ -1,4 +1,4 @@
-"""Times renders, and finds the number of samples that a time allows."""
+"""Times renders, and computes how many samples take a given time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 #: wavefront.
 _MAX_SPP = 2**24
 
-#: A render shorter than this (in seconds) is timed twice: a short disturbance can double its time.
+#: A render shorter than this (in seconds) is timed twice, as a short disturbance can double its
+#: time.
 _SHORT = 0.5
 
 
@@ -27,9 +28,9 @@ class Timed(NamedTuple):
     """A render and its cost.
 
     Attributes:
-        seconds: Wall clock of the whole render, learning and compilation included.
+        seconds: Wall clock time of the whole render, learning and compilation included.
         compiled: Was a kernel compiled, or loaded from the disk?
-        compile_seconds: Time for that, without tracing.
+        compile_seconds: Time to compile or load kernels, without tracing.
         launches: Number of kernel launches.
         spp: Samples per pixel that were taken.
         memory: Peak of the memory that Dr.Jit held, the scene included, in bytes.
@@ -102,9 +103,10 @@ def samples_for(
     """How many samples per pixel take ``budget`` seconds.
 
     Mitsuba's own integrators ignore ``timeout`` outside of the scalar variants, and integrators
-    that learn plan their pilot passes by the number of samples. So this function measures the speed
-    and computes the number. It doubles the samples until a render takes an eighth of the budget (or
-    four seconds). The last two renders give the cost of a sample and the fixed cost of a render.
+    that learn plan their pilot passes by the number of samples. Therefore, this function measures
+    the speed and computes the number. It doubles the samples until a render takes an eighth of the
+    budget (or four seconds). The last two renders give the cost of a sample and the fixed cost of a
+    render.
     """
 
     def seconds_of(spp: int) -> float:

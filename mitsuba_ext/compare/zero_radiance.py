@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Number of samples, about. The standard error of the share is then at most 0.1 %.
+#: Approximate number of samples. The standard error of the share is then at most 0.1 %.
 _SAMPLES = 1 << 18
 
 

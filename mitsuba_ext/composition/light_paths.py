@@ -58,7 +58,8 @@ class LightPathTrial(Learner):
     """Compares the variance of all techniques, times the time that they take, with that of camera
     paths alone. The time is estimated from the number of rays.
 
-    The variance of a pixel is divided by the square of its value, averaged with its neighbours.
+    The variance of a pixel is divided by the square of the mean radiance of the pixel and its
+    neighbours.
 
     Parameters:
         film: The film of the sensor.

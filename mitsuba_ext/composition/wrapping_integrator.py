@@ -26,7 +26,7 @@ class WrappingIntegrator(StagedIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         if "hide_emitters" in props:
             raise ValueError(
-                f'"{props.plugin_name()}": "hide_emitters" is for the nested integrator to know'
+                f'"{props.plugin_name()}": set "hide_emitters" in the nested integrator instead'
             )
         super().__init__(props)
         self.nested = self._nested(props)

@@ -1,2 +1,2 @@
-"""What replaces the decisions of the random walk: a folder for each slot. The contracts are in
-``transport/path_decisions.py``. Decisions do not learn: ``learning`` makes them of ``maps``."""
+"""Replacements for the decisions of the random walk, one folder for each. Their base classes are in
+``transport/path_decisions.py``. Decisions do not learn: ``learning`` makes them from ``maps``."""

@@ -1,2 +1,2 @@
-"""Depth of field as a filter of pictures: colour, depth and a lens in, a picture out
-(:func:`filters.defocus`); or layers of what hides what (:class:`filters.Capture`)."""
+"""Depth of field as a filter of pictures: of colour and depth (:func:`filters.defocus`), or of
+layers that also contain hidden surfaces (:class:`filters.Capture`)."""

@@ -1,4 +1,4 @@
-"""Layers without their noise, before a filter blurs them."""
+"""Denoises layers before a filter blurs them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from .layers import LayerSums
 def denoised(sums: LayerSums, size: Size) -> LayerSums:
     """A layer whose colours Open Image Denoise has denoised, guided by albedo and normal.
 
-    A denoiser knows little of a picture that a lens has blurred: its guides are blurred and noisy
-    too. Before the filter, they are sharp. Holes of the layer are filled in first, so that they
-    are no edges. Pixels that show a light stay as they are.
+    For a picture that a lens has blurred, a denoiser works less well, as its guides are blurred and
+    noisy too. Before the filter, the guides are sharp. Holes of the layer are filled in first, so
+    that they have no edges. Pixels that show a light are unchanged.
 
     Parameters:
-        sums: With guides.
-        size: Of the layer.
+        sums: The layer, with guides.
+        size: Size of the layer.
 
     Raises:
         InstallationError: The package ``mitsuba-oidn`` is missing.

@@ -19,22 +19,22 @@ def effective_filter(
     """The picture that a thin lens makes of a near, an in-focus and a far layer.
 
     The near layer is blurred by a separable filter of one radius, ``cap``. Its opacity α is the
-    part of the lens that it hides from what is behind. A pixel of that is the mean over its
-    effective circle of confusion, at 48 points: the circle of its own blur is smaller by the factor
-    1 - α, and its middle is moved towards the near objects.
+    part of the lens that it hides from the layers behind it. A pixel of these is the mean over its
+    effective circle of confusion, at 48 points: the circle of its own blur, smaller by the factor
+    1 - α, with its centre moved towards the near objects.
 
-    A straight edge that hides the share α of the lens' width leaves a part whose middle is α away
-    from that of the lens. So the circle is moved by α times the radius of the whole one. The source
-    moves it by α times the effective radius, which is α (1 - α) of the whole one: that agrees for
-    small α only. What is itself nearer than the focus is seen on the other side of the lens: its
-    circle is moved away from the near objects.
+    A straight edge that hides the share α of the lens' width leaves a part whose centre is α away
+    from that of the lens. The circle is therefore moved by α times the radius of the whole one. The
+    source moves it by α times the effective radius, which is α (1 - α) of the whole one: that
+    agrees for small α only. Surfaces that are nearer than the focus themselves are seen on the
+    other side of the lens: their circle is moved away from the near objects.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 5, Eqs. 5.4 and 5.5.
 
     Parameters:
-        near: The near layer, if there is one.
+        near: The near layer; ``None`` if there is none.
         rest: The other layers, the nearest first.
-        size: Of the pictures.
+        size: Size of the pictures.
         cap: Radius of the near layer's blur, in pixels.
     """
     lens = LensPoints(ring_points())
@@ -47,7 +47,7 @@ def effective_filter(
         color, through = rgb(field.color), 1 - hidden
     for layer in rest:
         radius = dr.gather(mi.Float, layer.blur, index)
-        # A place on the lens: what is behind the focus is seen on the other side. Eq. 5.5 (Guo)
+        # The shift changes sign with the radius: behind the focus, it is mirrored. Eq. 5.5 (Guo)
         middle = mi.Point2f(position) + 0.5 - radius * hidden * direction
         radius = dr.abs(radius) * (1 - hidden)  # Eq. 5.4
         view = lens.view(Pyramid(layer.color, size), radius)
@@ -62,7 +62,7 @@ def effective_limits(blurs: np.ndarray) -> tuple[Limits, float]:
     the near one: the median of its surfaces.
 
     Parameters:
-        blurs: Signed radii in pixels of what is seen; any sample of the pixels.
+        blurs: Signed radii in pixels of the visible surfaces; any sample of the pixels.
     """
     near = blurs[blurs > IN_FOCUS]
     if near.size == 0:

@@ -1,4 +1,4 @@
-"""The filters of this folder by name, and what each needs."""
+"""The filters of this folder by name, with one interface."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .thin_lens import ThinLens
 
 @dataclass
 class Capture:
-    """What was seen from the middle of the lens.
+    """The picture seen from the middle of the lens, in layers.
 
     Attributes:
-        size: Of the picture.
-        sums: Of each layer.
-        blur: Signed radius of the circle of confusion in pixels, of what is seen first.
+        size: Size of the picture.
+        sums: The sums of each layer.
+        blur: Signed radius of the circle of confusion of the first surface, in pixels.
     """
 
     size: Size
@@ -34,19 +34,19 @@ class Capture:
 
 
 class Filter(Protocol):
-    """Makes the picture of a lens from one of its middle.
+    """Makes the picture of a lens from the one seen from its middle.
 
     Attributes:
-        has_layers: Does it look behind what is seen first?
+        has_layers: Does it use surfaces behind the first one?
     """
 
     has_layers: bool
 
     def limits(self, blurs: np.ndarray) -> Limits:
-        """The layers for surfaces of such blurs."""
+        """The limits of the layers, for surfaces with these blurs."""
 
     def picture(self, capture: Capture) -> mi.Color3f:
-        """Called after :meth:`limits`."""
+        """The picture. Called after :meth:`limits`."""
 
 
 class _Lens:
@@ -96,7 +96,7 @@ _MAKERS: dict[str, Callable[[], Filter]] = {
     "one_pass": lambda: _OfPicture(one_pass_filter),
 }
 
-#: What a filter can be called.
+#: The names of the filters.
 FILTERS = tuple(_MAKERS)
 
 
@@ -108,14 +108,14 @@ def make_filter(name: str) -> Filter:
 def defocus(
     color: mi.TensorXf, depth: mi.TensorXf, lens: ThinLens, filter: str = "lens"
 ) -> mi.TensorXf:
-    """The picture that a lens makes of what its middle sees.
+    """The picture that a lens makes, from the one seen from its middle.
 
-    What the picture does not show, behind near objects, is filled in from what is around it.
+    Surfaces hidden behind near objects are filled in from the visible ones around them.
 
     Parameters:
         color: RGB of any range, [y, x, 3].
-        depth: Along the axis of the lens, positive, [y, x]; infinite for the sky.
-        lens: Its ``film_width`` is that of the picture, or wider where the picture is a crop.
+        depth: Depth along the axis of the lens, positive, [y, x]; infinite for the sky.
+        lens: The lens. Its ``film_width`` is that of the picture, or larger if that is a crop.
         filter: One of ``FILTERS``.
 
     Raises:

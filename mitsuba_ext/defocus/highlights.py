@@ -1,5 +1,5 @@
-"""Small bright things out of focus: what is spread over its circle of confusion, instead of being
-looked for at points of the lens."""
+"""Highlights: small bright spots out of focus. Each is spread over its circle of confusion, as the
+gathering at points of the lens would miss it from most pixels."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from ..arrays import from_numpy
 from .images import Pyramid, Size, rgb
 from .layers import Layer
 
-#: A highlight is so many times as bright as the square around it that its circle fills, whatever
-#: layers that shows: more than the bright half of a pattern.
+#: A highlight is at least this many times as bright as the mean over the square that its circle of
+#: confusion would fill, in the sum of all layers. The bright half of a pattern has less.
 _BRIGHTER = 3.0
 
-#: Circles of a smaller radius, in pixels, are found by the points of the lens.
+#: Highlights with circles of a smaller radius, in pixels, are left to the points of the lens.
 _LEAST_RADIUS = 2.0
 
-#: All highlights together cover so many pixels, at most, for each pixel of the picture.
+#: The most pixels that all highlights together cover, per pixel of the picture.
 _MOST_COVERED = 8
 
-#: How much light gets through: called with the indices of pixels, their middles, and points of the
-#: lens.
+#: Returns the transmittance of layers; called with the indices of pixels, their centres, and points
+#: of the lens.
 Visibility = Callable[..., "mi.Float"]
 
 
 @dataclass
 class Highlights:
-    """Pixels of a layer that are spread, and by what these are brighter than what is around.
+    """The pixels of a layer that are spread.
 
     Attributes:
         pixel: Their indices.
-        blur: Signed radii in pixels, not 0.
-        excess: RGB.
+        blur: Signed radii of their circles of confusion in pixels, not 0.
+        excess: RGB by which they are brighter than their surroundings.
     """
 
     pixel: mi.UInt32
@@ -48,21 +48,23 @@ class Highlights:
 def without_highlights(
     layer: Layer, around: Pyramid, size: Size
 ) -> tuple[mi.Float, Highlights | None]:
-    """The colours of a layer without what is brighter than its surroundings, and that: ``None`` if
-    there is nothing. 48 points of the lens would meet a bright pixel from one pixel and miss it
-    from the next.
+    """Divides a layer into its colours without highlights, and the highlights (``None`` if there
+    are none). With gathering alone, the 48 lens points of one pixel would hit a bright pixel, and
+    those of the next one would miss it.
 
     Parameters:
-        around: The sum of all layers.
+        layer: The layer.
+        around: The pyramid of the sum of all layers.
+        size: Size of the picture.
     """
     glow = layer.glow if layer.glow is not None else layer.blur
     found = dr.compress(_Pixels(layer, glow, around, size, size.pixels()[0]).is_bright())
     if len(found) == 0:
         return layer.color, None
     pixels = _Pixels(layer, glow, around, size, found)
-    # The darkest square around has nothing of it
+    # The darkest of the squares around a highlight shows the brightness without it
     excess = rgb(pixels.color) * (1 - pixels.darkest() / pixels.bright)
-    # What the layer before shows is not shown twice
+    # Highlights that the layer before contains too are removed here, but not spread twice
     is_shared = pixels.blur > dr.opaque(mi.Float, layer.shared)
     radius, blur = dr.select(is_shared, 0, pixels.radius), pixels.blur
     dr.eval(excess, radius, blur)
@@ -70,7 +72,7 @@ def without_highlights(
     is_gone = dr.select(is_shared, mi.Float(1), 0)
     if len(spread_ones) > 0:
         dr.scatter(is_gone, mi.Float(1), spread_ones)
-    # A new array: the pyramid has the other one
+    # A copy, as the pyramid uses the original array
     rest = dr.copy(layer.color)
     for k, channel in enumerate(excess):
         dr.scatter_add(rest, -channel * is_gone, 4 * found + k)
@@ -84,7 +86,7 @@ def without_highlights(
 
 
 class _Pixels:
-    """Pixels of a layer, and how bright it is around them."""
+    """Pixels of a layer, and the brightness of their surroundings."""
 
     def __init__(
         self, layer: Layer, glow: mi.Float, around: Pyramid, size: Size, index: mi.UInt32
@@ -98,12 +100,12 @@ class _Pixels:
         self._middle = mi.Point2f(size.position(index)) + 0.5
 
     def is_bright(self) -> mi.Bool:
-        """Brighter than the square around it?"""
+        """Is the pixel a highlight: much brighter than the square around it?"""
         limit = dr.maximum(_BRIGHTER * self._square(0, 0), 0)
         return (self.radius > _LEAST_RADIUS) & (self.bright > limit)
 
     def darkest(self) -> mi.Float:
-        """The brightness of the darkest of nine squares."""
+        """The brightness of the darkest of the nine squares at and around the pixel."""
         darkest = self._square(0, 0)
         for y in (-1, 0, 1):
             for x in (-1, 0, 1):
@@ -113,17 +115,19 @@ class _Pixels:
 
     def _square(self, x: int, y: int) -> mi.Float:
         color = self._view.at(self._middle + self._step * mi.Vector2f(x, y))
-        # What covers a part of a pixel only is not brighter than something else that does
+        # Colours are multiplied by coverage: scale that of the square to the coverage of the pixel
         return self.color.w * _brightness(color) / dr.maximum(color.w, 1e-6)
 
 
 def spread(picture: mi.Float, highlights: Highlights, size: Size, visibility: Visibility) -> None:
-    """Adds highlights to a picture: each to the disk of its blur, where the layers before it let it
-    through.
+    """Adds highlights to a picture: each to the pixels of its circle of confusion, attenuated by
+    the layers in front of it.
 
     Parameters:
         picture: RGB of each pixel, row by row.
-        visibility: How much of what is seen from these pixels through these points of the lens.
+        highlights: The highlights of a layer.
+        size: Size of the picture.
+        visibility: The transmittance of the layers in front.
     """
     position = size.position(highlights.pixel)
     _spread(picture, position, highlights.blur, highlights.excess, size, visibility)
@@ -131,8 +135,8 @@ def spread(picture: mi.Float, highlights: Highlights, size: Size, visibility: Vi
 
 
 def _affordable(excess: mi.Color3f, radius: mi.Float, size: Size) -> mi.UInt32:
-    """The numbers of the highlights that may be spread: those that are brightest for the pixels
-    that they cover, of those of a radius."""
+    """The indices of the highlights to spread, out of those with a radius above 0: if all of them
+    cover too many pixels, those with the largest brightness per covered pixel."""
     covered = math.pi * np.square(radius.numpy())
     order = np.flatnonzero(covered)
     if covered.sum() > _MOST_COVERED * size.count:
@@ -151,7 +155,7 @@ def _spread(picture, position, blur, excess, size, visibility):
     radius = dr.abs(blur)
     reach = mi.Int32(dr.ceil(radius + 0.5))
     side = 2 * reach + 1
-    # By what a disk of pixels differs from one of the plane: all of the light arrives
+    # Normalize by the sum over pixels, which differs from the area of the disk: no light is lost
     i, total = mi.Int32(0), mi.Float(0)
     while i < side * side:
         total += _coverage(mi.Vector2i(i % side, i // side) - reach, radius)
@@ -163,7 +167,7 @@ def _spread(picture, position, blur, excess, size, visibility):
         at = position + offset
         active = (weight > 0) & size.contains(at)
         index = size.index(at)
-        # From there, the highlight is seen through this point
+        # The point of the lens through which the pixel `at` sees the highlight
         point = -mi.Point2f(offset) / blur
         light = excess * (weight / total * visibility(index, mi.Point2f(at) + 0.5, point))
         for c in range(3):

@@ -1,4 +1,4 @@
-"""Images as flat arrays of packets of four numbers, and their pyramids."""
+"""Images as flat arrays, with four numbers for each pixel, and their pyramids."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Size:
         return index, self.position(index)
 
     def position(self, index: mi.UInt32) -> mi.Vector2i:
-        """The position of the pixel of an index."""
+        """The position of the pixel with an index."""
         y = index // self._width
         return mi.Vector2i(mi.Int32(index - y * self._width), mi.Int32(y))
 
@@ -53,7 +53,7 @@ class Pyramid:
     Parameters:
         data: The image: 4 numbers for each pixel, row by row.
         size: Its size.
-        most_levels: Copies, at most, the image included.
+        most_levels: The most levels, the image included.
     """
 
     def __init__(self, data: mi.Float, size: Size, most_levels: int = 12) -> None:
@@ -65,7 +65,7 @@ class Pyramid:
         for level in sizes:
             starts.append(starts[-1] + level.count)
         self.level_count = len(sizes)
-        # Each copy is an array of its own first: an array that is read is copied to be written
+        # Levels are separate arrays first: Dr.Jit would copy one array that is read and written
         copies = [data]
         for level in sizes[:-1]:
             copies.append(dr.ravel(halved(mi.Vector4f, copies[-1], level)))
@@ -84,7 +84,7 @@ class Pyramid:
         return result
 
     def view(self, level: mi.UInt32) -> LevelView:
-        """The copy number ``level`` in each lane."""
+        """A view of a level, which can differ from lane to lane."""
         return LevelView(
             self._data, dr.gather(mi.UInt32, self._starts, level),
             dr.gather(mi.Int32, self._widths, level), dr.gather(mi.Int32, self._heights, level),
@@ -103,7 +103,7 @@ class LevelView:
     scale: mi.Float
 
     def at(self, place: mi.Point2f) -> mi.Vector4f:
-        """The pixel that holds a place, given in pixels of the image from its corner; beyond the
+        """The pixel at a place, given in pixels of the whole image from its corner; beyond the
         border, the nearest pixel."""
         column = dr.clip(mi.Int32(dr.floor(place.x * self.scale)), 0, self.width - 1)
         row = dr.clip(mi.Int32(dr.floor(place.y * self.scale)), 0, self.height - 1)
@@ -120,10 +120,10 @@ def halved(kind: type[T], flat: mi.Float, size: Size, start: mi.UInt32 | int = 0
 
 
 def bilinear(kind: type[T], flat: mi.Float, size: Size, place: mi.Point2f) -> T:
-    """An image between the middles of its pixels.
+    """Interpolates an image between the centres of its pixels.
 
     Parameters:
-        place: In pixels from the corner of the image.
+        place: The position, in pixels from the corner of the image.
     """
     corner = mi.Vector2i(dr.floor(place - 0.5))
     right = place - 0.5 - mi.Point2f(corner)
@@ -136,17 +136,17 @@ def bilinear(kind: type[T], flat: mi.Float, size: Size, place: mi.Point2f) -> T:
 
 
 def filled(kind: type, values: mi.Float, weight: mi.Float, size: Size) -> mi.Float:
-    """Fills the holes of an image: where ``weight`` is below 1, means of what is around take the
-    rest (Gortler et al., *The Lumigraph*, SIGGRAPH 1996: pull and push).
+    """Fills the holes of an image: where ``weight`` is below 1, means of the pixels around are
+    added with the missing weight (Gortler et al., *The Lumigraph*, SIGGRAPH 1996: pull and push).
 
     Parameters:
-        kind: ``mi.Float`` or ``mi.Vector4f``: what each pixel has.
+        kind: The type of a pixel: ``mi.Float`` or ``mi.Vector4f``.
         values: The numbers of each pixel, row by row, already multiplied by its ``weight``.
         weight: How much is known of each pixel, in [0, 1].
-        size: Of the image.
+        size: Size of the image.
 
     Returns:
-        The values; 0 where nothing is known anywhere.
+        The values; 0 if no pixel is known.
     """
     dr.eval(values, weight)
     levels = [(values, weight, size)]
@@ -155,10 +155,10 @@ def filled(kind: type, values: mi.Float, weight: mi.Float, size: Size) -> mi.Flo
         _index, position = size.half().pixels()
         total, known = kind(0), mi.Float(0)
         for at in _four(size, 2 * position):
-            # A pixel beyond the border is the one at the border again
+            # Beyond the border, the pixel at the border is used again
             total += dr.gather(kind, flat, at)
             known += dr.gather(mi.Float, weight, at)
-        # Where more than one of the four is known, these count as one
+        # The weight of the four together is at most 1
         scale = dr.rcp(dr.maximum(known, 1))
         total, known = dr.ravel(total * scale), known * scale
         dr.eval(total, known)

@@ -1,5 +1,5 @@
-"""Layers of a picture, by how much a lens blurs them: what is near hides what is behind it from a
-part of the lens only."""
+"""Divides a picture into layers by how much a lens blurs them. Layers are needed because near
+objects hide those behind them from a part of the lens only."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import numpy as np
 
 from .images import Size, filled
 
-#: What is blurred by less, in pixels, is in focus.
+#: Surfaces that are blurred by less than this, in pixels, are in focus.
 IN_FOCUS = 1.0
 
-#: Two layers share what is blurred by up to this much more than the limit between them, relative
-#: to the limit and at least in pixels: a surface that crosses the limit has no gap.
+#: Two layers overlap, so that a surface that crosses the limit between them has no gap: both have
+#: surfaces blurred by up to this much more than the limit (relative to it, and at least in pixels).
 _OVERLAP, _LEAST_OVERLAP = 0.25, 1.0
 
-#: Objects that are all nearer than the focus distance, or all farther, get two layers if the more
-#: blurred part is blurred by this factor more than the other.
+#: Surfaces on one side of the focus are divided into two layers if the blur of the more blurred
+#: part is at least this many times that of the other.
 _SPLIT_RATIO = 1.5
 
 
@@ -34,9 +34,9 @@ class Layer:
             pixel's area that the layer fills).
         blur: Signed radius of the circle of confusion in pixels (:meth:`ThinLens.blur`). Beyond the
             layer's edges, that of the nearest pixels.
-        glow: That of the light of a pixel: its samples weighted by their brightness. ``None`` if
-            that is not known.
-        shared: What is blurred by more is in the layer before as well.
+        glow: The same radius as a mean of samples weighted by their brightness. ``None`` if not
+            known.
+        shared: Surfaces with a larger blur are in the layer before as well.
     """
 
     color: mi.Float
@@ -47,10 +47,10 @@ class Layer:
 
 @dataclass
 class Limits:
-    """Between which blurs the layers are.
+    """The limits between layers.
 
     Attributes:
-        blurs: Signed radii in pixels, the largest first; one less than layers.
+        blurs: Signed radii in pixels, the largest first; one fewer than layers.
     """
 
     blurs: list[float]
@@ -60,7 +60,7 @@ class Limits:
         return len(self.blurs) + 1
 
     def contains(self, layer: int, blur: mi.Float) -> mi.Bool:
-        """Does the layer of this number hold a surface of this blur? Layers overlap."""
+        """Does the layer with this index contain a surface of this blur? Layers overlap."""
         inside = mi.Bool(True)
         if layer > 0:
             limit = self.blurs[layer - 1]
@@ -70,12 +70,12 @@ class Limits:
         return inside
 
     def shared(self, layer: int) -> float:
-        """The layer before the one of this number has what is blurred by more as well."""
+        """See :attr:`Layer.shared`, for the layer with this index."""
         return self.blurs[layer - 1] if layer > 0 else math.inf
 
     def is_before(self, layer: int, blur: mi.Float) -> mi.Bool:
-        """Is the layer before a surface of this blur, or does it hold it? Then a ray that got there
-        tells whether something of the layer is in its way."""
+        """Is the layer in front of a surface of this blur, or does it contain it? If so, a ray that
+        reaches the surface shows whether the layer covers it."""
         inside = mi.Bool(True)
         if layer > 0:
             limit = self.blurs[layer - 1]
@@ -84,10 +84,10 @@ class Limits:
 
 
 def limits_of(blurs: np.ndarray) -> Limits:
-    """Limits for up to five layers: two before the focus, what is in focus, two behind.
+    """Limits for up to five layers: two in front of the focus, one in focus, two behind.
 
     Parameters:
-        blurs: Signed radii of what is seen; any sample of the pixels.
+        blurs: Signed radii of the visible surfaces; any sample of the pixels.
     """
     limits = []
     near, far = blurs[blurs > IN_FOCUS], blurs[blurs < -IN_FOCUS]
@@ -99,9 +99,9 @@ def limits_of(blurs: np.ndarray) -> Limits:
 
 
 def split(blurs: np.ndarray) -> list[float]:
-    """The limit between two classes of positive blurs that leaves least variance within these
-    (Otsu, *A Threshold Selection Method from Gray-Level Histograms*, 1979); none where the classes
-    are alike."""
+    """The limit that divides positive blurs into two classes with the least variance within them
+    (Otsu, *A Threshold Selection Method from Gray-Level Histograms*, 1979); none if the classes
+    are similar."""
     if blurs.max() < _SPLIT_RATIO * blurs.min():
         return []
     counts, edges = np.histogram(blurs.astype(np.float64), 256)
@@ -115,7 +115,7 @@ def split(blurs: np.ndarray) -> list[float]:
     best = int(between.argmax())
     if between[best] <= 0 or mean_above[best] < _SPLIT_RATIO * mean_below[best]:
         return []
-    # In the middle of a gap: all limits in it are as good
+    # Take the middle of a gap in the histogram, as all limits within the gap are equally good
     last = best
     while counts[last + 1] == 0:
         last += 1
@@ -124,18 +124,19 @@ def split(blurs: np.ndarray) -> list[float]:
 
 @dataclass
 class LayerSums:
-    """What the samples of each pixel add up to, for one layer.
+    """Sums over the samples of each pixel, for one layer.
 
     Attributes:
-        color: RGB of the samples that met the layer.
+        color: RGB of the samples that hit the layer.
         blur: Their blurs.
         hits: Their number.
-        known: The number of samples that tell whether the layer is there: those that met something
+        known: The number of samples that show whether the layer is there: those that hit something
             in it or behind it.
-        guides: What guides a denoiser: sums of RGB of the albedo, and of the shading normal; and
-            how many of the hits were lights. Empty if there is no denoiser.
-        glow: The blurs times the brightness of the samples, and this brightness, if anybody asked.
-        shared: What is blurred by more is in the layer before as well.
+        guides: For a denoiser: sums of RGB of the albedo, and of the shading normal; and how many
+            of the hits were lights. Empty if there is no denoiser.
+        glow: The blurs times the brightness of the samples, and this brightness; ``None`` if they
+            are not needed.
+        shared: Surfaces with a larger blur are in the layer before as well.
     """
 
     color: mi.Color3f
@@ -148,13 +149,13 @@ class LayerSums:
 
     @property
     def is_there(self) -> bool:
-        """Did any sample meet the layer?"""
+        """Did any sample hit the layer?"""
         return bool((self.hits > 0).numpy().any())
 
 
 def layers_from_sums(sums: Sequence[LayerSums], size: Size) -> list[Layer]:
-    """Layers, the nearest first; those that nothing is in are left out. The last one covers all
-    pixels: what nobody has seen gets colours from around."""
+    """Layers, the nearest first; empty ones are left out. The last one covers all pixels: where no
+    sample has hit it, it is filled with the colours around."""
     present = [layer.is_there for layer in sums]
     last = max((i for i, is_there in enumerate(present) if is_there), default=0)
     return [
@@ -165,15 +166,15 @@ def layers_from_sums(sums: Sequence[LayerSums], size: Size) -> list[Layer]:
 
 
 def _layer(sums: LayerSums, size: Size, is_last: bool) -> Layer:
-    # Filters with negative lobes can leave a pixel with less than no samples
+    # With film filters that have negative lobes, the sums of a pixel can be negative
     is_known = (sums.known > 1e-6) & (sums.hits > 1e-6 * sums.known)
     scale = dr.select(is_known, dr.rcp(dr.select(is_known, sums.known, 1)), 0)
     coverage = dr.minimum(sums.hits * scale, 1)
-    # Where it overshoots, the colour keeps its brightness
+    # The mean colour of the hits, times the clipped coverage
     scale = dr.select(is_known, coverage / dr.select(is_known, sums.hits, 1), 0)
     color = sums.color * scale
     values = dr.ravel(mi.Vector4f(color.x, color.y, color.z, coverage))
-    # Nothing hides the last layer from itself
+    # The last layer is filled up to full coverage, as nothing is behind it
     weight = coverage if is_last else dr.select(sums.known > 1e-6, mi.Float(1), 0)
     blurs = sums.blur * scale
     dr.eval(values, weight, blurs, coverage)
@@ -190,8 +191,9 @@ def sums_of_picture(color: mi.Color3f, blur: mi.Float, limits: Limits) -> list[L
     """The sums of a picture of which only the first surface is known.
 
     Parameters:
-        color: Of each pixel, row by row.
-        blur: Its signed radius of the circle of confusion.
+        color: The colour of each pixel, row by row.
+        blur: The signed radius of its circle of confusion.
+        limits: The limits of the layers.
     """
     sums = []
     for k in range(limits.layer_count):

@@ -1,4 +1,5 @@
-"""The picture that a lens makes of layers: for each point of the lens, what hides what."""
+"""The picture that a lens makes of layers, with the visibility computed for each point of the lens.
+"""
 
 from __future__ import annotations
 
@@ -16,41 +17,43 @@ from .images import LevelView, Pyramid, Size, rgb
 from .layers import Layer
 from .lens_points import RINGS, LensPoints, ring_points
 
-#: Neighbouring pixels turn the points by different angles, of which these are the ranks in a square
-#: of 4 × 4 pixels (Bayer's matrix): what the 48 points leave out differs from pixel to pixel.
+#: Neighbouring pixels rotate the points by different angles, so that the errors of the 48 points
+#: differ from pixel to pixel. These are the ranks of the angles in a square of 4 × 4 pixels (Bayer
+#: matrix).
 _TURNS = (0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5)
 
-#: Up to these radii of all that a pixel sees, in pixels, so few points of the lens are enough: the
-#: rings of the last ones are those of the others. A circle that does not leave the pixel needs one.
+#: Pairs of a radius and points per ring: if no layer that a pixel sees is blurred by more than the
+#: radius, in pixels, these few points are enough; above the last radius, it is all of ``RINGS``. A
+#: circle that does not leave the pixel needs one point.
 _FEW_POINTS = ((0.5, (1,)), (2.0, (4, 8)))
 
-#: How often highlights are looked for.
+#: Most passes that search for highlights.
 _ROUNDS = 2
 
-#: A layer in which blurs differ by no more, in pixels, has one everywhere.
+#: If the blurs of a layer differ by no more than this, in pixels, they count as equal.
 _FLAT = 0.5
 
-#: A layer of this coverage shows nothing of what is behind it.
+#: From this coverage on, a layer hides what is behind it.
 _OPAQUE = 0.9999
 
-#: So many pixels around the circle of its own blur a pixel may see besides.
+#: How many pixels beyond the circle of its own blur a pixel may see.
 _MARGIN = 2.0
 
 
 def lens_filter(layers: list[Layer], size: Size) -> mi.Color3f:
     """The picture that a thin lens makes of layers.
 
-    From each of 48 points of the lens, each layer is seen at another place. A layer covers what is
-    behind it for this point only. So what is near hides a part of the lens from what is far, which
-    becomes sharper, and shifted. This is a mask of the visible part of the lens for each pixel,
-    where the source has a radius and a shift.
+    Each of 48 points of the lens sees each layer shifted. A layer covers those behind it for this
+    point only. Near objects therefore hide a part of the lens from far ones, which become sharper,
+    and shifted. Each pixel has a mask of the visible part of the lens, where the thesis of Guo
+    (``effective.py``) approximates it by a radius and a shift.
 
-    The place is found in two steps: that for the blur at the pixel, and then that for the blur of
-    the layer there.
+    The shifted position is found in two steps: first with the blur at the pixel, then with the
+    layer's blur at the position of the first step.
 
     Parameters:
-        layers: The nearest first.
-        size: Of the pictures.
+        layers: The layers, the nearest first.
+        size: Size of the pictures.
     """
     return _LensFilter(layers, size).picture()
 
@@ -67,7 +70,8 @@ class _LensFilter:
         self._is_flat = [_range(layer.blur) <= _FLAT for layer in layers]
 
     def _take_highlights(self) -> None:
-        """Takes them out of the layers. Without the brightest of them, their edges stand out."""
+        """Moves highlights from the layers to ``_highlights``. Once the brightest ones are gone,
+        their edges stand out, and are found in a second pass."""
         layers = self._layers
         for _ in range(_ROUNDS):
             around, before = reduce(Pyramid.plus, self._pyramids), len(self._highlights)
@@ -82,7 +86,8 @@ class _LensFilter:
                 return
 
     def picture(self) -> mi.Color3f:
-        """Computes the pixels that see the same layers through as many points together."""
+        """Computes the picture, together for all pixels that see the same layers through the same
+        number of points."""
         index, position = self._size.pixels()
         place = mi.Point2f(position) + 0.5
         group = self._group(place)
@@ -106,7 +111,7 @@ class _LensFilter:
         return dr.gather(mi.Color3f, picture, index)
 
     def _before(self, count: int) -> Visibility:
-        """How much the first layers let through."""
+        """A function that returns the transmittance of the first ``count`` layers."""
 
         def visibility(pixel: mi.UInt32, place: mi.Point2f, point: mi.Point2f) -> mi.Float:
             seen = [self._view(k, pixel) for k in range(count)]
@@ -115,11 +120,11 @@ class _LensFilter:
         return visibility
 
     def _group(self, place: mi.Point2f) -> mi.UInt32:
-        """Which layers each pixel may see, one bit for each; and above these, the number of the
-        points that are enough. The last layer is everywhere, but behind others that are opaque."""
+        """For each pixel, one bit for each layer that it may see, and above these bits an index
+        into ``_few``. The last layer can be seen everywhere except behind opaque ones."""
         bits, largest, is_open = mi.UInt32(0), mi.Float(0), mi.Bool(True)
         for k, (layer, pyramid) in enumerate(zip(self._layers, self._pyramids)):
-            # Four pixels of a copy that is so coarse that they cover the circle
+            # Four pixels of a level that is coarse enough that they cover the circle
             reach = dr.abs(layer.blur) + _MARGIN
             level = mi.UInt32(dr.ceil(dr.log2(2 * reach)))
             view = pyramid.view(dr.minimum(level, pyramid.level_count - 1))
@@ -144,8 +149,8 @@ class _LensFilter:
 
 @dataclass
 class _LayerView:
-    """A layer as a pixel sees it: the pixel's own blur, the blurs of all (``None`` if these are the
-    same), the colours."""
+    """A layer as a pixel sees it: the layer's blur at the pixel, its blurs at all pixels (``None``
+    if these are equal), and its colours."""
 
     blur: mi.Float
     blurs: mi.Float | None
@@ -153,16 +158,16 @@ class _LayerView:
 
 
 class _Points:
-    """Points of the lens, which pixels turn by different angles."""
+    """Points of the lens, which pixels rotate by different angles."""
 
     def __init__(self, rings: tuple[int, ...]) -> None:
         points = ring_points(rings) if sum(rings) > 1 else np.zeros((1, 2))
         self.table = LensPoints(points)
-        # The rings repeat themselves after this angle
+        # The rings are symmetric under rotations by 2π / gcd
         self._step = dr.opaque(mi.Float, 2 * math.pi / math.gcd(*rings) / len(_TURNS))
 
     def turn(self, position: mi.Vector2i) -> mi.Vector2f:
-        """Sine and cosine of the angle by which a pixel turns the points."""
+        """Sine and cosine of the angle by which a pixel rotates the points."""
         ranks = from_numpy(mi.UInt32, _TURNS)
         rank = dr.gather(mi.UInt32, ranks, mi.UInt32((position.y & 3) * 4 + (position.x & 3)))
         return mi.Vector2f(*dr.sincos(mi.Float(rank) * self._step))

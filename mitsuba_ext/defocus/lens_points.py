@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import from_numpy
 from .images import LevelView, Pyramid
 
-#: Points of the rings, the innermost first. Every point stands for the same area.
+#: Number of points of each ring, the innermost first. Every point stands for the same area.
 RINGS = (8, 16, 24)
 
 
@@ -26,7 +26,7 @@ def ring_points(rings: tuple[int, ...] = RINGS) -> np.ndarray:
     points = []
     for i, count in enumerate(rings):
         radius = np.sqrt((ends[i] + ends[i + 1]) / 2)
-        # Points of neighbouring rings do not stand in line
+        # Rotate every second ring, so that points of neighbouring rings are not aligned
         angle = 2 * np.pi * (np.arange(count) + 0.5 * (i % 2)) / count
         points.append(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     return np.concatenate(points)
@@ -49,8 +49,8 @@ class LensPoints:
         return dr.gather(mi.Point2f, self._table, i)
 
     def view(self, pyramid: Pyramid, radius: mi.Float) -> LevelView:
-        """The copy of an image of which the pixels are half as large as the distance between the
-        points on a disk of this radius: little is left out between them."""
+        """The level of a pyramid whose pixels are half as large as the distance between the points
+        on a disk of this radius, so that little is missed between them."""
         level = dr.round(dr.log2(dr.maximum(self._step * dr.abs(radius), 1)))
         return pyramid.view(mi.UInt32(dr.minimum(level, pyramid.level_count - 1)))
 
@@ -60,8 +60,8 @@ def disk_mean(points: LensPoints, view: LevelView, middle: mi.Point2f, radius: m
     """The mean of an image over a disk around each pixel.
 
     Parameters:
-        view: The copy of the image to look into.
-        middle, radius: In pixels, from the corner of the image.
+        view: The level of the image's pyramid to read.
+        middle, radius: Centre (from the corner of the image) and radius, in pixels.
     """
     i, total = mi.UInt32(0), mi.Vector4f(0)
     while i < points.count:

@@ -1,5 +1,5 @@
-"""The blurred near layer: a separable filter of colour, coverage, depth, and of where its objects
-are."""
+"""Blurs the near layer: a separable filter of its colour, coverage and blur, and of the direction
+towards its objects."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import mitsuba as mi
 from .images import Size, bilinear, halved
 from .layers import Layer
 
-#: The window has at most so many pixels to each side: larger ones are those of smaller copies.
+#: The most pixels of the window to each side. Larger windows are applied to a copy of the picture
+#: at lower resolution.
 _MOST_TAPS = 12
 
 
@@ -22,7 +23,8 @@ class NearField:
     Attributes:
         color: RGB times opacity, and opacity.
         blur: The largest radius in the window: that of the nearest object, in pixels.
-        direction: Towards the objects in the window: of length 1, or 0 where there are none.
+        direction: The direction towards the objects in the window: of length 1, or 0 if there are
+            none.
     """
 
     color: mi.Vector4f
@@ -31,8 +33,8 @@ class NearField:
 
 
 def near_field(layer: Layer, size: Size, radius: float) -> NearField:
-    """Filters a layer by a Gaussian whose standard deviation is a third of ``radius``, which is
-    that of the window, in pixels.
+    """Filters a layer by a Gaussian. ``radius`` is that of the window, in pixels; the standard
+    deviation is a third of it.
 
     Source: J. J. Guo, PhD thesis, TU Delft, section 5.4.1.1, Listing 1 and Eq. 5.5. Wide windows
     are filtered in a copy of lower resolution.
@@ -60,7 +62,7 @@ def near_field(layer: Layer, size: Size, radius: float) -> NearField:
     place = (mi.Point2f(position) + 0.5) / scale
     color, found = (bilinear(mi.Vector4f, flat, size, place) for flat in (color, around))
     length = dr.sqrt(found.x**2 + found.y**2)
-    # Equal on all sides: no direction, but for rounding
+    # If the coverage is equal on all sides, only rounding errors are left of the direction
     is_clear = length > 1e-3 * dr.maximum(found.z, 1e-3)
     direction = mi.Vector2f(found.x, found.y) / dr.select(is_clear, length, 1)
     return NearField(color, found.w, dr.select(is_clear, direction, 0))
@@ -71,9 +73,9 @@ def _pass(axis, position, size, color, around, taps, factor):
     """The filter along an axis.
 
     Parameters:
-        color: RGB times coverage, and coverage: a Gaussian mean.
-        around: The sum of the offsets of what is covered, in x and y; of the coverage; and the
-            largest blur. Every pixel of the window counts as much.
+        color: RGB times coverage, and coverage. Their result is a Gaussian mean.
+        around: The sums of the offsets of covered pixels in x and y, and of the coverage; and the
+            largest blur. All pixels of the window have the same weight.
     """
     i = -taps
     mean, weights = mi.Vector4f(0), mi.Float(0)

@@ -1,5 +1,5 @@
-"""Filters of a single picture, to compare with: they know nothing of what is hidden, and blur what
-is far by its whole circle of confusion."""
+"""Filters of a single picture, for comparisons. They have no data on hidden surfaces, and blur far
+surfaces by their whole circle of confusion."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ _SPIRAL = 96
 
 
 def gather_filter(color: mi.Color3f, blur: mi.Float, size: Size) -> mi.Color3f:
-    """Blurs a picture: near objects over what is far, each gathered at 48 points.
+    """Blurs a picture: near surfaces over far ones, both gathered at 48 points.
 
-    What is nearer than the focus is found in a circle of the largest blur around, and counts where
-    its own blur reaches the pixel. What is farther is gathered in the circle of the pixel's own
-    blur; what is sharper counts only where its blur reaches the pixel. Behind a near pixel, what is
-    far and around it takes its place.
+    Surfaces nearer than the focus are gathered in a circle with the radius of the largest blur
+    around; each counts if its own blur reaches the pixel. Farther ones are gathered in the circle
+    of the pixel's own blur; sharper ones count only if their blur reaches the pixel. Behind a near
+    pixel, the far surfaces around it are used.
 
     Source: J. J. Guo, PhD thesis, TU Delft, Table 5.1 (*gather*), which leaves the details open;
     these are those of J. Jimenez, *Next Generation Post Processing in Call of Duty*, SIGGRAPH
     course, 2014.
 
     Parameters:
-        color, blur: Of each pixel, row by row; blurs are signed radii in pixels.
+        color, blur: Colour and blur of each pixel, row by row; blurs are signed radii in pixels.
+        size: Size of the picture.
     """
     lens = LensPoints(ring_points())
     index, position = size.pixels()
@@ -36,7 +37,7 @@ def gather_filter(color: mi.Color3f, blur: mi.Float, size: Size) -> mi.Color3f:
     widest = _largest_around(dr.maximum(blur, 0), size)
     own = dr.gather(mi.Float, blur, index)
     near, opacity = _near(lens, picture.view(mi.UInt32(0)), place, widest)
-    # Copies of lower resolution would mix the blurs of what is near and what is far
+    # Copies of lower resolution would mix the blurs of near and far surfaces
     far = _far(lens, picture.view(mi.UInt32(0)), place, own)
     return near * opacity + far * (1 - opacity)
 
@@ -48,7 +49,7 @@ def _near(lens, view, place, widest):
         point = lens.at(i)
         found = view.at(place + widest * point)
         reaches = (found.w >= widest * dr.norm(point)) & (found.w > 0.5)
-        # A pixel of blur r is one of r² π that cover this one
+        # The weight is proportional to 1 / r², as a pixel of blur r is spread over r² π pixels
         weight = dr.select(reaches, dr.square(widest / dr.maximum(found.w, 0.5)), 0)
         total += weight * rgb(found)
         weights += weight
@@ -69,21 +70,22 @@ def _far(lens, view, place, own):
         total += weight * rgb(found)
         weights += weight
         i += 1
-    # Where nothing reaches the pixel, it is what it was
+    # Where nothing reaches the pixel, its colour is unchanged
     mean = total / dr.maximum(weights, 1e-6)
     return mi.Color3f(dr.select(weights > 0, mean, rgb(centre)))
 
 
 def one_pass_filter(color: mi.Color3f, blur: mi.Float, size: Size) -> mi.Color3f:
-    """Blurs a picture in one pass over a spiral around each pixel: a pixel there counts where its
-    blur reaches, and is otherwise replaced by the mean so far. What is farther than the pixel
-    reaches no wider than twice the pixel's own blur.
+    """Blurs a picture in one pass over a spiral around each pixel: a point of the spiral counts if
+    its blur reaches the pixel, and is otherwise replaced by the mean so far. The blur of points
+    farther than the pixel is limited to twice the pixel's own blur.
 
     Source: D. Gustafsson, *Bokeh depth of field in a single pass*, 2018; J. J. Guo, PhD thesis, TU
     Delft, Table 5.1 (*one pass*).
 
     Parameters:
-        color, blur: Of each pixel, row by row; blurs are signed radii in pixels.
+        color, blur: Colour and blur of each pixel, row by row; blurs are signed radii in pixels.
+        size: Size of the picture.
     """
     k = np.arange(_SPIRAL) + 0.5
     angle, radius = k * np.pi * (3 - np.sqrt(5)), np.sqrt(k / _SPIRAL)
@@ -105,7 +107,7 @@ def _spiral(lens, view, place, widest, here, start):
         point = lens.at(i)
         found = view.at(place + widest * point)
         reach = dr.abs(found.w)
-        # Farther than this pixel
+        # Points that are farther than this pixel
         limit = dr.select(found.w < here, 2 * dr.abs(here), dr.inf)
         reach = dr.minimum(reach, limit)
         share = dr.clip(reach - widest * dr.norm(point) + 0.5, 0, 1)
@@ -116,7 +118,8 @@ def _spiral(lens, view, place, widest, here, start):
 
 
 def _largest_around(radius: mi.Float, size: Size) -> mi.Float:
-    """The largest of the radii that reach each pixel, or about that: of squares of pixels."""
+    """An upper bound of the radii that reach each pixel, computed for squares of 16 × 16 pixels:
+    the largest radius within a distance of the largest of all."""
     tile = 16
     width, height = -(-size.width // tile), -(-size.height // tile)
     tiles = Size(width, height)
@@ -134,7 +137,6 @@ def _largest_around(radius: mi.Float, size: Size) -> mi.Float:
         for y in (-1, 0, 1):
             for x in (-1, 0, 1):
                 near = dr.gather(mi.Float, found, tiles.index(middle + mi.Vector2i(x, y)))
-                # It does not reach farther than its radius
                 around = dr.maximum(around, dr.select(near > 0, near, 0))
         found = around
     del index

@@ -1,4 +1,4 @@
-"""How far a thin lens blurs a point of the scene."""
+"""How much a thin lens blurs a point of the scene."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import mitsuba as mi
 
 @dataclass(frozen=True)
 class ThinLens:
-    """A thin lens before a film.
+    """A thin lens in front of a film.
 
-    Light that reaches the pixel x through the point u of the unit disk (the aperture) passes the
-    depth z where the middle of the lens sees the position x + u · blur(z). So a point is blurred to
-    a disk, its circle of confusion, of the radius \\|blur(z)\\|.
+    Light that reaches the pixel x through the point u of the unit disk (the aperture) crosses the
+    depth z at a point that the middle of the lens sees at the position x + u · blur(z). A point is
+    therefore blurred to a disk, its circle of confusion, of the radius \\|blur(z)\\|.
 
     Attributes:
-        aperture_radius: In units of the scene.
-        focus_distance: Depth of what is in focus, along the axis of the lens; may be infinite.
-        fov: Angle that the film's width sees, in degrees.
-        film_width: Pixels of the whole film, not of a crop window.
+        aperture_radius: Radius of the aperture, in units of the scene.
+        focus_distance: Depth of surfaces in focus, along the axis of the lens; may be infinite.
+        fov: Horizontal field of view of the whole film, in degrees.
+        film_width: Width of the whole film, not of a crop window, in pixels.
     """
 
     aperture_radius: float
@@ -41,8 +41,8 @@ class ThinLens:
 
     @property
     def pixels_per_disparity(self) -> float:
-        """By how many pixels the edge of the aperture and its middle see a point apart that is at
-        inverse depth 1, with the focus at infinity."""
+        """The distance in pixels between the images of a point at inverse depth 1, seen from the
+        edge and from the middle of the aperture, with the focus at infinity."""
         width = 2 * math.tan(math.radians(self.fov) / 2)
         return self.aperture_radius * self.film_width / width
 
@@ -52,11 +52,11 @@ class ThinLens:
         return -self.pixels_per_disparity / self.focus_distance
 
     def blur(self, depth: mi.Float) -> mi.Float:
-        """The radius of the circle of confusion in pixels, with a sign: positive for what is nearer
-        than the focus distance.
+        """The signed radius of the circle of confusion in pixels: positive for points nearer than
+        the focus distance.
 
         Parameters:
-            depth: Along the axis of the lens, positive; may be infinite.
+            depth: Depth along the axis of the lens, positive; may be infinite.
         """
         # The reciprocal of infinity is not 0 in all backends
         return self.blur_at(dr.select(dr.isfinite(depth), dr.rcp(depth), 0))

@@ -1,7 +1,8 @@
-"""Open Image Denoise [1] on rendered images, through the package ``mitsuba-oidn``.
+"""Denoises images with Open Image Denoise [1], through the package ``mitsuba-oidn``.
 
-It is guided by the albedo and the shading normal of each pixel, where these are known. Guides are
-denoised first, each on its own. A denoised image is biased: compare techniques by their own images.
+The denoiser is guided by the albedo and the shading normal of each pixel, where these are known.
+Guides are denoised first, each on its own. A denoised image is biased: compare techniques by their
+own images.
 
 [1] Áfra. Intel Open Image Denoise. https://www.openimagedenoise.org
 """
@@ -21,12 +22,13 @@ from . import image_files, reading
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: The guides as layers of an EXR, and their channels.
+#: The names of the guides, which end the names of their layers in an EXR, and their channels.
 _GUIDES = {"albedo": "RGB", "normal": "XYZ"}
 
 
 def denoiser() -> ModuleType:
-    """
+    """The module ``mitsuba_oidn``.
+
     Raises:
         InstallationError: The package is missing, or does not start here.
     """
@@ -41,10 +43,10 @@ def denoiser() -> ModuleType:
 
 
 def remark(film: mi.Film) -> str | None:
-    """What a user should know about the film of an image to be denoised.
+    """A warning about the film of an image to be denoised; ``None`` if there is none.
 
     Raises:
-        InputError: It has no RGB.
+        InputError: The film has no RGB image.
     """
     import mitsuba as mi
 
@@ -62,12 +64,12 @@ def denoise(
     pixels: np.ndarray, albedo: np.ndarray | None = None, normal: np.ndarray | None = None,
     is_linear: bool = True,
 ) -> np.ndarray:  # fmt: skip
-    """An image without its noise.
+    """Denoises an image.
 
     Args:
         pixels: RGB, (height, width, 3).
-        albedo: Guides it; the same shape, in [0, 1].
-        normal: Guides it, if there is an albedo too; the same shape, in [-1, 1].
+        albedo: A guide; the same shape, in [0, 1].
+        normal: A guide, used only with an albedo; the same shape, in [-1, 1].
         is_linear: ``False`` for images with 8 bits, in [0, 1].
 
     Returns:
@@ -77,7 +79,7 @@ def denoise(
         InstallationError: See :func:`denoiser`.
     """
     oidn = denoiser()
-    # Without the albedo, it accepts no normals
+    # Open Image Denoise accepts normals only with an albedo
     guides = {} if albedo is None else {"albedo": _without_noise(oidn, albedo, 1, 0)}
     if guides and normal is not None:
         guides["normal"] = _without_noise(oidn, normal, 2, -1)
@@ -91,16 +93,16 @@ def denoise(
 def denoise_file(
     source: Path, targets: Iterable[Path], metadata: Mapping[str, object]
 ) -> list[str]:
-    """Denoises an image.
+    """Denoises an image file.
 
     Args:
         source: Any image that ``diff`` reads. An EXR may hold guides: layers whose names end with
             ``albedo`` (R, G, B) and ``normal`` (X, Y, Z).
-        targets: Where to write it; the extensions say how.
-        metadata: Of an EXR.
+        targets: Files to write; their extensions set the formats.
+        metadata: Metadata for an EXR.
 
     Returns:
-        The layers that guided it.
+        The names of the guides that were used.
 
     Raises:
         InputError: The image cannot be read.
@@ -131,16 +133,15 @@ def denoise_file(
 def _without_noise(
     oidn: ModuleType, guide: np.ndarray, scale: float, offset: float
 ) -> np.ndarray:
-    """A guide that has been denoised itself, as an image of values in [0, 1], of which it is
-    ``scale`` times the value plus ``offset``: a denoiser that can trust its guides keeps more
-    detail."""
+    """A denoised guide: with guides that have no noise, the denoiser keeps more detail. The guide
+    is ``scale`` · x + ``offset``, where x is in [0, 1], as the denoiser needs it."""
     guide = np.asarray(guide, dtype=np.float32)
     result = np.array(oidn.denoise(np.ascontiguousarray((guide - offset) / scale), hdr=False))
     return np.ascontiguousarray(scale * result + offset, dtype=np.float32)
 
 
 def _layer(channels: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
-    """The only layer whose name ends so; ``None`` if there are none or several."""
+    """The only layer whose name ends with ``name``; ``None`` if there are none or several."""
     letters = _GUIDES[name]
     ends = {c.rpartition(".")[0] for c in channels if c.rpartition(".")[0].lower().endswith(name)}
     whole = [end for end in ends if all(f"{end}.{letter}" in channels for letter in letters)]

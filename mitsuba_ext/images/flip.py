@@ -82,8 +82,9 @@ def mean_flip(image: np.ndarray, reference: np.ndarray) -> float:
 def _evaluator() -> ModuleType | None:
     """The package, with OpenMP threads that sleep when they wait.
 
-    By default they spin: for 8 ms after a call, they slow down whatever is measured next, and on a
-    busy machine they slow each other down (twice the time at 320x180, fifty times for tiny images).
+    By default they spin. They then slow down whatever is measured in the 8 ms after a call, and on
+    a busy machine they slow each other down (twice the time at 320x180, fifty times for tiny
+    images).
     """
     policy = os.environ.get(_WAIT_POLICY)
     os.environ.setdefault(_WAIT_POLICY, "PASSIVE")  # read once, at the import

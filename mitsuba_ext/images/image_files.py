@@ -68,7 +68,7 @@ def write_exr_fast(
 
 
 def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """The channels of an EXR as 32-bit arrays by name, and its metadata.
+    """Reads the channels of an EXR as 32-bit arrays by name, and its metadata.
 
     Raises:
         InputError: The file is missing, damaged, or not an EXR.
@@ -89,7 +89,7 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
 
 
 def open_bitmap(path: Path) -> mi.Bitmap:
-    """Any image that Mitsuba can read, whatever its extension says.
+    """Opens any image that Mitsuba can read, whatever its extension.
 
     Raises:
         InputError: The file is missing, damaged, or not an image.
@@ -184,8 +184,8 @@ def _save_converted(bitmap: mi.Bitmap, path: Path) -> None:
 
 
 def to_rgb(image: object, channels: Sequence[str]) -> np.ndarray:
-    """A rendered tensor as an array (height, width, 3): alpha and AOVs are dropped, grey is
-    repeated.
+    """Converts a rendered tensor to an array (height, width, 3): alpha and AOVs are dropped, grey
+    is repeated.
 
     Args:
         image: The tensor; its first channels are those of the film's image.
@@ -230,7 +230,7 @@ def _annotate(bitmap: mi.Bitmap, metadata: Mapping[str, object]) -> None:
 
 
 def _attribute(value: object) -> str | float | int:
-    """What stands in the header of an EXR: text and numbers as they are, all else as JSON."""
+    """A value for the header of an EXR: text and numbers as they are, all else as JSON."""
     plain = isinstance(value, (str, float)) or (
         isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**31
     )

@@ -1,12 +1,12 @@
-"""How far an image is from a reference.
+"""Measures the error of an image against a reference.
 
 All functions take linear RGB of shape (height, width, 3) and compute in double precision. Where the
 variance of the reference's mean is known, it is subtracted from the squared errors: its noise would
 otherwise add to every error. The difference can be zero or negative: then the error of the image is
 too small to be measured with this reference.
 
-σ/μ and FLIP keep the noise of the reference. They take absolute values, so what to subtract would
-depend on the correlation of the noise between channels, which references do not record. A
+σ/μ and FLIP include the noise of the reference. They take absolute values, so the amount to
+subtract would depend on the correlation of the noise between channels, which is not stored. A
 reference by the same method with K times the samples of the image raises σ/μ by a factor of
 √(1 + 1/K), 3 % at K = 16.
 """
@@ -26,7 +26,7 @@ RELATIVE_FLOOR = 1e-2
 #: Share of the pixels, those with the largest errors, that the trimmed relMSE leaves out.
 TRIMMED_SHARE = 1e-3
 
-#: What a channel contributes to a colour difference: its share of the luminance [Cline 2007].
+#: The weights of the channels in a colour difference: their shares of the luminance [Cline 2007].
 COLOR_WEIGHTS = (0.299, 0.587, 0.114)
 
 
@@ -76,7 +76,7 @@ def errors(
     squared, weight = _squared_and_weight(image, reference, reference_variance)
     mse = float(squared.mean())
     relative = squared * weight
-    # The trimmed pixels are those with the largest errors before the variance is subtracted
+    # Trim the pixels with the largest errors before the variance is subtracted
     seen = (np.asarray(image, np.float64) - reference) ** 2 * weight
     return Errors(
         relmse=float(relative.mean()),

@@ -1,5 +1,5 @@
-"""Images of any source as linear RGB: our own renders and references, those of other renderers,
-photographs, arrays."""
+"""Reads images of any source as linear RGB: our own renders and references, those of other
+renderers, photographs, arrays."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def read_image(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, dict[st
         the channels that were read, for example ``"ViewLayer.Combined.R/G/B"``.
 
     Raises:
-        InputError: The file cannot be read, holds no image, or holds several that could be meant.
+        InputError: The file cannot be read, or does not contain exactly one image.
     """
     path = Path(path)
     if path.suffix.lower() in (".npy", ".npz"):

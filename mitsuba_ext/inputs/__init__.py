@@ -1,1 +1,1 @@
-"""What a user names, read and checked: scene files, integrators with parameters, variants."""
+"""Reads and checks the user's input: scene files, integrators with parameters, variants."""

@@ -1,4 +1,4 @@
-"""What a command renders: a scene file, an integrator, a sensor."""
+"""What a command renders: a scene, an integrator and a sensor."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from .specifications import NamedIntegrator, make_named
 
 @dataclass
 class Chosen:
-    """A scene, with what renders it.
+    """A scene, and the integrator and the sensor that render it.
 
     Attributes:
         loaded: The scene.
         named: The integrator.
-        sensor_index: The number of the sensor.
+        sensor_index: The index of the sensor.
     """
 
     loaded: LoadedScene
@@ -60,7 +60,7 @@ class Chosen:
         return self.scene.sensors()[self.sensor_index]
 
     def remarks(self, is_sensor_chosen: bool) -> list[str]:
-        """Warnings about what the image will not show."""
+        """Warnings about parts of the scene that the image will not show."""
         remarks = scene_remarks(self.scene, self.sensor, self.named.integrator, self.named.name)
         count = len(self.scene.sensors())
         if count > 1 and not is_sensor_chosen:
@@ -81,15 +81,15 @@ class LastScene:
         specification: str | None, sensor_index: int, values: str | None = None,
         moved: Callable[[str], str] | None = None,
     ) -> Chosen:  # fmt: skip
-        """The scene of a file, with what renders it.
+        """Loads the scene of a file, and makes its integrator.
 
         Args:
             path: The file.
-            size: Of the image; ``None`` for the film's.
+            size: Size of the image; ``None`` for the film's.
             definitions: Values of the file's ``$name`` parameters.
             specification: The integrator; ``None`` for the scene's.
-            values: Of the loaded scene, as :func:`.scene_values.as_text` makes them; ``None`` if no
-                image will have any.
+            values: Values of parameters of the loaded scene, from :func:`.scene_values.as_text`;
+                ``None`` if no image of the call has any.
             moved: See :func:`.scenes.load_scene`.
 
         Raises:
@@ -98,9 +98,9 @@ class LastScene:
         is_own, has_values = specification is None, values is not None
         key = (mi.variant(), path, size, tuple(definitions.items()), is_own, has_values)
         if key != self._key:
-            # First: Dr.Jit compiles the methods of all living objects
+            # Free the last scene first, as Dr.Jit compiles the methods of all living objects
             self._key = self._loaded = self._values = None
-            gc.collect()  # what mi.traverse returns refers to itself
+            gc.collect()  # the object that mi.traverse returns refers to itself
             self._loaded = load_scene(path, size, definitions, is_own, has_values, moved)
             self._values = SceneValues(self._loaded.scene) if has_values else None
             self._key = key
@@ -115,6 +115,6 @@ def _of_scene(loaded: LoadedScene) -> NamedIntegrator:
         raise InputError(
             f"{loaded.source}: the scene has no integrator: name one with --integrator"
         )
-    # The scene's files have its parameters
+    # The identity is of the code alone: the hash of the scene's files covers the parameters
     code = hash_code([type(integrator)]) or ""
     return NamedIntegrator(name, name, dict(loaded.settings), integrator, code)

@@ -22,7 +22,7 @@ _COMPILED = ("builtins", "mitsuba", "drjit.detail")
 
 
 def hash_each(files: Iterable[Path]) -> dict[Path, str]:
-    """SHA-256 of each file, by the file that links lead to."""
+    """SHA-256 of each file, by its path with links resolved."""
     return {
         file: hashlib.sha256(file.read_bytes()).hexdigest()
         for file in sorted({file.resolve() for file in files})
@@ -35,7 +35,7 @@ def hash_files(
     """SHA-256 over a scene's files, and its parameters.
 
     Args:
-        hashes: Of the files, from :func:`hash_each`.
+        hashes: The hashes of the files, from :func:`hash_each`.
         parameters: Values of the ``$name`` placeholders.
         source: The dict that the scene was made from, if it was not a file.
     """
@@ -88,7 +88,8 @@ def hash_code(classes: Iterable[type]) -> str | None:
 
 
 def _feed(digest: Any, value: object) -> None:
-    """Feeds a value of a scene's dict: nested dicts, numbers, arrays, transformations, objects."""
+    """Adds a value of a scene's dict to ``digest``: nested dicts, numbers, arrays, transformations,
+    objects."""
     import mitsuba as mi
 
     if isinstance(value, Mapping):

@@ -1,7 +1,8 @@
-"""Names of integrators, of what can be nested in them, and of parameters; suggestions for misspelt
-ones.
+"""Names of integrators, of plugins that can be nested in them, and of parameters; suggestions for
+misspelt names.
 
-This module does not import Mitsuba, which takes a second: so a misspelt name is reported at once.
+This module does not import Mitsuba, which takes a second, so that a misspelt name is reported at
+once.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def unknown_parameter(kind: str, name: str, key: str) -> InputError:
     """The error for a parameter that a plugin did not read.
 
     Args:
-        kind: How the message calls the plugin: "integrator" or "nested plugin".
+        kind: What the plugin is, for the message: "integrator" or "nested plugin".
         name: Its name.
         key: The name of the parameter.
     """
@@ -62,12 +63,12 @@ def unknown_parameter(kind: str, name: str, key: str) -> InputError:
 
 
 def parameter_names(name: str) -> list[str]:
-    """The parameters on the page of a plugin of ours; none for any other plugin."""
+    """The parameters of a plugin of this package, from its page; none for other plugins."""
     return [key for row in parameter_rows(name) for key in row.name.split(", ")]
 
 
 def parameter_rows(name: str) -> list[Parameter]:
-    """The rows of the table of parameters on the page of a plugin of ours."""
+    """The rows of the parameter table of a plugin of this package; none for other plugins."""
     files = [file for kind in registry.plugin_names() for file in registry.plugin_files(kind)]
     pages = [read_page(file) for file in files if file.stem == name]
     return [row for page in pages for row in page.parameters]

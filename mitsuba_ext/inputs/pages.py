@@ -2,8 +2,8 @@
 
 Docstrings have Mitsuba's form: a title underlined with dashes, a ``.. pluginparameters::`` list of
 name, type and description (which ends in ``(Default: …)``), and prose. A row named ``(Common
-parameters)`` stands for the list in the docstring of the base class, but for those parameters that
-the plugin describes itself.
+parameters)`` stands for the list in the docstring of the base class, except for parameters that the
+plugin describes itself.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Page:
 
 
 def read_page(file: Path) -> Page:
-    """The page of the plugin in ``file``, which has the name of the file."""
+    """The page of the plugin in ``file``, which is named like the file."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
     classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
     # One plugin class per file; a helper class does not have a parameter list
@@ -78,7 +78,7 @@ def parse_page(name: str, docstring: str) -> Page:
 
 
 def _class_page(file: Path, tree: ast.Module, cls: ast.ClassDef) -> Page:
-    """The page of a class, with the parameters that it has from its base class."""
+    """The page of a class, with the parameters of its base class."""
     page = parse_page(file.stem, _docstring(cls))
     own = {parameter.name for parameter in page.parameters}
     rows: list[Parameter] = []
@@ -94,10 +94,11 @@ def _class_page(file: Path, tree: ast.Module, cls: ast.ClassDef) -> Page:
 def _base_class(
     file: Path, tree: ast.Module, cls: ast.ClassDef
 ) -> tuple[Path, ast.Module, ast.ClassDef]:
-    """Where the base class is defined that ``file`` imports from this package, and its definition.
+    """The file, its syntax tree and the definition of the base class that ``file`` imports from
+    this package.
 
     Raises:
-        ValueError: There is none.
+        ValueError: There is no such base class.
     """
     bases = {base.id for base in cls.bases if isinstance(base, ast.Name)}
     for node in tree.body:

@@ -48,7 +48,7 @@ def _parse(text: str) -> dict[str, Any]:
 
 
 def _split(text: str) -> Iterator[str]:
-    """The parameters: the parts between the commas that begin one, outside of brackets."""
+    """The texts of the parameters: splits at commas that begin a parameter, outside of brackets."""
     depths = _depths(text)
     if min(depths, default=0) < 0:
         raise ValueError('found "]" without "["')

@@ -1,4 +1,4 @@
-"""The files that a scene consists of: its XML files, and all that these name."""
+"""The files of a scene: its XML files, and all files that these name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def files_of(state: mi.parser.ParserState, parameters: Mapping[str, str]) -> list[Path]:
-    """The files of a parsed scene, by their absolute names: XML files, meshes, textures, spectra.
+    """The absolute paths of a parsed scene's files: XML files, meshes, textures, spectra.
 
     Args:
         state: The parsed scene, before any transformation.
@@ -35,19 +35,20 @@ def named_by_absolute_path(files: list[Path], parameters: Mapping[str, str]) -> 
 
 
 def named_in(state: mi.parser.ParserState) -> Iterator[tuple[tuple[object, str], str]]:
-    """The texts among the parameters of a scene's plugins, each with its node and key."""
+    """The string parameters of a scene's plugins, each with its node and key: these can be names of
+    files."""
     import mitsuba as mi
 
     for node in state.nodes:
-        properties = mi.Properties(node.props)  # a copy: what is read counts as known to a plugin
+        properties = mi.Properties(node.props)  # a copy: reading a property marks it as queried
         for key in properties.keys():
             if properties.type(key) == mi.Properties.Type.String and properties[key]:
                 yield (node, key), properties[key]
 
 
 def _named_in_xml(files: list[Path], parameters: Mapping[str, str]) -> Iterator[tuple[Path, str]]:
-    """What attributes ``filename`` name: included files, and spectra, which the parser replaces by
-    their contents."""
+    """The files that ``filename`` attributes name: included files, and spectra. The parser replaces
+    both by their contents."""
     elements = []
     values = {}
     for file in files:

@@ -1,4 +1,4 @@
-"""Warnings about what an integrator ignores in a scene."""
+"""Warnings about parts of a scene that an integrator ignores."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _SEES_MEDIA = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpa
 def scene_remarks(
     scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator, name: str
 ) -> list[str]:
-    """Warns of media that ``integrator`` does not see, and of a scene without lights.
+    """Warns of media that ``integrator`` does not render, and of a scene without lights.
 
     Parameters:
-        name: What the sentences call the integrator.
+        name: The name of the integrator in the sentences.
 
     Returns:
-        Sentences. There is none about integrators that are neither Mitsuba's nor ours: they may see
-        media, and need no lights.
+        Sentences. There is none about integrators that are neither Mitsuba's nor ours: they may
+        render media, and may need no lights.
     """
     tracers = [
         each
@@ -37,7 +37,7 @@ def scene_remarks(
         and len(with_nested(each)) == 1
     ]
     remarks = []
-    # Those of ours render media, or refuse to
+    # Our integrators render media, or refuse scenes that have them
     blind = [
         each
         for each in tracers

@@ -1,6 +1,6 @@
-"""Values of a scene's objects, as ``mi.traverse`` names them, set without loading the scene again.
+"""Sets values of a scene's objects, by keys of ``mi.traverse``, without loading the scene again.
 
-Values travel as JSON text, so that requests to other processes can hold and compare them.
+Values are passed as JSON text, so that requests to other processes can hold and compare them.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ def _plain(key: str, value: Any) -> Any:
 
 
 class SceneValues:
-    """The values of a scene.
+    """Sets and resets values of a scene.
 
     Parameters:
-        scene: Loaded with the names of its objects kept.
+        scene: The scene, loaded with ``keep_names``.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -59,13 +59,13 @@ class SceneValues:
         self._before: dict[str, Any] = {}
 
     def set(self, text: str) -> None:
-        """Sets values, and those that were set before back to the scene's own.
+        """Sets values, and resets all others that were set before to the scene's own.
 
         Args:
-            text: From :func:`as_text`.
+            text: The values, from :func:`as_text`.
 
         Raises:
-            InputError: The scene has no such parameter, or it takes no such value.
+            InputError: The scene has no such parameter, or the parameter does not accept the value.
         """
         values = json.loads(text) if text else {}
         found = self._parameters
@@ -94,8 +94,8 @@ def _copy(value: Any) -> Any:
 
 
 def _like(own: Any, value: Any) -> Any:
-    """The value, of the type of the scene's own. Arrays keep their size, which other parameters
-    depend on."""
+    """Converts a value to the type of the scene's own. Arrays must keep their size, on which other
+    parameters depend."""
     kind = type(own)
     if isinstance(own, (bool, int, float)):
         if isinstance(value, list):
@@ -107,7 +107,7 @@ def _like(own: Any, value: Any) -> Any:
         if array.shape != tuple(shape):
             raise ValueError(f"{'x'.join(map(str, shape))} numbers are expected")
         return kind(array)
-    # One number is enough for a colour, but not for a list of vertices
+    # One number can stand for a colour, but not for a list of vertices
     is_flexible = dr.size_v(kind) != dr.Dynamic and not isinstance(value, list)
     if not is_flexible and np.size(value) != len(own):
         raise ValueError(f"{len(own)} numbers are expected")

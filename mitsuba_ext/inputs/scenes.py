@@ -22,8 +22,8 @@ from .scene_files import files_of, named_in
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: Settings that all integrators of a comparison share: the maximum depth, the depth from which on
-#: Russian roulette is played, and whether emitters are hidden from the camera.
+#: Settings that all integrators of a comparison share: the maximum depth, the depth at which
+#: Russian roulette begins, and whether emitters are hidden from the camera.
 SETTINGS = ("max_depth", "rr_depth", "hide_emitters")
 
 #: How Mitsuba's integrators print a depth without limit.
@@ -34,7 +34,7 @@ def check_source(source: object) -> None:
     """Checks that ``source`` can be a scene: a file, or a dict of the active variant.
 
     Raises:
-        InputError: It cannot.
+        InputError: It is neither.
     """
     if isinstance(source, Mapping):
         check_variant(source)
@@ -75,10 +75,10 @@ class LoadedScene:
         path: The XML file; ``None`` for a scene made from a dict.
         parameters: The ``$name`` parameters that were passed to it.
         files: The XML file, and all files that it names, by their absolute paths.
-        file_hashes: SHA-256 of each of them, by the file that links lead to.
+        file_hashes: SHA-256 of each of them, by its path with links resolved.
         content_hash: SHA-256 over the XML or dict, its parameters, and all these files.
-        settings: ``max_depth`` and ``rr_depth`` of the scene's own integrator, as far as it has
-            them, and ``hide_emitters`` where it is set.
+        settings: ``max_depth`` and ``rr_depth`` of the scene's own integrator, if it has them, and
+            ``hide_emitters`` if it is set.
         integrator_name: Plugin name of the scene's own integrator; empty if there is none.
         size: Width and height of the image in pixels (of the crop window, if there is one).
     """
@@ -95,7 +95,7 @@ class LoadedScene:
 
     @property
     def source(self) -> str:
-        """How messages name the scene."""
+        """The name of the scene in messages."""
         return "the scene" if self.path is None else str(self.path)
 
 
@@ -129,10 +129,11 @@ def load_scene(
         size: Width and height that replace those of the film.
         parameters: Values for the ``$name`` placeholders of the file.
         keep_integrator: ``False`` leaves the scene's integrator out, so that a scene whose
-            integrator is unknown here can be rendered with another.
-        keep_names: Objects stay what they are in the file, for ``mi.traverse``: by default, Mitsuba
+            integrator is not installed can be rendered with another.
+        keep_names: Keep objects as they are in the file, for ``mi.traverse``. By default, Mitsuba
             merges meshes of the same material, and equal materials.
-        moved: Says where a file is now that was at an absolute path; other texts it returns.
+        moved: Maps the absolute path of a file to its present path; returns all other texts as
+            they are.
 
     Raises:
         InputError: The file is missing or broken, something in it cannot be made or is of another
@@ -288,7 +289,7 @@ def _drop_integrators(state: mi.parser.ParserState) -> None:
 
 def _is_integrator(node: mi.parser.SceneNode, key: str) -> bool:
     """Is the node an integrator? The parser of dicts does not know the kind of a plugin that is
-    written in Python, so this makes one to see."""
+    written in Python, so this function instantiates it."""
     import mitsuba as mi
 
     if node.type != mi.ObjectType.Unknown:

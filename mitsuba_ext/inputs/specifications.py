@@ -38,8 +38,8 @@ class NamedIntegrator:
         parameters: Its parameters, as far as they are known; a dict for a nested plugin.
         integrator: The integrator.
         identity: Text that changes whenever the integrator could render other images or take other
-            time. It covers the plugins, their parameters, and the code of those that are written in
-            Python. If these cannot be known (an integrator that exists already, code without a
+            time. It covers the plugins, their parameters, and the code of plugins that are written
+            in Python. If these cannot be known (an integrator that exists already, code without a
             file), the identity is random, so that stored runs are never used.
     """
 
@@ -62,8 +62,8 @@ def make_named(
             (:func:`.plugin_text.parse_plugin`); the path of an XML file whose root is an
             ``<integrator>``, or of a JSON file with a dict for ``mi.load_dict``; such a dict; or an
             integrator that exists already (which inherits nothing).
-        inherited: Parameters (a :attr:`LoadedScene.settings`) for each integrator, nested ones
-            included, that knows them and does not set them.
+        inherited: Parameters (from :attr:`LoadedScene.settings`) for each integrator, nested ones
+            included, that has them and does not set them.
         label: The label. Default: made from the specification.
 
     Raises:
@@ -128,7 +128,7 @@ def _identity(made: _Made, content: str | dict[str, Any]) -> str:
 
 
 def _never_again() -> str:
-    """An identity that no other integrator has, and this one only in this process."""
+    """An identity that no other integrator has, nor this one in another process."""
     return uuid.uuid4().hex
 
 
@@ -171,7 +171,7 @@ def _make(
     }
     objects = {key: made.integrator for key, made in nested.items()}
     if any(isinstance(item, mi.Integrator) for item in objects.values()):
-        inherited = {}  # they apply to the nested integrator, which traces the paths
+        inherited = {}  # these are for the nested integrator, which traces the paths
     name, given = plugin["type"], {**inherited, **own, **objects}
     properties = mi.Properties(name)
     for key, value in given.items():

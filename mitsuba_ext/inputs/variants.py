@@ -12,7 +12,7 @@ from ..errors import InputError
 
 
 def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
-    """Selects a variant, then imports the modules: their classes bind to it."""
+    """Selects a variant, then imports the modules, whose classes are bound to the variant."""
     import mitsuba as mi
 
     from ..errors import one_line

@@ -1,2 +1,3 @@
-"""Who learns: learners that observe pilot samples (``learner.py``), what they record, and whether
-what they have learned pays (``benefit.py``). A folder for each slot, as in ``decisions``."""
+"""Learners, which observe pilot samples (``learner.py``), their records, and the estimate whether a
+learned decision is worth its time (``benefit.py``). One folder for each decision, as in
+``decisions``."""

@@ -1,32 +1,32 @@
-"""Whether what was learned is worth its time.
+"""Is a learned decision worth its time?
 
 The benefit of a decision is the ratio of the efficiencies, 1 / (variance · time), with it and
-without. Pilots tell both, each with its uncertainty:
+without. Variance and time are estimated from pilots:
 
-- The variance is that of the image by the paths of a pilot, and what it would be if the decision
-  had been that of ``path``. The paths are divided into batches, which tell how well the ratio is
-  known. The brightest paths, one in 32768 and one in each pass at least, are left out: they would
-  decide alone.
-- The time is calibrated: rays are counted, and what a decision adds to them is known in units of
-  the time of a ray. A clock would be closer to the truth on an idle machine, but equal seeds would
-  choose differently, and on a busy machine everybody would.
+- Variance: that of the image from the paths of a pilot, and that which these paths would have with
+  the decision of ``path``. The paths are divided into batches, from which the uncertainty of the
+  ratio is estimated. The brightest paths, one in 32768 and one in each pass at least, are left out:
+  they would dominate the estimate.
+- Time: rays are counted, and the additional cost of a decision is a constant in units of the time
+  of a ray. A clock would be more accurate on an idle machine, but renders with equal seeds could
+  choose differently, above all on a busy machine.
 
-The prior is that nothing is gained or lost: what is uncertain counts less the less is known.
+The prior is that efficiency does not change. It weighs more, the less certain an estimate is.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-#: What decisions cost for each event, in units of the time of a ray: choosing a light from a table
-#: (medians over 15 scenes: 0.1 to 0.4), guiding the first direction of a path (0.3 to 1), and each
-#: further one. ``benchmarks/decision_costs.py`` measures them.
+#: The cost of decisions, in units of the time of a ray: of choosing a light from a table
+#: (medians over 15 scenes: 0.1 to 0.4), of guiding the first direction of a path (0.3 to 1), and of
+#: each further one. ``benchmarks/decision_costs.py`` measures them.
 TABLE, FIRST_GUIDED, GUIDED = 0.2, 0.7, 0.25
 
-#: Batches of paths, and one path in so many is left out.
+#: The number of batches of paths; one path in ``TRIM`` is left out.
 BATCHES, TRIM = 32, 1 << 15
 
-#: What decisions gain in scenes at large: the standard deviation of the logarithm.
+#: The prior: the standard deviation, over scenes, of the logarithm of a decision's efficiency.
 _PRIOR = 0.5
 
 
@@ -52,17 +52,18 @@ def trimmed_batches(error: np.ndarray, more: np.ndarray) -> np.ndarray:
 
 
 def gain_of(sums: np.ndarray) -> tuple[float, float]:
-    """By how much, relatively, a decision lowers the variance, and the standard error of the
-    logarithm of what is left.
+    """The relative reduction of variance by a decision, and the standard error of the logarithm of
+    the remaining variance.
 
     Parameters:
-        sums: Of :func:`trimmed_batches`, or the same of any quantity; shape [2, batches].
+        sums: Those of :func:`trimmed_batches`, or such sums of another quantity; shape
+            [2, batches].
     """
     error, more = sums.sum(axis=1)
     if error <= 0 or error + more <= 0:
         return 0.0, 0.0
     left = error / (error + more)
-    # Leaving out one batch at a time
+    # Jackknife: leave out one batch at a time
     others, more_of_others = error - sums[0], more - sums[1]
     ratios = others / np.maximum(others + more_of_others, 1e-300)
     count = sums.shape[1]
@@ -71,10 +72,11 @@ def gain_of(sums: np.ndarray) -> tuple[float, float]:
 
 
 def is_worth(efficiency: float, error: float, least: float) -> bool:
-    """Is ``least`` to be expected of an efficiency of which the logarithm is known up to ``error``?
+    """Is the expected efficiency at least ``least``, for an estimate ``efficiency`` whose logarithm
+    has the standard error ``error``?
 
-    The less is known of the efficiency, the closer to one it is expected to be. To ask for
-    certainty instead would leave the choice to the seed where pilots are noisy and much is to
-    gain."""
+    The less certain the estimate, the closer to one is the expected efficiency. A significance test
+    instead would make the choice depend on the seed where pilots are noisy and the possible gain is
+    large."""
     known = _PRIOR**2 / (_PRIOR**2 + error**2)
     return efficiency > 0 and known * np.log(efficiency) >= np.log(least)

@@ -1,4 +1,4 @@
-"""What a technique that learns is made of."""
+"""The base class of learners."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ class Learner(Observer):
     wants_scout = False
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> Any | None:
-        """The decision of the first pilot; ``None`` for the one that is there. ``p``, ``n``:
-        vertices and normals of the scout, none if no learner wants one."""
+        """The decision of the first pilot; ``None`` keeps the current one. ``p``, ``n``: vertices
+        and normals that the scout has found, empty if no learner wants one."""
         raise NotImplementedError
 
     def learn(self, scene: mi.Scene, is_last: bool) -> Any | None:
-        """The decision of the next stage, which is the last one if ``is_last`` says so; ``None``
-        for the same as before."""
+        """The decision of the next stage, which is the last one if ``is_last``; ``None`` keeps the
+        current one."""
         raise NotImplementedError
 
     def state(self) -> dict[str, np.ndarray]:
-        """What the decision of the last stage is made of, once that has been learned; empty where
-        it is that of Mitsuba's ``path``."""
+        """The arrays that determine the decision of the last stage, once it has been learned; empty
+        where it is that of Mitsuba's ``path``."""
         return {}
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> Any | None:
         """The decision of the last stage, from a :meth:`state` that is not empty, for the same
-        scene. Nothing else is asked of a learner that is restored."""
+        scene. A restored learner does not learn: only :meth:`finish` and its summary are used."""
         raise NotImplementedError
 
     def finish(self) -> None:
-        """All have learned: lets go of what the last stage does not need."""
+        """Called after all learners have learned: frees what the last stage does not need."""
 
     def __str__(self) -> str:
-        """A summary of what was learned; empty if another learner's says it."""
+        """A summary of what was learned; empty if the summary of another learner covers it."""
         raise NotImplementedError

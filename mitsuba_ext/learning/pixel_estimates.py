@@ -1,4 +1,4 @@
-"""What radiance the pixels have, about, and by how much errors of paths count there."""
+"""Estimates of the radiance of pixels, and of the weights of errors in them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 
 from ..arrays import from_numpy
 
-#: Pixels on each side of one that count for it, along each axis.
+#: Pixels on each side, along each axis, over which the radiance of a pixel is averaged.
 _RADIUS = 4
 
-#: Squared radiance of a dark pixel, in units of the squared mean of all.
+#: Added to the squared radiance of a pixel, in units of the squared mean of the image.
 _FLOOR = 1e-2
 
 
 def brightness(L: mi.Spectrum) -> mi.Float:
-    """One number for a path's radiance: errors count the same in all channels."""
+    """The mean of the channels of a path's radiance: errors count the same in all channels."""
     return dr.mean(L)
 
 
@@ -37,7 +37,7 @@ class PixelEstimates:
         rows = -(-(int(index.max(initial=0)) + 1) // self._width)
         size = max(rows * self._width, len(self._sum))
         values = np.where(np.isfinite(values), values, 0)
-        # NumPy adds one after the other: equal seeds make equal sums
+        # NumPy adds in a fixed order: equal seeds make equal sums
         self._sum = np.bincount(index, values, size) + _padded(self._sum, size)
         self._count = np.bincount(index, minlength=size) + _padded(self._count, size)
 
@@ -46,11 +46,11 @@ class PixelEstimates:
         return self._scale(self._means())
 
     def importance(self, pixel: mi.UInt32, radiance: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """For each of some samples that were added: by how much squared errors count at its place
-        in the image, and its own squared error, weighted so.
+        """For samples that were added: the weight of squared errors in each one's pixel, and its
+        own squared error with this weight.
 
-        A sample is part of the mean that its error is relative to. What a rare bright one counts is
-        thereby bounded, by the square of the number of samples in the mean."""
+        A sample is part of the mean to which its error is relative. The weighted error of a rare
+        bright one is thereby bounded, by the square of the number of samples in the mean."""
         means = self._means()
         weight = dr.square(dr.gather(mi.Float, self._scale(means), pixel))
         radiance = dr.select(dr.isfinite(radiance), radiance, 0)
@@ -69,13 +69,13 @@ class PixelEstimates:
 
 
 def relative_scale(image: np.ndarray) -> np.ndarray:
-    """1 / radiance of each pixel of an image, [y, x], and its neighbours."""
+    """1 / mean radiance of each pixel of an image and its neighbours, shape [y, x]."""
     means = _box_sums(image) / _box_sums(np.ones_like(image))
     return _inverse(means, image.mean())
 
 
 def _inverse(means: np.ndarray, mean: float) -> np.ndarray:
-    # An image that is black all over has no scale: all that is expected there is 0
+    # The bound of 1e-30 matters only in images that are black all over: every contribution is 0
     return 1 / np.sqrt(np.maximum(means**2 + _FLOOR * mean**2, 1e-30))
 
 

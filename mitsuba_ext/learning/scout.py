@@ -1,4 +1,4 @@
-"""Finding out where in a scene the paths of a sensor scatter, before anything is learned there."""
+"""Finds where in a scene the paths of a sensor scatter, before learning begins."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..regions.surface_sides import lit_normal
 from ..transport.observer import Observer
 from ..transport.vertex import Vertex
 
-#: Paths, about, and vertices of each.
+#: About the number of recorded paths, and the number of vertices recorded of each.
 _PATHS, _VERTICES = 1 << 16, 3
 
 #: Longest path of a scout in segments.
@@ -39,7 +39,7 @@ class Scout(Observer):
         dr.scatter(self._seen, mi.UInt32(1), slot, active)
 
     def vertices(self) -> tuple[mi.Point3f, mi.Normal3f]:
-        """The places, and the geometric normals on the side from which they were seen."""
+        """The positions of the vertices, and the geometric normals on the side that was hit."""
         slots = dr.compress(self._seen > 0)
         if len(slots) == 0:
             return mi.Point3f(), mi.Normal3f()

@@ -1,1 +1,1 @@
-"""What next event estimation chooses from: parts of emitters (cells), and their first weights."""
+"""Parts of emitters (cells) for next event estimation, and their weights before learning."""

@@ -1,4 +1,4 @@
-"""Which light a vertex is connected to."""
+"""The light that was chosen for a connection."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import mitsuba as mi
 
 @dataclass
 class Choice:
-    """What was chosen for a connection.
+    """The choice of a light cell for a connection.
 
     Attributes:
         row: Row of the table at the vertex.
-        cell: What was chosen there.
-        probability: With what probability.
+        cell: The chosen light cell.
+        probability: The probability of that choice.
     """
 
     row: mi.UInt32

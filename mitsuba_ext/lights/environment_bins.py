@@ -19,7 +19,7 @@ class EnvironmentBins:
 
     Inside a bin, a texel is chosen by its brightness and a point in it by the bilinear function
     that Mitsuba's ``envmap`` interpolates with: for maps the density of a bin is proportional to
-    what it emits. The sun of a ``sunsky`` is one more bin, the last, cut out of the others.
+    its emission. The sun of a ``sunsky`` is one more bin, the last, cut out of the others.
 
     Parameters:
         scene: The scene with the environment emitter.
@@ -53,7 +53,7 @@ class EnvironmentBins:
             emitted = np.append(emitted, self._texels.sun_emission())
         self.count = len(emitted)
         self.share = emitted / emitted.sum()
-        # Densities on the sphere, but for 1 / sin θ
+        # Densities on the sphere, without the factor 1 / sin θ
         corners = corners * (columns * rows / self._texels.area / bin_weight)[bin][:, None]
         self._corners = from_numpy(mi.Float, corners)
 
@@ -90,7 +90,7 @@ class EnvironmentBins:
         pdf = density / sin_theta
         if self._sun is not None:
             d = dr.select(in_sun, self._sun.sample(sample), d)
-            # Samples of other bins in the disk get no density: these directions are the sun's bin's
+            # Samples of other bins in the sun's disk get density 0: they belong to the sun's bin
             is_lost = ~in_sun & self._sun.contains(d)
             pdf = dr.select(in_sun, 1 / self._sun.solid_angle, dr.select(is_lost, 0, pdf))
         ds = self._texels.directions.sample(ref, d)

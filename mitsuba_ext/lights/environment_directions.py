@@ -19,8 +19,8 @@ class EnvironmentDirections:
 
     Attributes:
         emitter (mi.Emitter), pointer (mi.EmitterPtr): The emitter.
-        is_map (bool): Does an image say what it emits?
-        center (mi.Point3f): Of the scene.
+        is_map (bool): Is the emitter an ``envmap``, whose emission is an image?
+        center (mi.Point3f): Centre of the scene.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -48,7 +48,7 @@ class EnvironmentDirections:
         return ds
 
     def radiance(self, ref: mi.Interaction3f, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
-        """What arrives from the direction ``d``."""
+        """The radiance from the direction ``d``."""
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi, si.wavelengths, si.time = -d, ref.wavelengths, ref.time
         return self.emitter.eval(si, active)
@@ -63,7 +63,8 @@ class EnvironmentDirections:
         return self._to_world @ d, sin_theta
 
     def uv(self, d: mi.Vector3f) -> tuple[mi.Point2f, mi.Float]:
-        """The inverse: a point, whose first coordinate is only known up to an integer."""
+        """The inverse of :meth:`direction`: a point, whose first coordinate is only known up to an
+        integer, and the sine of the polar angle."""
         v = self._to_local @ d
         u = dr.atan2(v.x, -v.z) * dr.inv_two_pi
         # Accurate near the poles, where the cosine does not change

@@ -1,4 +1,4 @@
-"""What an environment emitter emits, in a table of texels of latitude and longitude."""
+"""The emission of an environment emitter, as a table of texels of latitude and longitude."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .environment_directions import EnvironmentDirections
 from .spectra import brightness, comparison_wavelengths
 from .sun import SunDisk
 
-#: Nodes (columns, rows) at which emitters that are no maps are evaluated. Features smaller than the
+#: Nodes (columns, rows) at which emitters without a map are evaluated. Features smaller than the
 #: 0.35° between two nodes are found only if the emitter's own sampling finds them. The disk of the
 #: sun is left out.
 _NODES = (1024, 513)
@@ -18,7 +18,7 @@ _NODES = (1024, 513)
 #: Nodes of a constant emitter, for which only sin θ is interpolated.
 _CONSTANT_NODES = (64, 33)
 
-#: Samples that the own sampling of an emitter that is no map takes.
+#: Samples that are taken by the own sampling of an emitter without a map.
 _OWN_SAMPLES = 1 << 16
 
 #: Weight of black texels relative to the mean.
@@ -29,14 +29,14 @@ class EnvironmentTexels:
     """The brightness of an environment at the corners of texels, between which it is interpolated.
 
     For maps these are the nodes between which Mitsuba's ``envmap`` interpolates: a density that is
-    interpolated in the same way is proportional to what is emitted.
+    interpolated in the same way is proportional to the emission.
 
     Parameters:
         scene: The scene with the environment emitter.
 
     Attributes:
-        directions (EnvironmentDirections): Of the emitter.
-        sun (SunDisk | None): The sun of a ``sunsky``. What it emits is not in the table.
+        directions (EnvironmentDirections): The directions of the emitter.
+        sun (SunDisk | None): The sun of a ``sunsky``. Its emission is not in the table.
         columns, rows (int): Number of texels.
     """
 
@@ -64,7 +64,8 @@ class EnvironmentTexels:
 
     @property
     def area(self) -> float:
-        """From a mean over texels of brightness times sin θ to the integral over the sphere."""
+        """The factor from a mean over texels of brightness times sin θ to the integral of the
+        brightness over the sphere."""
         return 2 * np.pi**2
 
     def sun_emission(self) -> float:
@@ -108,7 +109,7 @@ class EnvironmentTexels:
     def radiance(
         self, ref: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool
     ) -> mi.Spectrum:
-        """What arrives in the direction of ``ds``, whose ``uv`` is known."""
+        """The radiance from the direction of ``ds``, whose ``uv`` is known."""
         if self.directions.is_map:
             # By the sample's uv, without a search for the texel
             return self.directions.emitter.eval_direction(ref, ds, active)
@@ -121,7 +122,7 @@ class EnvironmentTexels:
         index = dr.arange(mi.UInt32, columns * (rows + 1))
         row = index // columns
         u = mi.Float(index - row * columns) / columns + self._shift
-        # Not at the poles: a direction there belongs to no column
+        # Not exactly at the poles: a direction there belongs to no column
         v = dr.clip(mi.Float(row), 1e-2, rows - 1e-2) / rows
         value = self._brightness(mi.Point2f(u, v)).numpy().reshape(rows + 1, columns)
         if not self.directions.is_map:

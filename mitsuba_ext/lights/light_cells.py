@@ -1,4 +1,4 @@
-"""All that next event estimation can choose: cells of emitters, and bins of an environment."""
+"""All lights that next event estimation can choose: cells of emitters, bins of an environment."""
 
 from __future__ import annotations
 

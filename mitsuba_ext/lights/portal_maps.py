@@ -1,4 +1,4 @@
-"""An environment in coordinates in which what is seen through a portal is a rectangle.
+"""An environment in coordinates in which the view through a portal is a rectangle.
 
 Source: B. Bitterli, J. Novák, W. Jarosz, *Portal-Masked Environment Map Sampling*, Computer
 Graphics Forum 34(4), 2015.
@@ -19,25 +19,25 @@ from .environment_directions import EnvironmentDirections
 from .spectra import brightness, comparison_wavelengths
 from .sun import SunDisk
 
-#: Texels of a map along each axis, which spans half a turn: fewest, and most.
+#: The fewest and the most texels of a map along each axis, which spans half a turn.
 _LEAST, _MOST = 256, 2048
 
-#: Directions that are looked at in each texel, along each axis.
+#: Number of directions that are evaluated in each texel, along each axis.
 _LOOKS = 2
 
-#: Directions that are looked at in a sun that is a disk.
+#: Number of directions that are evaluated in a sun that is a disk.
 _SUN_LOOKS = 1 << 14
 
-#: What is added to each texel, relative to the mean of all.
+#: Added to each texel, relative to the mean of all.
 _FLOOR = 1e-3
 
-#: Portals that are turned alike, to so many digits, share a map.
+#: Portals whose axes agree to this number of digits share a map.
 _DIGITS = 5
 
 
 @dataclass
 class Window:
-    """What is seen of a map from a point through a portal.
+    """The part of a map that is seen from a point through a portal.
 
     Attributes:
         map: The number of the map.
@@ -88,7 +88,7 @@ class PortalMaps:
         n = self.resolution
         sums = np.zeros((len(tables), n + 1, n + 1))
         sums[:, 1:, 1:] = np.cumsum(np.cumsum(tables, axis=1), axis=2)
-        # Maps of several orientations keep their relation: portals are chosen by these sums
+        # The same scale for all orientations: portals are chosen by these sums
         scale = 1 / sums[0, -1, -1]
         self._sums = from_numpy(mi.Float64, scale * sums)
         values = scale * (n / np.pi) ** 2 * np.ravel(tables)
@@ -98,7 +98,7 @@ class PortalMaps:
     # ---- From a point ----
 
     def window(self, index: mi.UInt32, p: mi.Point3f, active: mi.Bool) -> Window:
-        """What portal ``index`` shows to the point ``p``."""
+        """The window of portal ``index`` from the point ``p``."""
         row = self._portal(index, active)
         x, y, z = (mi.Vector3f(*row[i : i + 3]) for i in (3, 6, 9))
         frame = mi.Frame3f(x, y, z)
@@ -115,8 +115,8 @@ class PortalMaps:
     def sample(
         self, window: Window, point: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Float64]:
-        """A direction through the portal, and the density of :meth:`emitted`, which is in
-        proportion to that of the sample: divided by the sum of the window."""
+        """A direction through the portal, and the value of :meth:`emitted` there. That value
+        divided by the sum of the window is the density of the sample."""
         first, end = self._range(window.low.x, window.high.x)
         before = self._column_sum(window, window.low.x, active)
         goal = before + mi.Float64(point.x) * window.total
@@ -154,8 +154,8 @@ class PortalMaps:
     def emitted(
         self, index: mi.UInt32, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool
     ) -> mi.Float64:
-        """What arrives from ``d``, by the map, if that leads from ``p`` out through portal
-        ``index``; else 0. Its integral over the directions is the sum of the window."""
+        """The emission of the map in the direction ``d``, if that leads from ``p`` out through
+        portal ``index``; else 0. Its integral over directions is the sum of the window."""
         row = self._portal(index, active)
         frame = mi.Frame3f(*(mi.Vector3f(*row[i : i + 3]) for i in (3, 6, 9)))
         center, local = frame.to_local(mi.Point3f(*row[:3]) - p), frame.to_local(d)
@@ -186,7 +186,7 @@ class PortalMaps:
         return first, dr.clip(mi.UInt32(dr.ceil(high)), first + 1, self._size)
 
     def _column_sum(self, window: Window, x: mi.Float, active: mi.Bool) -> mi.Float64:
-        """The sum over the columns of the window up to ``x``, but for a constant."""
+        """The sum over the columns of the window up to ``x``, plus a constant."""
         column, fx = self._split(x)
         sums = []
         for y in (window.low.y, window.high.y):
@@ -209,7 +209,7 @@ class PortalMaps:
         return dr.lerp(below, above, fy)
 
     def _split(self, at: mi.Float) -> tuple[mi.UInt32, mi.Float64]:
-        """A texel, and the part of it: sums are linear there."""
+        """The texel of a coordinate, and the fraction within it, in which sums are linear."""
         texel = dr.minimum(mi.UInt32(at), self._size - 1)
         return texel, mi.Float64(at - mi.Float(texel))
 
@@ -281,8 +281,8 @@ def _between(
     low: mi.Float,
     high: mi.Float,
 ) -> mi.Float:
-    """Where a sum that grows evenly from ``left`` to ``right``, of which low to high is there,
-    reaches its goal."""
+    """The coordinate at which a sum reaches ``goal``: it grows linearly from ``below`` to ``above``
+    over the part of [``left``, ``right``] within [``low``, ``high``]."""
     start, end = dr.maximum(mi.Float(left), low), dr.minimum(mi.Float(right), high)
     part = above - below
     t = dr.select(part > 0, mi.Float((goal - below) / part), 0.5)

@@ -18,8 +18,8 @@ from .spectra import brightness
 #: Samples of an emitter.
 _SAMPLES = 256
 
-#: Most texels of a spot's texture that are evaluated: of larger textures, only some are. And the
-#: points along each edge of a texture that is no bitmap.
+#: The most texels of a spot's texture that are evaluated: of larger textures, only some are. And
+#: the points along each edge of a texture that is not a bitmap.
 _MOST_TEXELS, _POINTS = 1 << 22, 256
 
 
@@ -46,7 +46,7 @@ def emitter_powers(scene: mi.Scene) -> np.ndarray:
 def _sent_out(scene: mi.Scene, indices: np.ndarray) -> np.ndarray:
     if len(indices) == 0:
         return np.zeros(0)
-    # What moves has its power where it rests
+    # The power of a moving light is computed at rest
     at_rest = [e.nested if is_moving_light(e) else e for e in scene.emitters()]
     shapes = [
         e.nested.get_shape() if is_moving_light(e) else shape

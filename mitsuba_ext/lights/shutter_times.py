@@ -1,4 +1,4 @@
-"""Intervals of the time while a shutter is open: where a moving light is depends on it."""
+"""Intervals of the time while a shutter is open, in which moving lights have different places."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class ShutterTimes:
 
     Parameters:
         scene: The scene with its lights.
-        sensor: Whose shutter it is.
+        sensor: The sensor with the shutter.
 
     Attributes:
-        count (int): Intervals: 1 where no light moves, or the shutter shows one moment.
+        count (int): Number of intervals: 1 where no light moves, or the shutter shows one moment.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
@@ -36,7 +36,7 @@ class ShutterTimes:
         return dr.minimum(mi.UInt32(x * self.count), self.count - 1)
 
     def sample(self, index: mi.UInt32, sampler: mi.Sampler) -> mi.Float:
-        """A random time in an interval; where there is one only, its begin."""
+        """A random time in an interval; its begin if there is only one interval."""
         if self.count == 1:
             return mi.Float(self._begin)
         x = (mi.Float(index) + sampler.next_1d()) / self.count

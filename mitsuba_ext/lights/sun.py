@@ -31,7 +31,7 @@ class SunDisk:
 
     Attributes:
         direction (mi.Vector3f): The axis.
-        solid_angle (float): Of the cone.
+        solid_angle (float): Solid angle of the cone.
     """
 
     def __init__(self, direction: mi.Vector3f, half_angle: float) -> None:

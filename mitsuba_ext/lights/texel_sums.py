@@ -1,5 +1,5 @@
-"""Sums of an environment over rectangles of texels, and samples in proportion to what it emits
-times a function that is known at the corners of a rectangle.
+"""Sums of an environment's emission over rectangles of texels, and samples in proportion to the
+emission times a function that is given at the corners of a rectangle.
 
 Source: Cline, PhD dissertation, section 5.2.1 and appendix 5A.
 """
@@ -31,7 +31,7 @@ class Corners:
         return 0.25 * (self.v00 + self.v10 + self.v01 + self.v11)
 
     def divided(self, by_x: mi.Bool, low: mi.Float, high: mi.Float) -> tuple[Corners, Corners]:
-        """Those of both halves.
+        """The values at the corners of both halves.
 
         Parameters:
             by_x: Is the rectangle divided across x, or across y?
@@ -50,7 +50,7 @@ class Corners:
 
 @dataclass
 class Sums(Corners):
-    """The same in double precision."""
+    """Values at the corners of a rectangle, in double precision."""
 
     v00: mi.Float64
     v10: mi.Float64
@@ -64,8 +64,8 @@ class Rectangle:
 
     Attributes:
         f: A function at the corners.
-        sums: Of what the texels emit, from the first one of all to the corners, in units of all; in
-            double precision, as differences of sums are what dark texels beside a sun emit.
+        sums: The summed-area table of the emission at the corners, relative to the total emission;
+            in double precision, as dark texels beside a sun are small differences of large sums.
     """
 
     x0: mi.UInt32
@@ -77,14 +77,14 @@ class Rectangle:
 
     @property
     def share(self) -> mi.Float:
-        """What the texels emit, in units of all."""
+        """The share of the texels in the total emission."""
         s = self.sums
         # Sums grow along each row and column; only rounding could make the difference negative
         return mi.Float(dr.maximum((s.v11 - s.v01) - (s.v10 - s.v00), 0))
 
     @property
     def weight(self) -> mi.Float:
-        """Eq. 5.5 (Cline): what the texels emit times the mean of the function."""
+        """Eq. 5.5 (Cline): the emission of the texels times the mean of the function."""
         return self.share * self.f.mean
 
 
@@ -93,7 +93,7 @@ class TexelSums:
     a sun.
 
     Parameters:
-        texels: What is emitted.
+        texels: The emission.
     """
 
     def __init__(self, texels: EnvironmentTexels) -> None:
@@ -107,7 +107,7 @@ class TexelSums:
         self._sums = from_numpy(mi.Float64, sums / sums[-1, -1])
         self._nodes = from_numpy(mi.Float, node / node.max())
         self._stride = dr.opaque(mi.UInt32, texels.columns + 1)
-        #: From the probability of a texel to a density on the sphere, but for 1 / sin θ.
+        #: The factor from the probability of a texel to a density on the sphere, without 1 / sin θ.
         self._density = dr.opaque(mi.Float, texels.columns * texels.rows / texels.area)
 
     def rectangle(
@@ -168,7 +168,7 @@ class TexelSums:
         active: mi.Bool,
     ) -> tuple[mi.Point2f, mi.Float]:
         """The random numbers with which :meth:`sample` gives a direction in a rectangle, and its
-        density there; :meth:`EnvironmentTexels.find` tells where it is."""
+        density there. The direction is given by the results of :meth:`EnvironmentTexels.find`."""
         probability, first, size = mi.Float(1), mi.Point2f(0), mi.Point2f(1)
         while dr.hint(active & _is_divisible(inside), label="warp back"):
             by_x, low, high, of_low = self._halves(inside, active)
@@ -223,7 +223,7 @@ class TexelSums:
         return by_x, low, high, dr.select(a + b > 0, a / (a + b), 0.5)
 
     def _corners(self, inside, active) -> list[mi.Float]:
-        """What is emitted at the corners of a texel, in units of their mean."""
+        """The emission at the corners of a texel, relative to their mean."""
         first = inside.y0 * self._stride + inside.x0
         values = [
             dr.select(active, dr.gather(mi.Float, self._nodes, first + i, active), 1)
@@ -237,8 +237,8 @@ class TexelSums:
 def part_of(
     first: mi.Point2f, size: mi.Point2f, by_x: mi.Bool, is_low: mi.Bool, share: mi.Float
 ) -> tuple[mi.Point2f, mi.Point2f]:
-    """The random numbers that lead to one of two halves: the least ones and their range, from those
-    that lead to the whole.
+    """The random numbers that lead to one of two halves of a rectangle, as their least values and
+    the size of their range, from those that lead to the whole.
 
     Parameters:
         by_x: Do the halves lie side by side along x?

@@ -16,7 +16,7 @@ from .power import emitter_powers
 from .shutter_times import ShutterTimes
 from .spectra import brightness, comparison_wavelengths
 
-#: Least weight of a cell, relative to the mean of its row (pbrt's).
+#: Least weight of a cell, relative to the mean of its row (as in pbrt).
 _FLOOR = 1e-3
 
 #: The least and the largest number of points of a row at which a cell is evaluated. The largest
@@ -93,14 +93,14 @@ def spatial_weights(scene: mi.Scene, rows: VoxelRows, cells: LightCells) -> mi.F
 
 
 def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) -> mi.Float:
-    """The root of the mean square of what each cell contributes to a white diffuse surface of each
-    row if nothing is in between; shape [rows · cells]."""
+    """The root mean square of the contribution of each cell to a white diffuse surface of each row
+    without occlusion; shape [rows · cells]."""
 
     def squared_contribution(row: mi.UInt32, cell: mi.UInt32, sampler: mi.Sampler) -> mi.Float64:
         size = dr.gather(mi.UInt32, rows.size, row)
         index = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(size)), size - 1)
         index += dr.gather(mi.UInt32, rows.first, row)
-        # Of lights that move, pilots see the other times
+        # Moving lights are evaluated at time 0; pilots see the other times
         value, d = _light(cells, cell, dr.gather(mi.Point3f, rows.p, index), mi.Float(0), sampler)
         cosine = dr.maximum(dr.dot(d, dr.gather(mi.Normal3f, rows.n, index)), 0) + _LEAST_COSINE
         # In double precision: the square of a bright light may exceed the range of single precision

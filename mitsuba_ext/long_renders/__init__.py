@@ -1,1 +1,1 @@
-"""Renders of many independent batches: they can be saved, gone on with, merged and divided."""
+"""Renders of many independent batches, which can be saved, continued, merged, and distributed."""

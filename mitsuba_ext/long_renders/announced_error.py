@@ -1,4 +1,4 @@
-"""The error of an image that its own batches announce."""
+"""Estimates the error of an image from the variance of its own batches."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from scipy.ndimage import median_filter
 
 from ..images.metrics import RELATIVE_FLOOR
 
-#: Width of the neighbourhood, in pixels, that tells how bright a pixel is.
+#: Width, in pixels, of the neighbourhood from which the brightness of a pixel is estimated.
 _NEIGHBOURS = 3
 
 
 def announced_error(mean: np.ndarray, variance: np.ndarray) -> float | None:
-    """The relMSE of an image whose truth is not known; ``None`` for a black one.
+    """Estimates the relMSE of an image without a reference; ``None`` for a black one.
 
-    The variance of a pixel is divided by the square of its brightness. The pixel itself would be a
-    bad judge of that: one that holds a bright spot has a large variance, and would be forgiven it
-    because it is bright. So the median over its neighbourhood is taken. Pixels that are not finite
-    do not count.
+    The variance of a pixel is divided by the square of its brightness. The pixel's own value would
+    be a bad estimate of its brightness: a firefly has a large variance, but also a large value, and
+    would hardly raise the error. The brightness is therefore the median over the neighbourhood of
+    the pixel. Pixels that are not finite are left out.
 
     Args:
-        mean, variance: Of the image, and of this mean: [height, width, 3].
+        mean, variance: The image and the variance of this mean, [height, width, 3].
     """
     is_finite = (np.isfinite(mean) & np.isfinite(variance)).all(axis=2, keepdims=True)
     count = 3 * np.count_nonzero(is_finite)

@@ -23,16 +23,16 @@ class RenderRequest:
 
     Attributes:
         scene: The file.
-        size, definitions: Of the image, and values of the file's ``$name`` parameters.
+        size, definitions: Size of the image, and values of the file's ``$name`` parameters.
         specification: The integrator; ``None`` for the scene's.
-        sensor: Its number.
-        seed: Of the random numbers.
+        sensor: The index of the sensor.
+        seed: The seed of the random numbers.
         variant, plugins: Mitsuba's variant, and modules that register other plugins.
-        threads: Of a process; 0 for as many as there are cores.
-        values: Of the loaded scene, as :func:`~mitsuba_ext.inputs.scene_values.as_text` makes them;
-            ``None`` if no frame has any.
-        description: What the image depends on, as JSON: a process that would render another image
-            refuses. Empty for what each process finds.
+        threads: Threads of a process; 0 for as many as there are cores.
+        values: Values of parameters of the loaded scene, from
+            :func:`~mitsuba_ext.inputs.scene_values.as_text`; ``None`` if no frame has any.
+        description: Everything that the image depends on, as JSON. A process refuses the request if
+            its own files or versions give another description. Empty to skip this check.
     """
 
     scene: str
@@ -53,8 +53,8 @@ class BatchRenderer(IntegratorBatches):
 
     Parameters:
         request: What to render; its variant is the active one.
-        bundle: The scene's files; ``None`` for those at their paths.
-        scenes: Keeps the scene.
+        bundle: The scene's files; ``None`` to read them at their paths.
+        scenes: Keeps the loaded scene for the next render.
 
     Attributes:
         request: What to render.
@@ -92,7 +92,7 @@ class BatchRenderer(IntegratorBatches):
         super().__init__(integrator, self.chosen.scene, self.chosen.sensor, request.seed)
 
     def description(self) -> dict[str, Any]:
-        """What the image depends on, but for the number of samples."""
+        """Everything that the image depends on, except the number of samples."""
         request, film = self.request, self.sensor.film()
         loaded, named = self.chosen.loaded, self.chosen.named
         folder = loaded.path.resolve().parent
@@ -117,7 +117,7 @@ class BatchRenderer(IntegratorBatches):
         """
         Raises:
             InputError: The integrator cannot render this scene.
-            KeyboardInterrupt: The batch was interrupted: it is lost.
+            KeyboardInterrupt: The batch was interrupted, and is lost.
         """
         try:
             return super().render(batch, learned)

@@ -20,12 +20,12 @@ from ..inputs.scenes import LoadedScene
 
 @dataclass(frozen=True)
 class Bundle:
-    """Files, by their absolute paths on the machine that made the bundle.
+    """The contents of files.
 
     Attributes:
-        files: Their contents.
-        folders: Where Mitsuba searched for files there.
-        digest: SHA-256 over all of it.
+        files: Their contents, by their absolute paths on the machine that made the bundle.
+        folders: The folders in which Mitsuba searched for files on that machine.
+        digest: SHA-256 over paths, contents and folders.
     """
 
     files: Mapping[str, bytes]
@@ -34,15 +34,15 @@ class Bundle:
 
     @classmethod
     def of(cls, loaded: LoadedScene, others: tuple[str, ...] = ()) -> Bundle:
-        """The files of a scene.
+        """Bundles the files of a scene.
 
         Args:
             loaded: The scene.
             others: More files, such as that of an integrator.
 
         Raises:
-            InputError: A file has changed since the scene was loaded, or it is named in a way that
-                means nothing on other machines.
+            InputError: A file has changed since the scene was loaded, or the scene names it by an
+                absolute path, which cannot be used on other machines.
         """
         if fixed := named_by_absolute_path(loaded.files, loaded.parameters):
             raise InputError(
@@ -58,18 +58,20 @@ class Bundle:
             raise InputError(f"{loaded.source}: cannot be sent to the workers: {error}") from None
         if not is_same:
             raise InputError(f"{loaded.source}: its files have changed since the render began")
-        # The scene may be a link; what the resolver does not find is opened in the current folder
+        # The scene may be a link. Mitsuba opens names that its resolver does not find in the
+        # current folder
         searched = [loaded.path.resolve().parent, *mi.file_resolver(), os.curdir]
         folders = tuple(os.path.abspath(str(folder)) for folder in searched)
         return cls(files, folders, _digest(files, folders))
 
     @contextlib.contextmanager
     def unpacked(self) -> Iterator[Callable[[str], str]]:
-        """A context in which the files are in a temporary folder, and Mitsuba finds them. Yields a
-        function that says where a file is now; names that are not in the bundle it returns.
+        """A context in which the files are in a temporary folder, where Mitsuba finds them. Yields
+        a function that maps the path of a file to its path there; it returns names that are not in
+        the bundle as they are.
 
         Raises:
-            InputError: The bundle was damaged on its way, or there is no room for it.
+            InputError: The bundle was damaged in transfer, or the disk has no room for it.
         """
         if self.digest != _digest(self.files, self.folders):
             raise InputError("the scene was damaged on its way to the worker")
@@ -92,7 +94,7 @@ class Bundle:
                 resolver.prepend(str(root / os.path.relpath(folder, os.sep)))
             try:
                 yield moved
-            except InputError as error:  # names as the user knows them
+            except InputError as error:  # show the original paths, without the temporary folder
                 raise InputError(str(error).replace(str(root), "")) from error
             finally:
                 for _ in self.folders:

@@ -17,15 +17,15 @@ from ..errors import InputError, InstallationError
 if TYPE_CHECKING:
     from distributed import Client
 
-#: Seconds for the scheduler to answer, and for a first worker to come.
+#: Seconds for the scheduler to answer, and for a first worker to connect.
 _PATIENCE = 10
 
-#: Seconds between two questions for the workers.
+#: Seconds between two queries for the list of workers.
 _PERIOD = 5.0
 
 
 class DaskWorkers(Executor):
-    """The executor of a client of Dask, with the additional methods of
+    """The executor of a Dask client, with the additional methods of
     :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`.
 
     Parameters:
@@ -34,7 +34,7 @@ class DaskWorkers(Executor):
 
     def __init__(self, client: Client) -> None:
         self._client = client
-        # By default, a batch that has failed would not be tried again: Dask takes it for known
+        # By default (pure), Dask would not run a failed batch again, but return its known result
         self._executor = client.get_executor(pure=False)
         self._keys: weakref.WeakKeyDictionary[Future, str] = weakref.WeakKeyDictionary()
         self._avoided: set[str] = set()
@@ -51,11 +51,11 @@ class DaskWorkers(Executor):
         return future
 
     def share(self, value: Any) -> Any:
-        """Puts a value on a worker, from which others get it."""
+        """Puts a value on one worker, from which the others fetch it."""
         return self._client.scatter([value], hash=False)[0]
 
     def avoid(self, future: Future) -> None:
-        """Gives nothing to the worker of this task until the task is done."""
+        """Gives no further tasks to the worker of this one until it is done."""
         key = self._keys.get(future)
         for address, keys in self._client.processing().items():
             if key in keys:
@@ -70,29 +70,30 @@ class DaskWorkers(Executor):
         self._executor.shutdown(wait=wait)
 
     def count(self) -> int:
-        """How many workers (processes) there are."""
+        """The number of workers (processes)."""
         return len(self._addresses())
 
     def _addresses(self) -> set[str]:
         now = time.monotonic()
         if now - self._asked > _PERIOD:
             self._asked = now
-            with contextlib.suppress(OSError):  # the scheduler is gone
+            with contextlib.suppress(OSError):  # the scheduler does not answer
                 self._known = set(self._client.scheduler_info(n_workers=-1)["workers"])
         return self._known
 
 
 @contextlib.contextmanager
 def dask_cluster(address: str) -> Iterator[tuple[DaskWorkers, Callable[[], None]]]:
-    """A context with an executor that renders on a cluster, and a function to call now and then:
-    without the scheduler, what is awaited never comes. At the end of the context, batches that have
-    not begun are cancelled.
+    """A context with an executor that renders on a cluster, and a function that checks the
+    connection. Call the function now and then: without the scheduler, results never arrive. At the
+    end of the context, batches that have not begun are cancelled.
 
     Args:
-        address: Of the scheduler: ``tcp://host:port``.
+        address: The address of the scheduler: ``tcp://host:port``.
 
     Raises:
-        InputError: No scheduler answers, or it has no workers; or the function finds it gone.
+        InputError: No scheduler answers, or it has no workers. The function raises it if the
+            connection is lost.
         InstallationError: Dask is not installed.
     """
     try:

@@ -1,4 +1,4 @@
-"""Gives batches to workers, of which some may die or hang."""
+"""Distributes batches to workers, some of which may die or hang."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ from .bundle import Bundle
 from .state import Batch, BatchResult
 from .tasks import Missing, digest_of, render_batch
 
-#: Batches that wait at each worker.
+#: How many batches are submitted at a time, per worker.
 QUEUE = 2
 
-#: Seconds between two looks at what others render.
+#: Seconds between two checks of the submitted batches.
 _PERIOD = 1.0
 
-#: How often a batch fails before the render is given up.
+#: How often a batch may fail before the render ends with an error.
 _TRIES = 3
 
-#: A batch is late after this multiple of the median time from giving a batch away to its result,
-#: and not before so many seconds: a worker that begins loads the scene and compiles kernels.
-#: Before anything has come back, it is late after the last number of seconds.
+#: A batch is late after the first number times the median time from submission to result, but not
+#: before the second number of seconds (a new worker loads the scene and compiles kernels). Before
+#: the first result, it is late after the third number of seconds.
 _LATE, _FIRST_LATE, _UNKNOWN_LATE = 5.0, 60.0, 600.0
 
-#: Results whose times count for the median.
+#: Number of the last results whose times give the median.
 _REMEMBERED = 101
 
 
 @dataclass
 class _Task:
-    """A batch that has been given away.
+    """A batch that has been submitted to workers.
 
     Attributes:
-        given: When that was done last.
-        copies: How often it was done because others were late.
+        given: When it was submitted last.
+        copies: How often it was submitted again because its result was late.
         failures: How often it failed.
-        futures: What is awaited.
-        needs: What workers have asked for.
+        futures: The futures of all submissions that have not ended.
+        needs: The data that workers lacked, which the next submission contains.
     """
 
     given: float
@@ -57,17 +57,17 @@ class _Task:
 
 
 class Dispatch:
-    """Renders batches by an executor. A batch that fails, or whose result is late, is given away
-    again; its first result counts.
+    """Renders batches with an executor. A batch that fails, or whose result is late, is submitted
+    again; its first result is used.
 
-    An executor may have two methods more than any. ``share(value)`` returns what can be sent to
-    many workers in place of the value, and ``avoid(future)`` says that the worker which has the
-    task of ``future`` is to get no others until it is done.
+    An executor may have two additional methods. ``share(value)`` returns a handle that can be sent
+    to many workers in place of the value. ``avoid(future)`` gives no other tasks to the worker of
+    ``future`` until that is done.
 
     Parameters:
-        executor: Who renders. Its workers need this package, but not the scene's files.
-        renderer: What is rendered.
-        workers: Says how many batches the executor renders at a time.
+        executor: Runs the workers. These need this package, but not the scene's files.
+        renderer: The render whose batches they render.
+        workers: Returns how many batches the executor renders at a time.
     """
 
     def __init__(
@@ -77,12 +77,12 @@ class Dispatch:
         workers: Callable[[], int],
     ) -> None:
         self._executor, self._renderer, self._workers = executor, renderer, workers
-        # Workers have another current folder, and perhaps other files
+        # Workers have another current folder, and their files may differ
         description = json.dumps(renderer.description(), default=str)
         self._request = replace(_absolute(renderer.request), description=description)
         self._tasks: dict[Batch, _Task] = {}
         self._running: dict[Future, Batch] = {}
-        # Waiting for thousands of futures by ``concurrent.futures.wait`` takes milliseconds
+        # A queue, as ``concurrent.futures.wait`` takes milliseconds for thousands of futures
         self._finished: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._looked = 0.0
         self._seconds: deque[float] = deque(maxlen=_REMEMBERED)
@@ -95,12 +95,13 @@ class Dispatch:
         learned: Callable[[], bytes | None],
         is_stopped: Callable[[], bool],
     ) -> Iterator[BatchResult]:
-        """The results of the batches, as they come.
+        """Yields the results of the batches in the order of their arrival.
 
         Args:
-            learned: What has been learned; ``None`` as long as a batch still has to: it is rendered
-                alone.
-            is_stopped: Asked while nothing comes.
+            batches: The batches to render.
+            learned: Returns the learned state that batches load; ``None`` until the first batch has
+                learned it, which is rendered alone.
+            is_stopped: Called while no result arrives: returns True to end.
 
         Raises:
             InputError: A batch cannot be rendered.
@@ -129,7 +130,7 @@ class Dispatch:
                 future.cancel()
 
     def _give(self, batch: Batch, learned: bytes | None) -> None:
-        """Gives a batch away, with what its workers have asked for."""
+        """Submits a batch, with the data that its workers lacked."""
         task = self._tasks[batch]
         sent, bundle = None, None
         if task.needs.learned:
@@ -146,7 +147,7 @@ class Dispatch:
     def _taken(
         self, future: Future, learned: bytes | None, is_stopped: Callable[[], bool]
     ) -> BatchResult | None:
-        """The result of a batch, if it is the first one."""
+        """The result of a batch; ``None`` if there is none yet, or another copy was faster."""
         batch = self._running.pop(future)
         task = self._tasks.get(batch)
         if task is None:  # a copy was faster
@@ -164,7 +165,7 @@ class Dispatch:
             for other in task.futures:
                 other.cancel()
             return result
-        self._shared.clear()  # it may have died with a worker
+        self._shared.clear()  # the shared values may have been lost with a worker
         task.failures += 1
         if is_stopped():  # the workers may have got the same signal
             return None
@@ -184,7 +185,7 @@ class Dispatch:
         if self._seconds:
             limit = max(_FIRST_LATE, _LATE * statistics.median(self._seconds))
         for batch, task in self._tasks.items():
-            # Each time it may take longer: perhaps the batch is slow, and not its worker
+            # The limit doubles with each copy, as the batch may be slow, and not its worker
             if now - task.given > limit * 2**task.copies:
                 for future in task.futures:
                     getattr(self._executor, "avoid", lambda future: None)(future)
@@ -207,7 +208,7 @@ class Dispatch:
 
 
 def _absolute(request: RenderRequest) -> RenderRequest:
-    """A request whose files are found from any folder."""
+    """The request with absolute paths of files, which are valid in any current folder."""
 
     def absolute(name: str) -> str:
         path = Path(name)
@@ -220,7 +221,7 @@ def _absolute(request: RenderRequest) -> RenderRequest:
 
 
 def _failure(future: Future) -> BaseException | None:
-    """Why a batch failed; raises what is wrong with the input."""
+    """The error of a batch; ``None`` if it succeeded. Raises the error if it is about the input."""
     if future.cancelled():
         return CancelledError("its worker is gone")
     error = future.exception()

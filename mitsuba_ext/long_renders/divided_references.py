@@ -1,4 +1,4 @@
-"""References of comparisons, rendered by others."""
+"""Renders the references of comparisons in worker processes."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ from .state import Batch
 
 
 class ReferenceWorkers:
-    """Those who render the references of a comparison. What is measured is rendered elsewhere, one
-    render at a time: times of machines that differ, or of cores that are shared, cannot be
-    compared.
+    """The workers that render the references of a comparison. They do not render the measured runs,
+    as times on different machines, or on shared cores, cannot be compared.
 
     Parameters:
-        executor: Who renders: see :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`.
+        executor: Runs the workers: see :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`.
         count: How many batches it renders at a time.
         plugins: Modules that register other plugins.
-        threads: Of each process; 0 for as many as there are cores.
+        threads: Threads of each process; 0 for as many as there are cores.
     """
 
     def __init__(
@@ -45,15 +44,16 @@ class ReferenceWorkers:
         spp: int,
         batches: Batches | None,
     ) -> Iterator[Batches]:
-        """The sum of the batches so far, after each of them: as
+        """Yields the sum of the batches so far after each batch, like
         :func:`~mitsuba_ext.rendering.batches.each_batch`.
 
         Args:
             scene: The scene, from a file.
             specification: The integrator, as text.
-            seed: Of the reference.
-            count, spp: Of the batches, those of ``batches`` included, and of samples in each.
-            batches: The first ones, if they are there already.
+            seed: The seed of the reference.
+            count, spp: Number of batches, those of ``batches`` included, and samples per pixel of
+                each.
+            batches: The first ones, if they have been rendered already; else ``None``.
 
         Raises:
             InputError: The scene or the integrator cannot be sent, or a batch fails.
@@ -61,7 +61,7 @@ class ReferenceWorkers:
         if scene.path is None or not isinstance(specification, str):
             raise InputError(
                 "cannot be sent to others: for an executor, the scene must be a file, and the "
-                "reference's integrator text"
+                "reference's integrator must be given as text"
             )
         film = scene.scene.sensors()[0].film()
         has_crop_window = tuple(film.crop_size()) != tuple(film.size())
@@ -74,7 +74,8 @@ class ReferenceWorkers:
         dispatch = Dispatch(self._executor, renderer, lambda: self._count)
         index = batches.count if batches else 0
         waiting = (Batch(seed, number, spp) for number in range(index, count))
-        # Added in their order: the batches of an interrupted reference are those that come first
+        # Added in the order of their index, as an interrupted reference continues after the first
+        # ``batches.count``
         early = {}
         for result in dispatch.results(waiting, lambda: b"", lambda: False):
             early[result.batch.index] = result
@@ -86,7 +87,7 @@ class ReferenceWorkers:
 
 
 class _Loaded(LastScene):
-    """A scene that is there already."""
+    """Returns a scene that has been loaded already."""
 
     def __init__(self, loaded: LoadedScene) -> None:
         self._given = loaded

@@ -1,4 +1,4 @@
-"""The folder in which a render is kept."""
+"""The folder in which a render is saved."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from ..errors import InputError
 from ..files import make_folder, replacing
 from .state import RenderState
 
-#: What is rendered; the state; the one before it.
+#: Files: the description of what is rendered; the state; the state before it.
 _DESCRIPTION, _STATE, _BEFORE = "render.json", "state.npz", "state.before.npz"
 
-#: The key of a description under which it has the hashes of the scene's files by their names. They
-#: only tell which file has changed: the names differ from place to place.
+#: The key of the hashes of the scene's files in a description, by their names. They only serve to
+#: name the file that has changed, as names can differ between machines.
 _FILES = "scene files"
 
-#: Number of the format of these files.
+#: Version of the format of these files.
 _FORMAT = 2
 
 
 class CheckpointFolder:
-    """A folder with the state of a render, from which it can go on.
+    """A folder with the state of a render, from which it can continue.
 
-    A new state replaces the old one in one step, and the one before stays: whatever ends the
-    process, and at any moment, one of both is whole.
+    A new state replaces the old one in one step, and the state before it is kept. Whenever the
+    process ends, and for whatever reason, one of the two is undamaged.
 
     Parameters:
         path: The folder, which is made if it is missing.
 
     Attributes:
-        damaged: The file of the newest state, if :meth:`load` found that one damaged and returned
-            the one before.
+        damaged: The file of the newest state, if :meth:`load` found it damaged and returned the
+            state before it; else ``None``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -50,10 +50,10 @@ class CheckpointFolder:
         return marks.in_use(self.path)
 
     def describe(self, description: Mapping[str, Any]) -> None:
-        """Says what is rendered.
+        """Stores the description of what is rendered, or compares it with the stored one.
 
         Raises:
-            InputError: Something else was rendered before in this folder.
+            InputError: The folder belongs to another render.
         """
         file = self.path / _DESCRIPTION
         if not file.exists():
@@ -66,10 +66,10 @@ class CheckpointFolder:
         check_same(self.description(), json.loads(json.dumps(description, default=str)), self.path)
 
     def description(self) -> dict[str, Any]:
-        """What is rendered.
+        """The stored description of what is rendered.
 
         Raises:
-            InputError: This is no such folder, or it is damaged.
+            InputError: There is none, or it is damaged.
         """
         file = self.path / _DESCRIPTION
         if not file.exists():
@@ -80,7 +80,7 @@ class CheckpointFolder:
             raise InputError(f"{file}: cannot be read ({error})") from None
 
     def load(self) -> RenderState:
-        """The newest state that is whole; an empty one if there is none.
+        """The newest state that is not damaged; an empty one if there is none.
 
         Raises:
             InputError: There are states, but all of them are damaged.
@@ -97,10 +97,10 @@ class CheckpointFolder:
         return RenderState()
 
     def save(self, state: RenderState) -> None:
-        """Keeps a state.
+        """Saves a state.
 
         Raises:
-            OSError: It cannot be written; the one before is still there.
+            OSError: It cannot be written; the state before it is still there.
         """
         file = self.path / _STATE
         temporary = self.path / f".{_STATE}"
@@ -109,7 +109,7 @@ class CheckpointFolder:
                 np.savez(stream, format=np.array(_FORMAT), **state.arrays())
                 stream.flush()
                 os.fsync(stream.fileno())
-            # A damaged state must not replace the one before, which is whole
+            # A damaged state must not replace the one before it, which is not damaged
             if file.exists() and self.damaged is None:
                 os.replace(file, self.path / _BEFORE)
             os.replace(temporary, file)
@@ -124,11 +124,11 @@ def check_same(
     """
     Args:
         before, now: Descriptions of renders.
-        where: What the error calls the first.
-        free: Keys that may differ. The name of the scene's file may always.
+        where: The name of ``before`` in the error message.
+        free: Keys that may differ. The name of the scene's file may always differ.
 
     Raises:
-        InputError: They are not the same; the sentence names what differs.
+        InputError: They differ; the message names the difference.
     """
     if found := difference(before, now, free):
         raise InputError(
@@ -137,7 +137,7 @@ def check_same(
 
 
 def difference(before: Mapping[str, Any], now: Mapping[str, Any], free: Sequence[str] = ()) -> str:
-    """Says in which key two descriptions of renders differ; empty if they are the same."""
+    """A text about the first key in which two descriptions differ; empty if they are the same."""
     for key in dict.fromkeys([*before, *now]):
         if key in ("scene", _FILES, *free) or before.get(key) == now.get(key):
             continue
@@ -145,7 +145,7 @@ def difference(before: Mapping[str, Any], now: Mapping[str, Any], free: Sequence
         change = f"{there} there, {here} here"
         if key == f"{_FILES} hash":
             key, change = _FILES, _changed_files(before.get(_FILES, {}), now.get(_FILES, {}))
-        elif key.endswith("hash"):  # which tells nobody anything
+        elif key.endswith("hash"):  # its value would not help the user
             key = key.removesuffix("hash").strip()
             change = "its code has changed" if key == "integrator" else "it has changed"
         elif isinstance(there, Mapping) and isinstance(here, Mapping):
@@ -156,7 +156,7 @@ def difference(before: Mapping[str, Any], now: Mapping[str, Any], free: Sequence
 
 
 def _changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """Names the files, of which hashes are given, that are not the same."""
+    """A text that names the files whose hashes differ."""
     names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     are = "has" if len(names) == 1 else "have"
@@ -169,7 +169,7 @@ def _read(file: Path) -> dict[str, np.ndarray] | None:
         with np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         return arrays if int(arrays.pop("format")) == _FORMAT else None
-    except Exception:  # NumPy, zipfile and zlib raise a dozen kinds; a checksum is in the file
+    except Exception:  # NumPy, zipfile (which verifies checksums) and zlib raise many kinds
         return None
 
 

@@ -1,4 +1,4 @@
-"""Batches of a render by an integrator."""
+"""Renders batches with an integrator."""
 
 from __future__ import annotations
 
@@ -19,13 +19,15 @@ from ..rendering.seed_passes import can_render, is_independent, pass_length
 from ..rendering.totals import RenderTotals, forget_memory_peak
 from .state import Batch, BatchResult
 
-#: About how many samples a batch of ours has: each traces its kernels anew, and begins its chains.
+#: Approximate number of samples in a batch of one of our integrators. Batches are this large
+#: because each one traces its kernels anew, and starts its Markov chains anew.
 _SAMPLES = {dr.JitBackend.LLVM: 1 << 22, dr.JitBackend.CUDA: 1 << 25}
 
-#: Samples per pixel of a batch of ours, at least, and of one whose samples are stratified.
+#: The fewest samples per pixel of a batch of one of our integrators: with an independent sampler,
+#: and with one that stratifies.
 _SPP, _STRUCTURED_SPP = 16, 64
 
-#: Samples per pixel of the batch that the others learn from, if there are so many.
+#: Samples per pixel of the batch that learns for the others, if the render has as many.
 _LEARNING_SPP = 128
 
 
@@ -37,10 +39,10 @@ class IntegratorBatches:
 
     Attributes:
         sensor, seed: The sensor and the seed.
-        learns: Does the integrator learn something that can be kept?
+        learns: Does the integrator learn something that other batches can load?
 
     Raises:
-        InputError: The variant has no batches.
+        InputError: The variant is a scalar one.
     """
 
     def __init__(
@@ -52,7 +54,7 @@ class IntegratorBatches:
             )
         self._integrator, self._scene, self.sensor = integrator, scene, sensor
         self.seed = seed
-        # Its own file, if it has one, holds for all batches already
+        # An integrator with save_learned or load_learned uses its own file for all batches
         self.learns = bool(
             getattr(integrator, "can_learn", False)
             and not integrator.save_learned
@@ -60,8 +62,8 @@ class IntegratorBatches:
         )
 
     def length(self, spp: int, teaches: bool) -> int:
-        """The samples per pixel of the next batch, of ``spp`` that are left. It does not depend on
-        the speed, so that the same command gives the same image.
+        """The samples per pixel of the next batch, out of ``spp`` that are missing. They do not
+        depend on the speed, so that the same command gives the same image.
 
         Args:
             teaches: Do the batches after it use what it learns?
@@ -78,10 +80,10 @@ class IntegratorBatches:
         """
         Args:
             learned: What an earlier batch has learned; empty if there was nothing to learn;
-                ``None`` if this batch is the one that learns it.
+                ``None`` if this batch is the one that learns.
 
         Raises:
-            KeyboardInterrupt: The batch was interrupted: it is lost.
+            KeyboardInterrupt: The batch was interrupted, and is lost.
         """
         if not self.learns:
             return self._rendered(batch)

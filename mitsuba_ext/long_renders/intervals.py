@@ -1,4 +1,4 @@
-"""How often a render is kept."""
+"""How often a render is saved."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Interval:
-    """How often a render is kept: every so many seconds, or samples per pixel."""
+    """How often a render is saved: its period in seconds, or in samples per pixel."""
 
     seconds: float = 0.0
     spp: int = 0
 
     @classmethod
     def parse(cls, text: str) -> Interval:
-        """Of text such as ``60s``, ``10m`` or ``100spp``.
+        """Reads text such as ``60s``, ``10m`` or ``100spp``.
 
         Raises:
-            ValueError: It is none.
+            ValueError: The text has another form.
         """
         match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|m|h|spp)", text)
         if not match or float(match[1]) == 0 or (match[2] == "spp" and "." in match[1]):
@@ -30,13 +30,13 @@ class Interval:
 
 
 class LastKept:
-    """When a render was kept last.
+    """Remembers when a render was saved last.
 
     Parameters:
-        spp: Its samples per pixel when it began.
+        spp: The samples per pixel that it begins with.
 
     Attributes:
-        begin: When that was.
+        begin: When it began, by ``time.perf_counter``.
     """
 
     def __init__(self, spp: int) -> None:
@@ -44,11 +44,11 @@ class LastKept:
         self.mark(spp)
 
     def mark(self, spp: int) -> None:
-        """It is kept now."""
+        """Call it when the render, with ``spp`` samples per pixel, is saved."""
         self._time, self._spp = time.perf_counter(), spp
 
     def is_due(self, every: Interval, spp: int) -> bool:
-        """Is it to be kept again?"""
+        """Should the render be saved again?"""
         if every.spp:
             return spp - self._spp >= every.spp
         return time.perf_counter() - self._time >= every.seconds

@@ -1,4 +1,4 @@
-"""``checkpoint`` of our integrators: a render that goes on from a folder."""
+"""The parameter ``checkpoint`` of our integrators: a render that is saved in a folder."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from .state import Batch, BatchResult, RenderState
 
 
 class KeptRender:
-    """A render in batches that a folder keeps.
+    """A render in batches that is saved in a folder, and continued from there.
 
     Parameters:
         integrator: An integrator whose ``render()`` renders a batch, and which has the attribute
             ``is_cancelled``.
-        folder, every: Where it is kept, and how often.
-        parameters: Of the integrator, as far as the image depends on them.
+        folder, every: The folder, and how often the render is saved.
+        parameters: The integrator's parameters on which the image depends.
     """
 
     def __init__(
@@ -48,17 +48,17 @@ class KeptRender:
         seconds: float | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> tuple[RenderState, bool]:
-        """Renders what is missing, and leaves the image in the film. Returns what has been
-        rendered, and whether it was interrupted.
+        """Renders the missing batches, and puts the image of all batches into the film. Returns the
+        state of the render, and whether it was interrupted.
 
         Args:
             spp: Samples per pixel of the whole image; 0 for the number of the sampler.
-            seconds: The time of this call, if it is limited.
+            seconds: The time limit of this call; ``None`` for none.
             progress: Called after each batch with the fraction done.
 
         Raises:
             InputError: The folder holds another render, or cannot be used.
-            KeyboardInterrupt: Ctrl-C, before there was an image.
+            KeyboardInterrupt: Ctrl-C, before the first batch was done.
         """
         goal = Goal(sample_count(sensor, spp), seconds=seconds)
         batches = _Batches(self._integrator, scene, sensor, seed)
@@ -108,7 +108,7 @@ class KeptRender:
             mi.Log(mi.LogLevel.Warn, f"the render could not be kept: {problem}")
 
     def _description(self, scene: mi.Scene, sensor: mi.Sensor, seed: int) -> dict[str, Any]:
-        """What the image depends on, but for the number of samples."""
+        """Everything that the image depends on, except the number of samples."""
         integrator, film = self._integrator, sensor.film()
         return {
             "scene hash": fingerprint(scene) + _digest_of_text(scene),
@@ -127,7 +127,7 @@ class _CancelledError(Exception):
 
 
 class _Batches(IntegratorBatches):
-    """A batch that was cancelled has fewer samples than it should: it is lost."""
+    """Discards a batch that was cancelled, as it has fewer samples than it should."""
 
     def render(self, batch: Batch, learned: bytes | None = None) -> BatchResult:
         result = super().render(batch, learned)
@@ -137,15 +137,15 @@ class _Batches(IntegratorBatches):
 
 
 def _digest_of_text(scene: mi.Scene) -> str:
-    """What shapes and lights say of themselves: choices such as the distribution of a microfacet
-    BSDF are no parameters that the fingerprint could see."""
+    """A hash of the ``str()`` of shapes and lights. It covers choices such as the distribution of a
+    microfacet BSDF, which are not among the parameters that the fingerprint covers."""
     parts = [*scene.shapes(), *scene.emitters()]
     text = sorted(re.sub("0x[0-9a-f]+", "", str(part)) for part in parts)  # without addresses
     return hashlib.sha256("".join(text).encode()).hexdigest()
 
 
 def _digest(sensor: mi.Sensor) -> str:
-    """Of a sensor, its film, filter and sampler."""
+    """A hash of a sensor, its film, filter and sampler."""
     values, film = mi.traverse(sensor), sensor.film()
     text = [f"{key}={values[key]}" for key in sorted(values.keys())]
     text += [sensor.class_name(), sensor.sampler().class_name(), film.class_name()]

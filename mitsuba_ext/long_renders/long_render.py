@@ -1,4 +1,4 @@
-"""A render of as many batches as it takes."""
+"""A render in batches, until a goal is reached."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from .dispatch import QUEUE, Dispatch
 from .integrator_batches import IntegratorBatches
 from .state import Batch, BatchResult, RenderState
 
-#: Batches, at least, that tell the error of an image.
+#: The fewest batches from which the error of an image is estimated.
 _FEWEST = 8
 
-#: The error is computed again after so many times the batches: for large images, this takes as long
-#: as some of their samples.
+#: The error is computed again when the number of batches has grown by this factor: for large
+#: images, the computation takes as long as some of their samples.
 _LATER = 1.05
 
 
 @dataclass(frozen=True)
 class Goal:
-    """When a render ends: at the first of these.
+    """When a render ends: as soon as one of these is reached.
 
     Attributes:
         spp: Samples per pixel; ``None`` for no limit.
-        error: The relative error of the image, as relMSE, that its batches announce.
-        seconds: The time of this call. The first batches tell how many fit: a render that ended by
-            the clock would prefer samples that are fast.
+        error: The relMSE of the image, as estimated from its batches; ``None`` for none.
+        seconds: The time of this call; ``None`` for no limit. The speed of the first batches
+            decides how many fit: a render that ended by the clock would prefer fast samples.
     """
 
     spp: int | None = None
@@ -41,16 +41,16 @@ class Goal:
 
 class LongRender:
     """Adds batches to a state until a goal is reached. Batches are independent renders, which are
-    added as they come: it does not matter who renders them.
+    added in the order of their arrival: any process can render them.
 
     Parameters:
         renderer: Renders the batches.
-        state: What has been rendered already.
+        state: The batches that have been rendered already.
         progress: Called after each batch.
 
     Attributes:
-        state: What has been rendered.
-        goal_spp: Samples per pixel in the end, as far as it is known.
+        state: The batches that have been rendered.
+        goal_spp: Samples per pixel of the finished render; 0 if unknown.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class LongRender:
     ) -> None:
         self._renderer, self._progress = renderer, progress
         self.state, self.goal_spp = state, 0
-        # After how many batches it was computed last
+        # The number of batches after which the error was computed last, and that error
         self._error: tuple[int, float | None] = (0, None)
 
     def run(
@@ -71,14 +71,14 @@ class LongRender:
         executor: Executor | None = None,
         workers: int | Callable[[], int] = 1,
     ) -> bool:
-        """Renders; was the goal reached?
+        """Renders. Returns True if the goal was reached.
 
         Args:
             goal: When to end.
-            is_stopped: Asked after each batch, and while batches of others are awaited.
-            executor: Who renders what a ``BatchRenderer`` does: see
+            is_stopped: Called after each batch, and while workers render: returns True to end.
+            executor: Renders the batches of a ``BatchRenderer`` in other processes: see
                 :class:`~mitsuba_ext.long_renders.dispatch.Dispatch`. ``None`` for this process.
-            workers: How many batches the executor renders at a time, or a function that says so.
+            workers: How many batches the executor renders at a time, or a function that returns it.
 
         Raises:
             InputError: A batch cannot be rendered.
@@ -90,7 +90,7 @@ class LongRender:
         else:
             dispatch = Dispatch(executor, self._renderer, count_workers)
             results = dispatch.results(self._batches(), lambda: self._learned, is_stopped)
-        # Speed is measured between the first result and this one
+        # The speed is measured from the first result to the one with this number
         measured = 1 + QUEUE * count_workers()
         begin, warm, count = time.perf_counter(), 0.0, 0
         while not self._is_reached():
@@ -99,7 +99,7 @@ class LongRender:
             self.state.add(result)
             count += 1
             if count == 1:
-                # Its kernels may have been compiled
+                # Its time is not measured, as its kernels may have been compiled
                 warm, before = time.perf_counter(), self.state.spp
             elif goal.seconds is not None and count == measured:
                 seconds = (time.perf_counter() - warm) / (self.state.spp - before)
@@ -109,7 +109,7 @@ class LongRender:
 
     @property
     def error(self) -> float | None:
-        """The relative error that the batches announce, or announced not long ago; ``None`` before
+        """The relMSE estimated from the batches (it may be a few batches old); ``None`` before
         there are enough of them, and for a black image."""
         batches = self.state.images
         if batches is None or batches.count < _FEWEST:
@@ -122,8 +122,8 @@ class LongRender:
 
     @property
     def spp_left(self) -> int | None:
-        """Samples per pixel that are still to come, as far as it is known: until an error is
-        reached, as many as its fall with 1/n announces."""
+        """Samples per pixel that are still to be rendered; ``None`` if unknown. For an error to
+        reach, the estimate assumes that relMSE falls with 1/n."""
         found = [self.goal_spp - self.state.spp] if self.goal_spp else []
         if self._goal.error and (error := self.error) is not None:
             found.append(round(self.state.spp * (error / self._goal.error - 1)))
@@ -145,17 +145,18 @@ class LongRender:
         return error is not None and error <= limit
 
     def _plan(self, left: float, seconds: float) -> None:
-        """Says how many samples fit into the time that is left, by the seconds of one."""
+        """Sets the goal to the samples that fit into ``left`` seconds; ``seconds`` is the time of
+        one sample per pixel."""
         fits = self.state.spp + max(0, round(left / seconds))
         self.goal_spp = min(fits, self._goal.spp or fits)
 
     @property
     def _learned(self) -> bytes | None:
-        """What the next batch uses; ``None`` if it has to learn it for others."""
+        """The learned state that the next batch loads; ``None`` if that batch has to learn it."""
         return self.state.learned if self._renderer.learns else b""
 
     def _batches(self) -> Iterator[Batch]:
-        """The next batches: first those that were still to come when others had been added."""
+        """The next batches: indices that are missing among the finished batches come first."""
         seed, spp = self._renderer.seed, self.state.spp
         known = {batch.index for batch in self.state.done if batch.seed == seed}
         for index in itertools.count():

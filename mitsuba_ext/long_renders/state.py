@@ -1,4 +1,4 @@
-"""What has been rendered so far: sums over batches, and which batches these are."""
+"""The state of a render in batches: the sum of their images, and the list of the batches."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Batch(NamedTuple):
     """A part of a render.
 
     Attributes:
-        seed: Of the render.
+        seed: The seed of the render.
         index: The number of the batch among those of this seed.
-        spp: Samples per pixel.
+        spp: Its samples per pixel.
     """
 
     seed: int
@@ -30,17 +30,17 @@ class Batch(NamedTuple):
 
 
 class BatchResult(NamedTuple):
-    """What a batch has brought.
+    """The result of a batch.
 
     Attributes:
-        batch: Which one.
+        batch: The batch.
         contents, has_weights: See :class:`~mitsuba_ext.rendering.film_sums.FilmSums`.
         image: The developed film with its AOVs: [height, width, channel].
         channels, image_channel_count: See :class:`~mitsuba_ext.rendering.batches.Batches`.
         aov_names: Channels besides those of the image.
-        learned: What the integrator has learned, for the other batches; empty if there was nothing
-            to learn, ``None`` if it did not try.
-        totals: What it cost.
+        learned: The file ``save_learned`` of the integrator, for the other batches; empty if there
+            was nothing to learn, ``None`` if the batch was not asked to learn.
+        totals: The cost of the batch.
     """
 
     batch: Batch
@@ -55,15 +55,15 @@ class BatchResult(NamedTuple):
 
 
 class RenderState:
-    """Sums over batches. Its size does not depend on how many there are, but for 12 bytes each.
+    """Sums over batches. Each batch adds only 12 bytes to the size of the state.
 
     Attributes:
         done: The batches, in the order in which they were added.
-        film: The sum of what they have left in the film.
+        film: The sum of the contents of their films.
         images: Mean and variance of their images; ``None`` before the first.
         aov_names: Channels besides those of the image.
         learned: What one of them has learned for the others: see :class:`BatchResult`.
-        totals: What they cost.
+        totals: Their total cost.
     """
 
     def __init__(self) -> None:
@@ -92,10 +92,10 @@ class RenderState:
         self.totals = self.totals.plus(result.totals)
 
     def plus(self, other: RenderState) -> RenderState:
-        """The batches of both.
+        """The merged state, with the batches of both.
 
         Raises:
-            InputError: Both have the same batch, or they have other channels.
+            InputError: Both contain the same batch, or their channels differ.
         """
         shared = {batch[:2] for batch in self.done} & {batch[:2] for batch in other.done}
         if shared:
@@ -119,7 +119,7 @@ class RenderState:
     # ---- As arrays ----
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All that :meth:`from_arrays` needs."""
+        """The state as arrays, for :meth:`from_arrays`."""
         images = self.images.arrays() if self.images else {}
         learned = {}
         if self.learned is not None:

@@ -1,4 +1,4 @@
-"""What a worker does: it renders a batch, and keeps the scene for the next one."""
+"""The task of a worker: to render a batch. It keeps the scene for the next one."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from .state import Batch, BatchResult
 
 
 class Missing(NamedTuple):
-    """What a worker needs for a batch, and does not have.
+    """The answer of a worker that lacks data for a batch.
 
     Attributes:
-        scene: The scene's files, or the same ones.
-        learned: What the integrator has learned.
+        scene: Does it lack the scene's files, or have other versions of them?
+        learned: Does it lack the learned state?
     """
 
     scene: bool
@@ -31,7 +31,8 @@ class Missing(NamedTuple):
 
 
 def digest_of(learned: bytes | None) -> str | None:
-    """What tells a worker whether it has what was learned; see :func:`render_batch`."""
+    """The digest by which a worker knows whether it has the learned state already; see
+    :func:`render_batch`."""
     if learned is None:
         return None
     return hashlib.sha256(learned).hexdigest() if learned else ""
@@ -44,7 +45,7 @@ class _Kept(NamedTuple):
 
 _kept: _Kept | None = None
 
-#: What was learned last, and its digest.
+#: The digest of the learned state that was received last, and that state.
 _learned: tuple[str | None, bytes | None] = (None, None)
 
 #: Held while a batch is rendered: a worker of Dask has several threads, and Dr.Jit uses all cores
@@ -59,13 +60,17 @@ def render_batch(
     learned: bytes | None = None,
     bundle: Bundle | None = None,
 ) -> BatchResult | Missing:
-    """Renders a batch in this process. What it needs is sent only if it asks for it: most workers
-    have it from the batch before.
+    """Renders a batch in this process. The scene and the learned state are sent only to workers
+    that lack them: most have them from the batch before.
 
     Args:
-        digest: Of what was learned: :func:`digest_of`. Empty if there was nothing to learn,
-            ``None`` if this batch is the one that learns it.
-        learned, bundle: What was learned, and the scene, for a worker that has asked for it.
+        request, batch: What to render.
+        digest: The digest of the learned state, from :func:`digest_of`. Empty if there was nothing
+            to learn, ``None`` if this batch is the one that learns.
+        learned, bundle: The learned state and the scene, for a worker that lacks them.
+
+    Returns:
+        The result, or the data that this worker lacks.
 
     Raises:
         InputError: The scene cannot be rendered, or this process would render another image.
@@ -77,7 +82,7 @@ def render_batch(
                 raise InputError("what was learned was damaged on its way to the worker")
             _learned = digest, learned
         if _kept is None or _kept.request != request:
-            _kept = None  # Dr.Jit compiles what is alive
+            _kept = None  # first, as Dr.Jit compiles the methods of all living objects
             if renderer := _renderer(request, bundle):
                 _kept = _Kept(request, renderer)
         is_missing = Missing(_kept is None, bool(digest) and _learned[0] != digest)
@@ -95,7 +100,7 @@ def forget() -> None:
 
 
 def _renderer(request: RenderRequest, bundle: Bundle | None) -> BatchRenderer | None:
-    """``None`` if the files at the paths of the request are missing, or not the same."""
+    """Loads the scene of a request; ``None`` if the files at its paths are missing, or differ."""
     select_variant(request.variant, request.plugins)
     if request.threads:
         dr.set_thread_count(request.threads)
@@ -108,7 +113,7 @@ def _renderer(request: RenderRequest, bundle: Bundle | None) -> BatchRenderer | 
     if not request.description:
         return renderer
     found = json.loads(json.dumps(renderer.description(), default=str))
-    # Links may have been followed there: the hash of the scene has other files
+    # The bundle's maker may have followed links, so that its hash covers files of other names
     free = ["scene files hash"] if bundle else []
     if wrong := difference(json.loads(request.description), found, free):
         if bundle is None:

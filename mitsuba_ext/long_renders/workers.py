@@ -26,18 +26,19 @@ def threads_of_each(count: int) -> int:
 
 
 class Workers(Executor):
-    """Processes, each of which does one thing at a time. One that dies is replaced: only what it
-    was doing fails. (In a single ``ProcessPoolExecutor``, everything would.)
+    """Processes, each of which runs one task at a time. A process that dies is replaced, and only
+    its own task fails. (In a single ``ProcessPoolExecutor``, all tasks would fail.)
 
     Parameters:
-        count: How many processes there are.
+        count: Number of processes.
     """
 
     def __init__(self, count: int) -> None:
         self._waiting: queue.SimpleQueue = queue.SimpleQueue()
         self._pools: list[ProcessPoolExecutor | None] = [None] * count
         self._is_given_up = False
-        # A process ends with the thread that started it: this must be one that stays
+        # A process ends with the thread that started it, so these threads live as long as this
+        # object
         self._threads = [
             threading.Thread(target=self._serve, args=(number,), daemon=True)
             for number in range(count)
@@ -51,8 +52,8 @@ class Workers(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Ends the processes. With ``cancel_futures``, they are killed: what they are doing is not
-        needed any more, and one of them may hang."""
+        """Ends the processes. With ``cancel_futures``, they are killed: their tasks are not needed
+        any more, and one of them may hang."""
         if cancel_futures:
             self._is_given_up = True
             for pool in filter(None, self._pools):
@@ -65,7 +66,7 @@ class Workers(Executor):
                 thread.join()
 
     def _serve(self, number: int) -> None:
-        """Has a process do what waits, one after the other."""
+        """Runs the waiting tasks in a process, one after the other."""
         while (item := self._waiting.get()) is not None:
             future, function, arguments, options = item
             if self._is_given_up:
@@ -94,11 +95,11 @@ class Workers(Executor):
 
 
 def _start(parent: int) -> None:
-    """Leaves signals to the parent, and ends with it."""
-    # Batch systems send signals to all processes. By SIGTERM, the pool ends them
+    """Makes a worker process ignore signals, which its parent handles, and end with its parent."""
+    # Batch systems send signals to all processes. SIGTERM is not ignored: the pool sends it
     for number in {*interrupts.SIGNALS, interrupts.KEEP} - {signal.SIGTERM, None}:
         signal.signal(number, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it has ended meanwhile
+        if os.getppid() != parent:  # the parent has ended meanwhile
             os._exit(1)

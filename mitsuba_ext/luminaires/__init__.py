@@ -1,1 +1,1 @@
-"""Shapes as lights that are sampled by the solid angle that they subtend."""
+"""Area lights that are sampled by the solid angle that their shapes subtend."""

@@ -10,8 +10,9 @@ from mitsuba_ext.luminaires.surfaces import surface
 
 
 class AreaLuminaire(mi.Emitter):
-    """An emitter on a shape: a spectrum or texture of radiance, times what :meth:`profile` says of
-    the direction. Light leaves to the side of the shading normal, as from Mitsuba's ``area``.
+    """An emitter on a shape. Its radiance is a spectrum or texture, times the value of
+    :meth:`profile` for the direction. Light leaves to the side of the shading normal, as from
+    Mitsuba's ``area``.
 
     Attributes:
         is_projected: Are polygons sampled by projected solid angle?
@@ -45,7 +46,7 @@ class AreaLuminaire(mi.Emitter):
     # ---- Mitsuba's interface ----
 
     def _surface(self) -> Surface:
-        # Not kept: the shape may be moved. What is read here costs nothing in the kernel
+        # Not stored, since the shape may be moved. Reading its parameters costs nothing in kernels
         return surface(self.name, self.get_shape(), self.is_projected)
 
     def eval(self, si, active=True):
@@ -94,7 +95,7 @@ class AreaLuminaire(mi.Emitter):
         active = mi.Bool(active)
         point = self._surface().sample_area(sample2, active)
         si = point.si
-        # ----- The direction: about the geometric normal, on the side that shines -----
+        # ----- The direction: about the geometric normal, on the side that emits -----
         local, pdf = self.sample_profile(sample3)
         side = dr.select(dr.dot(si.n, si.sh_frame.n) < 0, -si.n, si.n)
         d = mi.Frame3f(side).to_world(local)

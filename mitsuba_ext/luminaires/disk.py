@@ -1,4 +1,4 @@
-"""Disks."""
+"""Sampling disks by solid angle."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from ..solid_angles.disk import EllipticalCone, elliptical_cone
 from .surface import Surface, SurfacePoint
 
-#: A disk is round if its axes differ by less than this factor in length, and from a right angle.
+#: A disk is round if its axes are equally long and perpendicular, up to this fraction of their
+#: squared length.
 _TOLERANCE = 1e-4
 
 

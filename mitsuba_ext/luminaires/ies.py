@@ -1,4 +1,4 @@
-"""Reads photometric files (IES LM-63): intensity by angle."""
+"""Reading photometric files (IES LM-63), which hold intensities by angle."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-#: Of vertical angles 0 … 90 and horizontal angles 0 … 360, in degrees.
+#: The vertical angles 0 … 90 and horizontal angles 0 … 360 of the table, in degrees.
 _VERTICAL, _HORIZONTAL = np.linspace(0, 90, 181), np.linspace(0, 360, 145)
 
 
 @dataclass
 class Intensities:
-    """The intensity of a luminaire in the half space that it shines into, over the largest.
+    """The intensity of a luminaire in its front half space, divided by the largest intensity.
 
     Attributes:
         values: Shape [horizontal, vertical]: horizontal angles from 0° to 360°, both included, or a
@@ -29,7 +29,8 @@ def read_ies(file: Path) -> Intensities:
     """Reads a photometric file of type C, the type of almost all luminaires.
 
     Raises:
-        ValueError: The file is something else, or shines nowhere ahead.
+        ValueError: The file is damaged or of another type, or the luminaire does not shine into its
+            front half space.
     """
     text = file.read_text(encoding="latin-1")
     parts = re.split(r"^TILT *= *(\S+).*$", text, maxsplit=1, flags=re.MULTILINE)
@@ -38,7 +39,7 @@ def read_ies(file: Path) -> Intensities:
     try:
         numbers = np.array(parts[2].replace(",", " ").split(), dtype=np.float64)
         if parts[1] == "INCLUDE":
-            # How lamps shine when they are tilted: the lamp's position, and pairs
+            # Skip the factors for tilted lamps: the lamp's position, a count, and pairs
             numbers = numbers[2 + 2 * int(numbers[1]) :]
         vertical_count, horizontal_count, kind = (int(n) for n in numbers[3:6])
         angles = numbers[13 : 13 + vertical_count + horizontal_count]

@@ -1,4 +1,4 @@
-"""Meshes of few triangles."""
+"""Sampling meshes of few triangles by solid angle."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..arrays import from_numpy
 from ..solid_angles.spherical_triangle import SphericalTriangle, spherical_triangle
 from .surface import Surface, SurfacePoint
 
-#: Meshes with more triangles are not sampled by solid angle: each sample asks all triangles.
+#: Meshes with more triangles are not sampled by solid angle: each sample visits all triangles.
 MOST_TRIANGLES = 16
 
 #: Floats of a triangle in the table: a corner, two edges, a sign; and three normals.
@@ -20,9 +20,9 @@ _WORDS = 20
 class MeshSurface(Surface):
     """A mesh, sampled by the solid angle of those of its triangles that face the point.
 
-    A triangle is chosen in proportion to its solid angle. So all directions in which one triangle
-    is seen have the same density, and :meth:`pdf` need not know which triangle that is. Where
-    triangles hide each other, some samples are lost.
+    A triangle is chosen in proportion to its solid angle. All directions to triangles then have the
+    same density, and :meth:`pdf` does not depend on the triangle. Where triangles hide each other,
+    some samples are occluded.
     """
 
     def __init__(self, shape: mi.Shape) -> None:
@@ -34,7 +34,8 @@ class MeshSurface(Surface):
         self._share = from_numpy(mi.Float, np.append(0, share))
 
     def _triangle(self, index: mi.UInt32, p: mi.Point3f, active: mi.Bool) -> SphericalTriangle:
-        """A triangle as seen from ``p``; one that does not face it has no solid angle."""
+        """The triangle ``index``, seen from ``p``. A triangle that does not face ``p`` has the
+        solid angle 0."""
         width = max(dr.width(index), dr.width(p))
         row = dr.gather(mi.ArrayXf, self._table, index, active, shape=(_WORDS, width))
         corner, ba, ac = (mi.Vector3f(row[i], row[i + 1], row[i + 2]) for i in (0, 3, 6))
@@ -42,8 +43,8 @@ class MeshSurface(Surface):
         a = b + ba
         triangle = spherical_triangle(a, b, a + ac, ba, ac)
         if self._is_smooth:
-            # Light leaves where the interpolated normal faces the point. That is nowhere if it does
-            # so for none of the normals at none of the corners
+            # Light leaves where the interpolated normal faces the point. There is no such place if
+            # none of the three normals faces the point from any of the three corners
             normals = (mi.Vector3f(row[i], row[i + 1], row[i + 2]) for i in (10, 13, 16))
             faces = mi.Bool(False)
             for normal in normals:
@@ -55,7 +56,7 @@ class MeshSurface(Surface):
         return triangle
 
     def _sums(self, p: mi.Point3f) -> list[mi.Float]:
-        """Half of the solid angle of the first, the first two, … triangles."""
+        """Half of the solid angle of the first triangle, of the first two, and so on."""
         sums = []
         for index in range(self._count):
             half_angle = self._triangle(mi.UInt32(index), p, mi.Bool(True)).half_angle
@@ -129,7 +130,7 @@ def _table(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray, bool]:
     shading = stored[faces]
     table[:, 10:19] = sign * shading.reshape(-1, 9)
     cosine = (shading * normal[:, None]).sum(-1) / np.maximum(2 * area[:, None], 1e-300)
-    # The side that shines is that of the interpolated normals
+    # The light emits to the side of the interpolated normals
     table[:, 9] *= np.where(cosine[:, 0] < 0, -1, 1)
     is_smooth = bool(np.any(np.abs(cosine[area > 0]) < 1 - 1e-4))
     return table, area, is_smooth

@@ -13,18 +13,18 @@ from mitsuba_ext.motion.rigid_motion import Motion, Pose, PoseTable
 
 
 class MovingEmitter(mi.Emitter):
-    """Answers what an emitter is asked at the pose of the question's time: points and directions go
-    to the frame in which ``nested`` rests, and its answers come back. Densities per area and per
-    solid angle are the same in both frames.
+    """A moving emitter. For each call, points and directions are transformed to the frame in which
+    ``nested`` rests, by the pose at the time of the call, and the results are transformed back.
+    Densities per area and per solid angle are the same in both frames.
 
     Parameters:
-        name: Of the plugin.
+        name: Name of the plugin.
         nested: The emitter at rest.
-        motion: How its frame moves.
+        motion: The motion of its frame.
 
     Attributes:
         nested (mi.Emitter): The emitter at rest.
-        motion (Motion): How its frame moves.
+        motion (Motion): The motion of its frame.
     """
 
     def __init__(self, name: str, nested: mi.Emitter, motion: Motion, id: str = "") -> None:
@@ -60,7 +60,7 @@ class MovingEmitter(mi.Emitter):
         )
 
     def eval(self, si, active=True):
-        # It is asked about a direction relative to the surface
+        # ``si.wi`` is relative to the surface, so that the frame does not matter
         return self.nested.eval(si, active)
 
     def sample_ray(self, time, sample1, sample2, sample3, active=True):
@@ -78,7 +78,7 @@ class MovingEmitter(mi.Emitter):
 
     def bbox(self):
         box = self.nested.bbox()
-        if not box.valid():  # Mitsuba's projector knows none
+        if not box.valid():  # Mitsuba's projector has none
             origin = np.array(self.nested.world_transform().matrix).reshape(4, 4)[:3, 3]
             box = mi.ScalarBoundingBox3f(mi.ScalarPoint3f(origin), mi.ScalarPoint3f(origin))
         return self.motion.box(box)

@@ -1,4 +1,4 @@
-"""How the radiance of a light depends on direction."""
+"""Profiles: the dependence of a light's radiance on direction."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import mitsuba as mi
 from ..arrays import from_numpy
 from .ies import Intensities
 
-#: Radiance is intensity over the area that is seen. Of this, at least such a share of the light's
-#: area is seen from everywhere: luminaires are not flat.
+#: Radiance is intensity divided by the projected area of the light. The projected area is taken to
+#: be at least this fraction of the area, since real luminaires are not flat.
 LEAST_COSINE = 0.1
 
 
 class Profile:
-    """A factor of the radiance.
+    """A direction-dependent factor of the radiance.
 
     Attributes:
-        needs_axis: Does it change when the light turns about its normal?
+        needs_axis: Does the profile change if the light is rotated about its normal?
     """
 
     needs_axis = False
@@ -26,8 +26,9 @@ class Profile:
         """The factor.
 
         Parameters:
-            cosine: Between the direction and the normal, positive.
-            cos_turn, sin_turn: Of the angle about the normal, from the axis x of the light.
+            cosine: Cosine between the direction and the normal, positive.
+            cos_turn, sin_turn: Cosine and sine of the angle about the normal, from the light's
+                x axis.
         """
         raise NotImplementedError
 
@@ -47,7 +48,7 @@ class PowerOfCosine(Profile):
         return dr.power(dr.maximum(cosine, 0), self._exponent)
 
     def sample(self, sample):
-        # By what leaves the surface: cosineⁿ⁺¹
+        # In proportion to radiance · cosine: cosineⁿ⁺¹
         n = self._exponent + 1
         z = dr.power(1 - sample.y, dr.rcp(n + 1))
         sin, cos = dr.sincos(dr.two_pi * sample.x)
@@ -56,7 +57,7 @@ class PowerOfCosine(Profile):
 
 
 class AngularTable(Profile):
-    """Measured intensities, over the area that is seen."""
+    """Measured intensities, divided by the projected area of the light."""
 
     def __init__(self, intensities: Intensities) -> None:
         rows, self._columns = intensities.values.shape
@@ -76,7 +77,7 @@ class AngularTable(Profile):
         return value / dr.maximum(cosine, LEAST_COSINE)
 
     def _row(self, row: mi.UInt32, vertical: mi.Float) -> mi.Float:
-        """Linear between vertical angles, given in steps of the table."""
+        """Interpolates linearly in ``vertical``, an angle in steps of the table."""
         column = dr.clip(mi.Int32(vertical), 0, self._columns - 2)
         index = row * self._columns + mi.UInt32(column)
         a, b = (dr.gather(mi.Float, self._values, index + i) for i in (0, 1))

@@ -1,4 +1,4 @@
-"""Rectangles, and the parallelograms that sheared ones are."""
+"""Sampling rectangles, which may be sheared to parallelograms, by solid angle."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..solid_angles.projected_polygon import ProjectedPolygon
 from ..solid_angles.spherical_polygon import SphericalPolygon, spherical_polygon
 from .surface import Surface, SurfacePoint
 
-#: The share of the samples of a projected solid angle that have the density of the solid angle.
+#: With projected solid angle sampling, the fraction of samples that are taken by solid angle.
 _SHARE = 0.1
 
-#: Lights with a smaller projected solid angle are sampled by their solid angle: the sum of their
-#: edges would be inexact.
+#: Lights with a smaller projected solid angle are sampled by their solid angle, since the sum over
+#: their edges would be inexact.
 _LEAST_AREA = 1e-3
 
 
@@ -45,7 +45,7 @@ class RectangleSurface(Surface):
         return _reciprocal(self._seen_from(it.p).solid_angle)
 
     def _uv(self, polygon: SphericalPolygon, sample: mi.Point2f) -> mi.Point2f:
-        """The point that the map of the polygon's solid angle gives."""
+        """The point that is uniformly distributed by solid angle, as coordinates ``uv``."""
         index, a, b = polygon.sample(sample)
         # The corners of the two triangles are 1 and 2, and 2 and 3
         is_first = index == 0
@@ -61,13 +61,13 @@ class RectangleSurface(Surface):
 
 
 class ProjectedRectangleSurface(RectangleSurface):
-    """A rectangle, sampled by its projected solid angle: also by the cosine with the normal of the
-    receiver. A share of the samples has the density of the solid angle, for receivers whose
-    reflection does not end with that cosine (shading normals, transmission), so that weights are
-    bounded. Which side of the receiver is seen is not known: what lies below the horizon gets
-    samples as well, by the modulus of the cosine.
+    """A rectangle, sampled by its projected solid angle: in proportion to the cosine with the
+    receiver's normal. A fraction of the samples is taken by solid angle instead. It bounds the
+    weights for receivers that scatter light even where this cosine is 0 (shading normals,
+    transmission). The side of the receiver that scatters the light is not known: directions below
+    the horizon are sampled too, by the absolute value of the cosine.
 
-    Small lights, and receivers without a normal, are left to the solid angle."""
+    Small lights are sampled by solid angle, and so are all lights at receivers without a normal."""
 
     def sample(self, it, sample, active):
         polygon = self._seen_from(it.p)
@@ -123,7 +123,8 @@ class ProjectedRectangleSurface(RectangleSurface):
         return dr.select(is_projected, mixed, by_angle)
 
     def _hit(self, p: mi.Point3f, d: mi.Vector3f) -> mi.Point2f:
-        """Where a ray meets the plane of the rectangle."""
+        """The point where a ray hits the plane of the rectangle, clipped to the rectangle, as
+        coordinates ``uv``."""
         x, y = self._edges
         offset, normal = p - self._corner, dr.cross(x, y)
         slope = dr.dot(d, normal)
@@ -142,8 +143,7 @@ def _column(matrix: mi.Matrix4f, index: int) -> np.ndarray:
 
 
 def _data(vector: np.ndarray) -> mi.Vector3f:
-    """A vector that is no literal: so the code of all rectangles is the same, and is compiled
-    once."""
+    """A vector that is not a literal, so that all rectangles share the same compiled code."""
     return mi.Vector3f(*(from_numpy(mi.Float, [x]) for x in vector))
 
 

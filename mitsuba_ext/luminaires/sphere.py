@@ -1,4 +1,4 @@
-"""Spheres."""
+"""Sampling spheres by solid angle."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import mitsuba as mi
 from ..solid_angles.cone import Cone, cone
 from .surface import Surface, SurfacePoint, per_solid_angle
 
-#: By how much of its radius a point may be farther from the centre of a sphere that shines inwards,
-#: and yet lie on its surface: a few roundings of coordinates.
+#: Points on the surface of a sphere that shines inwards may lie outside of it by this fraction of
+#: the radius, because of rounding.
 _ROUNDING = 1e-5
 
 
 class SphereSurface(Surface):
-    """A sphere: seen from outside it is sampled by the solid angle of its cone, and from inside,
-    where it is all around, by area. (A point of the surface then gets directions with a density
+    """A sphere. From outside it is sampled by the solid angle of its cone; from inside, where it
+    surrounds the point, by area. (For a point on the surface, the density of directions is then
     proportional to the cosine.)"""
 
     def __init__(self, shape: mi.Shape) -> None:
@@ -27,7 +27,7 @@ class SphereSurface(Surface):
 
     def _is_inside(self, p: mi.Point3f) -> mi.Bool:
         if not self._shines_inwards:
-            # Nothing is to be seen from within
+            # The inner side does not emit
             return mi.Bool(False)
         return dr.squared_norm(p - self._centre) < dr.square((1 + _ROUNDING) * self._radius)
 
@@ -55,7 +55,7 @@ class SphereSurface(Surface):
         return pdf
 
     def sample_area(self, sample, active):
-        # Not by the shape: it does not turn normals with the sphere
+        # Not by the shape's method, which does not rotate normals with the sphere
         normal = mi.warp.square_to_uniform_sphere(sample)
         return SurfacePoint(self._point(normal, active), dr.rcp(self.area()))
 

@@ -1,4 +1,4 @@
-"""The way to sample each kind of shape."""
+"""The choice of the sampling method for each kind of shape."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from .surface import Surface
 
 
 def surface(name: str, shape: mi.Shape | None, is_projected: bool = False) -> Surface:
-    """How points of a shape are sampled for a light.
+    """The sampling method for a light on this shape.
 
     Parameters:
-        name: Of the light's plugin, for errors.
-        shape: What emits.
-        is_projected: By projected solid angle?
+        name: Name of the light's plugin, for errors.
+        shape: The shape of the light.
+        is_projected: Sample by projected solid angle?
 
     Raises:
-        NotImplementedError: Nothing is known of the solid angle of this shape.
+        NotImplementedError: Shapes of this kind cannot be sampled by (projected) solid angle.
         RuntimeError: The light has no shape.
     """
     if shape is None:

@@ -1,2 +1,3 @@
-"""What is learned and stored: tables of lights, visibilities and densities, with lookups that
-decisions trace into kernels. Nothing here knows who fills them or who reads them."""
+"""Learned data: tables of lights, visibilities and densities, with lookups that decisions trace
+into kernels. Nothing here depends on the learners that fill them or the decisions that read them.
+"""

@@ -1,8 +1,8 @@
-"""What is in between: how often directions of an environment are visible, in tiles of the film.
+"""How often directions of an environment are visible, by tile of the film.
 
-Source: Cline, PhD dissertation, chapter 6. In the place of maps at the corners of a grid, of which
-the four around a pixel must agree, samples are counted in tiles, and each tile also looks at those
-around it; in the place of three classes (visible, occluded, uncertain) there are probabilities.
+Source: Cline, PhD dissertation, chapter 6. Instead of maps at the corners of a grid, of which the
+four around a pixel must agree, samples are counted in tiles, and the tiles around each one are a
+prior. Instead of three classes (visible, occluded, uncertain), there are probabilities.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from ..arrays import from_numpy
 from ..discrete_sampling import ONE_MINUS_EPSILON
 from ..transport.observer import Observer
 
-#: Edge of a tile in pixels, at least; and tiles of a film, at most.
+#: The least edge of a tile in pixels, and the most tiles of a film.
 _TILE, _MOST_TILES = 8, 8192
 
-#: The weight of the prior, in tests: what is known of the cell in the tiles around, and of the tile
-#: as a whole.
+#: The weight, in tests, of the priors: a cell's counts in the tile and those around it, whose prior
+#: is the sum over all cells of these tiles.
 _PRIOR_TESTS = 1.0
 
 
@@ -30,8 +30,8 @@ class Tile:
     """The maps for a vertex.
 
     Attributes:
-        number: Of the tile.
-        is_known: Are they those of this vertex? Later ones of a path lie elsewhere.
+        number: Number of the tile.
+        is_known: Do the maps apply to this vertex? Later vertices of a path lie elsewhere.
     """
 
     number: mi.UInt32
@@ -44,7 +44,7 @@ class Cell:
 
     Attributes:
         index: The number of the cell, that of its tile included.
-        is_known: Does it belong to one?
+        is_known: Does the connection belong to a cell?
     """
 
     index: mi.UInt32
@@ -52,11 +52,11 @@ class Cell:
 
 
 class VisibilityCounts(Observer):
-    """Counts the shadow rays of each cell of each tile, and those that arrived.
+    """Counts the shadow rays of each cell of each tile, and how many were unoccluded.
 
     Parameters:
-        width, height: Of the film, with its border where that is sampled.
-        columns, rows: Cells of a tile.
+        width, height: Size of the film in pixels, with its border where that is sampled.
+        columns, rows: Number of columns and rows of the cells of a tile.
     """
 
     def __init__(self, width: int, height: int, columns: int, rows: int) -> None:
@@ -101,7 +101,7 @@ class VisibilityCounts(Observer):
         self._counts = from_numpy(mi.UInt64, values)
 
     def release(self) -> None:
-        """Lets go of the counts."""
+        """Frees the counts."""
         self._counts = mi.UInt64()
 
     def visibility(self) -> np.ndarray:
@@ -134,11 +134,11 @@ def _with_neighbours(values: np.ndarray) -> np.ndarray:
 
 
 class PrimaryVisibility:
-    """Distributes the random numbers of connections: cells of the unit square get the more of them
-    the more often what they led to was visible.
+    """Warps the random numbers of connections: cells of the unit square get more of them, the more
+    often their connections were unoccluded.
 
     Parameters:
-        counts: Of the same cells.
+        counts: The counts of these cells.
         reallocated: The share of the numbers that is distributed so; the rest stays uniform.
     """
 
@@ -157,7 +157,7 @@ class PrimaryVisibility:
     def sample(
         self, tile: Tile, point: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Point2f, mi.Float]:
-        """Numbers in the place of uniform ones, and their density."""
+        """Warps uniform numbers; returns the numbers and their density."""
         counts, active, uniform = self._counts, active & tile.is_known, point
         first = tile.number * counts.rows
         row, y = _search(self._of_rows, first, counts.rows, point.y, active)
@@ -175,13 +175,13 @@ class PrimaryVisibility:
 
 
 def _cumulative(weight: np.ndarray) -> mi.Float:
-    """Along the last axis, up to each entry, it included; the last is 1."""
+    """Sums along the last axis up to and including each entry, scaled so that the last is 1."""
     sums = np.cumsum(weight, axis=-1)
     return from_numpy(mi.Float, sums / sums[..., -1:])
 
 
 def _search(table: mi.Float, first: mi.UInt32, count: int, number: mi.Float, active):
-    """The entry that a number chooses, and what is left of the number."""
+    """The entry that a number chooses, and the rest of the number, stretched to [0, 1)."""
     index = mi.UInt32(0)
     step = 1 << (count - 1).bit_length() - 1
     while step > 0:
@@ -195,13 +195,13 @@ def _search(table: mi.Float, first: mi.UInt32, count: int, number: mi.Float, act
 
 
 class WorldVisibility:
-    """How much of rectangles of an environment is visible.
+    """Weights of rectangles of an environment by their visibility.
 
     Parameters:
-        counts: Of cells of equal size in the map.
-        reallocated: The share of the samples that follow it; the rest knows nothing of visibility.
-        emission: What cells emit, in units of all; shape [rows, columns].
-        columns, rows: Texels of the map.
+        counts: The counts of cells, which have equal size in the environment map.
+        reallocated: The share of the samples that follow visibility; the rest ignores it.
+        emission: The share of each cell in the total emission; shape [rows, columns].
+        columns, rows: Number of columns and rows of the texels of the environment map.
     """
 
     def __init__(
@@ -211,12 +211,12 @@ class WorldVisibility:
         weight = np.sqrt(counts.visibility())
         mean = (weight * emission).sum(axis=(1, 2), keepdims=True)
         weight = (1 - reallocated) * mean + reallocated * weight
-        # Sums from the first cell, and those of squares
+        # Summed-area tables of the weights and of their squares
         sums = np.zeros((len(weight), counts.rows + 1, counts.columns + 1, 2))
         values = np.stack([weight, weight**2], axis=-1)
         sums[:, 1:, 1:] = values.cumsum(axis=1).cumsum(axis=2)
         self._sums = from_numpy(mi.Float, sums)
-        # Opaque: a number that differs from render to render would need another kernel
+        # Opaque: it differs from render to render, and the kernel must not
         self._least = dr.opaque(mi.Float, float(weight.min()))
         self._counts = counts
         self._x, self._y = counts.columns / columns, counts.rows / rows
@@ -225,8 +225,8 @@ class WorldVisibility:
         self, tile: Tile, x0: mi.UInt32, y0: mi.UInt32, x1: mi.UInt32, y1: mi.UInt32,
         active: mi.Bool,
     ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
-        """The mean over the cells that a rectangle of texels touches, positive, and the standard
-        deviation between them; a constant where the tile is not known."""
+        """The mean weight of the cells that a rectangle of texels touches, positive, and the
+        standard deviation between them; a constant where the tile is not known."""
         counts, active = self._counts, active & tile.is_known
         a, c = mi.UInt32(mi.Float(x0) * self._x), mi.UInt32(mi.Float(y0) * self._y)
         b = dr.maximum(mi.UInt32(dr.ceil(mi.Float(x1) * self._x)), a + 1)

@@ -29,20 +29,20 @@ _PRIOR_TESTS, _PRIOR_SQUARES = 1.0, 4.0
 #: The reflection of a dark diffuse surface, in units of a white one without the factor 1/π.
 _DARK = 0.1
 
-#: So many tests of an entry are enough: a pilot with more records only a part of them. And the
-#: approximate number of tests of a sample.
+#: The number of tests of an entry that is enough: a pilot with more records only a part of them.
+#: And the approximate number of tests of a sample.
 _ENOUGH_TESTS, _TESTS_PER_SAMPLE = 32, 2
 
-#: Bytes of an entry, at most: the expectation, the counters, the table that is made of them, and
-#: what that takes in between.
+#: Bytes of an entry, at most: the expectation, the counters, the table that is made from them, and
+#: temporaries.
 BYTES_PER_ENTRY = 128
 
 
 class LightMap(Observer):
-    """Counts, for each row of surfaces and each light cell, the shadow rays, those that arrived,
-    and their squared contributions. It observes the walk, in which a selection with the same rows
-    and cells must choose the lights. Counters are integers, so that the same samples give bitwise
-    the same map.
+    """Counts, for each row of surfaces and each light cell, the shadow rays, those that are not
+    occluded, and their squared contributions. It observes a walk whose next event decision must
+    choose from the same rows and cells. Counters are integers, so that the same samples give
+    bitwise the same map.
 
     Parameters:
         scene: The scene to learn.
@@ -51,8 +51,8 @@ class LightMap(Observer):
         samples: Approximate number of samples that will be observed.
 
     Attributes:
-        unoccluded (mi.Float): The contribution of each cell to each row if nothing is in between;
-            shape [rows · cells].
+        unoccluded (mi.Float): The contribution of each cell to each row without occlusion; shape
+            [rows · cells].
         tests, successes (mi.UInt32): Shadow rays, and how many of them arrived.
         squares (mi.UInt64): Sum of the squared contributions in units of ``unoccluded``.
     """
@@ -67,7 +67,7 @@ class LightMap(Observer):
         # Tests in the low half, successes in the high one: one addition counts both
         self._counts = dr.zeros(mi.UInt64, entries)
         self.squares = dr.zeros(mi.UInt64, entries)
-        # One in so many lanes is recorded
+        # One in this number of lanes is recorded
         enough = _ENOUGH_TESTS * entries
         self._stride = dr.opaque(mi.UInt32, max(1, samples * _TESTS_PER_SAMPLE // enough))
         self._is_recorded = mi.Bool(True)
@@ -97,7 +97,7 @@ class LightMap(Observer):
         tested = tested & self._is_recorded
         expected = dr.gather(mi.Float, self.unoccluded, entry, tested)
         known = visible & tested & (expected > 0)
-        # What the cell contributes, whatever the probability of choosing it
+        # The contribution of the cell, without the probability of choosing it
         brought = brightness(contribution) * choice.probability
         square = dr.square(dr.select(known, brought / expected, 0))
         square = dr.select(dr.isfinite(square), dr.minimum(square, _LIMIT), 0)
@@ -117,7 +117,7 @@ class LightMap(Observer):
         return mi.UInt32(self._counts >> 32)
 
     def restore(self, tests: mi.UInt32, successes: mi.UInt32, squares: mi.UInt64) -> None:
-        """Takes over the counts of another map with the same rows and cells."""
+        """Sets the counts to those of another map with the same rows and cells."""
         self._counts = mi.UInt64(tests) | (mi.UInt64(successes) << 32)
         self.squares = mi.UInt64(squares)
         self.evaluate()
@@ -189,10 +189,11 @@ class LightMap(Observer):
         )
 
     def square_ratios(self, default: mi.Float, other: mi.Float) -> mi.Float:
-        """For each row, what the mean square of a connection becomes if its cell is chosen with
-        ``other`` probabilities, relative to ``default`` ones; shapes [rows], [rows · cells]."""
+        """For each row, the mean square of a connection if its cell is chosen with the
+        probabilities ``other``, relative to that with ``default``, at most 1; shape [rows], from
+        probabilities of shape [rows · cells]."""
         count = self.cells.count
-        # In units of the row: squares of any light's brightness are numbers then
+        # Relative to the sum of the row: squares stay finite for lights of any brightness
         row = dr.repeat(dr.block_sum(self.unoccluded, count), count)
         square = dr.square(self.unoccluded / row) * self._square(self.visibility())
         before, after = (

@@ -77,7 +77,7 @@ def save(path: Path, scene: mi.Scene, light_map: LightMap) -> None:
 
 
 def of_arrays(arrays: dict[str, np.ndarray], scene: mi.Scene) -> LightMap:
-    """The map that :func:`arrays_of` has made arrays of, for the same scene."""
+    """The map from the arrays of :func:`arrays_of`, for the same scene."""
     return _light_map(_Stored(**arrays), scene, 0)
 
 

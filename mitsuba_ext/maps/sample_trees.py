@@ -31,7 +31,7 @@ class SampleTrees:
     returns the sample unchanged.
 
     A split along the first axis and the two below it are packed into a node of eight bytes: three
-    probabilities, which of the four children are leaves, and where these stand.
+    probabilities, which of the four children are leaves, and where the children are stored.
 
     Parameters:
         probability: The probability of each node's left child; ``LEAF`` for a leaf. Shape [nodes].
@@ -92,7 +92,7 @@ class SampleTrees:
 
     @classmethod
     def of_state(cls, state: dict[str, np.ndarray]) -> SampleTrees:
-        """The trees that :meth:`state` has made arrays of."""
+        """The trees from the arrays of :meth:`state`."""
         trees = cls.__new__(cls)
         # As integers: bit patterns of nodes may be those of NaNs
         trees._nodes = dr.reinterpret_array(mi.Float, from_numpy(mi.UInt32, state["nodes"]))

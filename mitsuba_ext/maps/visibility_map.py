@@ -74,7 +74,7 @@ class VisibilityMap:
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Takes over the counters of a map of the same scene and grid."""
+        """Sets the counters to those of a map of the same scene and grid."""
         self.tests, self.successes, self._holds_light = (
             from_numpy(mi.UInt32, state[key]) for key in ("tests", "successes", "holds_light")
         )
@@ -88,8 +88,8 @@ class VisibilityMap:
         return self._entry_count() * _BYTES_PER_ENTRY + cells * _BYTES_PER_CELL
 
     def entry(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
-        """The index of the pair of voxels that hold ``p`` and ``q``, and whether both are known
-        (points at infinity and in voxels without geometry are not)."""
+        """The index of the pair of voxels that hold ``p`` and ``q``, and whether it exists (not for
+        points at infinity and in voxels without geometry)."""
         i, i_known = self.voxels.index(p, active)
         j, j_known = self.voxels.index(q, active)
         return self.entry_of(i, j), i_known & j_known
@@ -154,7 +154,7 @@ class VisibilityMap:
         return dr.compress(self._holds_light > 0)
 
     def test_count(self, entry: mi.UInt32) -> mi.UInt32:
-        """How many segments were tested."""
+        """The number of segments that were tested."""
         return dr.gather(mi.UInt32, self.tests, entry)
 
     def ratio(self, entry: mi.UInt32) -> mi.Float:

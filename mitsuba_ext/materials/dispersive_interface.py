@@ -1,4 +1,5 @@
-"""What dispersive dielectrics share: parameters, refractive indices, calls that they refuse."""
+"""The common part of dispersive dielectrics: parameters, refractive indices, and the refusal of
+callers that do not support dispersion."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ import mitsuba as mi
 from ..transport.heroes import DISPERSES, knows_heroes
 from .glass import GLASSES, VISIBLE, Cauchy, Constant, Index, Sellmeier, check_index
 
-#: The media that can be outside, by Mitsuba's names: their index is the same at all wavelengths.
+#: Names of the media that can be outside, as in Mitsuba. Their index is the same at all
+#: wavelengths.
 _OUTSIDE = {
     "vacuum": 1.0,
     "helium": 1.000036,
@@ -59,12 +61,12 @@ class DispersiveInterface:
             )
 
     def is_answerable(self, ctx: mi.BSDFContext) -> bool:
-        """Does the caller let only the hero be refracted, or is there no dispersion? If neither,
-        the plugin must answer by :meth:`infinite_sample` or infinite values.
+        """True if the caller refracts only the hero wavelength, or if there is no dispersion.
+        Otherwise the plugin must return :meth:`infinite_sample` or infinite values.
 
-        A caller that is being traced gets a warning, not an error: Dr.Jit traces the BSDFs of all
-        scenes in memory, and nothing tells whether this one is in the scene that is rendered. Only
-        if it is, the infinite values reach the image.
+        In a traced call, there is a warning instead of an error: Dr.Jit traces the BSDFs of all
+        scenes in memory, and the BSDF cannot know if it is in the scene that is rendered. The
+        infinite values reach the image only if it is.
 
         Raises:
             NotImplementedError: The caller would refract all wavelengths in the hero's direction,
@@ -89,8 +91,9 @@ class DispersiveInterface:
     def infinite_sample(
         si: mi.SurfaceInteraction3f, sample1: mi.Float
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
-        """A BSDF sample of infinite weight, reflected or straight on, so that it finds what would
-        be reflected or refracted. (Integrators end a path whose weight is NaN, as if it were 0.)"""
+        """A BSDF sample of infinite weight, in the mirror direction or straight on, so that it
+        reaches the surfaces that would be reflected or refracted. (The weight is not NaN, since
+        integrators treat a weight of NaN like 0.)"""
         bs = dr.zeros(mi.BSDFSample3f)
         bs.wo = dr.select(mi.Float(sample1) < 0.5, mi.reflect(si.wi), -si.wi)
         bs.pdf, bs.eta = mi.Float(1), mi.Float(1)
@@ -98,10 +101,11 @@ class DispersiveInterface:
         return bs, mi.Spectrum(dr.inf)
 
     def check_differs(self) -> None:
-        """
+        """Checks that the indices inside and outside differ at all visible wavelengths.
+
         Raises:
-            ValueError: At some visible wavelength the index is the same on both sides, where the
-                half vector of a refraction is not defined.
+            ValueError: At some wavelength they are the same, where the half vector of a refraction
+                is not defined.
         """
         start, end = map(int, VISIBLE)
         n = [self._inside(float(wavelength)) for wavelength in range(start, end + 1)]
@@ -112,19 +116,19 @@ class DispersiveInterface:
             )
 
     def η(self, si: mi.SurfaceInteraction3f) -> list[mi.Float]:
-        """The index inside relative to that outside, for the hero and then for the other
-        wavelengths; a single value if nothing disperses."""
+        """The relative index of refraction, inside / outside: for the hero, then for the other
+        wavelengths; a single value if there is no dispersion."""
         if not self._disperses:
             return [mi.Float(self._inside.n / self._outside)]
         η = self._inside(si.wavelengths) / self._outside
         return [η[k] for k in range(dr.size_v(mi.Spectrum))]
 
     def reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """The factor of reflection that the scene sets."""
+        """The parameter ``specular_reflectance``."""
         return self._texture("specular_reflectance", si, active)
 
     def transmittance(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """The factor of refraction that the scene sets."""
+        """The parameter ``specular_transmittance``."""
         return self._texture("specular_transmittance", si, active)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -132,7 +136,7 @@ class DispersiveInterface:
             callback.put(name, texture, +mi.ParamFlags.Differentiable)
 
     def describe(self, *others: str) -> str:
-        """``to_string`` of the plugin."""
+        """The text for ``to_string`` of the plugin; ``others`` are further lines."""
         lines = [f"inside = {self._description}", f"ext_ior = {self._outside:.6g}"]
         lines += [f"{name} = {texture}" for name, texture in self._textures.items()]
         lines = [line.replace("\n", "\n  ") for line in (*lines, *others)]
@@ -222,6 +226,6 @@ def check_uniform(
 
 
 def fresnel_spectrum(cos_θ: mi.Float, η: list[mi.Float]) -> mi.Spectrum:
-    """The reflectance at each wavelength."""
+    """The Fresnel reflectance at each wavelength."""
     F = [mi.fresnel(cos_θ, η_k)[0] for η_k in η]
     return mi.Spectrum(F if len(F) > 1 else F[0])

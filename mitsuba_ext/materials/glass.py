@@ -12,8 +12,8 @@ from typing import Any
 
 import drjit as dr
 
-#: The range of Mitsuba's colour matching functions, in nm. Beyond it, an index is that of the
-#: nearer end.
+#: The range of Mitsuba's colour matching functions, in nm. Wavelengths outside of it have the index
+#: of the nearer end.
 VISIBLE = (360.0, 830.0)
 
 
@@ -72,7 +72,7 @@ def _resonances(*terms: tuple[float, float]) -> Sellmeier:
     return Sellmeier(tuple((b, wavelength**2) for b, wavelength in terms))
 
 
-#: Materials by the names that a scene uses. Schott's data sheets (2017), but for the last four:
+#: Materials by their names in scene files. From Schott's data sheets (2017), except the last four:
 #: fused silica (I. H. Malitson, 1965), water of 20 °C (M. Daimon, A. Masumura, 2007), diamond
 #: (F. Peter, 1923), and the ordinary ray of sapphire (I. H. Malitson, M. J. Dodge, 1972).
 GLASSES: dict[str, Sellmeier] = {
@@ -118,7 +118,8 @@ def check_index(index: Index) -> None:
     """Checks that ``index`` is a positive number at each visible wavelength.
 
     Raises:
-        ValueError: It is not at some wavelength, or Sellmeier's formula has a pole there.
+        ValueError: It is not positive at some visible wavelength, or Sellmeier's formula has a pole
+            there.
     """
     for _b, c in getattr(index, "terms", ()):
         pole = 1000 * math.sqrt(max(c, 0.0))

@@ -1,1 +1,1 @@
-"""Metropolis light transport: chains of random numbers and of paths."""
+"""Metropolis light transport: Markov chains in primary sample space and in path space."""

@@ -1,5 +1,5 @@
-"""The parameters of a motion, which are the same for everything that moves: a displacement and a
-turn, or poses at times. The page of the shape ``moving`` describes them."""
+"""The parameters of a motion, which all moving plugins share: a displacement and a turn, or poses
+at times. The page of the shape ``moving`` describes them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .rigid_motion import Motion
 if TYPE_CHECKING:
     import mitsuba as mi
 
-#: The most that a pose may differ from a rigid one: matrices in text files are rounded.
+#: Largest deviation of a pose from a rigid one: matrices in text files are rounded.
 _RIGID_TOLERANCE = 1e-4
 
 
@@ -23,11 +23,12 @@ def read_motion(plugin: str, props: mi.Properties) -> Motion:
     """The motion that the parameters of a plugin describe.
 
     Parameters:
-        plugin: Its name, for errors.
-        props: The properties that it got.
+        plugin: Name of the plugin, for errors.
+        props: The plugin's properties.
 
     Raises:
-        TypeError, ValueError: A parameter is wrong or missing, or some exclude each other.
+        TypeError, ValueError: A parameter is wrong or missing, or two parameters exclude each
+            other.
     """
     keys = sorted(key for key in props.keys() if re.fullmatch(r"(pose|time)_\d+", key))
     simple = [k for k in ("translate", "axis", "angle", "begin", "end") if k in props]

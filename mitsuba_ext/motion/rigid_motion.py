@@ -1,9 +1,9 @@
 """Rigid motion in time: its description, its bounds, and its poses on the device.
 
-A motion takes a point p of the *rest frame* to R(t) · (p − center) + position(t). It is a sequence
-of segments; during each, the position moves at constant velocity, and the rotation goes at constant
-speed about an axis that is fixed in the world. Before the first segment and after the last one,
-everything is at rest.
+A motion maps a point p of the *rest frame* to R(t) · (p − center) + position(t). It is a sequence
+of segments. During each, the position moves at constant velocity, and the rotation has a constant
+angular velocity about an axis that is fixed in the world. Before the first segment and after the
+last one, there is no motion.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import from_numpy
 
-#: The largest angle, and the largest number, of the steps by which a rotation's bounds are found.
+#: The largest angle, and the largest number, of the steps in which the bounds of a rotation are
+#: computed.
 _BOUNDS_STEP = math.radians(3)
 _MOST_BOUNDS_STEPS = 4096
 
@@ -32,9 +33,9 @@ class Motion:
     """A rigid motion of S segments.
 
     Attributes:
-        times: When the segments begin, and when the last one ends: [S + 1], increasing.
+        times: Start times of the segments, and the end time of the last one: [S + 1], increasing.
         positions: Positions of the center at these times: [S + 1, 3].
-        starts: Rotations at the begin of the segments, as quaternions (x, y, z, w): [S, 4].
+        starts: Rotations at the start of the segments, as quaternions (x, y, z, w): [S, 4].
         turns: Rotation vectors of the segments (axis times angle in radians, which may exceed a
             full turn): [S, 3].
         center: The point of the rest frame about which it turns: [3].
@@ -54,8 +55,9 @@ class Motion:
         turn: Sequence[float] = (0, 0, 0),
         center: Sequence[float] = (0, 0, 0),
     ) -> Motion:
-        """From rest at ``begin``, displaced by ``translate`` and turned by the rotation vector
-        ``turn`` (radians) about ``center``, which is displaced as well, at ``end``."""
+        """A motion that starts at ``begin`` and ends at ``end``. It displaces everything by
+        ``translate``, and rotates it by the rotation vector ``turn`` (radians) about ``center``,
+        which is displaced as well."""
         center = np.array(center, dtype=np.float64)
         return Motion(
             times=np.array([begin, end], dtype=np.float64),
@@ -67,8 +69,8 @@ class Motion:
 
     @staticmethod
     def keyed(times: Sequence[float], poses: Sequence[np.ndarray]) -> Motion:
-        """Through ``poses`` (rigid 4×4 matrices) at ``times``: in between, positions of the rest
-        frame's origin are interpolated linearly, rotations by slerp (the shorter way)."""
+        """A motion through ``poses`` (rigid 4×4 matrices) at ``times``. In between, positions of
+        the rest frame's origin are interpolated linearly, rotations by slerp (the shorter way)."""
         matrices = np.asarray(poses, dtype=np.float64)
         rotations = Rotation.from_matrix(matrices[:, :3, :3])
         return Motion(
@@ -86,7 +88,8 @@ class Motion:
         return self._move_in_segment(np.asarray(points), k, x)
 
     def bounds(self, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A box that the convex hull of ``corners`` [n, 3], given in the rest frame, never leaves.
+        """A box that holds the convex hull of ``corners`` [n, 3], given in the rest frame, at all
+        times.
 
         Returns:
             Its least and its greatest corner.
@@ -98,8 +101,8 @@ class Motion:
             moved = np.stack(
                 [self._move_in_segment(corners, k, i / steps) for i in range(steps + 1)]
             )
-            # Between two steps, a corner is no farther from the straight line than an arc of the
-            # largest radius is from its chord
+            # Between two steps, a corner deviates from the straight line by at most the sagitta of
+            # an arc of the largest radius
             radius = np.linalg.norm(corners - self.center, axis=1).max()
             sagitta = radius * (1 - math.cos(min(angle / steps / 2, math.pi)))
             low = np.minimum(low, moved.min(axis=(0, 1)) - sagitta)
@@ -200,7 +203,7 @@ class PoseTable:
         )
 
     def _segment(self, first: mi.UInt32, time: mi.Float) -> mi.UInt32:
-        """The row of the last segment that began before ``time``, else ``first``."""
+        """The row of the last segment that began before ``time``; ``first`` if none did."""
         if self._stride == 1:
             return first
         last = self._stride - 1
@@ -217,7 +220,7 @@ class PoseTable:
 
 def _rows(motion: Motion) -> np.ndarray:
     """The segments in the layout of the device: start; axis and half the angle; position and time
-    at the begin; displacement and 1 / duration; center. Shape [S, _ROW, 4]."""
+    at the start; displacement and 1 / duration; center. Shape [S, _ROW, 4]."""
     angles = np.linalg.norm(motion.turns, axis=1, keepdims=True)
     axes = np.divide(motion.turns, angles, out=np.zeros_like(motion.turns), where=angles > 0)
     durations = np.diff(motion.times)[:, None]

@@ -18,7 +18,8 @@ def checked_points(function: str, x: npt.ArrayLike, most_axes: int = 1) -> Float
     """The points as an array of shape (N,), or with two axes also (N, D).
 
     Raises:
-        ValueError: The shape is another, there are no points, or some are outside of the unit cube.
+        ValueError: The shape is different, there are no points, or some are outside of the unit
+            cube.
     """
     x = np.asarray(x, float)
     if not 1 <= x.ndim <= most_axes or x.size == 0:
@@ -83,7 +84,7 @@ def trapezoid_weights(x: npt.ArrayLike) -> tuple[FloatArray, float, float]:
 
 
 def nearest_neighbour_weights(x: npt.ArrayLike, tests: npt.ArrayLike) -> FloatArray:
-    """For each point, the share of the test points that are nearest to it (Yakowitz et al.). This
+    """For each point, the fraction of test points that are nearest to it (Yakowitz et al.). This
     estimates the measure of its clipped cell in any dimension, without a Voronoi diagram.
 
     Parameters:

@@ -45,7 +45,7 @@ def piecewise_points(
     Parameters:
         u: Points of shape (N,).
         edges: Limits of the K pieces, ascending from 0 to 1.
-        probabilities: Of the pieces, of shape (K,), with sum 1.
+        probabilities: Probabilities of the pieces, of shape (K,), with sum 1.
 
     Raises:
         ValueError: Points, edges or probabilities are not as described.
@@ -62,8 +62,8 @@ def piecewise_weights(
     weigher: Weigher = unbiased_weights,
 ) -> FloatArray:
     """Weights of independent points of a piecewise constant density, computed in each piece
-    separately. By chance, a piece may have no point. So its weights are divided by the probability
-    that it has one: sums are unbiased if those with ``weigher`` are.
+    separately. A piece may have no point by chance. Its weights are therefore divided by the
+    probability that it has at least one: sums are unbiased if those with ``weigher`` are.
 
     Parameters:
         x: Points in [0, 1], of shape (N,).

@@ -1,4 +1,4 @@
-"""Regions of surfaces, the finer the more often something happens there."""
+"""Regions of surfaces, finer where more of the given points lie."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class NestedRegions:
     surfaces.
 
     Region 0 is the whole scene. Regions of large voxels follow, then those of the smaller voxels
-    inside of them; a region exists only where there are points enough. A point belongs to the
+    inside of them; a region exists only where there are enough points. A point belongs to the
     smallest region that contains it.
 
     Parameters:
@@ -80,7 +80,7 @@ class NestedRegions:
 
     @classmethod
     def of_state(cls, state: dict[str, np.ndarray]) -> NestedRegions:
-        """Regions that only :meth:`number` points, from a :meth:`state`."""
+        """Regions from a :meth:`state`, with only :meth:`number` and ``count``."""
         regions = cls.__new__(cls)
         regions._origin, regions._scale = state["origin"], state["scale"]
         regions._pairs = VoxelSides(

@@ -81,7 +81,7 @@ class RowCounts:
     """The number of rows that :class:`SurfaceRows` would have, as a function of the resolution.
 
     Parameters:
-        bbox, p, n: Those of the rows.
+        bbox, p, n: See :class:`SurfaceRows`.
     """
 
     def __init__(self, bbox: mi.ScalarBoundingBox3f, p: mi.Point3f, n: mi.Normal3f) -> None:

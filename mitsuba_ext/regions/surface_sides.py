@@ -9,7 +9,7 @@ import numpy as np
 #: Share of the vertices that may lie outside of the region, on either side of each axis.
 _OUTSIDE = 2e-3
 
-#: What is added to the region on each side.
+#: Margin of the region on each side, in units of its size.
 _MARGIN = 0.02
 
 

@@ -1,4 +1,4 @@
-"""A render whose samples go where the error is."""
+"""Adaptive sampling: a render that takes more samples of pixels with large errors."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from .sample_allocation import SampleAllocation
 from .stages import Stage
 from .time_budget import TimeBudget
 
-#: The first pass, and each of the others, has this share of all samples by default.
+#: By default, each pass takes all samples divided by this number.
 _PASS_SHARE = 8
 
-#: Sets of a stratified sampler in the first pass: their scatter shows the variance.
+#: Number of sets of a stratified sampler in the first pass: their spread gives the variance.
 _SETS = 4
 
 
@@ -30,7 +30,7 @@ class AdaptiveJob(Job):
     ``pass_spp`` and ``counts_samples`` it reads.
 
     The pilots of the nested integrator and the first pass take the same number of samples of every
-    pixel, and all others as many as :class:`SampleAllocation` says.
+    pixel. For later passes, :class:`SampleAllocation` computes the number of each pixel.
     """
 
     divides_stages = False  # moments are those of whole passes
@@ -47,10 +47,10 @@ class AdaptiveJob(Job):
         self._pass_spp = min(integrator.pass_spp or -(-spp // _PASS_SHARE), spp)
         self._set_size = 1
         if hasattr(self.sampler, "set_film"):
-            # The scatter of a pixel's sets shows the variance only if they are independent
+            # The spread of a pixel's sets gives the variance only if they are independent
             self.sampler.set_film(0)
         if self.plan.structured:
-            # Each pass has sets of its own, with a sampler of its own
+            # Each pass has its own sets and its own sampler
             self.sampler.set_sample_count(max(1, self._pass_spp // _SETS))
             self._set_size = self.sampler.sample_count()
             self.sampler.set_samples_per_wavefront(self._set_size)
@@ -93,7 +93,8 @@ class AdaptiveJob(Job):
         )
 
     def _samples_that_fit(self) -> float | None:
-        """Into the time left; ``None`` where there is no limit, or the speed is not known."""
+        """The number of samples that fit into the time left; ``None`` if there is no limit, or the
+        speed is not known yet."""
         if not self.budget.is_limited or self._seconds_per_sample == 0:
             return None
         return max(1.0, (self.budget.end - time.perf_counter()) / self._seconds_per_sample)
@@ -103,7 +104,8 @@ class AdaptiveJob(Job):
         return self._run_sets(stage, *self.allocation.first(spp))
 
     def _run_sets(self, stage: Stage, sets: np.ndarray, weight: np.ndarray) -> bool:
-        """Renders so many sets of each pixel into the block; did it have to compile a kernel?"""
+        """Renders ``sets`` sets of each pixel into the block. Returns True if it compiled a
+        kernel."""
         begin, misses = time.perf_counter(), kernel_cache_misses()
         pixels = np.repeat(np.arange(len(sets), dtype=np.uint32), sets)
         table = from_numpy(mi.Float, weight)
@@ -131,7 +133,7 @@ class AdaptiveJob(Job):
         numbers = camera.draw_numbers(self.sensor, sampler, lanes, stage.camera)
         rays = camera.camera_rays(self.sensor, lanes, numbers, self.plan.spp)
         sample = self._sample(stage, sampler, rays, dr.gather(mi.Float, weight, pixel))
-        # dr.mean() would write the number of lanes into the kernel: a kernel for each pass
+        # dr.mean() would make the number of lanes a literal: another kernel for each pass
         brightness = dr.sum(sample.L * (rays.importance * rays.weight)) / len(sample.L)
         dr.eval(brightness, self.block.tensor(), self.tally)
         dr.sync_thread()
@@ -145,7 +147,8 @@ class AdaptiveJob(Job):
         super().fill_film()
 
     def _put_counts(self) -> None:
-        """Fills the last channel of the block, which the film divides by the weights of samples."""
+        """Writes the sample counts to the last channel of the block, times the weights by which the
+        film divides."""
         width, height = self._pixels
         tensor = self.block.tensor()
         shape = tuple(tensor.shape)

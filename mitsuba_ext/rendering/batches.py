@@ -20,8 +20,8 @@ from .camera import film_told, find_sensor
 
 
 class Batches:
-    """Running mean and variance of batches, each weighted by its samples. Its memory and its cost
-    per batch do not grow with their number.
+    """Running mean and variance of batches, each weighted by its samples. Memory and cost per batch
+    do not grow with the number of batches.
 
     Attributes:
         channels: Names of the channels: those of the film's image, then the integrator's AOVs.
@@ -47,7 +47,7 @@ class Batches:
         self._state = (count + 1, samples + spp, mean, squares)
 
     def plus(self, other: Batches) -> Batches:
-        """The batches of both, which must be independent."""
+        """The batches of both objects together, which must be independent."""
         (count, samples, mean, squares), (more, added, its_mean, its_squares) = (
             self._state, other._state
         )  # fmt: skip
@@ -65,7 +65,7 @@ class Batches:
         return total
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All that :meth:`from_arrays` needs."""
+        """The state as arrays, for :meth:`from_arrays`."""
         count, samples, mean, squares = self._state
         return {
             "channels": np.array(self.channels), "mean": np.asarray(mean),
@@ -76,7 +76,7 @@ class Batches:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Batches:
-        """Batches as they were.
+        """The inverse of :meth:`arrays`.
 
         Raises:
             KeyError: An array is missing.
@@ -95,7 +95,7 @@ class Batches:
 
     @classmethod
     def load(cls, path: Path) -> Batches:
-        """Reads what :meth:`save` wrote.
+        """Reads a file that :meth:`save` has written.
 
         Raises:
             OSError, ValueError, KeyError, zipfile.BadZipFile: The file is missing or damaged.
@@ -161,12 +161,12 @@ def each_batch(
 
 
 def batch_seeds(seed: int | mi.UInt32, count: int, first: int = 0) -> list[int]:
-    """Seeds of ``count`` batches of a render with the given seed, from number ``first`` on.
+    """Seeds of ``count`` batches of a render with the given seed, from batch ``first`` on.
 
     They are hashes of 32 bits. With consecutive seeds, renders with neighbouring seeds would share
     batches, and Mitsuba's stratified samplers give pixel p at seed s + spp the numbers of pixel
-    p + 1 at seed s. They are the second output of TEA, because our integrators take the first for
-    the seeds of their passes: else pass k of one batch would repeat batch k.
+    p + 1 at seed s. They are the second output of TEA, because our integrators use the first output
+    for the seeds of their passes: otherwise, pass k of one batch would repeat batch k.
     """
     if isinstance(seed, mi.UInt32):
         seed = seed[0]
@@ -210,8 +210,8 @@ def _no_batches(film: mi.Film) -> Batches:
 def _complete(image: np.ndarray, film: mi.Film, channel_count: int) -> np.ndarray:
     """The image with the channels of the film.
 
-    The image that "aov" returns lacks channels that it leaves in the film. So this takes the image
-    itself from ``image``, and the other channels, which have names, from the film.
+    The image that "aov" returns lacks channels that it leaves in the film. Colour and alpha are
+    therefore taken from ``image``, and the other channels, which have names, from the film.
     """
     if image.shape[2] == channel_count:
         return image

@@ -1,4 +1,4 @@
-"""From pixels to rays, and from radiance back to the film: the two ends of every render."""
+"""Camera rays for the pixels of a film, and adding their radiance to the film."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .camera_samples import CameraSamples
 
 
 def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
-    """The sensor that ``render(sensor=…)`` means.
+    """The sensor for the argument ``sensor`` of ``render``: an index in the scene, or a sensor.
 
     Raises:
         ValueError: There is no sensor of this index.
@@ -30,28 +30,29 @@ def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
 
 
 def film_extent(film: mi.Film) -> tuple[int, int]:
-    """Width and height of the sampled pixels: the crop window, plus the filter's border where the
-    film wants it sampled."""
+    """Width and height of the sampled pixels: the crop window, plus the filter's border if the
+    film's ``sample_border`` is set."""
     border = 2 * film.rfilter().border_size() if film.sample_border() else 0
     width, height = film.crop_size()
     return int(width) + border, int(height) + border
 
 
 def tell_film(sampler: mi.Sampler, film: mi.Film, first: int = 0) -> None:
-    """Tells a sampler which pixels its lanes stand for, if it asks (``sobol_owen`` does): those of
-    the film row by row, from number ``first`` on."""
+    """Tells a sampler which pixels its lanes stand for, if it has the method ``set_film`` (as
+    ``sobol_owen``): those of the film row by row, from index ``first`` on."""
     if hasattr(sampler, "set_film"):
         sampler.set_film(film_extent(film)[0], first)
 
 
 def forget_state(sensor: mi.Sensor) -> None:
-    """Lets the sensor's sampler forget how far a render has got, as ``mi.render`` does afterwards.
-    That waits to be evaluated, which recorded kernels would do: the whole render, a second time."""
+    """Resets the state of the sensor's sampler after a render, as ``mi.render`` does. The state is
+    not evaluated: a recorded kernel would evaluate it, and with it the whole render a second
+    time."""
     sensor.sampler().seed(0, 1)
 
 
 def own_sampler(sensor: mi.Sensor) -> mi.Sampler:
-    """A copy of the sensor's sampler, or the sampler itself where it cannot be copied (samplers
+    """A copy of the sensor's sampler, or the sampler itself if it cannot be copied (samplers
     written in Python need not have ``clone``)."""
     try:
         sampler = sensor.sampler().clone()
@@ -63,7 +64,8 @@ def own_sampler(sensor: mi.Sensor) -> mi.Sampler:
 
 @contextmanager
 def film_told(sensor: mi.Sensor) -> Iterator[None]:
-    """The same for integrators of Mitsuba, which tell samplers nothing."""
+    """A context that calls :func:`tell_film` for the sensor's sampler. It is for Mitsuba's own
+    integrators, which do not call it."""
     sampler = sensor.sampler()
     tell_film(sampler, sensor.film())
     try:
@@ -76,12 +78,12 @@ def film_told(sensor: mi.Sensor) -> Iterator[None]:
 
 @dataclass
 class Lanes:
-    """Which sample of which pixel each lane of a pass takes.
+    """The sample that each lane of a pass takes.
 
     Attributes:
-        pixel: The number of the pixel, row by row in the film's extent.
+        pixel: The index of the pixel, row by row in the film's extent.
         corner: Its corner on the film.
-        index: The number of the sample among all of the render in this pixel.
+        index: The index of the sample among all samples of the render in this pixel.
     """
 
     pixel: mi.UInt32
@@ -92,20 +94,21 @@ class Lanes:
 def lanes_of(
     film: mi.Film, spp_per_pass: int, first: int = 0, pixels: range | None = None
 ) -> Lanes:
-    """The lanes of a pass of ``spp_per_pass`` samples for each of the ``pixels`` (all of them), row
-    by row in the film's extent, after ``first`` ones of earlier passes."""
+    """The lanes of a pass of ``spp_per_pass`` samples for each of the ``pixels``, row by row in the
+    film's extent (all of them by default). Earlier passes took ``first`` samples of each pixel."""
     return PassLanes.of(film, spp_per_pass, first, pixels).lanes(film)
 
 
 @dataclass
 class PassLanes:
-    """The lanes of a pass, before it begins: what differs from pass to pass are arrays.
+    """The data from which the lanes of a pass are computed. Numbers that differ from pass to pass
+    are opaque arrays.
 
     Attributes:
         count: Samples of all pixels.
         spp: Samples of each pixel.
         first: Samples of each pixel in earlier passes.
-        start: The first pixel; ``None`` where it is that of the film.
+        start: The first pixel; ``None`` if it is the first of the film.
     """
 
     count: int
@@ -115,7 +118,7 @@ class PassLanes:
 
     @classmethod
     def of(cls, film: mi.Film, spp: int, first: int, pixels: range | None) -> PassLanes:
-        """Those of :func:`lanes_of`."""
+        """The data for :func:`lanes_of`, which has the same parameters."""
         width, height = film_extent(film)
         pixel_count = width * height if pixels is None else len(pixels)
         # Opaque, so that passes share a kernel
@@ -146,12 +149,12 @@ def lanes_at(film: mi.Film, pixel: mi.UInt32, index: mi.UInt32) -> Lanes:
 
 @dataclass
 class CameraNumbers:
-    """The numbers, in [0, 1), that make a camera ray.
+    """The random numbers, in [0, 1), that make a camera ray.
 
     Attributes:
-        film: Where in its pixel the ray begins.
-        aperture, time, wavelength: Point of the aperture, time in the shutter interval, and what
-            chooses the wavelengths.
+        film: Position of the ray in its pixel.
+        aperture, time, wavelength: The numbers that choose the point of the aperture, the time in
+            the shutter interval, and the wavelengths.
         weight, hero_weight, distance: See :class:`CameraRays`.
     """
 
@@ -167,9 +170,9 @@ class CameraNumbers:
 def draw_numbers(
     sensor: mi.Sensor, sampler: Numbers, lanes: Lanes | None, samples: CameraSamples
 ) -> CameraNumbers:
-    """Numbers in the order in which ``mi.SamplingIntegrator`` draws them, so that the same seed
-    gives the same rays as Mitsuba's own integrators. ``samples`` says which come from elsewhere:
-    only these need to know the ``lanes``."""
+    """Draws the numbers in the order in which ``mi.SamplingIntegrator`` does, so that the same seed
+    gives the same rays as Mitsuba's own integrators. Numbers for which ``samples`` has a source are
+    drawn from there; only these depend on the ``lanes``."""
     numbers = CameraNumbers(sampler.next_2d(), mi.Point2f(0.5), mi.Float(0), mi.Float(0))
     if sensor.needs_aperture_sample():
         if samples.aperture is None:
@@ -202,7 +205,7 @@ def draw_numbers(
 def camera_rays(
     sensor: mi.Sensor, lanes: Lanes, numbers: CameraNumbers, spp: int
 ) -> CameraRays:
-    """The rays that these numbers stand for; ``spp`` samples per pixel of the whole render scale
+    """The camera rays of these numbers. ``spp``, the samples per pixel of the whole render, scales
     the ray differentials."""
     film = sensor.film()
     scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
@@ -240,9 +243,9 @@ def sample_rays(
         sensor, sampler: The sampler is seeded for as many lanes as there are rays.
         spp_per_pass: Samples per pixel of this pass.
         spp: Samples per pixel of the whole render.
-        samples: Which numbers choose aperture, time and wavelengths.
+        samples: The sources of the numbers that choose aperture, time and wavelengths.
         first: Samples per pixel that earlier passes took.
-        pixels: Row by row in the film's extent; all of them by default.
+        pixels: The pixels, row by row in the film's extent; all of them by default.
     """
     lanes = lanes_of(sensor.film(), spp_per_pass, first, pixels)
     return camera_rays(sensor, lanes, draw_numbers(sensor, sampler, lanes, samples), spp)
@@ -256,9 +259,9 @@ def put(
     aovs: list[mi.Float],
     count: mi.Float | float = 1.0,
 ) -> None:
-    """Puts samples into an image block, in the channels that the film asks for, but for their
-    splats. ``aovs`` has one value per channel that the integrator announced to ``film.prepare``.
-    Each sample counts as many as ``count``: the film divides by the sum of these."""
+    """Puts samples, without their splats, into an image block, in the channels of the film.
+    ``aovs`` has one value per channel that the integrator announced to ``film.prepare``. ``count``
+    is the weight of each sample: the film divides by the sum of the weights."""
     weight = rays.weight * count
     L = sample.L * rays.importance * weight
     alpha = dr.select(sample.valid, mi.Float(weight), 0)
@@ -276,7 +279,8 @@ def put(
 
 
 def check_takes_splats(film: mi.Film) -> None:
-    """
+    """Checks that splats can be added to a film.
+
     Raises:
         NotImplementedError: Splats cannot be added to this film.
     """
@@ -298,14 +302,14 @@ def put_splats(film: mi.Film, block: mi.ImageBlock, splats: Splats) -> None:
 def _channels(
     film: mi.Film, L: mi.Spectrum, wavelengths: mi.Spectrum | None, alpha: mi.Float
 ) -> list[mi.Float]:
-    """The colour channels of a film, and alpha where it has that."""
+    """The colour channels of a film, and alpha if it has that channel."""
     rgb = to_rgb(L, wavelengths)
     has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
     return [rgb.x, rgb.y, rgb.z, *([alpha] if has_alpha else [])]
 
 
 def develop(film: mi.Film, develop: bool, evaluate: bool) -> mi.TensorXf:
-    """What ``render(develop=…, evaluate=…)`` returns, once the film holds the image."""
+    """The return value of ``render(develop=…, evaluate=…)``, once the film holds the image."""
     image = film.develop() if develop else mi.TensorXf()
     if not develop:
         film.schedule_storage()

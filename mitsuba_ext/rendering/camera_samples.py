@@ -1,4 +1,4 @@
-"""Which numbers choose what a camera ray is, besides its place on the film."""
+"""The sources of the numbers that make a camera ray, besides its film position."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from ..transport.numbers import Numbers
 
 
 class PixelNumbers(Protocol):
-    """Numbers for one purpose."""
+    """A source of numbers for one purpose."""
 
     def draw(
         self, sampler: Numbers, pixel: mi.UInt32, index: mi.UInt32
     ) -> tuple[Any, ...]:
-        """The number, and its weight (or two), of the sample ``index``, of those of the whole
-        render, of each pixel. ``sampler`` is that of the sensor."""
+        """The number for sample ``index`` (among all of the render) of each pixel, and its weight
+        (or two weights). ``sampler`` is that of the sensor."""
 
 
 @dataclass
 class CameraSamples:
-    """Where numbers of camera rays come from: ``None`` stands for the sensor's sampler, which is
-    Mitsuba's choice.
+    """The sources of the numbers of camera rays. ``None`` stands for the sensor's sampler, as in
+    Mitsuba.
 
     Attributes:
-        aperture: Points of the aperture, in two dimensions.
-        time: Times of the shutter interval.
-        wavelength: What chooses the four wavelengths u + k/4, with a second weight for spectra that
-            all four find: they repeat themselves after 1/4.
-        distance: What chooses the first distance of a path in a homogeneous medium.
+        aperture: Chooses points of the aperture, in two dimensions.
+        time: Chooses times in the shutter interval.
+        wavelength: Chooses the four wavelengths u + k/4. Its draws have a second weight, for
+            radiance that all four wavelengths carry: the density of u then has the period 1/4.
+        distance: Chooses the first distance of a path in a homogeneous medium.
     """
 
     aperture: PixelNumbers | None = None

@@ -1,4 +1,4 @@
-"""Parts of a film that are spread evenly over it."""
+"""Dividing a film into parts whose pixels are evenly spread."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import numpy as np
 
 
 def dithered_parts(width: int, height: int, count: int) -> list[np.ndarray]:
-    """Divides the pixels of a film, counted row by row, into parts: the second is as large as the
-    first, and each later one as large as all before. The pixels of each are a lattice.
+    """Divides the pixels of a film, counted row by row, into parts. The second part is as large as
+    the first, and each later one as large as all before. The pixels of a part form a lattice.
 
     Parameters:
-        width, height: Of the film.
-        count: Of the parts, at least 2.
+        width, height: Size of the film.
+        count: Number of parts, at least 2.
     """
     period = 1 << (count - 1)
-    # About the golden section of the period, and odd: rows are shifted against each other
+    # The shift between rows: close to the golden section of the period, and odd
     shift = round(0.382 * period) | 1
     y, x = np.mgrid[0:height, 0:width]
     phase = ((x + shift * y) % period).ravel()

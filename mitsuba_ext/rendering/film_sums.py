@@ -11,14 +11,14 @@ import numpy as np
 class FilmSums:
     """A film holds, for each pixel, the weighted sum of its samples and the sum of their weights.
     These sums are added over renders, which gives the film of a single render of all samples, for
-    every reconstruction filter. Of renders whose weights do not count the samples of the image
-    (chains, whose film has some samples of the camera besides), it is the images that are added,
-    each times its samples per pixel.
+    every reconstruction filter. The weights of some renders do not count the samples of the image
+    (Markov chains, whose film holds a few camera samples as well). Of these renders the images are
+    added, each times its samples per pixel.
 
     Attributes:
         contents: The sums, [height, width, channel], in double precision; 0.0 before the first.
-        has_weights: Does the film hold weights? A light tracer leaves an image without: the sum is
-            then that of the images, each times its samples per pixel.
+        has_weights: Does the film hold weights? A light tracer leaves an image without weights: the
+            images are then added, each times its samples per pixel.
         spp: Samples per pixel of all renders.
     """
 
@@ -27,10 +27,10 @@ class FilmSums:
         self.has_weights, self.spp = True, 0
 
     def add(self, film: mi.Film, spp: int, counts_samples: bool = True) -> None:
-        """Adds what a render of so many samples per pixel has left in the film.
+        """Adds the contents of the film after a render of ``spp`` samples per pixel.
 
         Args:
-            counts_samples: Do its weights count the samples of the image?
+            counts_samples: Do the film's weights count the samples of the image?
         """
         contents = np.array(film.develop(raw=True), dtype=np.float64)
         weights = contents[..., _weight_channel(film), None]

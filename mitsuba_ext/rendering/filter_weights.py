@@ -12,9 +12,9 @@ _TABLE = 1 << 14
 def put_splats(film: mi.Film, splats: mi.TensorXf, offset: mi.ScalarPoint2i, spp: int) -> None:
     """Adds splats to a film that holds ``spp`` camera samples per pixel, and no splats yet.
 
-    The film divides by the sum of the filter weights of its camera samples. That is a random
-    number, whose inverse is too large on average: by 6 % for one sample and a gaussian filter. So
-    splats are multiplied by the sum, and divided by its mean.
+    The film divides each pixel by the sum of the filter weights of its camera samples. This sum is
+    random, and its inverse is too large on average: by 6 % for one sample and a gaussian filter.
+    The splats are therefore multiplied by the sum, and divided by its mean.
     """
     if not film.rfilter().is_box_filter():
         channel = 4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3
@@ -26,7 +26,8 @@ def put_splats(film: mi.Film, splats: mi.TensorXf, offset: mi.ScalarPoint2i, spp
 
 def mean_weights(film: mi.Film) -> np.ndarray:
     """The mean of the filter weights that one camera sample in each pixel adds to each pixel:
-    [y, x]. Pixels at the edges get less, because there are no samples outside of the film."""
+    [height, width]. Pixels at the edges get less, because there are no samples outside of the
+    film."""
     rfilter = film.rfilter()
     radius = rfilter.radius()
     edges = np.linspace(-radius, radius, _TABLE + 1)

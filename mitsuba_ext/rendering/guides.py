@@ -1,5 +1,5 @@
-"""What guides a denoiser: albedo and normal of what the camera sees, in mirrors and through glass
-too."""
+"""Auxiliary features for denoisers: albedo and normal of the surfaces that the camera sees, also in
+mirrors and through glass."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from . import camera
 from .camera_samples import CameraSamples
 from .plan import check_extent
 
-#: The channels, as layers of an EXR call them.
+#: The names of the channels in an OpenEXR file.
 CHANNELS = (*(f"albedo.{letter}" for letter in "RGB"), *(f"normal.{letter}" for letter in "XYZ"))
 
 #: Samples per pixel.
 _SPP = 32
 
-#: Samples of a pass, about.
+#: Approximate number of samples of a pass.
 _PASS_SAMPLES = 1 << 22
 
 #: RGB of a spectrum that is 1 everywhere.
 _WHITE = (1.206, 0.949, 0.910)
 
-#: Surfaces, at most, that a camera ray passes or is mirrored by.
+#: Largest number of surfaces that transmit or reflect a camera ray.
 _MOST_BOUNCES = 16
 
 
 def render_guides(
     scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery, seed: int = 0
 ) -> dict[str, np.ndarray]:
-    """Albedo and shading normal of the first surface that is not perfectly specular: where camera
-    rays end that mirrors and glass send on. Replaces the contents of the film.
+    """Renders albedo and shading normal of the first surface that is not perfectly specular: camera
+    rays are traced on through mirrors and glass. Replaces the contents of the film.
 
     Args:
-        query: How a ray meets the scene.
+        query: Intersects rays with the scene.
 
     Returns:
         Arrays (height, width) by the names of :data:`CHANNELS`.
@@ -71,7 +71,7 @@ def render_guides(
         dr.eval(block.tensor())
     film.put_block(block)
     image = np.array(film.develop())[..., -len(CHANNELS) :]
-    # Wavelengths are samples, whose colours may be negative
+    # Colours of sampled wavelengths may be negative
     image[..., :3] = np.clip(image[..., :3], 0, 1)
     return {name: image[..., n] for n, name in enumerate(CHANNELS)}
 
@@ -94,8 +94,8 @@ def _albedo(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpect
 
 @dr.syntax
 def _follow(scene, query, sampler, ray, going, throughput):
-    """Follows rays through what reflects and refracts like a mirror: to the first surface with a
-    lobe that is not."""
+    """Follows rays through perfectly specular surfaces, to the first surface that has a smooth
+    lobe."""
     si, bounces = dr.zeros(mi.SurfaceInteraction3f), mi.UInt32(0)
     context = mi.BSDFContext()
     while going:
@@ -104,7 +104,7 @@ def _follow(scene, query, sampler, ray, going, throughput):
         bsdf = si.bsdf()
         numbers = sampler.next_1d(going), sampler.next_2d(going)
         bs, weight = sample_bsdf(bsdf, context, si, *numbers, going)
-        # Is there anything but mirror images here?
+        # Does the surface only scatter specularly?
         is_specular = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         is_specular |= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         is_specular &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)

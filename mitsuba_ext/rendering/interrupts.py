@@ -17,11 +17,12 @@ SIGNALS = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 ]
 
-#: Asks a long render to keep what it has; ``None`` on systems that do not have it.
+#: The signal that asks a long render to save its current state; ``None`` on systems without it.
 KEEP: int | None = getattr(signal, "SIGUSR1", None)
 
-#: Signals within so many seconds of the first one count as one. A terminal that is closed may send
-#: several, and some launchers forward a Ctrl-C that the terminal also sends to this process.
+#: Signals within this number of seconds after the first one are ignored. A terminal that is closed
+#: may send several, and some launchers forward a Ctrl-C that the terminal also sends to this
+#: process.
 TOGETHER = 0.5
 
 
@@ -32,7 +33,7 @@ class InterruptHandler:
     Attributes:
         number: The first signal; ``None`` if none was received yet.
         event: During a pass, the event that the first signal sets instead of interrupting the pass;
-            else ``None``.
+            otherwise ``None``.
     """
 
     def __init__(self) -> None:
@@ -58,7 +59,7 @@ class InterruptHandler:
 def requests_to_keep(
     handler: Callable[[int, FrameType | None], None] | signal.Handlers,
 ) -> Iterator[None]:
-    """A context in which :data:`KEEP` has a handler: else it would end the process."""
+    """A context in which :data:`KEEP` has a handler. Without one, the signal ends the process."""
     if KEEP is None or threading.current_thread() is not threading.main_thread():
         yield
         return

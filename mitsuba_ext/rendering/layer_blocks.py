@@ -1,4 +1,4 @@
-"""Where the samples of layers are collected."""
+"""Image blocks for the samples of layers."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from ..defocus.images import Size
 from ..defocus.layers import LayerSums, Limits
 from .pinhole import Surface
 
-#: Channels of each layer: RGB, alpha, blur, hits, blur times brightness; and of the guides of a
-#: denoiser.
+#: Channels of each layer: RGB, alpha, blur, hits, blur times brightness; and channels of a
+#: denoiser's features.
 _VALUES, _GUIDES = 7, 7
 
 
@@ -18,11 +18,11 @@ class LayerBlocks:
     """Image blocks that collect the layers' samples.
 
     Parameters:
-        film: Its reconstruction filter collects them; if there are guides, a box does, because a
-            denoiser takes noise that neighbours share for detail.
-        size, offset: Of the blocks; the offset is that of their corner on the film.
-        limits: Which layers there are.
-        has_guides: Do surfaces have guides?
+        film: The film whose reconstruction filter is used. With guides, a box filter is used
+            instead, because a denoiser mistakes noise that neighbouring pixels share for detail.
+        size, offset: Size of the blocks, and position of their corner on the film.
+        limits: The limits of the layers.
+        has_guides: Do surfaces have the features of a denoiser (:attr:`Surface.guides`)?
     """
 
     def __init__(
@@ -53,8 +53,9 @@ class LayerBlocks:
         """Adds samples.
 
         Parameters:
-            surface: What they met.
-            behind: Only to layers behind the one of a surface of this blur; infinite for all.
+            surface: The surface that each sample hit.
+            behind: Samples are only added to layers behind the layer of this blur; infinity for all
+                layers.
         """
         known, blur = [], surface.blur
         for k, block in enumerate(self._hits):

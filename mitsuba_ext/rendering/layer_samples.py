@@ -1,22 +1,24 @@
-"""Which pixels of a render in layers take samples of what the film does not show."""
+"""The pixels of a layered render that take samples of surfaces that are hidden, or outside of the
+film."""
 
 from __future__ import annotations
 
 import numpy as np
 
-#: Edge of the squares of pixels for which things are decided together.
+#: Edge of tiles, in pixels: the decisions are made for all pixels of a tile together.
 TILE = 8
 
-#: Where the blurs of neighbouring pixels differ by more, in pixels, one hides something behind it.
+#: If the blurs of neighbouring pixels differ by more than this, in pixels, there is an edge at
+#: which one surface hides another.
 _EDGE = 0.5
 
 
 def outside_pixels(blurs: np.ndarray, margin: int) -> np.ndarray:
-    """The pixels of a margin around the film that are blurred into it, or into which pixels of the
-    film are blurred, about: these by tiles.
+    """The pixels of the margin around the film that are blurred into the film, and, approximately
+    by tiles, those into which pixels of the film are blurred.
 
     Parameters:
-        blurs: With the margin, [y, x].
+        blurs: Blur of each pixel, margin included, [height, width].
     """
     height, width = blurs.shape
     outside = np.ones((height, width), dtype=bool)
@@ -28,7 +30,8 @@ def outside_pixels(blurs: np.ndarray, margin: int) -> np.ndarray:
 
 
 def distance_from_film(shape: tuple[int, int], margin: int) -> np.ndarray:
-    """How far pixels are away from a film that has a margin: [y, x]."""
+    """The distance of each pixel from the film, in pixels, [height, width]. ``shape`` includes the
+    margin."""
     away = [
         np.maximum(0, np.maximum(margin - i, i - (n - 1 - margin)))
         for i, n in zip(np.ogrid[: shape[0], : shape[1]], shape)
@@ -37,7 +40,7 @@ def distance_from_film(shape: tuple[int, int], margin: int) -> np.ndarray:
 
 
 def _spread(reach: np.ndarray) -> np.ndarray:
-    """By tile, the largest reach in pixels of the tiles that reach it; 0 for none."""
+    """For each tile, the largest reach, in pixels, of the tiles that reach it; 0 if none does."""
     steps = np.ceil(reach / TILE)
     found = np.zeros_like(reach)
     for step in range(int(steps.max()), 0, -1):
@@ -46,13 +49,13 @@ def _spread(reach: np.ndarray) -> np.ndarray:
 
 
 def least_blur_around(blurs: np.ndarray, sky: float) -> np.ndarray:
-    """By pixel, the least blur (that of the farthest thing) at an edge which is so near that the
-    lens may see that thing behind the pixel; infinity where there is no such edge. Decided for
-    tiles of pixels together.
+    """For each pixel, the smallest blur, which is that of the farthest surface, at edges so near
+    that the lens may see this surface behind the pixel; infinity if there is no such edge. It is
+    computed for tiles.
 
     Parameters:
-        blurs: Signed radii in pixels, [y, x].
-        sky: That of infinity.
+        blurs: Signed blur radii in pixels, [height, width].
+        sky: The blur of a point at infinity.
     """
     edge = np.full_like(blurs, np.inf)
     for axis in range(2):
@@ -63,7 +66,8 @@ def least_blur_around(blurs: np.ndarray, sky: float) -> np.ndarray:
         e[1:] = np.minimum(e[1:], least)
         e[:-1] = np.minimum(e[:-1], least)
     least, most = _by_tile(edge, np.inf, np.min), _by_tile(blurs, -np.inf, np.max)
-    # A ray through the edge of the lens is so far away from where the middle sees it
+    # The largest distance on the film between a surface seen through the edge of the lens and
+    # through its middle
     reach = np.ceil((most - sky) / TILE)
     found = np.full_like(least, np.inf)
     for radius in range(int(reach.max()) + 1):
@@ -86,7 +90,7 @@ def _by_pixel(tiles: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _around(tiles: np.ndarray, reduce: np.ufunc) -> np.ndarray:
-    """Of each tile and the eight around it."""
+    """``reduce`` over each tile and the eight tiles around it."""
     padded = np.pad(tiles, 1, mode="edge")
     height, width = tiles.shape
     return reduce.reduce([

@@ -1,4 +1,4 @@
-"""A render from the middle of a lens, in layers that a filter blurs."""
+"""Defocus by layers: a render from the middle of the lens, whose layers a filter blurs."""
 
 from __future__ import annotations
 
@@ -22,27 +22,28 @@ from .layer_samples import distance_from_film, least_blur_around, outside_pixels
 from .pinhole import PinholeView, Surface
 from .render import Job
 
-#: What lies around the film is blurred into it. So far outside samples are taken at most: this
-#: share of the film's longer edge; what is farther away is taken to be as it is there. An eighth
-#: leaves corners wrong under wide lenses, and a half costs 1.7 times as much and gains little.
+#: Surfaces outside of the film are blurred into it. Samples are taken in a margin of at most this
+#: width, in units of the film's longer edge; everything beyond is assumed to look like the edge of
+#: the margin. With 1/8, corners are wrong under wide lenses; 1/2 costs 1.7 times as much and gains
+#: little.
 _WIDEST_MARGIN = 1 / 4
 
-#: Marks pixels in a list of which hidden things are wanted.
+#: The bit that marks pixels, in a list, whose hidden surfaces are sampled.
 _HIDDEN = 0x80000000
 
-#: Samples of a pass over a list of pixels, at most.
+#: Largest number of samples of a pass over a list of pixels.
 _MOST_LANES = 1 << 21
 
 
 class LayeredJob(Job):
     """One render of :class:`~mitsuba_ext.integrators.ecoc_dof`.
 
-    The samples of the stages are those of the nested integrator along rays from the middle of the
-    lens. Then ``integrator.hidden_samples`` for each pixel are taken of what these surfaces hide,
-    where the lens sees a part of it, and of what lies around the film. A filter makes the picture.
+    The stages take samples of the nested integrator along rays from the middle of the lens. Then
+    ``integrator.hidden_samples`` samples per pixel are taken of hidden surfaces, where the lens
+    sees a part of them, and of surfaces outside of the film. A filter computes the picture.
     """
 
-    #: The samples go into layers too
+    #: The samples are also put into layers.
     freezes_passes = False
 
     def __init__(self, integrator, scene, sensor, seed, spp) -> None:
@@ -63,7 +64,7 @@ class LayeredJob(Job):
         self.blurs = self._blurs()
         self._trim()
         offset = [int(n) - self.margin for n in self.film.crop_offset()]
-        # A closed room has nothing behind its walls
+        # If the sky is not seen, the scene may be a closed room, with nothing behind its walls
         self._sees_sky = bool((self.blurs == np.float32(self.lens.blur_of_sky)).any())
         limits = self.filter.limits(self.blurs.ravel())
         self.layers = LayerBlocks(self.film, self.size, offset, limits, integrator.denoise)
@@ -73,7 +74,7 @@ class LayeredJob(Job):
         return Size(*(n + 2 * self.margin for n in self._crop))
 
     def _blurs(self) -> np.ndarray:
-        """The blur at the middle of each pixel: [y, x]."""
+        """The blur at the middle of each pixel, [height, width]."""
         _index, pixel = self.size.pixels()
         position = (mi.Point2f(pixel) + 0.5 - self.margin) / mi.Vector2f(self._crop)
         time = self.sensor.shutter_open() + 0.5 * self.sensor.shutter_open_time()
@@ -81,7 +82,8 @@ class LayeredJob(Job):
         return self.view.first(ray).blur.numpy().reshape(self.size.height, self.size.width)
 
     def _trim(self) -> None:
-        """Leaves as much of the margin as is blurred into the film, or the film into it."""
+        """Reduces the margin to the width that is blurred into the film, or into which the film is
+        blurred."""
         margin, film = self.margin, self.blurs[self._inside]
         distance = distance_from_film(self.blurs.shape, margin)
         inwards = distance[np.abs(self.blurs) >= distance].max()
@@ -93,14 +95,14 @@ class LayeredJob(Job):
 
     @property
     def _inside(self) -> tuple[slice, slice]:
-        """The pixels of the film among those with the margin."""
+        """The film, as slices of arrays that include the margin."""
         width, height = self._crop
         m = self.margin
         return slice(m, m + height), slice(m, m + width)
 
     def _sample(self, stage, sampler, rays: CameraRays, count=1.0) -> Sample:
-        # Before the samples are put into the block: null transmission of textures evaluates
-        # something while it is traced, and with it what waits for the block, in another kernel
+        # Before the samples are put into the block: tracing the null transmission of textures
+        # evaluates arrays, which would also evaluate the pending samples, in another kernel
         first = self.view.first(rays.ray)
         sample = super()._sample(stage, sampler, rays, count)
         self._put(rays, sample, first, mi.Float(rays.weight * count), mi.Bool(True))
@@ -123,11 +125,11 @@ class LayeredJob(Job):
         if not self._stopped(interrupt):
             self._run_besides(interrupt)
 
-    # ---- What the film does not show ----
+    # ---- Surfaces that are hidden, or outside of the film ----
 
     def _run_besides(self, interrupt) -> None:
-        """Takes samples of what lies around the film; and of what is hidden by something whose blur
-        is larger by more than 1 than that of the farthest thing around."""
+        """Takes samples of surfaces outside of the film, and of hidden surfaces: where the blur of
+        the surface in front is larger by more than 1 than that of the farthest surface around."""
         count = self.integrator.hidden_samples(self.statistics.spp)
         self._weight = dr.opaque(mi.Float, self.statistics.spp / count)
         pixels = np.flatnonzero(outside_pixels(self.blurs, self.margin)).astype(np.uint32)
@@ -138,7 +140,7 @@ class LayeredJob(Job):
             pixels = np.concatenate([pixels, hidden | _HIDDEN])
         if len(pixels) == 0:
             return
-        # Passes of about equal length, in which neighbouring lanes are alike
+        # Passes of about equal length; neighbouring lanes have neighbouring pixels
         most = min(_MOST_LANES // self.integrator.sample_cost, self.integrator.most_lanes)
         passes = -(-len(pixels) // max(1, most // count))
         for number, part in enumerate(np.array_split(pixels, passes)):
@@ -147,12 +149,12 @@ class LayeredJob(Job):
             self._run_list(mi.UInt32(part), count, number)
 
     def _run_list(self, pixels: mi.UInt32, count: int, number: int) -> None:
-        """Takes ``count`` samples of each of these."""
+        """Takes ``count`` samples of each of these pixels."""
         stage = self._last_stage
         lane = dr.arange(mi.UInt32, len(pixels) * count)
         place = lane // dr.opaque(mi.UInt32, count)
         sampler = mi.load_dict({"type": "independent"})
-        # Numbers that no other part of the render has
+        # A seed that no other part of the render uses
         seed = mi.sample_tea_32(mi.UInt32(self.plan.seed), mi.UInt32(0x80000000 + number))[0]
         sampler.seed(dr.opaque(mi.UInt32, seed[0]), len(lane))
         chosen = dr.gather(mi.UInt32, pixels, place)
@@ -169,8 +171,9 @@ class LayeredJob(Job):
     def _surface(
         self, rays: CameraRays, pixel: mi.UInt32, is_hidden: mi.Bool
     ) -> tuple[Surface, mi.Bool, mi.Float | None]:
-        """What a ray meets, or meets behind that where ``is_hidden``: from there on the ray goes.
-        And where there is something, and the blur of what hides it (infinite for nothing)."""
+        """The first surface along a ray; the surface hidden by it where ``is_hidden``, and then the
+        ray's origin is moved behind the first surface. Also returns the lanes that have a surface,
+        and the blur of the surface in front (infinite where not ``is_hidden``)."""
         first = self.view.first(rays.ray)
         if not self.filter.has_layers:
             return first, mi.Bool(True), None
@@ -183,8 +186,9 @@ class LayeredJob(Job):
         return dr.select(is_hidden, hidden, first), active | ~is_hidden, behind
 
     def _lanes_with_margin(self, pixel: mi.UInt32, index: mi.UInt32) -> camera.Lanes:
-        """Lanes for pixels of the film and its margin. Tables of the nested integrator that have an
-        entry for each pixel of the film know the nearest one."""
+        """Lanes for pixels of the film and its margin. Their ``pixel`` is the nearest one of the
+        film, since the nested integrator may have tables with an entry for each pixel of the
+        film."""
         corner = self.size.position(pixel) - self.margin
         border = self.film.rfilter().border_size() if self.film.sample_border() else 0
         extent = camera.film_extent(self.film)
@@ -206,7 +210,7 @@ class LayeredJob(Job):
             sums = [denoised(layer, self.size) for layer in sums]
         values = np.array(self.block.tensor())
         has_alpha = mi.has_flag(self.film.flags(), mi.FilmFlags.Alpha)
-        # The film divides by these
+        # The film divides by these weights
         weight = values[..., 4 if has_alpha else 3]
         values[..., :3] = self._picture(sums) * weight[..., None]
         if has_alpha:

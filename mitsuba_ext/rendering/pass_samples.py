@@ -1,4 +1,5 @@
-"""The samples of a pass, from camera rays to the image block: what is recorded (``frozen.py``)."""
+"""The samples of a pass, from camera rays to the image block: the functions that ``frozen.py``
+records."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from .camera_samples import CameraSamples
 
 
 class GradientsError(Exception):
-    """The radiance depends on parameters of which gradients are asked for."""
+    """The radiance depends on parameters for which gradients are enabled."""
 
 
 @frozen(any_width=True)
@@ -29,17 +30,17 @@ def put_samples(
     tally: mi.UInt64,
 ) -> None:
     """Takes the samples of a pass, and puts them into a block. Kernels have the width of the lanes,
-    whatever that of tables is, and read the state of the sampler, which has the same.
+    whatever the width of tables. They read the state of the sampler, which has the same width.
 
     Parameters:
-        estimator: What they are. It must not read arrays on the host.
-        samples: What chooses points of the aperture, times and wavelengths.
+        estimator: Takes the samples. It must not read arrays on the host.
+        samples: Chooses points of the aperture, times and wavelengths.
         spp: Samples per pixel of the whole render.
-        weight: How many samples each counts for.
-        tally: Counts of rays, which grow.
+        weight: The weight of each sample.
+        tally: Counts of rays, to which those of the pass are added.
 
     Raises:
-        GradientsError: Gradients are asked for.
+        GradientsError: The radiance has gradients.
     """
     rays, sample = _sampled(estimator, samples, scene, sensor, sampler, lanes, spp)
     if dr.grad_enabled(sample.L):
@@ -58,8 +59,8 @@ def look(
     lanes: camera.PassLanes,
     spp: int,
 ) -> mi.Spectrum:
-    """The radiance of samples of which observers learn; the film does not get them. The parameters
-    are those of :func:`put_samples`."""
+    """The radiance of samples from which observers learn. They are not added to the film. The
+    parameters are those of :func:`put_samples`."""
     return _sampled(estimator, samples, scene, sensor, sampler, lanes, spp)[1].L
 
 
@@ -79,7 +80,7 @@ def _sampled(
 
 
 def count_rays(tally: mi.UInt64, sample: Sample) -> None:
-    """Adds the counts of a pass."""
+    """Adds the counts of a pass to ``tally``."""
     counts = (
         sample.scatter_count,
         sample.shadow_count,

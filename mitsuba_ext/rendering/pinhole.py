@@ -1,4 +1,4 @@
-"""What a ray from the middle of a lens meets first, and what is behind that."""
+"""The first surface along a ray from the middle of a lens, and the surface that it hides."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from ..transport.lens_view import LensView, Passes
 from ..transport.numbers import Numbers
 from .guides import guides_of
 
-#: A surface that lets more of the light through than this is not there.
+#: Surfaces whose null transmission is larger than this are skipped.
 _MOST_TRANSMITTED = 0.5
 
-#: What is hidden begins where the blur is this share of that of what hides it, or ...
+#: The search for hidden surfaces begins at the depth at which the blur is this fraction of the blur
+#: of the surface in front, or ...
 _BEHIND = 0.5
 
-#: ... less than that by so many pixels: a smaller difference shows nothing of it.
+#: ... at which it is smaller by this number of pixels: the lens sees nothing of surfaces whose blur
+#: differs less.
 _LEAST_STEP = 2.0
 
 
@@ -33,16 +35,16 @@ class LensCentre:
 
 @dataclass
 class Surface:
-    """What a ray meets.
+    """A surface that a ray hits.
 
     Attributes:
         blur: Its signed radius of the circle of confusion in pixels; that of the sky if the ray
-            meets nothing.
-        is_hit: Does the ray meet a surface?
-        shape: Which one.
-        side: On which side of the surface the ray arrives: 1 or -1.
-        guides: What guides a denoiser: RGB of the albedo, the shading normal, and whether it is a
-            light. Empty if nobody asked for them.
+            hits nothing.
+        is_hit: Does the ray hit a surface?
+        shape: The shape that was hit.
+        side: The side of the surface on which the ray arrives: 1 or -1.
+        guides: The auxiliary features of a denoiser: RGB of the albedo, the shading normal, and
+            whether the surface is a light. Empty if there is no denoiser.
     """
 
     blur: mi.Float
@@ -53,13 +55,13 @@ class Surface:
 
 
 class PinholeView:
-    """The scene from the middle of a lens.
+    """The scene, seen from the middle of a lens.
 
     Parameters:
-        view: The lens' rays and depths.
+        view: Gives the lens' rays and depths.
         scene: The scene.
-        lens: By how much the lens blurs.
-        has_guides: Does a denoiser want to know the surfaces' albedo and normal?
+        lens: Gives the blur at a depth.
+        has_guides: Are the features of a denoiser computed (:attr:`Surface.guides`)?
     """
 
     def __init__(
@@ -76,20 +78,20 @@ class PinholeView:
     def beyond(
         self, ray: mi.Ray3f, first: Surface, active: mi.Bool
     ) -> tuple[mi.Ray3f, Surface, mi.Bool]:
-        """What the ``first`` surface hides, where ``active``.
+        """The surface that the ``first`` surface hides, where ``active``.
 
-        The ray is moved on, behind what belongs to the same object: where the blur is half as
-        large. Behind the focus, that is half of the way to the blur of the sky.
+        The start of the ray is moved behind surfaces of the same object: to the depth at which the
+        blur is half as large. Behind the focus, it is halfway to the blur of the sky.
 
         Returns:
-            The rest of the ray, what it meets, and whether there can be anything: not behind the
-            sky.
+            The rest of the ray, the surface that it hits, and whether there can be one: there is
+            nothing behind the sky.
         """
         sky, blur = self._lens.blur_of_sky, first.blur
         start = dr.select(blur > 0, _BEHIND * blur, blur - _BEHIND * (blur - sky))
         start = dr.minimum(start, blur - _LEAST_STEP)
         active = active & first.is_hit & (start > sky)
-        # The depth of which the blur is that of the start
+        # The depth that has the blur ``start``
         scale = dr.opaque(mi.Float, self._lens.pixels_per_disparity)
         depth = scale / dr.select(active, start - sky, 1)
         distance = (depth - self._view.depth(ray.o)) / dr.dot(ray.d, self._view.axis)
@@ -98,7 +100,7 @@ class PinholeView:
         rest.o = ray(dr.select(active, distance, 0))
 
         def passes(si: mi.SurfaceInteraction3f, side: mi.Float, active: mi.Bool) -> mi.Bool:
-            """Out of the object that hides the rest."""
+            """The rest of the ray may leave the object in front."""
             out = (si.shape == first.shape) & (side != first.side)
             return out | self._lets_through(si, side, active) if self._has_holes else out
 
@@ -126,6 +128,6 @@ class PinholeView:
     def _lets_through(
         si: mi.SurfaceInteraction3f, side: mi.Float, active: mi.Bool
     ) -> mi.Bool:
-        """Through a surface that lets light through."""
+        """Is the surface skipped because of its null transmission?"""
         through = si.bsdf().eval_null_transmission(si, active & si.is_valid())
         return dr.mean(mi.unpolarized_spectrum(through)) > _MOST_TRANSMITTED

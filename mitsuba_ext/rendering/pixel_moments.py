@@ -1,14 +1,15 @@
-"""How much the samples of each pixel vary."""
+"""Mean and variance of the samples of each pixel."""
 
 from __future__ import annotations
 
 import numpy as np
 
-#: What the neighbours of a pixel count, in samples of its own. Few samples say little about how
-#: rarely a pixel is bright; those of its neighbours say more.
+#: The weight of a pixel's neighbourhood, in units of the pixel's own samples. A few samples say
+#: little about rare bright values of a pixel; its neighbours add information.
 _NEIGHBOURS = 16.0
 
-#: Squared brightness of a dark pixel, in units of the squared mean of all: as relMSE has it.
+#: Added to the squared brightness of a pixel, in units of the squared mean of all pixels, as in
+#: relMSE.
 _FLOOR = 1e-2
 
 
@@ -16,12 +17,12 @@ class PixelMoments:
     """Mean and variance of the samples of each pixel.
 
     Parameters:
-        width, height: Pixels of the film.
-        set_size: Samples that a stratified sampler distributes together. The variance is that of
-            the means of sets, times their size.
+        width, height: Size of the film in pixels.
+        set_size: Number of samples that a stratified sampler distributes together. The variance is
+            that of the means of sets, times this number.
 
     Attributes:
-        count: Samples of each pixel, row by row.
+        count: Number of samples of each pixel, row by row.
     """
 
     def __init__(self, width: int, height: int, set_size: int = 1) -> None:
@@ -30,12 +31,12 @@ class PixelMoments:
         self._sum, self._squares = np.zeros(width * height), np.zeros(width * height)
 
     def add(self, pixel: np.ndarray, values: np.ndarray) -> None:
-        """Adds the sets of a pass: the pixel of each, and the brightness of their samples, one set
-        after the other. Samples that are not finite count as black."""
+        """Adds the sets of a pass. ``pixel`` holds the pixel of each set, ``values`` the brightness
+        of their samples, set by set. Samples that are not finite count as black."""
         values = np.where(np.isfinite(values), values, 0).astype(np.float64)
         values = values.reshape(-1, self._set_size).mean(axis=1)
         size = len(self.count)
-        # NumPy adds one after the other: equal seeds make equal sums
+        # NumPy adds in a fixed order: equal seeds give equal sums
         self._sum += np.bincount(pixel, values, size)
         self._squares += np.bincount(pixel, values**2, size)
         self.count += self._set_size * np.bincount(pixel, minlength=size)
@@ -43,17 +44,17 @@ class PixelMoments:
     def deviation(self) -> np.ndarray:
         """The standard deviation of one sample of each pixel, relative to its brightness.
 
-        A sample is part of the mean that its deviation is relative to. What a rare bright one
-        counts is thereby bounded, by the number of samples."""
+        Each sample is part of the mean by which its deviation is divided. The influence of a rare
+        bright sample is thereby bounded: by the number of samples."""
         sets = self.count / self._set_size
         mean = self._sum / np.maximum(sets, 1)
-        # One set alone has no variance: there, pixels say as much as their neighbours
+        # The variance of a single set is unknown: such a pixel only uses its neighbourhood
         variance = np.maximum(self._squares - sets * mean**2, 0) / np.maximum(sets - 1, 1)
         floor = _FLOOR * mean.mean() ** 2
         own = np.where(sets > 1, sets, 0)
         top = own * variance + _NEIGHBOURS * self._neighbours(variance)
         bottom = own * mean**2 + _NEIGHBOURS * self._neighbours(mean**2)
-        # In an image that is black all over, nothing deviates
+        # In a black image, the deviation is 0
         scale = np.maximum(bottom + (own + _NEIGHBOURS) * floor, 1e-30)
         return np.sqrt(self._set_size * top / scale)
 

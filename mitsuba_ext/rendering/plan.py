@@ -1,4 +1,4 @@
-"""What a render is going to do, decided before its first pass: stages, and how they are cut into
+"""The plan of a render, made before its first pass: the stages, and how they are cut into
 passes."""
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from .camera import film_extent
 #: pass itself two or three seconds on two CPU cores. A GPU gets longer passes.
 _PASS_SAMPLES = {dr.JitBackend.LLVM: 1 << 21, dr.JitBackend.CUDA: 1 << 24}
 
-#: Samples per pixel and pass, at least, however large the film is: neighbouring lanes that share a
-#: pixel trace rays that stay together. At 1920x1080, passes of one sample take 1.6 times as long.
-#: Not with a structured sampler, which keeps a state for each sample of a pass.
+#: Least number of samples per pixel in a pass, also for large films: neighbouring lanes of the same
+#: pixel trace coherent rays. At 1920x1080, passes of one sample take 1.6 times as long. It does not
+#: apply to structured samplers, which keep a state for each sample of a pass.
 _PASS_SPP = 16
 
-#: Passes of a structured sampler that learns, at least: a pilot is one of them or more.
+#: Least number of passes if an integrator that learns uses a structured sampler: pilots consist of
+#: whole passes.
 _MIN_STRUCTURED_PASSES = 16
 
 #: With a timeout, passes of a structured sampler are shorter by this factor. They cannot differ in
@@ -30,12 +31,12 @@ _TIMEOUT_PASS_DIVISOR = 4
 
 _MAX_WAVEFRONT = 1 << 32
 
-#: Passes of a render, at most: they last weeks.
+#: Largest number of passes of a render; they take weeks.
 _MOST_PASSES = 1 << 20
 
 
 class Planned(Protocol):
-    """What the plan of a render asks of an integrator."""
+    """The attributes and methods of an integrator that the plan of a render uses."""
 
     name: str
     timeout: float
@@ -43,17 +44,17 @@ class Planned(Protocol):
 
     @property
     def sample_cost(self) -> int:
-        """The time of a sample in units of that of a path, about."""
+        """The approximate time of a sample, in units of the time of a path."""
 
     @property
     def most_lanes(self) -> int:
-        """Samples that are taken at a time, at most, as memory allows."""
+        """Largest number of samples that are taken at a time, limited by memory."""
 
     def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
         """The samples per pixel of each pilot stage, out of ``spp``."""
 
     def samples_per_set(self, spp: int) -> int:
-        """So many samples of a pixel belong together."""
+        """The number of samples of a pixel that a timeout must not separate."""
 
 
 @dataclass(frozen=True)
@@ -61,15 +62,15 @@ class RenderPlan:
     """The samples of a render.
 
     Attributes:
-        seed: Of the render.
+        seed: Seed of the render.
         spp: Samples per pixel.
         stages: Samples per pixel of each stage: pilots, and the last one.
         pixel_count: Sampled pixels of the film.
         structured: Are the samples stratified over the whole render? Then all passes have the same
             length.
-        limit: Samples per pixel of a pass, at most.
-        set_size: Samples of a pixel that a timeout does not separate.
-        parts: Parts of the film, one of which is rendered after the other in each pass.
+        limit: Largest number of samples per pixel in a pass.
+        set_size: Number of samples of a pixel that a timeout does not separate.
+        parts: Number of parts of the film, which each pass renders one after the other.
     """
 
     seed: int
@@ -82,8 +83,8 @@ class RenderPlan:
     parts: int = 1
 
     def pass_length(self, samples: int, most_lanes: int = 0) -> int:
-        """Samples per pixel of passes of about equal length that take ``samples`` samples;
-        ``most_lanes`` as :class:`~mitsuba_ext.rendering.stages.Stage` says."""
+        """Samples per pixel of a pass, if ``samples`` samples are cut into passes of about equal
+        length. For ``most_lanes``, see :class:`~mitsuba_ext.rendering.stages.Stage`."""
         if self.structured:
             return self.limit
         limit = self.limit
@@ -105,8 +106,8 @@ class RenderPlan:
         return max(self.pass_length(samples) for samples in self.stages)
 
     def whole(self, before: int, samples: int, most: int) -> int:
-        """The samples of a stage, so many that the render ends with a whole set; ``most`` would do
-        so. ``before`` were taken in earlier stages."""
+        """The samples of a stage, rounded up so that the render ends with a whole set, which it
+        also does with ``most`` samples. ``before`` samples were taken in earlier stages."""
         return min(most, samples + -(before + samples) % self.set_size)
 
 
@@ -117,7 +118,7 @@ def plan_render(
 
     Raises:
         ValueError: ``spp`` is out of range, the film has more pixels than a wavefront can hold, or
-            these are too many samples for so many pixels.
+            ``spp`` is too large for this number of pixels.
     """
     if not 0 <= spp <= MOST_SPP:
         raise ValueError(
@@ -157,7 +158,7 @@ def plan_render(
         limit = max(d for d in range(1, limit + 1) if _divides(d, spp, set_size))
         pilots = [limit * max(1, samples // limit) for samples in pilots]
     stages = (*pilots, spp - sum(pilots))
-    # Of films that are too large for a pass even of one sample for each pixel
+    # More than one part if even one sample of each pixel is too much at a time
     parts = -(-pixel_count // integrator.most_lanes)
     return RenderPlan(seed, spp, stages, pixel_count, structured, limit, set_size, parts)
 
@@ -171,7 +172,7 @@ def check_extent(film: mi.Film) -> None:
     """Refuses a film that one pass cannot fill.
 
     Raises:
-        ValueError: It has more pixels than a wavefront can hold.
+        ValueError: The film has more pixels than a wavefront can hold.
     """
     width, height = film_extent(film)
     if width * height >= _MAX_WAVEFRONT:

@@ -1,4 +1,4 @@
-"""The one ``render()`` of all our integrators: stages, passes, time budget, film, statistics.
+"""The ``render()`` that all our integrators share: stages, passes, time budget, film, statistics.
 
 A render is a sequence of *stages*. All but the last are pilots: their samples teach the integrator
 something *and* land in the film, with weights that are fixed before the first sample is taken (each
@@ -34,7 +34,7 @@ from .time_budget import TimeBudget
 
 
 class Staged(Planned, Protocol):
-    """What :func:`render` asks of an integrator."""
+    """The attributes and methods of an integrator that :func:`render` uses."""
 
     progress: Callable[[float], None] | None
     statistics: RenderStatistics
@@ -43,7 +43,7 @@ class Staged(Planned, Protocol):
     def schedule(
         self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
     ) -> Schedule:
-        """The stages of a render, which take so many samples per pixel each."""
+        """The schedule of a render, whose stages take ``samples`` samples per pixel."""
 
     def aov_names(self) -> list[str]:
         """Channels besides colour and alpha."""
@@ -51,15 +51,16 @@ class Staged(Planned, Protocol):
     def sample_aovs(
         self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f
     ) -> list[mi.Float]:
-        """Their values along camera rays, but for those that the estimator finds."""
+        """The values of these channels for camera rays, without those that the estimator returns
+        (:attr:`Sample.aovs`)."""
 
     def no_gradients(self) -> NotImplementedError:
-        """What to raise where gradients are asked for."""
+        """The exception to raise if gradients are requested."""
 
 
 @dataclass
 class RenderStatistics:
-    """What a render did and what it cost.
+    """The samples, rays, times and memory of a render.
 
     Attributes:
         passes: Passes whose samples are in the film.
@@ -70,8 +71,8 @@ class RenderStatistics:
         rays: Rays traced, by kind: ``camera``, ``scatter`` (found by sampling a BSDF), ``shadow``.
         connections: Connections to lights that were considered; ``path`` traces a shadow ray for
             each, ours only for those that would contribute and that the shadow test lets through.
-        zero_radiance: Share of the camera samples that brought back nothing.
-        learned: Summary of what the integrator learned; empty where it learns nothing.
+        zero_radiance: Fraction of the camera samples whose radiance is zero.
+        learned: Summary of what the integrator learned; empty if it does not learn.
         memory: Peak of the memory that Dr.Jit held during the render, in bytes.
         interrupted: Did Ctrl-C, :meth:`cancel` or an error end the render before all samples were
             taken? Ctrl-C in the last pass does not.
@@ -104,12 +105,13 @@ def render(
 ) -> mi.TensorXf:
     """Renders ``scene`` with the estimators that ``integrator.schedule()`` makes.
 
-    Parameters are those of ``mi.Integrator.render``, and ``job``: what distributes the samples, if
-    that is not the same for all pixels. The statistics are left in ``integrator.statistics``.
+    Parameters are those of ``mi.Integrator.render``, and ``job``: the class that distributes the
+    samples, if pixels do not get equal numbers. The statistics are left in
+    ``integrator.statistics``.
 
     Raises:
         ValueError: There is no such sensor, ``spp`` is out of range, the film has more pixels than
-            a wavefront can hold, or these are too many samples for so many pixels.
+            a wavefront can hold, or ``spp`` is too large for this number of pixels.
         NotImplementedError: The integrator has AOVs, and the film is a special one.
         KeyboardInterrupt: Ctrl-C; the film then holds the image of the finished passes.
     """
@@ -139,7 +141,7 @@ class Job:
     #: Can a stage take samples of a part of the pixels?
     divides_stages = True
 
-    #: May a pass be recorded as a whole? Not where a subclass wants to see its samples.
+    #: May a whole pass be recorded (``frozen.py``)? False if a subclass reads the samples.
     freezes_passes = True
 
     def __init__(self, integrator, scene, sensor, seed, spp) -> None:
@@ -162,9 +164,9 @@ class Job:
                 f'channels ("aovs", "count_samples"): use an "hdrfilm".'
             )
         self.film.prepare(aovs)
-        # One part has no range: nothing is added to a pixel's number
+        # A single part has no range, so that kernels need not add its first pixel
         self.parts = [None] if self.plan.parts == 1 else self.plan.pixels
-        # Those of a structured sampler, which go on from pass to pass, for each part of the film
+        # Structured samplers, one for each part of the film, which keep their state between passes
         self.samplers: list[mi.Sampler] = []
         if self.plan.structured:
             self.samplers = [self.sampler, *(self.sampler.clone() for _ in self.parts[1:])]
@@ -185,8 +187,8 @@ class Job:
     def _seed(
         self, sampler: mi.Sampler, index: int, spp: int, pixels: range | np.ndarray | None
     ) -> None:
-        """Seeds a sampler for part ``index``, those of earlier passes counted. The first one is
-        seeded as Mitsuba's own integrators do: it draws the same numbers."""
+        """Seeds a sampler for part ``index``, counted over all passes. The first one is seeded as
+        in Mitsuba's own integrators, so that it draws the same numbers."""
         seed = self.plan.seed
         if index > 0:
             seed = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(index))[0][0]
@@ -248,8 +250,8 @@ class Job:
         return stage
 
     def _first_parts(self, schedule: Schedule) -> list[np.ndarray]:
-        """The pixels of the stages into which the schedule divides the first one; none if it is not
-        divided."""
+        """The pixels of each stage into which the schedule divides the first one; an empty list if
+        it is not divided."""
         if not (self.divides_stages and isinstance(schedule, DivisibleSchedule)):
             return []
         if self.plan.structured or self.plan.parts > 1:
@@ -284,7 +286,8 @@ class Job:
 
     def _scout(self, stage: Stage, pixels: range | None) -> None:
         sampler = mi.load_dict({"type": "independent"})
-        # The same for all seeds: what a scout decides changes the size of tables, and kernels
+        # The same numbers for all seeds: the decisions of a scout change sizes of tables, and with
+        # them the kernels
         number = 0 if pixels is None else pixels.start
         sampler.seed(dr.opaque(mi.UInt32, number), self._lanes(1, pixels))
         lanes = camera.PassLanes.of(self.film, 1, 0, pixels)
@@ -296,14 +299,15 @@ class Job:
         dr.eval(radiance)
 
     def _begin(self, stage: Stage, lanes: camera.PassLanes) -> None:
-        """Tells the observer of a stage, if there is one, which samples come."""
+        """Tells the observer of a stage, if there is one, the pixels of the next samples."""
         if stage.observer is not None:
             pixel = lanes.lanes(self.film).pixel
             dr.eval(pixel)
             stage.observer.begin(lanes.count, pixel)
 
     def _run_pass(self, stage: Stage, spp: int) -> bool:
-        """Renders ``spp`` samples per pixel into the block; did it have to compile a kernel?"""
+        """Renders ``spp`` samples per pixel into the block. Returns True if it compiled a
+        kernel."""
         begin = time.perf_counter()
         misses = kernel_cache_misses()
         for part in range(len(self.parts)):
@@ -334,12 +338,12 @@ class Job:
         self._finish_take(sampler)
 
     def _is_frozen(self, stage: Stage) -> bool:
-        """Are the passes of this stage recorded?"""
+        """Are the passes of this stage recorded (``frozen.py``)?"""
         if not self.freezes_passes or self.integrator.aov_names():
             return False
         if stage.observer is not None and not stage.observer.can_be_frozen:
             return False
-        # Special films prepare samples as they like
+        # Special films may run any code when they prepare samples
         is_special = mi.has_flag(self.film.flags(), mi.FilmFlags.Special)
         return not is_special and getattr(stage.estimator, "can_be_frozen", False)
 
@@ -365,7 +369,7 @@ class Job:
     def _sample(
         self, stage: Stage, sampler: mi.Sampler, rays: CameraRays, count: mi.Float | float = 1.0
     ) -> Sample:
-        """Puts the samples of these rays into the block, but for their splats."""
+        """Puts the samples of these rays, without their splats, into the block."""
         if stage.observer is not None:
             stage.observer.begin(dr.width(rays.ray), rays.pixel)
         sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
@@ -385,7 +389,7 @@ class Job:
         return sampler
 
     def fill_film(self) -> None:
-        """Hands the samples of the finished passes to the film."""
+        """Adds the samples of the finished passes to the film."""
         self.film.put_block(self.block)
         if self.splats is not None and self.statistics.spp > 0:
             tensor, offset = self.splats.tensor(), self.splats.offset()
@@ -408,6 +412,6 @@ class Job:
 
 
 def kernel_cache_misses() -> int:
-    """How many kernels have been compiled, or loaded from the disk, in this process."""
+    """The number of kernels that this process has compiled, or loaded from the disk."""
     _launches, soft_misses, hard_misses = dr.detail.launch_stats()
     return soft_misses + hard_misses

@@ -32,8 +32,9 @@ _PASS_SAMPLES = {dr.JitBackend.LLVM: 1 << 20, dr.JitBackend.CUDA: 1 << 24}
 #: the samples of one pass only, so shorter passes would cost efficiency.
 _PASS_SPP, _STRUCTURED_PASS_SPP = 4, 64
 
-#: If passes with a structured sampler have more samples than this (minutes on two CPU cores), they
-#: get only so many per pixel: batch systems kill 10 to 30 seconds after the first signal.
+#: If passes with a structured sampler would have more samples than this (minutes on two CPU cores),
+#: they get fewer per pixel, this number: batch systems kill a process 10 to 30 seconds after the
+#: first signal.
 _LONG_PASS, _LARGE_FILM_PASS_SPP = 1 << 25, 16
 
 #: With a time budget, passes are shorter by this factor, so that a whole number of them comes
@@ -45,9 +46,9 @@ _STREAM = 1 << 31
 
 
 def can_render(integrator: mi.Integrator) -> bool:
-    """Is the integrator, with all that are nested in it, one of Mitsuba's own, in a JIT variant?
-    Others may learn, and would learn again in each pass. In scalar variants, Mitsuba's integrators
-    can be stopped without passes."""
+    """Is the variant a JIT variant, and are the integrator and all integrators nested in it
+    Mitsuba's own? Others may learn, and would learn again in each pass. In scalar variants,
+    Mitsuba's integrators can be stopped without passes."""
     modules = {type(each).__module__.split(".")[0] for each in with_nested(integrator)}
     return dr.is_jit_v(mi.Float) and modules == {"mitsuba"}
 

@@ -1,4 +1,4 @@
-"""The stages of a render, and who makes them."""
+"""The stages of a render, and the schedules that make them."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ class Stage:
     """One stage of a render.
 
     Attributes:
-        estimator: What its samples are.
-        learned: What had been learned before.
+        estimator: Takes the samples of the stage.
+        learned: A summary of what the integrator has learned from earlier stages.
         is_scout: Does it take one sample per pixel that is not added to the film?
-        camera: What chooses points of the aperture, times and wavelengths.
-        weight: How many samples of the last stage each of its samples counts for. It must not
-            depend on any sample.
-        most_lanes: Samples of a pass, at most, where passes can be cut anywhere and hold one sample
-            of each pixel: what is recorded of each takes memory. 0 for no limit.
-        observer: Is told when a pass begins; the estimator tells it the rest.
+        camera: Chooses points of the aperture, times and wavelengths.
+        weight: The weight of its samples, in units of the weight of a sample of the last stage. It
+            must not depend on any sample.
+        most_lanes: Largest number of samples of a pass, since observers record each sample in
+            memory; 0 for no limit. A pass still has at least one sample of each pixel. Passes of
+            structured samplers ignore it.
+        observer: Is told when a pass begins. The estimator reports all other events to it.
     """
 
     estimator: Estimator
@@ -39,18 +40,18 @@ class Schedule(Protocol):
     """Makes the stages of one render, one after the other."""
 
     def next_stage(self) -> Stage:
-        """The next stage. All samples of the one before have been taken: what they teach is learned
-        now. Scouts come besides the stages of the plan."""
+        """Makes the next stage. All samples of the stage before have been taken, so that this
+        method can learn from them. Scouts are returned in addition to the stages of the plan."""
 
 
 @runtime_checkable
 class DivisibleSchedule(Schedule, Protocol):
-    """One whose first stage can be divided."""
+    """A schedule whose first stage can be divided."""
 
     def divide_first_stage(self, pixel_count: int) -> int:
-        """Into how many stages the first one is divided, each of which takes one sample for a part
-        of the pixels: the second is as large as the first, and each later one as large as all
-        before it. Called before the first stage, if the render can do so."""
+        """The number of stages into which the first one is divided. Each of them takes one sample
+        for a part of the pixels: the second part is as large as the first, and each later one as
+        large as all before it. Called before the first stage, if the render can divide stages."""
 
 
 class OneStage:

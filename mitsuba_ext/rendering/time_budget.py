@@ -17,8 +17,8 @@ _SHORT_PASS = 1 << 16
 #: from them takes additional time.
 _PILOT_SHARE = 0.25
 
-#: Share of the time left that the second pass of the last stage takes. It measures the speed more
-#: precisely than the short pass.
+#: Fraction of the time left that the second pass of the last stage takes. It measures the speed
+#: more precisely than the short pass.
 _SECOND_SHARE = 0.25
 
 

@@ -1,4 +1,4 @@
-"""What renders cost together: of one, or of many batches."""
+"""The total cost of one or more renders."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from .camera import film_extent
 
 @dataclass(frozen=True)
 class RenderTotals:
-    """The cost of renders. What is unknown is 0 or empty: Mitsuba's integrators count nothing.
+    """The cost of renders. Unknown values are 0 or empty: Mitsuba's integrators count nothing.
 
     Attributes:
-        rays: Rays traced, by kind: ``camera``, and of integrators of ours ``scatter`` and
+        rays: Rays traced, by kind: ``camera``, and for integrators of this package ``scatter`` and
             ``shadow``.
         connections: See :class:`~mitsuba_ext.rendering.render.RenderStatistics`.
-        render_seconds: The sum of the renders' times. Processes may share them.
-        learning_seconds, compile_seconds: Of these.
-        memory_bytes: The most that Dr.Jit held in a render, the scene included.
-        learned: What the integrator has learned, in words.
+        render_seconds: The sum of the times of all renders, which may have run in parallel
+            processes.
+        learning_seconds, compile_seconds: Parts of ``render_seconds``.
+        memory_bytes: Peak of the memory that Dr.Jit held in a render, the scene included.
+        learned: Summary of what the integrator has learned.
     """
 
     rays: Mapping[str, int] = field(default_factory=dict)
@@ -42,11 +43,11 @@ class RenderTotals:
         """The cost of an integrator's last render.
 
         Args:
-            film: That of the image.
+            film: The film that was rendered to.
             spp: Samples per pixel that were taken.
-            seconds: The render's time.
+            seconds: Time of the render.
         """
-        # It needs an active variant
+        # Imported here, since the module needs an active variant
         from .render import RenderStatistics
 
         own = getattr(integrator, "statistics", None)
@@ -72,18 +73,18 @@ class RenderTotals:
         )
 
     def known(self) -> dict[str, Any]:
-        """The attributes that are known."""
+        """The attributes that are not 0 or empty."""
         return {key: value for key, value in asdict(self).items() if value}
 
 
 def forget_memory_peak() -> None:
-    """Lets :func:`memory_peak` begin anew."""
+    """Resets :func:`memory_peak`."""
     if dr.is_jit_v(mi.Float):
         dr.detail.malloc_clear_statistics()
 
 
 def memory_peak() -> int:
-    """The most bytes that Dr.Jit has held; 0 in variants without Dr.Jit's memory."""
+    """Peak of the memory that Dr.Jit has held, in bytes; 0 in scalar variants."""
     if not dr.is_jit_v(mi.Float):
         return 0
     return dr.detail.malloc_watermark(dr.backend_v(mi.Float))

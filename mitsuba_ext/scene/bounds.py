@@ -12,7 +12,7 @@ import numpy as np
 
 
 def scene_bounds(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
-    """The box of all shapes; not valid where there are none."""
+    """The box of all shapes; not valid if there are none."""
     box = mi.ScalarBoundingBox3f()
     for shape in scene.shapes():
         box.expand(shape_bounds(shape))

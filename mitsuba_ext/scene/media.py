@@ -1,4 +1,5 @@
-"""Which scenes have participating media, and errors where an integrator does not see them."""
+"""Finds participating media in scenes, and raises errors for integrators that do not render them.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +12,13 @@ from .movers import movers
 
 
 def has_media(scene: mi.Scene) -> bool:
-    """Does any sensor or shape of ``scene`` border on a medium? What instances show cannot be seen
-    from outside: media there count for :func:`may_have_media` only."""
+    """Does any sensor or shape of ``scene`` border on a medium? Media within instances cannot be
+    found: they count for :func:`may_have_media` only."""
     return any(True for _ in _media(scene))
 
 
 def may_have_media(scene: mi.Scene) -> bool:
-    """The same, and true as well where an instance may show a medium."""
+    """Like :func:`has_media`, but also true if an instance may contain a medium."""
     if has_media(scene):
         return True
     return any(s.class_name() == "Instance" for s in _all(scene.shapes())) and _any_is_alive()
@@ -30,7 +31,7 @@ def may_have_grids(scene: mi.Scene) -> bool:
 
 
 def has_homogeneous_media(scene: mi.Scene) -> bool:
-    """Is there a homogeneous medium in ``scene``, as far as one can see?"""
+    """Is there a homogeneous medium in ``scene``, outside of instances?"""
     return any(medium.is_homogeneous() for medium in _media(scene))
 
 
@@ -38,8 +39,8 @@ def refuse_media(scene: mi.Scene, what: str, instead: str) -> None:
     """Raises an error if there are media in ``scene``.
 
     Parameters:
-        what: Begins the message: the plugin or the parameter that does not see media.
-        instead: Ends the message: what to do.
+        what: The beginning of the message: the plugin or parameter that does not support media.
+        instead: The end of the message: what to do.
 
     Raises:
         NotImplementedError: There are media in ``scene``.
@@ -51,13 +52,13 @@ def refuse_media(scene: mi.Scene, what: str, instead: str) -> None:
 
 
 def refuse_moving_grids(scene: mi.Scene, what: str) -> None:
-    """Raises an error where a shape that moves encloses a medium that would not move with it.
+    """Raises an error if a shape that moves encloses a medium that would not move with it.
 
     Parameters:
-        what: Begins the message.
+        what: The beginning of the message.
 
     Raises:
-        NotImplementedError: There is one that is not ``homogeneous``.
+        NotImplementedError: A moving shape encloses a medium that is not ``homogeneous``.
     """
     if any(not medium.is_homogeneous() for medium in _of_shapes(movers(scene))):
         raise NotImplementedError(
@@ -67,11 +68,11 @@ def refuse_moving_grids(scene: mi.Scene, what: str) -> None:
 
 
 def refuse_missing_colours(scene: mi.Scene, what: str) -> None:
-    """Raises an error where one colour, which may be that which chooses distances, knows nothing of
-    a medium.
+    """Raises an error if a medium has no extinction in one colour: distances that are sampled with
+    this colour never end in the medium.
 
     Parameters:
-        what: Begins the message.
+        what: The beginning of the message.
 
     Raises:
         NotImplementedError: A homogeneous medium has an extinction of zero in some colours only.
@@ -88,7 +89,7 @@ def refuse_missing_colours(scene: mi.Scene, what: str) -> None:
 
 
 def _media(scene: mi.Scene) -> Iterator[mi.Medium]:
-    """The media of ``scene``, one or several times each."""
+    """The media of ``scene``. Each can occur several times."""
     for sensor in scene.sensors():
         if sensor.get_medium() is not None:
             yield sensor.get_medium()
@@ -104,19 +105,19 @@ def _of_shapes(shapes: Iterable[mi.Shape]) -> Iterator[mi.Medium]:
 
 
 def _all(shapes: Iterable[mi.Shape]) -> Iterator[mi.Shape]:
-    """The shapes, and those of which moving ones consist."""
+    """The shapes, and the shapes of which moving ones consist."""
     for shape in shapes:
         yield shape
         yield from _all(getattr(shape, "children", ()))
 
 
-#: So many numbers of media are looked at.
+#: How many of Dr.Jit's indices of media are examined.
 _NUMBERS = 1024
 
 
 def _any_is_alive() -> bool:
-    """Is there any medium in memory? Dr.Jit numbers them from 1; every medium has a phase
-    function, and calls with numbers that stand for nothing return zero."""
+    """Is there any medium in memory? Dr.Jit gives media indices from 1 on. Every medium has a phase
+    function, and calls with unused indices return zero."""
     number = dr.opaque(mi.UInt32, 1) + dr.arange(mi.UInt32, _NUMBERS)
     phase = dr.reinterpret_array(mi.MediumPtr, number).phase_function()
     return bool(dr.any(phase != None))  # noqa: E711

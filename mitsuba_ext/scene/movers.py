@@ -1,4 +1,5 @@
-"""What of a scene moves, and errors where an integrator does not see that."""
+"""Finds the moving parts of a scene, and raises errors for integrators that do not render motion.
+"""
 
 from __future__ import annotations
 
@@ -10,27 +11,28 @@ from .nesting import class_name
 
 
 def movers(scene: mi.Scene) -> list[mi.Shape]:
-    """The shapes of ``scene`` that move: they have a ``motion``, and a scene ``at_rest``."""
+    """The shapes of ``scene`` that move. They have the attributes ``motion`` and ``at_rest`` (a
+    scene)."""
     return [s for s in scene.shapes() if isinstance(getattr(s, "motion", None), Motion)]
 
 
 def is_moving_light(emitter: mi.Emitter) -> bool:
-    """Is it a light that moves? It has a ``nested`` emitter, which rests, and a ``motion``."""
+    """Is it a light that moves? Such a light has a ``nested`` emitter at rest, and a ``motion``."""
     return isinstance(getattr(emitter, "motion", None), Motion)
 
 
 def is_moving_camera(sensor: mi.Sensor) -> bool:
-    """Is it a ``moving_camera``? It has a ``nested`` sensor, a ``motion`` and ``poses``."""
+    """Is it a ``moving_camera``? That has a ``nested`` sensor, a ``motion`` and ``poses``."""
     return isinstance(getattr(sensor, "motion", None), Motion)
 
 
 def sensor_at_rest(sensor: mi.Sensor) -> mi.Sensor:
-    """The sensor that is nested in a ``moving_camera``; any other sensor itself."""
+    """The sensor that is nested in a ``moving_camera``; any other sensor is returned as it is."""
     return sensor.nested if is_moving_camera(sensor) else sensor
 
 
 def point_at_rest(sensor: mi.Sensor, p: mi.Point3f, time: mi.Float) -> mi.Point3f:
-    """Where :func:`sensor_at_rest` has what ``sensor`` has at ``p`` at a time."""
+    """Transforms a point from world space at ``time`` to where :func:`sensor_at_rest` sees it."""
     if not is_moving_camera(sensor):
         return p
     return sensor.poses.pose(mi.UInt32(0), time).point_to_rest(p)
@@ -49,8 +51,8 @@ def refuse_movers(scene: mi.Scene, what: str, instead: str) -> None:
     """Raises an error if something moves in ``scene``.
 
     Parameters:
-        what: Begins the message: the plugin or the parameter that does not see moving shapes.
-        instead: Ends the message: what to do.
+        what: The beginning of the message: the plugin or parameter that does not support motion.
+        instead: The end of the message: what to do.
 
     Raises:
         NotImplementedError: Something moves in ``scene``.
@@ -62,7 +64,7 @@ def refuse_movers(scene: mi.Scene, what: str, instead: str) -> None:
 
 
 def refuse_moving_lights(scene: mi.Scene) -> None:
-    """Raises an error if a light moves: for what starts paths from lights.
+    """Raises an error if a light moves. For methods that start paths from lights.
 
     Raises:
         NotImplementedError: A light of ``scene`` moves.
@@ -75,13 +77,13 @@ def refuse_moving_lights(scene: mi.Scene) -> None:
 
 
 def check_motion_is_seen(integrator: mi.Integrator, scene: mi.Scene) -> None:
-    """Refuses to render a scene in which something moves with an integrator that does not see it.
+    """Refuses to render a scene with moving shapes with an integrator that does not support them.
 
-    Those that see it say so by the attribute ``sees_motion``. Mitsuba's own integrators and those
-    of other packages would render the scene without the shapes that move.
+    Integrators that support motion have the attribute ``sees_motion``. Mitsuba's own integrators
+    and those of other packages would render the scene without the shapes that move.
 
     Raises:
-        NotImplementedError: Something moves in ``scene``, and the integrator does not see it.
+        NotImplementedError: Something moves in ``scene``, and the integrator does not support it.
     """
     if not getattr(integrator, "sees_motion", False):
         refuse_movers(scene, f'"{class_name(integrator)}"', 'use "composed_path"')

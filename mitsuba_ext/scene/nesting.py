@@ -1,4 +1,4 @@
-"""Integrators as users and scene files know them: what is nested in them, and their classes."""
+"""Integrators, whether of this package or of Mitsuba: what is nested in them, and their classes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def refuse_checkpoint(name: str, nested: mi.Integrator) -> None:
     """
     Raises:
         ValueError: An integrator that is nested in the plugin ``name`` has the parameter
-            ``checkpoint``: a part of a render cannot be kept.
+            ``checkpoint``: a part of a render cannot be saved.
     """
     for each in with_nested(nested):
         if getattr(each, "checkpoint", ""):
@@ -41,7 +41,7 @@ def _children(integrator: mi.Integrator) -> list[mi.Integrator]:
     if isinstance(nested, mi.Integrator):
         return [nested]
 
-    # The base class is known once a variant is selected
+    # Defined here, as the base class exists only once a variant is selected
     class Collector(mi.TraversalCallback):
         def __init__(self) -> None:
             super().__init__()

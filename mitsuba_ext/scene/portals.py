@@ -1,4 +1,4 @@
-"""Openings through which a room is lit, as a scene marks them."""
+"""Portals: openings that a scene marks, through which a room is lit."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _RIGHT_ANGLE = 1e-3
 
 @dataclass(frozen=True)
 class Portal:
-    """A rectangle. All vectors have unit length.
+    """A rectangular opening. All vectors have unit length.
 
     Attributes:
-        center: Its middle.
+        center: Its centre.
         x, y: The directions of its edges.
         half_width, half_height: Half the length of its edges.
     """
@@ -29,7 +29,7 @@ class Portal:
 
     @property
     def outwards(self) -> np.ndarray:
-        """The direction through it, out of the room."""
+        """The normal that points out of the room."""
         return -np.cross(self.x, self.y)
 
     @property
@@ -40,11 +40,11 @@ class Portal:
 
     @classmethod
     def of_matrix(cls, matrix: np.ndarray) -> Portal:
-        """The square from (−1, −1) to (1, 1) of the plane z = 0, transformed; z points into the
-        room.
+        """The square from (−1, −1) to (1, 1) of the plane z = 0, transformed by ``matrix``; its z
+        axis points into the room.
 
         Raises:
-            ValueError: It is no rectangle.
+            ValueError: The result is not a rectangle.
         """
         if not np.isfinite(matrix).all() or (matrix[3] != (0, 0, 0, 1)).any():
             raise ValueError("it must be an affine transform of finite numbers")
@@ -56,7 +56,7 @@ class Portal:
         if abs(x @ y) > _RIGHT_ANGLE:
             raise ValueError("the square that it transforms must become a rectangle")
         y -= (x @ y) * x
-        if matrix[:3, 2] @ np.cross(x, y) < 0:  # mirrored: z says where the room is
+        if matrix[:3, 2] @ np.cross(x, y) < 0:  # mirrored: the room is still where z points
             x = -x
         return cls(matrix[:3, 3], x, y / np.linalg.norm(y), width, height)
 

@@ -1,2 +1,2 @@
-"""Sequences of points for samplers: their coordinates, and what makes them independent of each
-other from pixel to pixel and from set to set of dimensions."""
+"""Point sequences for samplers: their coordinates, and the randomization that makes them
+independent between pixels and between sets of dimensions."""

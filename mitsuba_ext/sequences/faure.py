@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import from_numpy
 from .scrambling import fraction, mixed
 
-#: The smallest prime that is not less than the number of dimensions.
+#: For each number of dimensions, the smallest prime that is not less than it.
 _BASES = {2: 2, 4: 5, 6: 7, 8: 11}
 
 
@@ -24,14 +24,14 @@ class Faure:
     1982.
 
     Parameters:
-        dimensions: Of the sequence: 2, 4, 6 or 8.
+        dimensions: Number of dimensions: 2, 4, 6 or 8.
     """
 
     def __init__(self, dimensions: int) -> None:
         self.pairs = dimensions // 2
         self._base = base = _BASES[dimensions]
         self._size = next(n for n in range(1, 33) if base**n >= 2**32)
-        # What each digit of an index adds to each digit of a coordinate
+        # The factor with which each digit of an index is added to each digit of a coordinate
         matrices = np.zeros((dimensions, self._size, self._size), dtype=np.uint32)
         for dimension in range(dimensions):
             for row in range(self._size):

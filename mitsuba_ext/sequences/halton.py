@@ -10,23 +10,23 @@ from .scrambling import fraction, mixed
 #: Bases of the dimensions.
 _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
 
-#: So many intervals are told apart: the numbers have 24 bits, and the next power of the largest
-#: base still fits into 32.
+#: Largest number of intervals that digits distinguish: the numbers have 24 bits, and the next power
+#: of the largest base still fits into 32 bits.
 _MOST_INTERVALS = 1 << 24
 
 
 class Halton:
-    """The Halton sequence: each dimension is the radical inverse of the index in another prime
+    """The Halton sequence: each dimension is the radical inverse of the index in a different prime
     base.
 
-    Digits are permuted by nested cyclic shifts: by a hash of the digits before, like Owen's
-    scrambling, but among the rotations only.
+    Digits are permuted by nested cyclic shifts: each digit is shifted by a hash of the digits
+    before it. This is Owen scrambling, restricted to cyclic permutations.
 
     Source: J. H. Halton, *On the Efficiency of Certain Quasi-random Sequences of Points in
     Evaluating Multi-dimensional Integrals*, 1960.
 
     Parameters:
-        dimensions: Of the sequence: 2, 4, 6 or 8.
+        dimensions: Number of dimensions: 2, 4, 6 or 8.
     """
 
     def __init__(self, dimensions: int) -> None:
@@ -37,14 +37,14 @@ class Halton:
         return mi.permute_kensler(index, count, seed)
 
     def coordinate(self, point, count, dimension, seed) -> mi.Float:
-        # In lanes that a loop has left, it is 0, by which nothing can be divided
+        # Lanes that a loop has left gather 0, which must not be a divisor
         base = dr.maximum(dr.gather(mi.UInt32, self._bases, dimension), 2)
         return radical_inverse(point, count, base, seed)
 
 
 class Hammersley(Halton):
-    """The Hammersley set: the first dimension is the index divided by the number of points, with a
-    random place between it and the next one; the others are those of the Halton sequence.
+    """The Hammersley set: the first dimension is the index plus a random number in [0, 1), divided
+    by the number of points; the others are those of the Halton sequence.
 
     Source: J. M. Hammersley, *Monte Carlo Methods for Solving Multivariable Problems*, 1960.
     """
@@ -59,10 +59,10 @@ class Hammersley(Halton):
 def radical_inverse(
     index: mi.UInt32, count: int, base: mi.UInt32, seed: mi.UInt32
 ) -> mi.Float:
-    """The digits of an index below ``count``, behind the point, shifted at random; a random number
-    follows."""
+    """The radical inverse of an index below ``count``: its digits, randomly shifted, behind the
+    radix point, followed by the digits of a random number."""
     count = dr.opaque(mi.UInt32, min(count, _MOST_INTERVALS))
-    # So many points have been told apart by the digits so far
+    # ``power`` is the number of intervals that the digits so far distinguish
     power, digits, rest, word = mi.UInt32(1), mi.UInt32(0), mi.UInt32(index), mixed(seed)
 
     def step(power, digits, rest, word):
@@ -73,6 +73,7 @@ def radical_inverse(
     power, digits, rest, word = dr.while_loop(
         (power, digits, rest, word), lambda power, *_: power < count, step, label="digits"
     )
-    # Points that share an interval (the digits left tell them apart) get different random numbers
+    # Points that share an interval differ in the remaining digits, which give them different random
+    # numbers
     value = (mi.Float(digits) + fraction(word + mixed(rest))) / mi.Float(power)
     return dr.minimum(value, 1 - 2.0**-24)

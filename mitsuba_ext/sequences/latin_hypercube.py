@@ -9,8 +9,8 @@ from .scrambling import fraction, mixed
 
 
 class LatinHypercube:
-    """In each dimension there is one point in each of as many intervals as there are points, in an
-    order of its own.
+    """Latin hypercube samples: each dimension is divided into as many intervals as there are
+    points, and each interval has one point, in a random order that differs between dimensions.
 
     Source: M. D. McKay, R. J. Beckman, W. J. Conover, *A Comparison of Three Methods for Selecting
     Values of Input Variables in the Analysis of Output from a Computer Code*, Technometrics 21(2),

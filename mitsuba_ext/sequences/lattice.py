@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from .scrambling import fraction, scrambled
 
-#: Good for 2^10 to 2^20 points.
+#: Integers that generate the lattice; they are constructed for 2^10 to 2^20 points.
 _GENERATING_VECTOR = (1, 182667, 469891, 498753, 110745, 446247, 250185, 118627)
 
 
@@ -19,7 +19,7 @@ class Lattice:
     Integration*, SIAM J. Sci. Comput. 28(6), 2006, with their vector.
 
     Parameters:
-        dimensions: Of the lattice: 2, 4, 6 or 8.
+        dimensions: Number of dimensions: 2, 4, 6 or 8.
     """
 
     def __init__(self, dimensions: int) -> None:
@@ -32,5 +32,5 @@ class Lattice:
         return scrambled(index, seed) & ((1 << bits) - 1)
 
     def coordinate(self, point, count, dimension, seed) -> mi.Float:
-        # Integers of 32 bits are numbers modulo 1
+        # Fixed-point arithmetic: 32-bit integers wrap around, which is the modulo 1
         return fraction(dr.brev(point) * dr.gather(mi.UInt32, self._vector, dimension) + seed)

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 
 def mixed(x: mi.UInt32) -> mi.UInt32:
-    """An integer of which each bit depends on all bits of ``x``.
+    """A hash: each bit of the result depends on all bits of ``x``.
 
     Source: C. Wellons, *Hash Prospector* (the function with the least bias of those of two rounds).
     """
@@ -34,7 +34,8 @@ def flipped_upwards(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
 
 def scrambled(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """Nested uniform (Owen) scrambling: flips each bit of ``x`` or not, by a hash of the bits above
-    it. Digits of a coordinate, and aligned ranges of indices of 2^k points, stay together.
+    it. Applied to coordinates, it preserves their stratification; applied to indices, it keeps
+    aligned ranges of 2^k points together.
 
     Source: A. B. Owen, *Randomly Permuted (t,m,s)-Nets and (t,s)-Sequences*, 1995; by hashing as in
     B. Burley, *Practical Hash-based Owen Scrambling*, JCGT 9(4), 2020.

@@ -1,4 +1,4 @@
-"""What a sampler asks of a sequence of points."""
+"""The interface of point sequences, as samplers use it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import mitsuba as mi
 
 
 class Sequence(Protocol):
-    """Points of a few dimensions, of which each set of dimensions of a path is another random copy.
+    """A sequence of points in a few dimensions. Each set of dimensions of a path uses a different
+    random copy of it.
 
     Attributes:
         pairs: Half the number of its dimensions.
@@ -17,10 +18,10 @@ class Sequence(Protocol):
     pairs: int
 
     def point(self, index: mi.UInt32, count: int, seed: mi.UInt32) -> mi.UInt32:
-        """The number of the point that a sample takes, in an order that the seed makes random.
+        """The index of the point that a sample takes, in a random order that the seed chooses.
 
         Parameters:
-            index: Of the sample.
+            index: Index of the sample.
             count: Samples per pixel of the render.
         """
 
@@ -30,7 +31,7 @@ class Sequence(Protocol):
         """A coordinate of a point, in [0, 1). Its distribution over all seeds is uniform.
 
         Parameters:
-            point: As :meth:`point` returned it.
+            point: The result of :meth:`point`.
             dimension: Below 2 · ``pairs``.
-            seed: Of this coordinate: it differs between dimensions, sets and pixels.
+            seed: Seed of this coordinate. It differs between dimensions, sets and pixels.
         """

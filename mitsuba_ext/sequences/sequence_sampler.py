@@ -13,17 +13,17 @@ from .pixel_order import level_count, shuffled, z_order
 from .scrambling import mixed
 from .sequence import Sequence
 
-#: Distances between the words of sets and of pixels that are hashed.
+#: Increment of the numbers that are hashed, from pixel to pixel and from set to set of dimensions.
 _GOLDEN = 0x9E3779B9
 
 
 class SequenceSampler(mi.Sampler):
-    r"""Each pixel has the same sequence, randomized on its own. With blue noise, pixels share the
-    points of one sequence instead (``pixel_order.py``).
+    r"""Each pixel has the same sequence, randomized independently. With blue noise, pixels share
+    the points of one sequence instead (``pixel_order.py``).
 
-    Numbers are drawn in pairs of dimensions; a single number takes the first of a pair. When the
-    dimensions of the sequence are used up, another random copy of it goes on, in another order
-    (Latin supercube sampling).
+    Numbers are drawn in pairs of dimensions; a single number takes the first of a pair. When all
+    dimensions of the sequence are used, the next ones come from another random copy of it, in
+    another order (Latin supercube sampling).
 
     .. pluginparameters::
 
@@ -38,9 +38,9 @@ class SequenceSampler(mi.Sampler):
         props: The parameters of the scene.
 
     Attributes:
-        sequence: Where the points come from. The plugin sets it.
-        blue_noise: Do pixels share a sequence? For sequences of which aligned ranges of 2^k points
-            are well distributed.
+        sequence: The point sequence. The plugin sets it.
+        blue_noise: Do pixels share a sequence? Only for sequences whose aligned ranges of 2^k
+            points are well distributed.
     """
 
     sequence: Sequence
@@ -50,22 +50,23 @@ class SequenceSampler(mi.Sampler):
         self.name = props.plugin_name()
         count = read_parameter(self.name, props, "sample_count", 4, 1, MOST_SPP)
         base_seed = read_parameter(self.name, props, "seed", 0, 0, 2**32 - 1)
-        # What the base class would read has been checked, and a copy is made from the values
+        # The base class gets the checked values; ``fork`` copies them too
         plain = mi.Properties("independent")
         plain["sample_count"], plain["seed"] = count, base_seed
         super().__init__(plain)
         self._base_seed = base_seed
         self._values = {"seed": base_seed}
-        # As far as Python says it; Mitsuba's own integrators take all samples in one wavefront
+        # Known only if it is set from Python; Mitsuba's own integrators take all samples in one
+        # wavefront
         self._per_wavefront: int | None = None
         self._first = self._pixel_seed = self._offset = self._dimension = mi.UInt32(0)
         self._step = 1
-        # What set_film() said, and whether pixels share a sequence since the last seed()
+        # The arguments of set_film(), and whether pixels share a sequence since the last seed()
         self._film: tuple[int, int] | None = None
         self._is_shared = False
 
     def read_dimensions(self, props: mi.Properties) -> int:
-        """How many dimensions the sequence has.
+        """Reads the number of dimensions of the sequence.
 
         Raises:
             ValueError: It is odd, or out of range.
@@ -79,25 +80,26 @@ class SequenceSampler(mi.Sampler):
         return dimensions
 
     def read_blue_noise(self, props: mi.Properties) -> None:
-        """Whether pixels share a sequence, and the width of the film for integrators of Mitsuba."""
+        """Reads whether pixels share a sequence, and the width of the film, which Mitsuba's own
+        integrators do not tell the sampler."""
         self.blue_noise = read_parameter(self.name, props, "blue_noise", False)
         width = read_parameter(self.name, props, "film_width", 0, 0, 2**31 - 1)
         self._values.update(blue_noise=self.blue_noise, film_width=width)
 
     def set_film(self, width: int | None, first: int = 0) -> None:
-        """Says which pixels the lanes stand for when the sampler is seeded: those of a film, row by
+        """Sets which pixels the lanes stand for when the sampler is seeded: those of a film, row by
         row.
 
         Parameters:
-            width: Pixels of a row. With 0, lanes stand for something else: there is no blue noise.
-                With ``None``, the parameter ``film_width`` counts, as at first.
+            width: Pixels of a row. 0 if lanes do not stand for pixels, which turns off blue noise.
+                ``None`` for the parameter ``film_width``, which is the default.
             first: The pixel of the first lane.
         """
         self._film = None if width is None else (width, first)
 
     # ---- Mitsuba's interface ----
 
-    # Methods of the base class call the overrides once more: what stands beside super() runs twice
+    # Methods of the base class call the overrides again, so that code next to super() runs twice
 
     def fork(self) -> SequenceSampler:
         """A sampler with the same parameters, not seeded."""
@@ -109,10 +111,10 @@ class SequenceSampler(mi.Sampler):
         return fork
 
     def clone(self) -> SequenceSampler:
-        """A copy that goes on as this one would."""
+        """A copy with the same state."""
         copy = self.fork()
         if self.wavefront_size() > 0:
-            # So that the base class knows how many lanes there are
+            # Sets the number of lanes in the base class
             mi.Sampler.seed(copy, 0, self.wavefront_size())
         copy._per_wavefront, copy._step = self._per_wavefront, self._step
         copy._is_shared = self._is_shared
@@ -135,7 +137,7 @@ class SequenceSampler(mi.Sampler):
         lane = dr.arange(mi.UInt32, self.wavefront_size())
         pixel = lane // step
         self._offset = lane - pixel * step
-        # Not a literal: each seed would compile kernels of its own
+        # Not a literal, which would need new kernels for each seed
         word = mi.UInt32(seed) + self._base_seed
         dr.make_opaque(word)
         self._pixel_seed = mixed(mixed(word) + pixel * _GOLDEN)
@@ -169,16 +171,16 @@ class SequenceSampler(mi.Sampler):
         return width, 0
 
     def _order_pixels(self, pixel: mi.UInt32, width: int, word: mi.UInt32) -> None:
-        """Gives each pixel its share of the points of one sequence."""
+        """Assigns each pixel its range of points of the shared sequence."""
         levels = level_count(self.sample_count())
         order = z_order(pixel, dr.opaque(mi.UInt32, width), levels)
-        # The same for all pixels of a tile
+        # The same seed for all pixels of a tile
         self._pixel_seed = mixed(word + order.tile * _GOLDEN)
         place = shuffled(order.place, levels, self._pixel_seed)
         self._offset += place * dr.opaque(mi.UInt32, self.sample_count())
 
     def advance(self) -> None:
-        # Not the base class's: it calls this once more, and its own state is not used
+        # Does not call the base class, which would call this again; its state is not used
         self._first = self._first + dr.opaque(mi.UInt32, self._step)
         self._dimension = mi.UInt32(0)
 
@@ -198,12 +200,13 @@ class SequenceSampler(mi.Sampler):
         return mi.Point2f(x, y)
 
     def _point_count(self) -> int:
-        """Points of the sequence of a pixel, or of the pixels that share one."""
+        """The number of points that a pixel, or all pixels that share a sequence, take from it."""
         count = self.sample_count()
         return count << (2 * level_count(count)) if self._is_shared else count
 
     def _next_pair(self, count: int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """The point, its dimension, and the seed of that."""
+        """The index of the point, the first dimension of the pair, and the seed of this
+        dimension."""
         number = self._dimension
         self._dimension = number + 1
         pairs = self.sequence.pairs

@@ -9,14 +9,14 @@ import numpy as np
 from ..arrays import from_numpy
 from .scrambling import fraction, mixed, scrambled
 
-#: Of each dimension but the first: the inner coefficients of the primitive polynomial, as bits, and
-#: the first direction numbers (Joe and Kuo).
+#: For each dimension but the first: the inner coefficients of the primitive polynomial, as bits,
+#: and the first direction numbers (Joe and Kuo).
 JOE_KUO = [
     (0, [1]), (1, [1, 3]), (1, [1, 3, 1]), (2, [1, 1, 1]), (1, [1, 1, 3, 3]), (4, [1, 3, 5, 13]),
     (2, [1, 1, 5, 5, 17]),
 ]  # fmt: skip
 
-#: Bits of an index that are looked up at once.
+#: Number of bits of an index for which one table entry is read.
 _BITS = 6
 
 
@@ -29,12 +29,13 @@ class Sobol:
     by hashes: B. Burley, *Practical Hash-based Owen Scrambling*, JCGT 9(4), 2020.
 
     Parameters:
-        dimensions: Of the sequence: 2, 4, 6 or 8.
+        dimensions: Number of dimensions: 2, 4, 6 or 8.
     """
 
     def __init__(self, dimensions: int) -> None:
         self.pairs = dimensions // 2
-        # Per dimension, group of bits, and value of these: the exclusive or of their columns
+        # For each dimension, group of bits, and value of these bits: the exclusive or of the
+        # columns of all bits that are set
         columns = _direction_numbers(dimensions)
         groups = -(-32 // _BITS)
         self._group_words = 1 << _BITS
@@ -47,8 +48,8 @@ class Sobol:
         self._table = from_numpy(mi.UInt32, table)
 
     def point(self, index: mi.UInt32, count: int, seed: mi.UInt32) -> mi.UInt32:
-        # The upper bits are the same for all samples. They would flip bits of the coordinates,
-        # which scrambling does
+        # The upper bits are the same for all samples. They would only flip bits of the coordinates,
+        # which scrambling does anyway
         return scrambled(index, seed) & ((1 << _index_bits(count)) - 1)
 
     def coordinate(self, point, count, dimension, seed) -> mi.Float:
@@ -61,12 +62,12 @@ class Sobol:
 
 
 def _index_bits(count: int) -> int:
-    """Bits of the numbers below ``count``."""
+    """The number of bits of the integers below ``count``."""
     return max(1, (count - 1).bit_length())
 
 
 def _direction_numbers(dimensions: int) -> np.ndarray:
-    """What each bit of an index flips in a coordinate: [dimension, bit]."""
+    """The bits of a coordinate that each bit of an index flips: [dimension, bit]."""
     columns = np.zeros((dimensions, 32), dtype=np.uint64)
     columns[0] = 1 << np.arange(31, -1, -1, dtype=np.uint64)
     for row, (polynomial, first) in zip(columns[1:], JOE_KUO):

@@ -1,2 +1,2 @@
-"""What a shape subtends at a point: solid angles, and maps of the unit square to directions in
-them. Nothing here knows a scene."""
+"""Solid angles of shapes seen from a point, and maps of the unit square to directions in them. No
+module here depends on a scene."""

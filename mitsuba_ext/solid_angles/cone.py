@@ -10,13 +10,13 @@ import mitsuba as mi
 
 @dataclass
 class Cone:
-    """The directions in which a sphere lies.
+    """The directions towards a sphere.
 
     Attributes:
         axis: Unit vector to the centre.
-        distance: Of the centre.
-        radius: Of the sphere, less than the distance.
-        depth: 1 - the cosine of the opening angle.
+        distance: Distance of the centre.
+        radius: Radius of the sphere, less than the distance.
+        depth: 1 - cosine of the angle between the axis and the side of the cone.
     """
 
     axis: mi.Vector3f
@@ -29,16 +29,16 @@ class Cone:
         return dr.two_pi * self.depth
 
     def sample(self, sample: mi.Point2f) -> mi.Vector3f:
-        """The unit vector from the centre of the sphere to the point that is seen in a direction,
-        which is uniformly distributed in the cone. The disk of directions is covered by concentric
-        squares, so that the map is continuous."""
+        """Samples a direction uniformly in the cone. Returns the unit vector from the centre of the
+        sphere to the point that is seen in this direction. The concentric map from square to disk
+        makes it continuous."""
         disk = mi.warp.square_to_uniform_disk_concentric(sample)
         # 1 - cos θ is uniform; sin²θ = (1 - cos θ) (1 + cos θ) is exact for small cones
         r_2 = dr.minimum(dr.squared_norm(disk), 1)
         versine = r_2 * self.depth
         sine_2 = versine * (2 - versine)
         # Law of cosines, in units of the radius: the ray meets the sphere at two distances whose
-        # product is ratio² - 1; the nearer one is that over the other
+        # product is ratio² - 1; the nearer one is this product divided by the other
         ratio = self.distance / self.radius
         half_chord = dr.safe_sqrt(1 - sine_2 * dr.square(ratio))
         gap = self.distance - self.radius
@@ -46,7 +46,7 @@ class Cone:
         far = dr.maximum(ratio * (1 - versine) + half_chord, 1e-37)
         across = dr.minimum(product / far * dr.sqrt(sine_2), 1)
         along = sine_2 * ratio + (1 - versine) * half_chord
-        # The direction of the disk's point; the centre of the disk has none
+        # The azimuth of the disk's point; at the centre of the disk, it is undefined
         r = dr.sqrt(r_2)
         x, y = (dr.select(r > 0, v / r, 0) for v in disk)
         return -mi.Frame3f(self.axis).to_world(mi.Vector3f(-x * across, -y * across, along))

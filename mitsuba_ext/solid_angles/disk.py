@@ -1,10 +1,10 @@
 """The elliptical cone that a disk subtends at a point.
 
-A map that keeps areas exactly needs elliptic integrals (I. Guillén et al., *Area-Preserving
-Parameterizations for Spherical Ellipses*, 2017). This one is a closed form instead: the distance
-from the axis of the cone is distributed exactly, and of the angle about the axis the distribution
-is one that can be inverted and differs from the exact one by a factor between 1 and 1.21, wherever
-the point lies. So the weights of samples are bounded, and the density is known.
+An exactly area-preserving map needs elliptic integrals (I. Guillén et al., *Area-Preserving
+Parameterizations for Spherical Ellipses*, 2017). The map here has a closed form instead. The
+distance from the axis of the cone is distributed exactly. The angle about the axis has a
+distribution that can be inverted, and that differs from the exact one by a factor between 1 and
+1.21, wherever the point lies. The density is known, and the weights of samples are bounded.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ import mitsuba as mi
 
 @dataclass
 class EllipticalCone:
-    """The directions in which a disk lies.
+    """The directions towards a disk.
 
-    The plane at right angles to the axis, at the distance 1, cuts the cone in an ellipse. Its
-    points are x = ``tan_x``·ρ·cos φ, y = ``tan_y``·ρ·sin φ.
+    The plane perpendicular to the axis, at distance 1, cuts the cone in an ellipse. The points of
+    the ellipse are x = ``tan_x``·ρ·cos φ, y = ``tan_y``·ρ·sin φ.
 
     Attributes:
         frame: The axes x and y of the ellipse, and the axis of the cone.
         tan_x, tan_y: Half-axes of the ellipse; tan_x ≤ tan_y.
-        radius: Of the disk. The lengths below are in units of it.
-        along, height: From the origin to the point where the axis meets the disk: how far along the
-            disk, away from the origin, and how far at right angles to it.
-        shift: From the centre of the disk to this point, in the same direction.
-        side: This direction.
+        radius: Radius of the disk. The lengths below are in units of it.
+        along, height: Vector from the origin to the point where the axis meets the disk: component
+            in the plane of the disk (along ``side``), and component perpendicular to it.
+        shift: Distance from the centre of the disk to this point, along ``side``.
+        side: Unit vector in the plane of the disk that points away from the origin.
     """
 
     frame: mi.Frame3f
@@ -47,7 +47,7 @@ class EllipticalCone:
         r_2 = dr.minimum(dr.squared_norm(disk), 1)
         # ----- The angle: density ∝ 1 / (f_x cos²φ + f_y sin²φ) -----
         f_x, f_y = _f(dr.square(self.tan_x)), _f(dr.square(self.tan_y))
-        # Of the scaled circle, the angle is uniform
+        # The angle of the point on the scaled circle is uniform
         cosine, sine = dr.sqrt(f_y) * disk.x, dr.sqrt(f_x) * disk.y
         length = dr.hypot(cosine, sine)
         cosine = dr.select(length > 0, cosine / length, 1)
@@ -59,8 +59,8 @@ class EllipticalCone:
         versine = r_2 * k / f
         ρ = dr.sqrt(r_2 * (2 - versine) / f) / dr.maximum(1 - versine, dr.rsqrt(1 + k))
         x, y = self.tan_x * ρ * cosine, self.tan_y * ρ * sine
-        # ----- Where the ray meets the disk, from where the axis does -----
-        # Not by a division through the height: this is exact also for a distant disk seen edge on
+        # ----- The point where the ray hits the disk, relative to that of the axis -----
+        # Without division by the height: this is exact also for a distant disk seen edge on
         distance_2 = dr.square(self.along) + dr.square(self.height)
         to_plane = dr.maximum(self.height - x * self.along, 1e-37)
         x_disk = self.shift + x * distance_2 / to_plane
@@ -69,8 +69,8 @@ class EllipticalCone:
         return (x_disk * self.side + y_disk * self.frame.t) * (self.radius / outside)
 
     def pdf(self, d: mi.Vector3f) -> mi.Float:
-        """The density, per solid angle, with which :meth:`sample` finds a direction in the cone.
-        The vector may have any length."""
+        """The density, per solid angle, with which :meth:`sample` samples the direction ``d`` in
+        the cone. The vector may have any length."""
         local = self.frame.to_local(d)
         # cos²φ and sin²φ, up to a factor
         x_2, y_2 = dr.square(local.x * self.tan_y), dr.square(local.y * self.tan_x)

@@ -1,14 +1,15 @@
 """Convex polygons, sampled by projected solid angle: by the cosine with a receiver's normal.
 
-Nusselt: projected on the plane of the receiver, the polygon's part of the unit sphere is a region
-of the unit disk, and a uniform point of this region is what is asked for (J. Arvo, *Stratified
-Sampling of 2-Manifolds*; course, 4.4). The region is sampled in polar coordinates: first the angle,
-then the squared radius, which is uniform between two edges. Parts above and below the horizon are
-two regions.
+The Nusselt analog: the polygon's part of the unit sphere, projected on the plane of the receiver,
+is a region of the unit disk. Projected solid angle sampling chooses a uniform point of this region
+(J. Arvo, *Stratified Sampling of 2-Manifolds*; course, 4.4). The region is sampled in polar
+coordinates: first the angle, then the squared radius, which is uniform between two edges. Parts
+above and below the horizon are two regions.
 
-Up to an angle, the area between the pole and an edge is its arc length times the height of its
-plane's normal (Eq. 4.53). If the pole lies in the polygon, the area is inverted edge by edge; else
-two chains of edges lie above each other, and their difference is inverted by Newton's method.
+Twice the area between the pole and an edge, up to an angle, is the arc length times the z component
+of the normal of the edge's plane (Eq. 4.53). If the pole lies in the polygon, the area is inverted
+edge by edge. Otherwise, the region lies between a near and a far chain of edges, and the difference
+of their areas is inverted by Newton's method.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-#: Steps of Newton's method, each kept inside a bracket, and the share of the area to which it is
-#: inverted: a rounding of floats.
+#: Largest number of steps of Newton's method, each kept inside a bracket, and the accepted error
+#: as a fraction of the area: the rounding error of single precision.
 _STEPS, _TOLERANCE = 9, 3e-7
 
 _TINY = 1e-30
@@ -31,7 +32,7 @@ class _Edge:
 
     Attributes:
         start, end: Its ends, unit vectors.
-        normal: Of its plane; from start to end it turns counterclockwise about it.
+        normal: Normal of its plane; the edge turns counterclockwise about it, from start to end.
         length: The angle between its ends; 0 if it lies below the horizon.
     """
 
@@ -46,11 +47,11 @@ class _Edge:
 
 
 class ProjectedPolygon:
-    """One side of the horizon: the part of a convex polygon where z > 0.
+    """The part of a convex polygon on one side of the horizon: where z > 0.
 
     Parameters:
         corners: Unit vectors, in the frame of the receiver.
-        normals: Of the planes through the origin and the edges (corner k to k + 1).
+        normals: Normals of the planes through the origin and the edges (corner k to k + 1).
         side: 1, or -1 for the part below the horizon, which is reflected up.
 
     Attributes:
@@ -85,14 +86,14 @@ class ProjectedPolygon:
         horizon = _Edge(leave, enter, mi.Vector3f(0, 0, turn), _angle(leave, enter))
         self._edges.append(horizon)
         total += turn * horizon.length
-        # Clockwise polygons are looked at from behind
+        # Polygons that are seen from behind are clockwise
         self._turn = dr.select(total < 0, mi.Float(-1), 1)
         for normal in normals:
             self._holds_pole &= self._turn * normal.z > 0
         self.area = 0.5 * dr.abs(total)
 
     def sample(self, sample: mi.Point2f, active: mi.Bool = True) -> mi.Vector3f:
-        """A unit vector of this side, with a density proportional to its z."""
+        """Samples a unit vector in the polygon, with a density proportional to its z."""
         target = 2 * self.area * sample.x
         # ----- The pole inside: an edge, a point of it, and a point between this and the pole -----
         before, chosen, passed = mi.Float(0), self._edges[0], mi.Float(0)
@@ -104,7 +105,7 @@ class ProjectedPolygon:
         slope = self._turn * chosen.normal.z
         angle = (target - passed) / dr.select(slope > _TINY, slope, 1)
         rim = chosen.at(dr.clip(angle, 0, chosen.length))
-        # ----- The pole outside: a direction in which it looks at the polygon -----
+        # ----- The pole outside: an azimuth, relative to the middle of the polygon -----
         middle = dr.zeros(mi.Vector3f)
         for edge in self._edges:
             middle += dr.select(edge.length > 0, edge.start + edge.end, 0)
@@ -133,10 +134,11 @@ class _Arc:
 
     Attributes:
         low, high: Azimuths of its ends, relative to the middle of the polygon.
-        end: Its end of the lower azimuth.
-        normal: Of its plane, with a positive z; and the vector at right angles to both.
-        across: In its plane at right angles to ``end``, towards the other end.
-        weight: Positive for the edges that are far from the pole.
+        end: Its end with the lower azimuth.
+        across: Vector in its plane, perpendicular to ``end``, towards the other end.
+        normal: Normal of its plane, with a positive z.
+        weight: ± the z component of the normal: positive for edges that are far from the pole,
+            negative for near edges.
     """
 
     low: mi.Float
@@ -165,7 +167,8 @@ class _Arc:
         )
 
     def passed(self, azimuth: mi.Float) -> mi.Float:
-        """Twice the area between the pole and the part below this azimuth, with its sign."""
+        """Twice the area between the pole and the part of the edge below this azimuth, with the
+        sign of ``weight``."""
         sin, cos = dr.sincos(dr.clip(azimuth, self.low, self.high))
         slope = self.normal.x * cos + self.normal.y * sin
         point = mi.Vector3f(cos * self.normal.z, sin * self.normal.z, -slope)
@@ -182,7 +185,8 @@ class _Arc:
 def _invert(
     arcs: list[_Arc], target: mi.Float, total: mi.Float, is_needed: mi.Bool
 ) -> mi.Float:
-    """The azimuth below which twice the area is ``target``, of ``total``."""
+    """The azimuth below which twice the area of the polygon is ``target``. ``total`` is twice the
+    whole area."""
     low, high = mi.Float(dr.inf), mi.Float(-dr.inf)
     for arc in arcs:
         low = dr.select(arc.weight != 0, dr.minimum(low, arc.low), low)
@@ -208,7 +212,7 @@ def _invert(
 
 
 def _radii(arcs: list[_Arc], azimuth: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Between which squared radii the polygon lies at an azimuth."""
+    """The squared radii between which the polygon lies at an azimuth."""
     near, far = mi.Float(0), mi.Float(0)
     sin, cos = dr.sincos(azimuth)
     for arc in arcs:

@@ -12,7 +12,7 @@ from .spherical_triangle import SphericalTriangle, spherical_triangle
 
 @dataclass
 class SphericalPolygon:
-    """What a flat convex polygon subtends at the origin.
+    """A flat convex polygon, seen from the origin.
 
     Attributes:
         triangles: The triangles (corner 0, corner k, corner k + 1), k = 1, 2, …
@@ -22,17 +22,18 @@ class SphericalPolygon:
 
     @property
     def solid_angle(self) -> mi.Float:
-        # The half angles are those of complex numbers, whose product has their sum: one arctangent
+        # Half angles are arguments of complex numbers. The argument of the product is their sum,
+        # which takes only one arctangent
         cos, sin = self.triangles[0].denominator, self.triangles[0].volume
         for triangle in self.triangles[1:]:
             x, y = triangle.denominator, triangle.volume
             cos, sin = cos * x - sin * y, cos * y + sin * x
         angle = dr.atan2(sin, cos)
-        # Rounding, where the polygon fills half of the sphere
+        # Near a half sphere, rounding may wrap the angle around
         return 2 * dr.select(angle < -1e-3, angle + dr.two_pi, dr.maximum(angle, 0))
 
     def sample(self, sample: mi.Point2f) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-        """A point of the polygon, uniformly distributed by solid angle: the number k - 1 of its
+        """Samples a point of the polygon, uniformly by solid angle. Returns the index k - 1 of its
         triangle, and the weights of the corners k and k + 1 (that of corner 0 is the rest).
 
         The map is continuous: ``sample.x`` moves the end of an arc from corner 0 along the other
@@ -59,7 +60,8 @@ def spherical_polygon(corners: list[mi.Vector3f], edges: list[mi.Vector3f]) -> S
 
     Parameters:
         corners: Three or more, in a plane.
-        edges: From each corner to the next one, exact also where the polygon is distant.
+        edges: Vectors from each corner to the next one, which must be exact also if the polygon is
+            distant.
     """
     triangles, diagonal = [], edges[0]
     for k in range(1, len(corners) - 1):

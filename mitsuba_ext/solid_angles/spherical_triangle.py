@@ -1,9 +1,9 @@
-"""Spherical triangles: their solid angle, and a map of the unit square to them that keeps areas.
+"""Spherical triangles: their solid angle, and an area-preserving map of the unit square to them.
 
 The map is that of J. Arvo, *Stratified Sampling of Spherical Triangles*, 1995 (course, 4.3), in the
 form of C. Peters, *BRDF Importance Sampling for Polygonal Lights*, 2021, which needs no angles of
-the triangle. Where those papers subtract numbers that are almost equal, the difference is computed
-from the edges of the triangle here. So triangles may be as small, and as distant, as one likes.
+the triangle. Where those papers subtract almost equal numbers, the difference is computed here from
+the edges of the triangle. The map is therefore exact for arbitrarily small and distant triangles.
 """
 
 from __future__ import annotations
@@ -13,21 +13,22 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-#: Smaller than every divisor that matters, and larger than 0.
+#: A lower bound of divisors: larger than 0, and smaller than all divisors of valid triangles.
 _TINY = 1e-37
 
 
 @dataclass
 class SphericalTriangle:
-    """What a flat triangle subtends at the origin. Lengths have a unit of its own.
+    """A flat triangle, seen from the origin. Its lengths are in units of the distance of its
+    farthest corner.
 
     Attributes:
         a, b, c: Its corners.
-        ba, ac: Its edges b → a and a → c, as exact as they are known: the difference of two corners
-            is inexact where the triangle is small and distant.
+        ba, ac: Its edges b → a and a → c. They are stored, since the difference of two corners is
+            inexact if the triangle is small and distant.
         lengths: Distances of the three corners.
         volume: Determinant of the directions to the corners, not negative.
-        denominator: 1 + the cosines between the three directions.
+        denominator: 1 + the sum of the cosines between the three directions.
         half_angle: Half of its solid angle.
     """
 
@@ -46,11 +47,11 @@ class SphericalTriangle:
         return 2 * self.half_angle
 
     def sample(self, sample: mi.Point2f) -> tuple[mi.Float, mi.Float]:
-        """A point of the triangle, uniformly distributed by solid angle, as the weights of the
+        """Samples a point of the triangle, uniformly by solid angle. Returns the weights of the
         corners a and c (that of b is the rest). ``sample.x`` chooses an arc from b to a point
         between a and c, ``sample.y`` a point of this arc."""
         a, b, c = (v / length for v, length in zip((self.a, self.b, self.c), self.lengths))
-        # ----- The point n between a and c: the triangle (a, b, n) has a share x of the whole -----
+        # ----- The point n between a and c: (a, b, n) has a fraction x of the solid angle -----
         # The vector between a and n is o = a·(rest + turned) + c·turned (Peters, Alg. 2). With
         # volume = r sin(Ω/2) and denominator = r cos(Ω/2), all numbers below are sums of positive
         # ones
@@ -97,11 +98,11 @@ def spherical_triangle(
 ) -> SphericalTriangle:
     """The triangle with the corners ``a``, ``b``, ``c`` as seen from the origin; see
     :class:`SphericalTriangle`."""
-    # In units of the greatest distance: products of lengths then are floats in scenes of any scale
+    # In units of the greatest distance, so that products of lengths do not over- or underflow
     unit = dr.rcp(dr.maximum(dr.maximum(dr.norm(a), dr.norm(b)), dr.maximum(dr.norm(c), _TINY)))
     a, b, c, ba, ac = (v * unit for v in (a, b, c, ba, ac))
     lengths = mi.Vector3f(dr.norm(a), dr.norm(b), dr.norm(c))
-    # The distance of the plane is least inexact by the nearest corner
+    # The distance of the plane is most exact if computed from the nearest corner
     nearest = dr.select(lengths.x < lengths.y, a, b)
     nearest = dr.select(lengths.z < dr.minimum(lengths.x, lengths.y), c, nearest)
     product = lengths.x * lengths.y * lengths.z

@@ -1,1 +1,1 @@
-"""What happens before a scene is read: LLVM, Mitsuba, plugins. Facts about this machine."""
+"""Prepares LLVM, Mitsuba and the plugins before a scene is read; describes the machine."""

@@ -1,6 +1,6 @@
-"""What ``mitsuba-ext doctor`` prints: versions, hardware, LLVM, plugins, and tiny renders.
+"""Prints the report of ``mitsuba-ext doctor``: versions, hardware, LLVM, plugins, tiny renders.
 
-Each part is independent: one that fails prints why, and the others follow. The renders run in
+Each part is independent: one that fails prints why, and the other parts follow. The renders run in
 another process, because an unusable backend ends its process without an exception.
 """
 
@@ -147,7 +147,8 @@ def _plugins() -> Iterator[str]:
 
 
 def _renders(variant: str) -> Iterator[str]:
-    """One line per integrator. After one that ends its process, a new process goes on."""
+    """One line per integrator. If an integrator ends its process, a new process renders the rest.
+    """
     from .registry import plugin_names
 
     runtime.check(variant)
@@ -206,7 +207,7 @@ def _render_here(variant: str, names: list[str]) -> None:
     mi.set_log_level(mi.LogLevel.Error)  # stdout is for the results, not for warnings
     description = mi.cornell_box()
     description["sensor"]["film"].update(width=32, height=32)
-    # Some integrators ask for a lens
+    # Some integrators need a lens
     description["sensor"].update(type="thinlens", aperture_radius=0.01, focus_distance=3.9)
     scene = mi.load_dict(description)
     for name in names:

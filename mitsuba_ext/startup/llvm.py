@@ -188,7 +188,7 @@ def _candidate_paths() -> Iterator[str]:
 
 @cache
 def cpu() -> tuple[str, frozenset[str]]:
-    """The CPU's name and its feature flags; no flags where they cannot be read."""
+    """The CPU's name and its feature flags; no flags if they cannot be read."""
     try:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:

@@ -1,4 +1,4 @@
-"""Installs what Dr.Jit's LLVM backend needs, or says which command does.
+"""Installs the libraries that Dr.Jit's LLVM backend needs, or prints a command that installs them.
 
 This module needs the standard library only, and is also a script::
 
@@ -47,7 +47,7 @@ def lacks_system_library() -> bool:
 
 
 def install_command(with_llvm: bool = True) -> str:
-    """How a user installs the missing libraries; a command is quoted with backticks."""
+    """Tells a user how to install the missing libraries; a command is quoted with backticks."""
     needed = [_SYSTEM_PACKAGE] if lacks_system_library() else []
     if shutil.which("apt-get"):
         if with_llvm:
@@ -61,7 +61,7 @@ def install_command(with_llvm: bool = True) -> str:
 
 
 def _as_root() -> list[str] | None:
-    """The prefix of a command that needs root; ``None`` if root is out of reach."""
+    """The prefix of a command that needs root; ``None`` if this process cannot become root."""
     if os.geteuid() == 0:
         return []
     if not shutil.which("sudo"):
@@ -75,7 +75,7 @@ def ensure() -> Library | None:
     """Finds a library that passes the probe; if there is none, installs one with apt.
 
     Returns:
-        The library that ``import mitsuba_ext`` will use; ``None`` without success.
+        The library that ``import mitsuba_ext`` will use; ``None`` if there is still none.
     """
     works = _newest_that_works()
     if works or os.environ.get(VARIABLE) or cpu_fault() or not shutil.which("apt-get"):

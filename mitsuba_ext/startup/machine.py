@@ -9,7 +9,7 @@ from .. import __version__
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that makes the image, and the active variant."""
+    """Versions of the software on which the image depends, and the active variant."""
     import drjit
     import mitsuba
     import numpy

@@ -56,8 +56,8 @@ def _around_mitsuba() -> Iterator[None]:
 
 
 class _Finder:
-    """Finds Dr.Jit and Mitsuba by the other finders of ``sys.meta_path``, and runs the hooks around
-    their execution."""
+    """Finds Dr.Jit and Mitsuba with the other finders of ``sys.meta_path``, and runs the hooks
+    before and after their modules are executed."""
 
     _AROUND: dict[str, Callable[[], AbstractContextManager[None]]] = {
         "drjit": _around_drjit,

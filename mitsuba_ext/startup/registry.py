@@ -50,7 +50,7 @@ _BASES = (
 
 _registered: set[str] = set()
 
-#: The kinds of plugins whose methods kernels call, and those plugins that are in memory.
+#: The kinds of plugins whose methods kernels call, and their instances that are in memory.
 _CALLED = ("emitters", "bsdfs", "shapes", "sensors")
 _alive: weakref.WeakSet[mi.Object] = weakref.WeakSet()
 
@@ -73,7 +73,7 @@ def plugin(cls: type) -> type:
 
 def is_any_called() -> bool:
     """Is there a plugin of ours in memory whose methods kernels call? Dr.Jit traces the methods of
-    all objects of a kind, also of those in scenes that nobody renders."""
+    all objects of a kind, also of those in scenes that are not rendered."""
     return len(_alive) > 0
 
 
@@ -90,7 +90,7 @@ def plugin_files(kind: str) -> list[Path]:
 
 
 def decision_names() -> list[str]:
-    """The plugins that Mitsuba takes for samplers, but that are decisions of the walk."""
+    """The plugins that are samplers to Mitsuba, but decisions of the walk to our integrators."""
     files = plugin_files("samplers")
     return [path.stem for path in files if "(DecisionPlugin)" in path.read_text(encoding="utf-8")]
 

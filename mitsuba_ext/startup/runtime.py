@@ -1,4 +1,4 @@
-"""Checks Mitsuba's version and the LLVM library, so that a wrong one ends in a clear message.
+"""Checks Mitsuba's version and the LLVM library, so that a wrong one leads to a clear message.
 
 ``mitsuba_import.py`` calls these functions before and after the import of Dr.Jit and Mitsuba, and
 ``registry.py`` whenever a variant is selected.
@@ -88,7 +88,7 @@ def check_version(found: str) -> None:
 
 
 def check_meshes(mesh: type) -> None:
-    """Refuses development builds of Mitsuba 3.10, which call themselves 3.9.1.
+    """Refuses development builds of Mitsuba 3.10, whose version number is 3.9.1.
 
     Args:
         mesh: The class ``mi.Mesh`` of the active variant.
@@ -134,7 +134,7 @@ def ensure_two_threads() -> None:
 def guard(mitsuba: ModuleType) -> None:
     """If LLVM does not work, makes ``mi.set_variant`` raise the error of :func:`check`.
 
-    Dr.Jit's own message about a library that it refuses is that there is none. If LLVM works,
+    If Dr.Jit refuses a library, its own message says that there is none. If LLVM works,
     ``mi.set_variant`` is not changed.
 
     Args:

@@ -1,12 +1,12 @@
-"""The calls of BSDFs: every place that evaluates or samples one goes through these.
+"""Calls of BSDFs: all code that evaluates or samples a BSDF uses these functions.
 
-Mitsuba's BSDFs return numbers that are not finite where there is nothing to return, and leave it to
-the weight of the sample, which is zero there, to hide them. ``roughconductor`` does it for every
-sample on its back, ``roughplastic`` and ``principledthin`` at directions in the plane of the
-surface. BSDFs that hold others multiply these numbers: ``blendbsdf`` makes the weight itself
-undefined. ``path`` ends such paths, because in Dr.Jit's LLVM and CUDA backends ``NaN != 0`` is
-false. So do we, where the number comes from: what is not finite counts as not sampled, and as a
-value and a density of zero. Everything else is returned as it is.
+Where a sample fails, Mitsuba's BSDFs may return numbers that are not finite, and rely on the
+sample's weight, which is zero there, to hide them. ``roughconductor`` does so for every sample on
+its back side, ``roughplastic`` and ``principledthin`` for directions in the plane of the surface.
+BSDFs that contain others multiply these numbers: in ``blendbsdf``, the weight itself becomes NaN.
+``path`` ends such paths, because in Dr.Jit's LLVM and CUDA backends ``NaN != 0`` is false. These
+functions do the same at the source: a sample that is not finite counts as failed, and a value or a
+density that is not finite as zero. Everything else is returned unchanged.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def sample_bsdf(
     active: mi.Bool | bool = True,
 ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
     """A direction, and value / density there. Where none is sampled, the weight and ``bs.pdf`` are
-    zero, and ``bs.wo`` is some direction."""
+    zero, and ``bs.wo`` is an arbitrary direction."""
     return _finite_sample(*bsdf.sample(ctx, si, sample_1, sample_2, active))
 
 

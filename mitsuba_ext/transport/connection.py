@@ -34,7 +34,7 @@ class Connection:
     Attributes:
         ds: The direction towards it.
         weight: Its radiance / density.
-        choice: What the next event decision told of its choice.
+        choice: What the next event decision returned about its choice.
     """
 
     ds: mi.DirectionSample3f
@@ -44,9 +44,9 @@ class Connection:
 
 # Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
 class Connector:
-    """Connects vertices to lights: chooses points, tests them, and weighs what they bring.
+    """Connects vertices to lights: chooses points, traces shadow rays, and applies MIS weights.
 
-    The parameters are the decisions of the walk that take part.
+    The parameters are the decisions of the walk that take part in it.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Connector:
     def one(
         self, place: Any, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
     ) -> Connection:
-        """The connection of a vertex that has one. Its density is 0 at other vertices."""
+        """The connection of vertices that have one. Its density is 0 where there is none."""
         dimension = self._next_event.choice_dimension
         choice = None
         if dimension > 0:
@@ -83,7 +83,7 @@ class Connector:
         connection = self._choose(place, LightNumbers(point, choice), vertex, active)
         if self._connections.first != 1 or self._connections.later != 1:
             count = self._connections.weight(vertex.depth)
-            # Without connections: lights that no BSDF sample can hit are not left out
+            # Vertices without connections still connect to lights that no BSDF sample can hit
             is_made = (count == 1) | ((count == 0) & connection.ds.delta)
             connection.ds.pdf = dr.select(is_made, connection.ds.pdf, 0)
             connection.weight = dr.select(is_made, connection.weight, 0)
@@ -108,20 +108,20 @@ class Connector:
         inside: Any = (),
         sampler: mi.Sampler | None = None,
     ) -> tuple[mi.Spectrum, mi.Bool, mi.Bool, mi.Bool, Any]:
-        """What a connection brings.
+        """The light that a connection adds to a path.
 
         Parameters:
-            state: Of the shadow test.
+            state: The state of the shadow test.
             survival_sample: See :meth:`survival_sample`.
             β: Multiplies the result.
             bsdf_value, pdf: The BSDF's value towards the light (cosine included), and the density
                 with which scattering finds this direction.
             count: Number of the vertex's connections.
-            inside, sampler: Of a path in a scene with media: where it is, and random numbers.
+            inside, sampler: For scenes with media: the path's state in them, and random numbers.
 
         Returns:
-            The light that arrives where nothing is in between, with its MIS weight; where it was
-            considered, where a shadow ray was traced, and where that found nothing; the new state.
+            The light that arrives if unoccluded, with its MIS weight; three masks: the connection
+            was considered, a shadow ray was traced, it was unoccluded; the new state.
         """
         si, ds = vertex.si, connection.ds
         bsdf_value = si.to_world_mueller(bsdf_value, -si.to_local(ds.d), si.wi)
@@ -173,8 +173,7 @@ class Connector:
         active: mi.Bool,
         inside: Any,
     ) -> tuple[mi.Spectrum, mi.UInt32, mi.UInt32, Any]:
-        """The same as :meth:`gather` of vertices that have one connection, in a scene with media.
-        """
+        """:meth:`gather` for vertices that have one connection, in a scene with media."""
         connection = self.one(place, sampler, vertex, active)
         bsdf_value, pdf = self._value(
             scattering_state, ctx, vertex, connection.ds, active
@@ -187,8 +186,8 @@ class Connector:
         return dr.select(visible, value, 0), *counts, shadow_state
 
     def _value(self, scattering_state, ctx, vertex: Vertex, ds, active):
-        """What a vertex scatters from a light, cosine included, and the density with which
-        scattering finds that."""
+        """The value of the BSDF (or phase function) towards a light, cosine included, and the
+        density with which scattering finds this direction."""
         wo = vertex.si.to_local(ds.d)
         value, pdf = self._scattering.eval_pdf(scattering_state, ctx, vertex, wo, active)
         value = self._heroes.connect(
@@ -210,12 +209,12 @@ class Connector:
         active: mi.Bool,
         inside: Any,
     ) -> tuple[mi.Spectrum, mi.UInt32, mi.UInt32, Any]:
-        """What all connections of vertices that have more than one bring to the path, throughput
+        """The light that the connections of vertices with more than one add to the path, throughput
         included; the number of connections that were considered, that of shadow rays, and the new
         state of the shadow test."""
         dimension = self._next_event.choice_dimension
         chosen = self._connections.begin(sampler, dimension)
-        # One number for all connections: a vertex draws as many numbers wherever it lies
+        # One number for all connections: each vertex draws the same count of random numbers
         survival_sample = self.survival_sample(sampler)
         total, index = mi.Spectrum(0), mi.UInt32(0)
         connection_count, shadow_count = mi.UInt32(0), mi.UInt32(0)
@@ -244,7 +243,7 @@ class Connector:
 
 
 def _turned(sample: mi.Float | tuple[()], index: mi.UInt32) -> mi.Float | tuple[()]:
-    """A number of its own for each connection: uniform if ``sample`` is, and evenly spread."""
+    """The number of connection ``index``: uniform if ``sample`` is, evenly spread over indices."""
     if isinstance(sample, tuple):
         return sample
     turned = dr.fma(mi.Float(index), _GOLDEN, sample)

@@ -1,4 +1,4 @@
-"""The light that a path runs into."""
+"""The emission of lights that a path hits."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def emission(
     weights: Weights,
     count: mi.Float | float = 1.0,
 ) -> tuple[mi.Spectrum, mi.Float, mi.DirectionSample3f, mi.Float]:
-    """The radiance that ``si`` (or the environment, if nothing was hit) emits towards the vertex
-    before it, times the MIS weight of having been found by scattering; this weight; the direction
-    from there, and the density with which connections find it (0 where they cannot).
+    """The radiance that ``si`` (or the environment, if nothing was hit) emits towards the previous
+    vertex, times the MIS weight of scattering; this weight; the direction from the previous vertex,
+    and the density with which connections find it (0 where they cannot).
 
     Parameters:
-        query: Found ``si``.
+        query: The decision that found ``si``.
         next_event, state: The decision whose connections could have found the light as well, and
-            its state when it left the vertex before.
-        weights: Of multiple importance sampling.
-        count: Number of its connections there.
+            its state when the path left the previous vertex.
+        weights: The MIS weights.
+        count: Number of connections of the previous vertex.
     """
     arrival = path.arrival
     ds = mi.DirectionSample3f(scene, si, arrival.ref)
@@ -41,6 +41,6 @@ def emission(
 
 
 def can_be_hit(scene: mi.Scene) -> bool:
-    """Is there a light that a scattered ray can run into?"""
+    """Is there a light that a scattered ray can hit?"""
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
     return any(not (int(e.flags()) & int(delta)) for e in scene.emitters())

@@ -1,4 +1,4 @@
-"""What a render asks for radiance: camera rays in, samples out."""
+"""The interface between a render and its estimator of radiance: camera rays in, samples out."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class CameraRays:
         ray: The rays themselves.
         pixel: The number of the ray's pixel, row by row in the film's extent; ``None`` for rays
             that belong to no film.
-        importance: What the sensor makes of the radiance that a ray brings back.
-        position: Where on the film (in pixels) to put it.
+        importance: The sensor's importance, a factor of the radiance along the ray.
+        position: Where on the film (in pixels) the result is added.
         weight: Importance weight of a sample; 1.0 where all count the same.
-        hero_weight: The factor of ``weight`` for paths of which only the first wavelength is left
+        hero_weight: A further factor, for paths of which only the first wavelength is left
             (``heroes.py``). The estimator applies it.
         medium: The participating medium in which the rays begin; ``None`` in a vacuum.
-        distance: The number that chooses the first distance in a homogeneous medium; ``None`` for
-            that of the sampler.
+        distance: The primary sample that chooses the first distance in a homogeneous medium;
+            ``None`` if the sampler chooses it.
     """
 
     ray: mi.RayDifferential3f
@@ -39,16 +39,16 @@ class CameraRays:
 
 @dataclass
 class Splats:
-    """Radiance for other pixels than those in which the camera rays begin: what light paths bring
-    to the sensor. There may be more or fewer of them than camera rays.
+    """Contributions to other pixels than those in which the camera rays begin: those of light paths
+    that reach the sensor. There may be more or fewer of them than camera rays.
 
     Attributes:
         value: Radiance times importance; the mean over all camera samples of a pixel's splats is
             added to it.
         position: Where on the film, in pixels of its crop window plus that window's offset.
-        wavelengths: Of ``value``, in spectral variants.
+        wavelengths: The wavelengths of ``value``, in spectral variants.
         active: Which lanes have something to add.
-        sample: The number of the camera ray to whose sample each belongs, for chains.
+        sample: For Markov chains: the number of the camera ray to whose sample each splat belongs.
     """
 
     value: mi.Spectrum
@@ -60,17 +60,17 @@ class Splats:
 
 @dataclass
 class Sample:
-    """What one camera ray brings back.
+    """The result of one camera ray.
 
     Attributes:
         L: Radiance estimate.
-        valid: Did the path meet a surface (or the visible environment)? It becomes alpha.
+        valid: Did the path hit a surface (or the visible environment)? It becomes alpha.
         scatter_count: Rays traced in directions that a BSDF chose.
-        shadow_count: Shadow rays traced; like all counts, in each lane, or in any other partition.
+        shadow_count: Shadow rays traced. Counts are arrays of any width, of which the sum matters.
         connection_count: Connections to a light that were considered: ``path`` traces a shadow ray
             for each of them.
         aovs: Values of arbitrary output variables, if the estimator finds any.
-        splats: What it found for other pixels.
+        splats: Contributions to other pixels.
     """
 
     L: mi.Spectrum
@@ -87,7 +87,7 @@ class Estimator(Protocol):
 
     Attributes:
         can_be_frozen: May a call be recorded as a whole (``frozen.py``)? It then reads no array on
-            the host, and makes no splats. If it is not there, no.
+            the host, and makes no splats. Estimators without this attribute are not recorded.
     """
 
     def __call__(

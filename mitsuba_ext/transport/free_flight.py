@@ -11,12 +11,13 @@ from .estimator import CameraRays
 
 
 class Distances:
-    """Which random numbers choose the distances of flights in homogeneous media: for the first one
-    that of the camera ray, if it has one (its density is part of the ray's weight); uniform ones.
+    """Which random numbers choose the distances of flights in homogeneous media: for the first
+    flight that of the camera ray, if it has one (its density is part of the ray's weight); uniform
+    ones otherwise.
 
     Attributes:
-        exact_transmittance: Is the transmittance of homogeneous media for shadow rays computed?
-            ``volpath`` estimates it by a random distance each, with more noise in the same time.
+        exact_transmittance: Do shadow rays use the closed-form transmittance of homogeneous media?
+            ``volpath`` samples a distance in each, with more noise in the same time.
     """
 
     exact_transmittance = True
@@ -36,8 +37,8 @@ class Distances:
 
 
 def component(σ: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
-    """One colour of an extinction. In spectral and monochromatic variants it is the first: the
-    hero wavelength is distributed as each of the others."""
+    """The colour ``channel`` of an extinction. In spectral and monochromatic variants, it is always
+    the first: the hero wavelength is distributed as each of the others."""
     chosen = σ[0]
     if mi.is_rgb:
         for index in range(1, len(σ)):
@@ -54,8 +55,8 @@ def interaction_at(ray: mi.Ray3f, p: mi.Point3f, medium: mi.MediumPtr) -> mi.Med
 
 
 def extinction(medium: mi.MediumPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Spectrum:
-    """The extinction that chooses distances (of homogeneous media: the true one); 0 where not
-    ``active``."""
+    """The majorant of the extinction, with which distances are sampled (in homogeneous media, the
+    extinction itself); 0 where not ``active``."""
     σ = medium.get_majorant(interaction_at(ray, mi.Point3f(0), medium), active)
     return dr.select(active, mi.Spectrum(σ), 0)
 
@@ -76,17 +77,17 @@ def track(
     β: mi.Spectrum,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Spectrum, mi.Bool]:
-    """Delta tracking: collisions at the density of the majorant, of which some change nothing.
+    """Delta tracking: samples collisions with the majorant, some of which are null collisions.
 
     Parameters:
-        ray, end: The ray, and the distance of the surface that it meets.
-        medium, channel: Where it flies, and whose colour chooses distances.
-        t, β: Where not ``active``, these are returned; ``β`` is the throughput up to the ray.
-        active: Where a medium of varying density begins.
+        ray, end: The ray, and the distance of the surface that it hits.
+        medium, channel: The medium, and the colour whose extinction chooses distances.
+        t, β: Returned where not ``active``; ``β`` is the throughput at the origin of the ray.
+        active: Does the ray begin in a medium of varying density?
 
     Returns:
         The distance of the first real collision, the throughput up to that (coefficient of
-        scattering included) or to the surface, and where there is a collision.
+        scattering included) or to the surface, and whether there is a collision.
     """
     ray = mi.Ray3f(ray)
     start, t, β = mi.Point3f(ray.o), mi.Float(t), mi.Spectrum(β)
@@ -96,7 +97,7 @@ def track(
     while dr.hint(active, label="flight"):
         mei = medium.sample_interaction(ray, sampler.next_1d(active), channel, active)
         is_inside = active & mei.is_valid() & ~(end < mei.t)
-        # By how much the colour that chose the distance is more likely to get there than others
+        # Transmittance of each colour, relative to that of the colour that chose the distance
         σ = mei.combined_extinction
         chosen = component(σ, channel)
         flown = dr.minimum(dr.select(is_inside, mei.t, dr.inf), end) - mei.mint

@@ -1,33 +1,33 @@
 """Functions that Dr.Jit traces once per scene, and launches again without Python.
 
-To trace a walk takes longer than to run it for a few ten thousand samples: Dr.Jit traces each call
+Tracing a walk takes longer than running it for a few ten thousand samples: Dr.Jit traces each call
 of a BSDF once for each BSDF of the scene. ``dr.freeze`` records the kernels of a function instead.
-It knows arrays, and objects of Mitsuba that hold arrays. What else a function depends on is
+It handles arrays, and objects of Mitsuba that hold arrays. All else that a function depends on is
 described here (:class:`_Description`): the classes of our objects and the values of their
-attributes, the parameters of the scene that are no arrays, the number of threads. A recording is
-used again only where all of it is the same.
+attributes, the parameters of the scene that are not arrays, the number of threads. A recording is
+used again only where all of this is the same.
 
-Nothing is recorded in spectral variants, whose tables of colours are nobody's argument; and where
-kernels call plugins that are written in Python: while these are traced, they may read arrays, and
-free memory of NumPy, for which Dr.Jit ends the process. A function with an argument that nobody can
-describe (a sampler in Python) is not frozen either. The log says why (level ``Debug``). If Dr.Jit
+Nothing is recorded in spectral variants, whose colour tables are not arguments of any function, and
+where kernels call plugins written in Python: while these are traced, they may read arrays, or free
+memory of NumPy, at which Dr.Jit ends the process. A function with an argument that cannot be
+described (a sampler in Python) is not frozen either. The log says why (level ``Debug``). If Dr.Jit
 cannot record a function, the render begins anew without recordings, and the log says so (level
 ``Info``).
 
-What a frozen function must keep to:
+Rules for a frozen function:
 
-- It leaves the attributes of its arguments alone: what it changes are the contents of their arrays.
+- It does not assign attributes of its arguments; it changes only the contents of their arrays.
   (This is checked.)
-- What its arguments hold besides is not changed between calls either, or they say with a method
-  ``kernel_state`` which of their attributes kernels depend on.
+- Other attributes of its arguments do not change between calls either, unless the argument has a
+  method ``kernel_state``, which returns those on which kernels depend.
 - It reads no array on the host, and its results are arrays, or dataclasses, dicts, lists and tuples
   of these. (This is checked.)
 - An array among its arguments is a literal in all calls or in none (``dr.opaque`` makes it none).
-  Kernels hold literals, until Dr.Jit meets another value: the first render of a scene would have
-  kernels of its own, and its image would differ from the second one by rounding.
-- Kernels whose width is that of an argument read an array of this width directly. Dr.Jit finds the
-  width of kernels that only gather by comparing with widths seen before; this fails where these
-  change, so that all widths are parts of the description, but for functions that say ``any_width``.
+  Dr.Jit compiles literals into kernels, until it meets another value: the first render of a scene
+  would have other kernels, and its image would differ from the second one by rounding.
+- Kernels whose width is that of an argument read an array of this width directly. Dr.Jit infers the
+  width of kernels that only gather from widths seen before, which fails where these change. All
+  widths are therefore part of the description, except for functions declared with ``any_width``.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ import numpy as np
 from ..startup import registry
 from ..startup.garbage import garbage_left_alone
 
-#: Scenes whose recordings are kept, and recordings of each, at most.
+#: The largest number of scenes whose recordings are kept, and of recordings of each.
 _MOST_SCENES, _MOST_RECORDINGS = 8, 256
 
 #: Values that are their own description.
@@ -55,11 +55,11 @@ _VALUES = (int, float, str, bytes, bool, type(None), enum.Enum, range)
 
 
 class NotRecordableError(RuntimeError):
-    """Dr.Jit cannot record a function, which had perhaps begun to change its arguments."""
+    """Dr.Jit cannot record a function, which may already have changed its arguments."""
 
 
 class _UndescribedError(Exception):
-    """Nobody knows whether this is the same as before; the message says what it is."""
+    """An argument cannot be compared with that of an earlier call; the message names it."""
 
 
 @dataclass
@@ -67,10 +67,10 @@ class _SceneRecordings:
     """The recordings of one scene.
 
     Attributes:
-        mark: An array of the scene. While it is held, no other scene has one of its index: scenes
-            themselves cannot be held weakly, and must not be kept alive.
+        mark: An array of the scene, whose index identifies the scene: while the array is held, no
+            other one has its index. Scenes cannot be referenced weakly, and must not be kept alive.
         held: Objects outside of the scene that descriptions name by their address.
-        recordings: By description.
+        recordings: The recordings, by description.
         refused: Functions that are not frozen.
     """
 
@@ -87,7 +87,7 @@ class _Current:
     Attributes:
         kept: The recordings of its scene.
         scene: Its scene.
-        values: Parameters of scene and sensor that are no arrays, and the number of threads.
+        values: Parameters of scene and sensor that are not arrays, and the number of threads.
         own: Addresses of the scene's objects.
     """
 
@@ -128,7 +128,7 @@ def _state(current: _Current | None, is_forbidden: bool) -> Iterator[None]:
 
 
 def forget_recordings() -> None:
-    """Lets go of all recordings."""
+    """Deletes all recordings."""
     _scenes.clear()
 
 
@@ -171,7 +171,7 @@ def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
         _scenes.popitem(last=False)
     sensors = scene.sensors()
     own = frozenset(_address(o) for o in (*sensors, *scene.emitters(), *scene.shapes()))
-    # Kernels that add from several threads have room for so many
+    # Kernels whose threads accumulate separately have memory for this number of threads
     threads = dr.thread_count()
     values = threads, _address(sensor), _values(parameters), _values(mi.traverse(sensor))
     if _address(sensor) not in own:
@@ -186,7 +186,7 @@ def _is_foreign(thing: mi.Object) -> bool:
 
 
 def _values(parameters: mi.SceneParameters) -> tuple:
-    """Those that are no arrays: they are parts of kernels, and users may change them."""
+    """The parameters that are not arrays: kernels contain them, and users may change them."""
     return tuple(
         (key, value if isinstance(value, _VALUES) else str(value))
         for key, value in parameters.items()
@@ -249,7 +249,8 @@ def _call(current: _Current, function: Callable, args: tuple, any_width: bool) -
 
 
 def _check_result(function: Callable, result: Any) -> None:
-    """Dr.Jit would return an object that it does not know as it was when it was recorded.
+    """Checks the types in a result: Dr.Jit would return an object that it does not know as it was
+    when it was recorded.
 
     Raises:
         TypeError: There is such an object in a result.
@@ -270,20 +271,20 @@ def _check_result(function: Callable, result: Any) -> None:
 
 
 class _Recording:
-    """What Dr.Jit has recorded of a function, for arguments of one description."""
+    """The kernels that Dr.Jit has recorded of a function, for arguments of one description."""
 
     def __init__(self, function: Callable) -> None:
         self._function, self._args = function, ()
         self._frozen = dr.freeze(self._run, warn_after=1 << 20)
 
     def _run(self, arrays: list[Any]) -> Any:
-        # The arrays are those that the arguments hold, so that Dr.Jit knows what is read
+        # The arrays are those that the arguments hold: Dr.Jit must see them as inputs
         return self._function(*self._args)
 
     def __call__(self, args: tuple, arrays: list[Any]) -> Any:
         self._args = args
         try:
-            # What it frees may be memory of NumPy: Dr.Jit cannot record that, and ends the process
+            # The garbage collector may free memory of NumPy, at which Dr.Jit ends the process
             with garbage_left_alone():
                 return self._frozen(arrays)
         except RuntimeError as error:
@@ -296,21 +297,21 @@ class _Recording:
 
 
 class _Description:
-    """All that the kernels of a function depend on but the contents of arrays.
+    """All that the kernels of a function depend on, except the contents of arrays.
 
     Parameters:
         current: The render.
         any_width: Are the widths of arrays left out?
 
     Attributes:
-        arrays: The arrays, and what holds such, in the order in which they were met.
+        arrays: The arrays, and objects that hold arrays, in the order in which they were met.
         held: Objects outside of the scene that are named by their address.
     """
 
     def __init__(self, current: _Current, any_width: bool) -> None:
         self._current, self._any_width = current, any_width
         self._met: dict[int, int] = {}
-        # Addresses of what was met must stay taken
+        # Keeps objects alive, so that no new one gets the id of an earlier one
         self._kept_alive: list[Any] = []
         self.arrays: list[Any] = []
         self.held: dict[int, Any] = {}

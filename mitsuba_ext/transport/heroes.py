@@ -1,9 +1,9 @@
-"""What the random walk and dispersive BSDFs agree on.
+"""Hero wavelengths: the convention between the random walk and dispersive BSDFs.
 
 A ray carries four wavelengths. The first, the *hero*, chooses lobes and directions. Reflection
-leads all four the same way. Refraction by a dispersive interface does not: only the hero goes on,
-and weighs four times as much. That is unbiased, since the hero is distributed as each of the
-others, and since whether a path has passed such an interface does not depend on wavelengths.
+leads all four the same way. Refraction by a dispersive interface does not: only the hero continues,
+with four times the weight. That is unbiased, since the hero is distributed as each of the others,
+and since whether a path has passed such an interface does not depend on wavelengths.
 
 Source: A. Wilkie, S. Nawaz, M. Droske, A. Weidlich, J. Hanika, *Hero Wavelength Spectral Sampling*,
 2014.
@@ -17,12 +17,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-#: A bit that Mitsuba does not use. In the flags of a BSDF, which every wrapper hands on: it
-#: disperses. In the ``type_mask`` of a ``BSDFContext``, of which only bits of lobes are looked at:
-#: the caller lets only the hero be refracted. A dispersive BSDF refuses to work for any other.
+#: A bit that Mitsuba does not use. In the flags of a BSDF, which wrapper BSDFs pass on, it means
+#: that the BSDF disperses light. In the ``type_mask`` of a ``BSDFContext``, of which Mitsuba reads
+#: only the bits of lobes, it means that the caller lets only the hero be refracted. A dispersive
+#: BSDF refuses to work for other callers.
 DISPERSES = 1 << 30
 
-#: The mask of callers who ask for everything, and know nothing of us.
+#: The default mask: its caller asks for all lobes, and does not know about heroes.
 _EVERYTHING = 0xFFFFFFFF
 
 
@@ -32,8 +33,8 @@ def knows_heroes(ctx: mi.BSDFContext) -> bool:
 
 
 def disperses(shapes: Iterable[mi.Shape]) -> bool:
-    """May any of these shapes disperse light? ``children`` of shapes are looked at too; what an
-    instance shows cannot be seen from outside, so that it may."""
+    """May any of these shapes disperse light? ``children`` of shapes are searched too. The BSDFs of
+    an instance are not accessible, so that every instance may."""
     return any(
         bool(shape.bsdf() and shape.bsdf().flags() & DISPERSES)
         or shape.class_name() == "Instance"
@@ -44,8 +45,8 @@ def disperses(shapes: Iterable[mi.Shape]) -> bool:
 
 def warn_of_sampler(scene: mi.Scene, sampler: mi.Sampler) -> None:
     """Warns if light may disperse in ``scene``, and ``sampler`` does not choose lobes and
-    wavelengths independently of each other: small lobe numbers of Mitsuba 3.9.1's ``ldsampler`` go
-    with some quarters of the wavelength numbers more often than with others."""
+    wavelengths independently of each other: in Mitsuba 3.9.1's ``ldsampler``, small lobe numbers
+    coincide more often with wavelength numbers in some quarters of [0, 1) than in others."""
     if (
         mi.is_spectral
         and sampler.class_name() == "LowDiscrepancySampler"
@@ -59,14 +60,14 @@ def warn_of_sampler(scene: mi.Scene, sampler: mi.Sampler) -> None:
 
 
 class Heroes:
-    """Lets only the hero be refracted by what disperses. Where nothing does, no code is left.
+    """Lets dispersive BSDFs refract only the hero. Adds no code where nothing disperses.
 
     Its state says whether only the hero is left of a path: a mask, or ``()`` where nothing
     disperses.
 
     Parameters:
-        scene: What the paths are in.
-        hero_weight: What multiplies the throughput where only the hero is left, besides 4.
+        scene: The scene.
+        hero_weight: A factor of the throughput, besides 4, where only the hero is left.
     """
 
     def __init__(self, scene: mi.Scene, hero_weight: mi.Float | float = 1.0) -> None:
@@ -115,7 +116,7 @@ class Heroes:
         """
         if not self._is_needed:
             return bsdf_weight, 1.0, is_alone
-        # What passes a hole of a mask is not refracted
+        # Light that passes through an opacity mask is not refracted
         refracts = self._refracts(bsdf, si, bs.wo)
         refracts &= ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         weight = self._collapse(bsdf_weight, refracts, is_alone)
@@ -129,7 +130,7 @@ class Heroes:
         if not self._is_needed:
             return value
         refracts = self._refracts(*one[2:]) | self._refracts(*other[2:])
-        # The lost wavelengths count once, however often they are lost
+        # The factor for lost wavelengths is applied once, even if both paths have lost them
         both, any_alone = one[0] & other[0], one[0] | other[0]
         hero = value[0] * dr.select(
             both, 1 / self._factor, dr.select(any_alone, 1, self._factor)
@@ -138,8 +139,8 @@ class Heroes:
         return dr.select(any_alone | refracts, alone, value)
 
     def _refracts(self, bsdf, si, wo) -> mi.Bool:
-        """Connections and samples must agree, for their MIS weights to add up: what counts is where
-        ``wo`` points, not which lobe of the BSDF it belongs to."""
+        """Does ``wo`` cross a dispersive interface? Its lobe does not matter: connections and BSDF
+        samples must agree, for their MIS weights to add up to one."""
         crosses = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) < 0
         return crosses & ((bsdf.flags() & DISPERSES) != 0)
 

@@ -1,4 +1,4 @@
-"""What a lens sees at which depth: what rays through points of its aperture meet first."""
+"""The depths that a lens sees: where rays through points of its aperture first hit a surface."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import mitsuba as mi
 from ..scene.movers import point_at_rest, sensor_at_rest, viewing_axis
 from .path_decisions import SceneQuery
 
-#: Surfaces that a ray may pass before it counts as having met one.
+#: The largest number of surfaces that a ray may pass through; the next one stops it.
 _MOST_PASSED = 16
 
-#: The numbers that choose the middle of the aperture, and of the wavelengths.
+#: The number that chooses the centre of the aperture, and of the range of wavelengths.
 _MIDDLE = 0.5
 
-#: Does a ray go on behind a surface? Called with its interaction, the side on which the ray arrives
+#: Does a ray pass through a surface? Called with its interaction, the side on which the ray arrives
 #: (1 or -1), and a mask.
 Passes = Callable[..., "mi.Bool"]
 
 
 class LensView:
-    """The surfaces that a sensor's rays meet first, and how deep these are: along the axis, from
-    the middle of the lens.
+    """The surfaces that a sensor's rays hit first, and their depths: distances along the axis, from
+    the centre of the lens.
 
     Parameters:
         scene: The scene.
         sensor: A ``thinlens``, or a ``perspective``, whose rays begin in the middle. It may move:
             depths are those in the frame in which it rests.
-        query: How a ray meets the scene.
+        query: How rays intersect the scene.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery) -> None:
@@ -42,8 +42,8 @@ class LensView:
     def ray(
         self, position: mi.Point2f, aperture: mi.Point2f | float, time: mi.Float
     ) -> mi.Ray3f:
-        """The ray through a place on the film, in units of its size, and the point of the aperture
-        that two numbers choose (by default its middle, 0.5)."""
+        """The ray through a position on the film, in units of its size, and the point of the
+        aperture that two numbers choose (0.5: its centre)."""
         return self._sensor.sample_ray(time, _MIDDLE, position, mi.Point2f(aperture))[0]
 
     def depth(self, p: mi.Point3f) -> mi.Float:
@@ -51,35 +51,35 @@ class LensView:
         return dr.dot(p - self._middle, self.axis)
 
     def inverse_depth(self, p: mi.Point3f, active: mi.Bool) -> mi.Float:
-        """1 / :meth:`depth`; 0 behind the lens, and where not ``active``, as of the sky."""
+        """1 / :meth:`depth`; 0 behind the lens, and where not ``active``: the value of the sky."""
         depth = self.depth(p)
         active = active & (depth > 0)
         return dr.select(active, dr.rcp(dr.select(active, depth, 1)), 0)
 
     def meet(self, ray: mi.Ray3f, active: mi.Bool = True) -> tuple[mi.Point3f, mi.Float]:
-        """The point that a ray meets first, in the frame in which the sensor rests, and its inverse
-        depth: 0 where the ray meets nothing."""
+        """The point that a ray hits first, in the frame in which the sensor rests, and its inverse
+        depth: 0 where the ray hits nothing."""
         pi = self.closest(ray, active)
         is_hit = pi.is_valid()
         p = point_at_rest(self._sensor, ray(dr.select(is_hit, pi.t, 0)), ray.time)
         return p, self.inverse_depth(p, is_hit)
 
     def closest(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
-        """What a ray meets first."""
+        """The first intersection of a ray."""
         return self._query.closest(self._scene, ray, coherent=True, active=mi.Bool(active))
 
     def surface(self, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-        """Everything about that."""
+        """The full surface interaction at the first intersection of a ray."""
         return self._query.interaction(self.closest(ray, active), ray)
 
     def onward(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Ray3f:
-        """The ray that leaves a surface where another one met it, in the same direction."""
+        """The continuation of ``ray`` behind the surface that it has hit, in the same direction."""
         return self._query.starts.along(si, ray.d)
 
     def surface_behind(
         self, ray: mi.Ray3f, passes: Passes, active: mi.Bool
     ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-        """The first surface that a ray does not pass, and on which side it arrives there."""
+        """The first surface that stops a ray, and the side on which the ray arrives there."""
         return _walk(self, mi.Ray3f(ray), passes, active)
 
 

@@ -1,9 +1,8 @@
-"""What participating media do to the random walk.
+"""Participating media in the random walk.
 
-The walk asks one of two objects: :class:`NoMedia` leaves nothing in the kernel, :class:`Media` is
-made where the scene has media. It decides as Mitsuba's ``volpath`` does, and (but for shadow rays
-through homogeneous media, whose transmittance is known) draws the same random numbers in the same
-order:
+The walk uses one of two objects: :class:`NoMedia` adds nothing to the kernel, :class:`Media` is for
+scenes with media. It decides as Mitsuba's ``volpath`` does, and (except for shadow rays through
+homogeneous media, whose transmittance is computed) draws the same random numbers in the same order:
 
 - a path that is in a medium scatters at a sampled distance, or reaches the surface
   (``free_flight.py``); then its vertex lies in the medium, and the phase function stands in for the
@@ -46,13 +45,13 @@ from .vertex import Arrival, MediumVertex, PathState, Vertex
 
 @dataclass
 class Inside:
-    """Where a path is, between two vertices.
+    """The state of a path between two vertices, in a scene with media.
 
     Attributes:
         medium: The medium; null in a vacuum.
         channel: The colour whose extinction chooses distances.
-        reach: The distance at which a homogeneous medium scatters, if nothing is in between.
-        distances: The state of who chooses distances.
+        reach: The distance at which a homogeneous medium scatters, if no surface is closer.
+        distances: The state of the decision that chooses distances (:class:`Distances`).
     """
 
     medium: mi.MediumPtr
@@ -62,7 +61,7 @@ class Inside:
 
 
 class NoMedia:
-    """There are no media: everything is as in ``path``."""
+    """For scenes without media: everything is as in ``path``."""
 
     exist = False
 
@@ -71,8 +70,8 @@ class NoMedia:
         return ()
 
     def launch(self, inside, sampler, rays: CameraRays, ray, active) -> tuple[mi.Ray3f, Any]:
-        """A ray that ends where a homogeneous medium scatters, and the state; the path began as one
-        of ``rays``."""
+        """``ray``, shortened to the distance at which a homogeneous medium scatters, and the state.
+        ``rays`` are the camera rays of the paths."""
         return ray, inside
 
     def behind(
@@ -84,29 +83,31 @@ class NoMedia:
     def fly(
         self, inside, sampler, ray, si, β, active
     ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum, MediumVertex | None]:
-        """The next vertex of a path that ``ray`` leads to ``si``: there, or in a medium on the way;
-        the throughput up to there, and what is known of a vertex in a medium."""
+        """The next vertex of a path whose ``ray`` hits ``si``: there, or in a medium on the way;
+        the throughput up to it, and its part that concerns media."""
         return si, β, None
 
     def goes_on(self, vertex: Vertex, max_depth: int, active) -> tuple[mi.Bool, mi.Bool]:
-        """May a path leave ``vertex``, and may that be connected to lights?"""
+        """May a path leave ``vertex``, and may ``vertex`` be connected to lights?"""
         goes_on = (vertex.depth + 1 < max_depth) & vertex.si.is_valid()
         return goes_on, goes_on & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
 
     def turns(self, vertex: Vertex, active) -> mi.Bool:
-        """Where, of ``active``, may the direction change?"""
+        """Which of the ``active`` paths may change their direction?"""
         return active
 
     def scatter(self, vertex: Vertex, sample_1, sample_2, bs, weight):
-        """The direction sample of ``vertex``, and its weight, where the BSDF has given these."""
+        """The direction sample of ``vertex`` and its weight: in a medium those of the phase
+        function, elsewhere ``bs`` and ``weight``, those of the BSDF."""
         return bs, weight
 
     def scattered(self, bs, active) -> mi.Bool:
-        """Where, of ``active``, does the sample ``bs`` count as a vertex?"""
+        """Which of the ``active`` samples ``bs`` scatter, and do not pass index-matched surfaces?
+        """
         return active
 
     def leave(self, vertex: Vertex, bs, path: PathState) -> PathState:
-        """What a path carries on when it leaves ``vertex`` with the sample ``bs``."""
+        """The state of a path that leaves ``vertex`` with the sample ``bs``."""
         return path
 
     def is_within(self, path: PathState, max_depth: int, active) -> mi.Bool:
@@ -114,7 +115,7 @@ class NoMedia:
         return active
 
     def kept(self, bs, before: Any, after: Any) -> Any:
-        """The state of the next event decision: the new one, but for index-matched surfaces."""
+        """The state of the next event decision: ``after``, at index-matched surfaces ``before``."""
         return after
 
     def cross(self, inside, si, d) -> Any:
@@ -122,17 +123,17 @@ class NoMedia:
         return inside
 
     def result(self, L, valid) -> mi.Spectrum:
-        """The radiance of a path that has met something, or not."""
+        """The radiance of a path; ``valid`` where it has hit something."""
         return dr.select(valid, L, 0)
 
     def visible_emission(self, emitted, path: PathState) -> mi.Spectrum:
-        """What a path gains from a light that it runs into."""
+        """The emission that a path gains from a light that it hits."""
         return emitted
 
 
 # Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
 class Media(NoMedia):
-    """There are media.
+    """For scenes with media.
 
     Parameters:
         hide_emitters: Are lights invisible to rays that nothing has scattered yet?
@@ -150,7 +151,7 @@ class Media(NoMedia):
         if mi.is_rgb:
             count = len(mi.Spectrum())
             channel = mi.UInt32(dr.minimum(sampler.next_1d() * count, count - 1))
-        sampler.next_1d()  # the roulette of `volpath`, which spares the camera's rays
+        sampler.next_1d()  # `volpath` draws a roulette number that camera rays do not use
         distances = self._distances.begin(rays)
         return Inside(mi.MediumPtr(rays.medium), channel, mi.Float(dr.inf), distances)
 
@@ -168,7 +169,7 @@ class Media(NoMedia):
 
     def behind(self, query, scene, ray, pi, active):
         last, behind = behind_emitters(query, scene, ray, pi, active)
-        # The light that is passed is not a vertex: distances are those from the ray's origin
+        # A hidden light is not a vertex: distances are measured from the ray's origin
         behind.t += dr.norm(last.o - ray.o)
         behind.valid &= behind.t <= ray.maxt
         behind.t = dr.select(behind.valid, behind.t, dr.inf)
@@ -184,7 +185,7 @@ class Media(NoMedia):
         ratio = attenuation(σ - chosen, t)
         mei = interaction_at(ray, ray(t), inside.medium)
         σ_s, _, _ = inside.medium.get_scattering_coefficients(mei, scatters)
-        sampler.next_1d(scatters)  # `volpath` asks whether the collision is a real one
+        sampler.next_1d(scatters)  # `volpath` draws whether the collision is a real one
         weight = ratio * dr.select(scatters, σ_s / chosen, 1)
         β = dr.select(is_homogeneous, β * mi.Spectrum(weight), β)
         # ----- Media of varying density -----
@@ -209,8 +210,8 @@ class Media(NoMedia):
         return active & ~is_matched
 
     def eval(self, vertex: Vertex, d, value, pdf, active) -> tuple[mi.Spectrum, mi.Float]:
-        """The value and the density of the direction ``d`` (in world space), where the BSDF has
-        given these."""
+        """The value and the density of the direction ``d`` (in world space): in a medium those of
+        the phase function, elsewhere ``value`` and ``pdf``, those of the BSDF."""
         in_medium = vertex.medium
         phase = in_medium.mei.medium.phase_function()
         active = active & in_medium.scatters
@@ -220,7 +221,7 @@ class Media(NoMedia):
     def transmittance(
         self, query, scene, vertex: Vertex, ds, inside, sampler, active
     ) -> mi.Spectrum:
-        """What is left of the light that ``ds`` is about at ``vertex``; see
+        """The transmittance between ``vertex`` and the light sample ``ds``; see
         :func:`transmittance`."""
         return transmittance(
             query, scene, vertex.si, ds, inside.medium, inside.channel, self._has_grids,
@@ -239,7 +240,7 @@ class Media(NoMedia):
         is_smooth = dr.select(
             mei.medium.use_emitter_sampling(),
             mi.UInt32(+mi.BSDFFlags.DiffuseTransmission),
-            # No connection finds what it leads to
+            # No connection finds light in this direction
             mi.UInt32(+mi.BSDFFlags.DeltaTransmission),
         )
         bs.sampled_type = dr.select(scatters, is_smooth, bs.sampled_type)
@@ -263,7 +264,7 @@ class Media(NoMedia):
         )
 
     def is_within(self, path, max_depth, active):
-        # Surfaces that may let a path pass were allowed one vertex too many
+        # `goes_on` allows paths that may pass a surface one vertex too many
         return active & (path.depth < max_depth)
 
     def kept(self, bs, before, after):
@@ -283,7 +284,7 @@ class Media(NoMedia):
 
 
 def media_of(scene: mi.Scene, hide_emitters: bool, distances: Distances) -> NoMedia:
-    """What the walk has to ask in ``scene``."""
+    """The object that handles the media of ``scene``."""
     if not may_have_media(scene):
         return NoMedia()
     return Media(hide_emitters, distances, may_have_grids(scene))

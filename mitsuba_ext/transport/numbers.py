@@ -1,7 +1,7 @@
 """Where the random numbers of an estimator come from, besides Mitsuba's samplers.
 
-An estimator draws with ``next_1d`` and ``next_2d``. What stands in for a sampler is a dataclass:
-Dr.Jit's loops then see the place that it has reached, and change it.
+An estimator draws with ``next_1d`` and ``next_2d``. Replacements of a sampler are dataclasses, so
+that Dr.Jit's loops see and update how far they have drawn.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def hashed_2d(word: mi.UInt32, index: mi.UInt32) -> mi.Point2f:
     High Performance Graphics, 2010.
     """
     x, y = mi.sample_tea_32(word, index, _ROUNDS)
-    # As many bits as a number has
+    # A float has 24 significant bits
     return mi.Point2f(x >> 8, y >> 8) * 2.0**-24
 
 
@@ -39,7 +39,7 @@ def hashed(word: mi.UInt32, count: int) -> list[mi.Float]:
 
 
 class Numbers(Protocol):
-    """What an estimator asks of a sampler."""
+    """The methods of a sampler that an estimator calls."""
 
     def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
         """The next number in [0, 1)."""
@@ -50,11 +50,11 @@ class Numbers(Protocol):
 
 @dataclass
 class BothEnds:
-    """Numbers of a path that begins at both ends: the light's part does not move those of the
-    camera's part when it draws more or fewer of them.
+    """Numbers of a bidirectional path, one sequence for each subpath: the numbers of the camera
+    subpath do not depend on how many the light subpath draws.
 
     Attributes:
-        camera, light: The numbers of each part.
+        camera, light: The numbers of each subpath.
     """
 
     camera: Numbers
@@ -68,7 +68,7 @@ class BothEnds:
 
 
 def schedule_state(numbers: Numbers) -> None:
-    """Schedules the place that ``numbers`` have reached with what is evaluated next: it would be
+    """Schedules the position that ``numbers`` have reached for the next evaluation: it would be
     traced again otherwise."""
     if isinstance(numbers, mi.Sampler):
         numbers.schedule_state()
@@ -77,7 +77,7 @@ def schedule_state(numbers: Numbers) -> None:
 
 
 def copied(numbers: Numbers) -> Numbers:
-    """Numbers to draw from instead of these, which are left alone, unless they are a sampler."""
+    """A copy of ``numbers``: drawing from it does not change them. A sampler is not copied."""
     if isinstance(numbers, mi.Sampler):
         return numbers
     if isinstance(numbers, BothEnds):
@@ -89,7 +89,8 @@ def copied(numbers: Numbers) -> Numbers:
 
 
 def reached(numbers: Numbers) -> Any:
-    """The place that numbers have reached, as a frozen function returns it: a sampler keeps it."""
+    """The position that ``numbers`` have reached, for a frozen function to return; ``()`` for a
+    sampler, which keeps its own."""
     if isinstance(numbers, mi.Sampler):
         return ()
     if isinstance(numbers, BothEnds):
@@ -98,7 +99,7 @@ def reached(numbers: Numbers) -> Any:
 
 
 def go_to(numbers: Numbers, place: Any) -> None:
-    """Lets ``numbers`` go on where a frozen function has got to with copies of them."""
+    """Moves ``numbers`` to the position that a frozen function has reached with copies of them."""
     if isinstance(numbers, BothEnds):
         go_to(numbers.camera, place[0])
         go_to(numbers.light, place[1])

@@ -1,4 +1,4 @@
-"""What the walk tells those who learn from it."""
+"""The events that the random walk reports to learners."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from .vertex import PathState, Vertex
 
 
 class Observer:
-    """What the walk tells while it is traced; whoever listens overrides what it wants to hear.
-    Observers scatter into arrays of their own; they see no return value and change nothing.
+    """Receives the events of a walk while it is traced. Subclasses override the methods that they
+    need, and scatter into arrays of their own; they return nothing and do not change the walk.
 
     No observer is a dataclass: Dr.Jit would take one that a loop uses for a part of its state.
     """
@@ -26,8 +26,8 @@ class Observer:
         """The camera rays of the pass that begins."""
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
-        """A pass of so many paths begins, one in each lane, in ``pixel`` of the film. The render
-        says so, before the walk is traced: now is the time to make arrays."""
+        """A pass of ``lanes`` paths begins; ``pixel`` is the film pixel of each. The render calls
+        this before the walk is traced, so that observers can allocate arrays."""
 
     def emission(
         self,
@@ -38,9 +38,9 @@ class Observer:
         pdf: mi.Float,
         active: mi.Bool,
     ) -> None:
-        """``path`` may have run into a light, in the direction ``ds`` from its last vertex, and
-        gains ``value``, the MIS weight ``mis`` included. ``pdf`` is the density with which a
-        connection finds this direction; 0 where none can."""
+        """``path`` may have hit a light, in the direction ``ds`` from its last vertex, and gains
+        ``value``, the MIS weight ``mis`` included. ``pdf`` is the density with which a connection
+        finds this direction; 0 where none can."""
 
     def vertex(self, vertex: Vertex, active: mi.Bool) -> None:
         """A path is about to connect ``vertex`` to lights."""
@@ -56,10 +56,10 @@ class Observer:
         visible: mi.Bool,
         tested: mi.Bool,
     ) -> None:
-        """A shadow ray was traced where ``tested``. ``choice`` is what the next event decision told
-        of its choice; ``contribution`` is BSDF · radiance / pdf; ``value`` is this times MIS weight
-        and throughput: what the path gains where the light is ``visible``; ``pdf`` is the density
-        with which scattering finds the direction."""
+        """A shadow ray was traced where ``tested``. ``choice`` is what the next event decision
+        returned about its choice; ``contribution`` is BSDF · radiance / pdf; ``value`` is this
+        times MIS weight and throughput: what the path gains where the light is ``visible``; ``pdf``
+        is the density with which scattering finds the direction."""
 
     def subpath(
         self,
@@ -71,7 +71,7 @@ class Observer:
     ) -> None:
         """``vertex`` was connected to a vertex of another subpath, in a region that was chosen with
         this probability, and the path gains ``value``: 0 also where there was no vertex to choose,
-        or something is in between."""
+        or the connection is occluded."""
 
     def direction(
         self,
@@ -81,22 +81,22 @@ class Observer:
         L: mi.Spectrum,
         active: mi.Bool,
     ) -> None:
-        """The number ``sample``, of density 1 / ``weight``, chose the direction in which a path
-        goes on; it has brought ``L`` until now."""
+        """The primary sample ``sample``, of density 1 / ``weight``, chose the direction in which a
+        path continues. The path has gathered the radiance ``L`` so far."""
 
     def survival(self, path: PathState, probability: mi.Float, active: mi.Bool) -> None:
-        """A path goes on with this probability; ``path`` is what it carries to the next vertex, not
-        yet divided by the probability."""
+        """Russian roulette lets a path continue with this probability; ``path`` is its state for
+        the next vertex, whose throughput is not yet divided by the probability."""
 
     def end(self, L: mi.Spectrum) -> None:
-        """All paths of the pass are at their end, and bring ``L``."""
+        """All paths of the pass have ended, with the radiance estimates ``L``."""
 
     def segment(self, p: mi.Point3f, q: mi.Point3f, active: mi.Bool) -> None:
         """A path went from ``p`` to ``q``."""
 
 
 class Observers(Observer):
-    """Tells several observers the same."""
+    """Forwards each event to several observers."""
 
     def __init__(self, observers: Sequence[Observer]) -> None:
         self._observers = observers

@@ -1,6 +1,6 @@
-"""The decisions of a random walk, as Mitsuba's ``path`` takes them, and at the same time what their
-replacements have to offer. They leave no code of their own in the kernel, but for shadow rays to
-lights at infinity.
+"""The decisions of a random walk. These base classes decide as Mitsuba's ``path`` does, and define
+the methods of their replacements. They add no code to the kernel, except for shadow rays to lights
+at infinity.
 
 Dr.Jit's loops see local variables only. Whatever a decision changes from one bounce to the next is
 therefore a *state* that its methods take and return; its attributes are read-only during the walk.
@@ -31,13 +31,13 @@ class DirectionSamples:
     def draw(
         self, state: Any, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
     ) -> tuple[mi.Float, mi.Point2f, mi.Float | float, Any]:
-        """The lobe's number, the direction's numbers, the factor by which the throughput is to be
-        multiplied (1 / density of the numbers), and the new state."""
+        """The number that chooses the lobe, the two that choose the direction, the factor by which
+        the throughput is to be multiplied (1 / density of the numbers), and the new state."""
         return sampler.next_1d(), sampler.next_2d(), 1.0, state
 
 
 class Scattering:
-    """Where a path goes on: where the BSDF's own samples lead.
+    """In which direction a path continues: that of a BSDF sample.
 
     Another distribution of directions can be mixed in. Then the densities that are returned must be
     those of the mixture: they go into the MIS weights of connections.
@@ -56,7 +56,7 @@ class Scattering:
         sample_1: mi.Float,
         sample_2: mi.Point2f,
     ) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum, Any]:
-        """Chooses a direction and looks at another one.
+        """Samples a direction, and evaluates the BSDF in another one.
 
         Parameters:
             wo: The other direction (local, towards the light of a connection).
@@ -64,7 +64,7 @@ class Scattering:
 
         Returns:
             The BSDF's value (cosine included) and the density of this decision for ``wo``; the
-            direction that was chosen, with its density; value / density there; the new state.
+            sampled direction, with its density; value / density there; the new state.
         """
         return *eval_and_sample_bsdf(vertex.bsdf, ctx, vertex.si, wo, sample_1, sample_2), state
 
@@ -93,11 +93,12 @@ class EmitterSampling:
     """Which point of which light to connect to: Mitsuba's choice (uniform, or by the emitters'
     ``sampling_weight``).
 
-    At each vertex the walk asks for what is known of the place (:meth:`visit`), with which it draws
-    one connection or many. What :meth:`density` needs at the next vertex is the state.
+    At each vertex, the walk calls :meth:`visit` once, and passes its result, the *place*, to
+    :meth:`sample` for each connection. What :meth:`density` needs at the next vertex is the state.
 
     Attributes:
-        choice_dimension: Numbers that choose the light, before those that choose a point on it.
+        choice_dimension: How many random numbers choose the light. They are drawn before those that
+            choose a point on it.
     """
 
     choice_dimension = 0
@@ -109,7 +110,7 @@ class EmitterSampling:
     def visit(
         self, state: Any, scene: mi.Scene, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> Any:
-        """What is known of the vertex ``si``."""
+        """The place of the vertex ``si``: what :meth:`sample` and :meth:`remember` need there."""
         return ()
 
     def sample(
@@ -120,8 +121,9 @@ class EmitterSampling:
         si: mi.SurfaceInteraction3f,
         active: mi.Bool,
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, Any]:
-        """A direction sample towards a light, its radiance / pdf (visibility not tested), and what
-        shadow tests and observers can know of the choice. ``place`` is from :meth:`visit`."""
+        """A direction sample towards a light, its radiance / pdf (visibility not tested), and a
+        description of the choice for shadow tests and observers. ``place`` is from :meth:`visit`.
+        """
         ds, weight = scene.sample_emitter_direction(si, numbers.point, False, active)
         return ds, weight, place
 
@@ -142,8 +144,8 @@ class EmitterSampling:
         active: mi.Bool,
     ) -> mi.Float:
         """The solid angle density with which :meth:`sample`, at ``ref``, gives the direction
-        ``ds`` in which a BSDF sample ran into the light at ``si``; ``state`` is that with which
-        ``ref`` was left."""
+        ``ds``, in which a BSDF sample has hit the light at ``si``. ``state`` is what
+        :meth:`remember` returned at ``ref``."""
         return scene.pdf_emitter_direction(ref, ds, active)
 
     def probability(
@@ -155,8 +157,8 @@ class EmitterSampling:
         active: mi.Bool,
     ) -> mi.Float:
         """The probability with which :meth:`sample`, at ``ref``, chooses an emitter that is a
-        single point or direction, by its number in ``scene.emitters()``; ``state`` is that with
-        which ``ref`` was left."""
+        single point or direction, by its number in ``scene.emitters()``. ``state`` is what
+        :meth:`remember` returned at ``ref``."""
         return scene.pdf_emitter(emitter, active)
 
 
@@ -174,12 +176,12 @@ class NoConnections(EmitterSampling):
 
 
 class ConnectionCount:
-    """To how many points of lights a vertex is connected: to one.
+    """How many points on lights a vertex is connected to: one.
 
     Attributes:
         first, later: Number of connections of a path's first vertex, and of each later one. With 0,
-            lights that a BSDF sample cannot hit (points and directions) are connected to all the
-            same.
+            vertices are still connected to lights that no BSDF sample can hit (points and
+            directions).
     """
 
     first, later = 1, 1
@@ -203,11 +205,12 @@ class ConnectionCount:
 
 
 class Weights:
-    """The MIS weights of what a path finds by connections to lights, and by running into them.
-    Other techniques may find the same; what they need to know of a path is its ``sums``.
+    """The MIS weights of the two ways in which a path finds light: connections to lights, and
+    scattered rays that hit lights. Where other techniques can find the same light, ``sums`` of the
+    path hold what their weights need.
 
     Parameters:
-        heuristic: Weighs the two.
+        heuristic: Weighs these two against each other.
     """
 
     def __init__(self, heuristic: Heuristic = power_heuristic) -> None:
@@ -218,7 +221,7 @@ class Weights:
         return ()
 
     def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Any:
-        """The sums at the vertex ``si``; ``path`` holds those with which the last one was left."""
+        """The sums at the vertex ``si``; ``path`` holds those of :meth:`leave` at the last one."""
         return path.sums
 
     def emission(
@@ -229,8 +232,8 @@ class Weights:
         path: PathState,
         pdf: mi.Float,
     ) -> mi.Float:
-        """For a light at ``si`` that the path has run into, in the direction ``ds``. ``pdf`` is the
-        density with which connections find it, times their number."""
+        """The weight of light at ``si`` that the path has hit in the direction ``ds``. ``pdf`` is
+        the density with which connections find it, times their number."""
         return self._heuristic(path.arrival.pdf, pdf)
 
     def connection(
@@ -241,17 +244,18 @@ class Weights:
         pdf: mi.Float,
         scattering_pdf: mi.Float,
     ) -> mi.Float:
-        """For a connection to the light that ``ds`` is about. ``pdf`` is its density times the
-        number of connections, ``scattering_pdf`` that with which scattering finds it."""
+        """The weight of a connection to the light sample ``ds``. ``pdf`` is its density times the
+        number of connections, ``scattering_pdf`` the density with which scattering finds it."""
         return dr.select(ds.delta, 1, self._heuristic(pdf, scattering_pdf))
 
     def leave(self, vertex: Vertex, bs: mi.BSDFSample3f) -> Any:
-        """The sums behind ``vertex``, in the direction that was chosen there."""
+        """The sums after ``vertex``, in the direction that was sampled there."""
         return vertex.path.sums
 
 
 class ScatteringAlone(Weights):
-    """No connection has a weight, but to light that scattering cannot find."""
+    """Uses scattering alone: connections have weight 0, except to light that scattering cannot
+    find."""
 
     def emission(self, scene, si, ds, path, pdf):
         return dr.select(path.arrival.pdf > 0, mi.Float(1), 0)
@@ -261,7 +265,8 @@ class ScatteringAlone(Weights):
 
 
 class ConnectionsAlone(Weights):
-    """Light that a path runs into has no weight, but where no connection finds it."""
+    """Uses connections alone: light that a path hits has weight 0, except where no connection can
+    find it."""
 
     def emission(self, scene, si, ds, path, pdf):
         return dr.select(pdf > 0, mi.Float(0), 1)
@@ -271,9 +276,9 @@ class ConnectionsAlone(Weights):
 
 
 class SubpathSelection:
-    """Which vertices of other subpaths a vertex is connected to: uniformly chosen ones. What
-    replaces it chooses a region of surfaces first, then one of the vertices that lie there,
-    uniformly; then its methods are asked.
+    """Which vertices of other subpaths a vertex is connected to: uniformly chosen ones.
+    Replacements choose a region of surfaces first, then one of the vertices in it uniformly; the
+    methods below are called for replacements only.
 
     Attributes:
         count: Number of regions; 0 where there are none.
@@ -288,25 +293,25 @@ class SubpathSelection:
     def choose(
         self, sample: mi.Point2f, region: mi.UInt32, active: mi.Bool
     ) -> tuple[mi.UInt32, mi.Float]:
-        """The region from which a vertex in ``region`` gets its partner, and the probability of
-        choosing that one."""
+        """The region of the vertex to which a vertex in ``region`` is connected, and the
+        probability of choosing that region."""
         raise NotImplementedError
 
     def expected(self, region: mi.UInt32, chosen: mi.UInt32, active: mi.Bool) -> mi.Float:
-        """For MIS weights: how often, on average, a vertex in ``region`` is connected to a certain
-        one in the region ``chosen``, in units of the number of other subpaths: probability of
+        """For MIS weights: how often, on average, a vertex in ``region`` is connected to a given
+        vertex in the region ``chosen``, in units of the number of other subpaths: probability of
         choosing the region / vertices of a subpath there."""
         raise NotImplementedError
 
 
 class Subpaths:
-    """Connects vertices to those of subpaths that another walk has stored. A walk needs none."""
+    """Connects vertices to those of subpaths that another walk has stored. A walk may have none."""
 
     def gather(
         self, scene: mi.Scene, sampler: mi.Sampler, vertex: Vertex, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.UInt32]:
-        """What the connections of a vertex bring to the path, throughput included, and the number
-        of shadow rays."""
+        """The radiance that the connections of a vertex add to the path, throughput included, and
+        the number of shadow rays."""
         raise NotImplementedError
 
 
@@ -326,8 +331,8 @@ class ShadowTest:
         active: mi.Bool,
     ) -> tuple[mi.Float | None, Any]:
         """The probability, in (0, 1], of testing the connection from ``si`` to ``ds.p``, and the
-        new state. ``choice`` is what the next event decision told of its choice. ``None`` means
-        always, and leaves the roulette out of the kernel."""
+        new state. ``choice`` is what the next event decision returned about its choice. ``None``
+        means always, and leaves the roulette out of the kernel."""
         raise NotImplementedError
 
 
@@ -338,12 +343,12 @@ class AlwaysTest(ShadowTest):
         return None, state
 
 
-#: The largest probability with which ``path`` lets a path go on.
+#: The largest survival probability of Mitsuba's ``path``.
 LARGEST_PROBABILITY = 0.95
 
 
 class Roulette:
-    """Which paths go on: the rule of Mitsuba's ``path``, by throughput."""
+    """Russian roulette by throughput, as in Mitsuba's ``path``."""
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
         """The state before the first bounce."""
@@ -353,13 +358,14 @@ class Roulette:
         self, state: Any, vertex: Vertex, path: PathState, active: mi.Bool
     ) -> tuple[mi.Float, Any]:
         """The probability, in (0, 1] where ``active``, with which a path leaves ``vertex`` in the
-        direction that was chosen there, and the new state. ``path`` is what it would carry along:
-        its depth is that of the next vertex, and what survives is divided by the probability."""
+        direction that was sampled there, and the new state. ``path`` is the state of the path after
+        ``vertex``: its depth is that of the next vertex. The walk divides the throughput of paths
+        that survive by the probability."""
         return dr.minimum(unguided_throughput(path), LARGEST_PROBABILITY), state
 
 
 def unguided_throughput(path: PathState) -> mi.Float:
-    """The largest component of the throughput, without its sampling weight, and without what
-    refraction does to it. Where guided samples are dense, paths have little throughput because they
-    matter; and a hero stands for four wavelengths."""
+    """The largest component of the throughput, without its sampling weight and the scaling by
+    refraction. The sampling weight says nothing about the importance of a path: it is small where
+    guided samples are dense, and 4 where a hero stands for four wavelengths."""
     return dr.max(path.β) / path.sampling_weight * dr.square(path.η)

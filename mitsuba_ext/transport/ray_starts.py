@@ -1,10 +1,10 @@
-"""Where rays start that leave a surface: a little above it, so that they do not meet it again.
+"""Offsets the origins of rays that leave a surface, so that they do not hit it again.
 
-Mitsuba's distance is ``RayEpsilon`` · (1 + max |p|): in scenes of less than 0.1 units, the 1 is far
-more than rounding demands. A scene of a few thousandths loses 1 to 2 % of its light where things
-touch each other, because rays start behind what is near; and camera paths and light paths lose
-different parts of it. There, the 1 is replaced by the size of the scene, as if the scene were
-enlarged to the size 1.
+Mitsuba's offset is ``RayEpsilon`` · (1 + max |p|). In scenes smaller than 0.1 units, the 1 is far
+more than rounding errors require. A scene of a few thousandths of a unit loses 1 to 2 % of its
+light where objects touch, because rays start behind nearby surfaces; camera paths and light paths
+lose different parts of it. In such scenes, the size of the scene replaces the 1, as if the scene
+were enlarged to the size 1.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from ..scene.bounds import scene_bounds
 
-#: Scenes whose coordinates are all smaller have distances of their own.
+#: Scenes whose coordinates are all smaller than this have an offset of their own.
 _SMALL = 0.1
 
 
@@ -32,7 +32,7 @@ class RayStarts:
     unit: float = 1.0
 
     def distance(self, p: mi.Point3f) -> mi.Float:
-        """How far from ``p`` rays start."""
+        """The offset of rays that leave a surface at ``p``."""
         return mi.math.RayEpsilon * (self.unit + dr.max(dr.abs(p)))
 
     def along(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Ray3f:
@@ -58,8 +58,8 @@ class RayStarts:
 
 
 def ray_starts(scene: mi.Scene) -> RayStarts:
-    """Those for a scene. Cameras and lights count as parts of it: points are found less exactly by
-    rays that come from afar."""
+    """The ray offsets of a scene. Its size includes cameras and lights: intersections are less
+    exact for rays that come from afar."""
     # Mitsuba's box may be too small, where it merged rectangles, but is never too large
     if _extent(scene.bbox()) >= _SMALL:
         return RayStarts()
@@ -69,7 +69,7 @@ def ray_starts(scene: mi.Scene) -> RayStarts:
     for emitter in scene.emitters():
         if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
             box.expand(emitter.bbox())
-            # Some emitters that are points have no box
+            # Some point emitters have no bounding box
             to_world = np.array(emitter.world_transform().matrix).reshape(4, 4)
             box.expand(mi.ScalarPoint3f(to_world[:3, 3]))
     extent = _extent(box)

@@ -1,4 +1,4 @@
-"""How a ray meets the scene: a decision of the walk, as Mitsuba's ``path`` takes it."""
+"""How rays intersect the scene: a decision of the walk, as Mitsuba's ``path`` takes it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .ray_starts import RayStarts
 
 
 class SceneQuery:
-    """How a ray meets the scene.
+    """How rays intersect the scene.
 
     Parameters (and attributes):
         starts: Where rays start that leave a surface; by default, where Mitsuba's do.
@@ -30,11 +30,12 @@ class SceneQuery:
     def interaction(
         self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f
     ) -> mi.SurfaceInteraction3f:
-        """Everything about an intersection that :meth:`closest` found."""
+        """The full surface interaction of an intersection that :meth:`closest` found."""
         return pi.compute_surface_interaction(ray, mi.RayFlags.All)
 
     def emitter(self, si: mi.SurfaceInteraction3f, emitter: mi.EmitterPtr) -> mi.EmitterPtr:
-        """The light of ``scene.emitters()`` that ``si`` belongs to, by Mitsuba's answer."""
+        """The light of ``scene.emitters()`` that ``si`` lies on; ``emitter`` is Mitsuba's answer.
+        """
         return emitter
 
     def occluded(
@@ -44,17 +45,17 @@ class SceneQuery:
         ds: mi.DirectionSample3f,
         active: mi.Bool,
     ) -> mi.Bool:
-        """Is there anything between ``si`` and the light that ``ds`` is about?"""
+        """Is the light sample ``ds`` occluded from ``si``?"""
         return scene.ray_test(self.shadow_ray(scene, si, ds), active=active)
 
     def shadow_ray(
         self, scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f
     ) -> mi.Ray3f:
-        """The ray from ``si`` to the light that ``ds`` is about."""
+        """The ray from ``si`` to the light sample ``ds``."""
         ray = self.starts.towards(si, ds.p)
         if any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters()):
-            # Mitsuba puts ds.p behind the bounds of the scene, which it knows wrongly where
-            # rectangles were merged (``bounds.py``): its shadow rays may end before a wall
+            # Mitsuba puts ds.p outside of the bounds of the scene, which are wrong where it has
+            # merged rectangles (``bounds.py``): its shadow rays may end before a wall
             is_infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
             ray.maxt = dr.select(is_infinite, dr.largest(mi.Float), ray.maxt)
         return ray

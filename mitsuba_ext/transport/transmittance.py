@@ -1,4 +1,4 @@
-"""What is left of light on its way through media and index-matched surfaces."""
+"""Transmittance of media and index-matched surfaces."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ def transmittance(
     sampler: mi.Sampler,
     active: mi.Bool,
 ) -> mi.Spectrum:
-    """An unbiased estimate of the transmittance between a vertex and a point of a light: that of
-    homogeneous media is known, or found by a random distance in each; in others, ratio tracking
-    (Novák et al., section 4.2). 0 where a surface that is not index-matched is in between.
+    """An unbiased estimate of the transmittance between a vertex and a point of a light. In
+    homogeneous media, it is computed, or estimated with a random distance; in others, by ratio
+    tracking (Novák et al., section 4.2). 0 where a surface that is not index-matched is in between.
 
     Parameters:
-        query: How rays meet the scene.
+        query: How rays intersect the scene.
         si, ds: The vertex, and the direction of the light.
         medium, channel: The medium in front of the vertex, and the colour that chooses distances.
         has_grids: May there be media that are not homogeneous?
-        exact: No random distances in homogeneous media?
+        exact: Is the transmittance of homogeneous media computed, without random distances?
     """
     medium = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
     ray = query.shadow_ray(scene, si, ds)
-    # Light from infinity is attenuated as far as Mitsuba's point of the light, and blocked by all
+    # Media attenuate light from infinity up to Mitsuba's ds.p; surfaces block it at any distance
     left = query.starts.towards(si, ds.p).maxt
     T = mi.Spectrum(1)
     active = mi.Bool(active)
@@ -74,11 +74,11 @@ def transmittance(
 def _flight(
     σ: mi.Spectrum, channel: mi.UInt32, exact: bool, sampler: mi.Sampler, active: mi.Bool
 ) -> tuple[mi.Float, mi.Spectrum]:
-    """The distance at which light ends, and by what rate it is attenuated up to there."""
+    """The distance at which light is absorbed, and the rate of its attenuation up to there."""
     if exact:
         return mi.Float(dr.inf), σ
     chosen = component(σ, channel)
-    # How likely it is to get somewhere is what the chosen colour loses on the way
+    # The probability of getting that far is the transmittance of the chosen colour
     return -dr.log(1 - sampler.next_1d(active)) / chosen, σ - chosen
 
 

@@ -1,4 +1,4 @@
-"""What a random walk knows of the vertex that it has reached."""
+"""The state of a random walk at the vertex that it has reached."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class PathState:
         β: Throughput up to the vertex.
         η: Product of the relative indices of refraction.
         sampling_weight: The factor of ``β`` that depends on how the path was sampled, not on what
-            it met: 1 / density of guided numbers, and 4 where one of four wavelengths is left.
-            Russian roulette divides it out.
+            it hit: 1 / density of guided primary samples, and 4 where only one of four wavelengths
+            is left. Russian roulette divides it out.
         depth: Number of vertices before this one, without the sensor's.
         arrival: How the path came to the vertex.
         hero_is_alone: Is only the first of the four wavelengths left? ``()`` where nothing in the
             scene disperses light.
-        sums: What the path knows of other ways to make it, for MIS weights; ``()`` where the
-            densities at the last vertex suffice.
+        sums: What MIS weights need about other techniques that can sample this path; ``()`` where
+            the densities at the last vertex suffice.
     """
 
     β: mi.Spectrum
@@ -53,7 +53,7 @@ class PathState:
 
 @dataclass
 class MediumVertex:
-    """What is known of a vertex in a medium.
+    """The part of a vertex that concerns participating media.
 
     Attributes:
         scatters: Does the path scatter in a medium? Elsewhere, its vertex is on a surface.
@@ -71,8 +71,8 @@ class Vertex:
     Attributes:
         si: The interaction there. In a medium, it has neither shape nor normal.
         bsdf: Its BSDF; null in a medium.
-        path: What the path brings along.
-        pixel: Where on the film the path begins, row by row; ``None`` where nobody has said.
+        path: The state of the path that has reached the vertex.
+        pixel: Index of the film pixel in which the path begins, row by row; ``None`` if unknown.
         medium: ``None`` where the scene has no media.
     """
 

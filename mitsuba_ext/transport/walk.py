@@ -4,8 +4,8 @@ The walk is Mitsuba's ``path``: next event estimation, multiple importance sampl
 heuristic, Russian roulette. With the default decisions it draws the same random numbers in the
 same order, so that a render of one pass returns the same image. Where the scene has participating
 media, it is ``volpath`` (``media.py``). A technique replaces one decision
-(``path_decisions.py``); Dr.Jit inlines Python while it traces, so a replaced decision costs what it
-does and a default one nothing.
+(``path_decisions.py``); Dr.Jit inlines Python while it traces, so a replaced decision costs only
+its own work and a default one nothing.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ class Walk:
         rr_depth: Depth at which Russian roulette begins.
         hide_emitters: Do camera rays pass through area lights, and is the environment invisible?
         directions: Which primary samples choose the lobe and the direction of a BSDF sample.
-        scattering: Where a path goes on.
+        scattering: In which direction a path continues.
         next_event: Which point of which light to connect to, and with what density.
         connections: To how many points a vertex is connected, and which numbers choose them.
         shadow_test: Whether the shadow ray of a connection is traced.
-        roulette: Which paths go on.
-        query: How a ray meets the scene.
+        roulette: With which probability a path continues.
+        query: How rays intersect the scene.
         distance: Which random numbers choose how far a path flies in a medium.
-        mis: How what connections find is weighed against what scattering finds.
+        mis: The MIS weights of connections and of scattering.
         subpaths: Other subpaths whose vertices are connected to those of the path.
-        observer: Is told what happens.
+        observer: Receives the events of the walk.
     """
 
     max_depth: int
@@ -100,7 +100,7 @@ class Walk:
             self.query, heroes, self.mis, self.observer, media,
         )  # fmt: skip
         makes_one, makes_many = connects and connector.single, connects and connector.many
-        # Light that comes through media takes random numbers
+        # In media, transmittance takes random numbers, which `volpath` draws before the BSDF's
         makes_early, makes_one = makes_one and media.exist, makes_one and not media.exist
 
         # --------------------- Configure the loop state ----------------------
@@ -227,7 +227,7 @@ class Walk:
 
             # ----- Russian roulette -----
             rr_active = path.depth >= self.rr_depth
-            carries = dr.max(path.β) != 0  # Dr.Jit says no to NaN
+            carries = dr.max(path.β) != 0  # False for NaN
             survival, roulette_state = self.roulette.survival(
                 roulette_state, vertex, path, active_next & rr_active & carries
             )

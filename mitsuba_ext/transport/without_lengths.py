@@ -1,4 +1,4 @@
-"""Leaves out paths of some lengths, where something else finds them."""
+"""MIS weights that leave out paths of some lengths, which another technique finds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class WithoutLengths(Weights):
     direct light has two.
 
     Parameters:
-        weights: Those of all other paths.
+        weights: The MIS weights of all other paths.
     """
 
     def __init__(self, weights: Weights, first: int, last: int) -> None:

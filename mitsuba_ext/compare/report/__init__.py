@@ -1,7 +1,7 @@
 """The report of a comparison: one HTML file with everything in it.
 
 It opens from the disk without a network, and can be sent to somebody as it is: images, plots,
-style sheet and script are inside. What it shows comes from the folder that the comparison wrote
+style sheet and script are inside. Its content comes from the folder that the comparison wrote
 (``results.json`` and the EXRs that it names), so that it can be written again at any time.
 """
 
@@ -21,12 +21,12 @@ def write_report(folder: str | Path) -> Path:
     """Writes ``report.html`` next to ``results.json``, and returns its path.
 
     Args:
-        folder: Where a comparison has left its ``results.json``. Images that are missing or
-            damaged are named in the report; everything else in it is still there.
+        folder: The folder with the ``results.json`` of a comparison. The report names images that
+            are missing or damaged, and contains everything else.
 
     Raises:
         InputError: There is no ``results.json``, or it cannot be read.
-        OSError: The report cannot be written; one that was there before stays.
+        OSError: The report cannot be written; an older report is kept.
     """
     from .page import render_page
 

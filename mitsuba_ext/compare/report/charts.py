@@ -14,7 +14,7 @@ from .records import Record, levels
 
 @dataclass(frozen=True)
 class Legend:
-    """An integrator's line below a plot; no slope where no line was fitted."""
+    """An integrator's line in the legend of a plot; no slope if no line was fitted."""
 
     label: str
     series: int
@@ -29,7 +29,7 @@ class Chart:
         title: What it shows.
         svg: The plot.
         legend: A line per integrator that is in the plot.
-        notes: What is drawn, and what could not be.
+        notes: Sentences about what is drawn, and what is not.
     """
 
     title: str

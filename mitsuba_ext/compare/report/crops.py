@@ -62,7 +62,7 @@ def choose_windows(errors: Sequence[np.ndarray], floor: float) -> list[Window]:
         for index in order.tolist()
     ]
     chosen: list[Window] = []
-    # Prefer windows that are apart: three windows along one edge would all show the same
+    # Prefer windows that are apart, as three windows along one edge would show the same
     for distance in (2 * side, side):
         for window in candidates:
             if len(chosen) < COUNT and all(window.distance(one) >= distance for one in chosen):
@@ -79,5 +79,5 @@ def _window_means(
     top, left = rows[:, None], columns[None, :]
     bottom, right = top + side, left + side
     total = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    # Rounded: else the table's cancellation error would decide between equal windows
+    # Rounded, so that the table's cancellation error does not decide between equal windows
     return np.round(total / side**2, 9)

@@ -1,4 +1,4 @@
-"""Numbers as the report prints them: three significant digits, a unit, and the interval in the
+"""Formats the numbers of the report: three significant digits, a unit, and the interval in the
 same unit."""
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def quantity(value: float, unit: Unit) -> str:
 
 
 def number(value: float) -> str:
-    """A pure number, with a power of ten where it is very small or large."""
+    """A number without a unit, with a power of ten if it is very small or large."""
     return quantity(value, plain)
 
 

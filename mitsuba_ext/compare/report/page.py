@@ -43,7 +43,7 @@ class Crop:
 
 def render_page(results: Record, folder: Path) -> str:
     """The HTML of a report. Images are read from ``folder``."""
-    # In the order in which they first appear: one colour per label on the whole page
+    # In the order of their first appearance: each label has one colour on the whole page
     labels = dict.fromkeys(one["label"] for s in results["scenes"] for one in s["integrators"])
     series_of = {label: index % len(plots.MARKERS) for index, label in enumerate(labels)}
     scenes = [
@@ -65,8 +65,8 @@ def render_page(results: Record, folder: Path) -> str:
         color_stops=_color_stops(),
         style=Markup((_FOLDER / "report.css").read_text(encoding="utf-8")),
         script=Markup(script),
-        # For the page's policy: only this script may run, and nothing may be loaded, even if a
-        # label or a message contains HTML
+        # For the page's content security policy: only this script may run, and nothing may be
+        # loaded, even if a label or a message contains HTML
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
 
@@ -90,7 +90,8 @@ def _environment() -> jinja2.Environment:
 
 
 def _breakable(label: str) -> Markup:
-    """A label that may be broken where its parts meet: ``neepp:`` ``max_depth=6,`` ``grid=8``."""
+    """A label with possible line breaks between its parts: ``neepp:`` ``max_depth=6,`` ``grid=8``.
+    """
     return Markup("<wbr>").join(re.split(r"(?<=[:,])", label))
 
 

@@ -1,4 +1,4 @@
-"""The images of a scene for the screen: one exposure for all, and error maps in one colour scale.
+"""The images of a scene for the screen: all with one exposure, and error maps in one colour scale.
 
 Every image is an 8-bit PNG of the size of the film, as ``data:`` URI. It is neither scaled down nor
 compressed with losses, which could be mistaken for errors of the integrator.
@@ -23,7 +23,7 @@ EXPOSURE_PERCENTILE = 95
 #: … to this fraction of white (linear).
 EXPOSURE_TARGET = 0.8
 
-#: Perceptually uniform, and black where there is no error.
+#: matplotlib's name of the colour map: perceptually uniform, and black for no error.
 COLOR_MAP = "inferno"
 
 #: The colour scale of the errors covers at most this many decades below its upper limit.
@@ -43,7 +43,7 @@ class Picture:
         pixels: 8-bit sRGB, (height, width, 3).
         image: ``pixels`` as URI.
         error: Mean relative squared error of every pixel over ``run_count`` runs, (height, width);
-            ``None`` where there is no reference.
+            ``None`` without a reference.
         error_map: ``error`` in colours, as URI; empty if ``error`` is ``None``.
     """
 
@@ -87,8 +87,8 @@ def load_pictures(scene: Record, level: float | None, folder: Path) -> Pictures:
             result.faults.append(f"the reference is missing here: {error}")
     shape = None if reference is None else reference.shape
 
-    # One image per integrator stays in memory until the exposure is known, which the first image
-    # decides. Errors are summed run by run.
+    # One image per integrator stays in memory until the exposure is known: it comes from the
+    # reference, or else from the first image. Errors are summed run by run.
     waiting: list[tuple[Record, Record, np.ndarray, np.ndarray | None, int]] = []
     for integrator in scene["integrators"]:
         first, total, count = None, None, 0
@@ -130,7 +130,7 @@ def exposure(pixels: np.ndarray) -> float:
     """The factor that brings the brighter parts of an image near white; 1 for a black image."""
     luminance = pixels @ np.array(_LUMINANCE)
     for bright in (np.percentile(luminance, EXPOSURE_PERCENTILE), luminance.max()):
-        if bright > 0:  # zero where a light covers less than 5 % of an image black otherwise
+        if bright > 0:  # the percentile is 0 if less than 5 % of the pixels are not black
             return float(EXPOSURE_TARGET / bright)
     return 1.0
 
@@ -172,7 +172,7 @@ def color_limits(errors: Sequence[np.ndarray]) -> tuple[float, float] | None:
 def color_indices(error: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     """Indices into :func:`color_table`, by the logarithm of the error."""
     low, high = np.log10(limits)
-    # high > low: they are rounded outwards, to different numbers. The floor keeps zeros from log10.
+    # high > low, as they are rounded outwards, to different numbers. The maximum avoids log10(0).
     share = (np.log10(np.maximum(error, limits[0])) - low) / (high - low)
     return np.round(np.clip(share, 0, 1) * 255).astype(np.uint8)
 
@@ -197,7 +197,7 @@ def png(pixels: np.ndarray, palette: np.ndarray | None = None) -> str:
 
 
 def _read(path: Path, shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """An image in double precision; of a reference, its mean."""
+    """Reads an image in double precision; of a reference with a variance, the mean."""
     pixels = reading.read_image(path)[0].astype(np.float64)
     if shape is not None and pixels.shape != shape:
         sizes = [f"{width}x{height}" for height, width, _ in (pixels.shape, shape)]

@@ -1,8 +1,8 @@
 """Error against cost on logarithmic axes, as SVG that takes its colours from the page.
 
-matplotlib draws in placeholder colours, which are then replaced by variables of the style sheet: so
-the plot fits a light and a dark page, and an integrator has the same colour everywhere. The legend
-is part of the page, where it can wrap.
+matplotlib draws in placeholder colours, which are then replaced by variables of the style sheet.
+The plot then fits a light and a dark page, and an integrator has the same colour everywhere. The
+legend is part of the page, where it can wrap.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _WIDTH, _HEIGHT = 5.6, 3.7  # inches; the page scales it
 #: Largest factor by which intervals may extend an axis beyond the points.
 _INTERVAL_ROOM = 2.0
 
-#: Smallest ratio of an axis's ends: else tiny differences would fill the plot.
+#: Smallest ratio of an axis's ends, so that tiny differences do not fill the plot.
 _LEAST_SPAN = 2.0
 
 
@@ -68,14 +68,14 @@ def plot(
     """Draws relMSE against a cost; ``None`` if there is nothing positive to draw.
 
     Args:
-        series: What to draw. Values that are not positive are left out.
-        x_label: What the cost is.
-        name: Unique on the page.
+        series: The integrators to draw. Values that are not positive are left out.
+        x_label: The name of the cost.
+        name: A name for the plot that is unique on the page.
         x_ticks: Where the x axis has its ticks; by default, chosen by the range.
-        target: The error that was asked for, drawn as a line across.
+        target: The error to reach, drawn as a horizontal line.
     """
-    # Imported here, so that comparisons without a report do not wait for it, and without pyplot,
-    # which would change the user's figures and backend
+    # Imported here, so that comparisons without a report do not wait for matplotlib; and not as
+    # pyplot, which would change the user's figures and backend
     import matplotlib
     from matplotlib.figure import Figure
 
@@ -139,8 +139,8 @@ def _draw(axes, series: Series) -> None:
 
 
 def _draw_slope_of_minus_one(axes, series: Series) -> None:
-    """The slope −1 of Monte Carlo, drawn through the centre of the first integrator's points.
-    Against seconds, it is also the line of equal efficiency."""
+    """Draws a line of slope −1, the convergence rate of Monte Carlo, through the centre of the
+    first integrator's points. Against seconds, it is also the line of equal efficiency."""
     points = [point for point in series.points if point.x[0] > 0 and point.y[0] > 0]
     if points:
         product = math.exp(sum(math.log(p.x[0] * p.y[0]) for p in points) / len(points))
@@ -158,7 +158,7 @@ def _ends(estimate: tuple[float, float | None, float | None]) -> list[float]:
 
 
 def _limits(values: Sequence[float], ends: Sequence[list[float]]) -> tuple[float, float]:
-    """The ends of an axis that holds all values, and the intervals up to a limit."""
+    """The ends of an axis that shows all values, and those ends of intervals that are close."""
     low, high = min(values), max(values)
     for end in (end for pair in ends for end in pair):
         if low / _INTERVAL_ROOM <= end <= high * _INTERVAL_ROOM:
@@ -197,7 +197,7 @@ def _for_the_page(svg: str, name: str) -> str:
     """Makes an ``<svg>`` that can share an HTML page with others."""
     svg = svg[svg.index("<svg") :]  # without the XML declaration and the DTD's address
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    # This style would apply to the whole page; report.css has it for the plots only
+    # This style would apply to the whole page; report.css has the same rules for the plots only
     svg = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")
     # matplotlib counts its ids from 1 in every figure

@@ -1,4 +1,4 @@
-"""``results.json`` as the report needs it: which runs belong together, and which level is shown.
+"""Reads ``results.json`` for the report: which runs belong together, and which level is shown.
 
 A *level* is one size of a run: samples per pixel, or seconds. Integrators are compared at the same
 level only.
@@ -23,7 +23,7 @@ def read_results(folder: Path) -> Record:
     """The content of ``folder/results.json``.
 
     Raises:
-        InputError: It is missing, is no JSON, or is of another schema.
+        InputError: The file is missing, is not JSON, or is of another schema.
     """
     path = folder / "results.json"
     try:

@@ -1,4 +1,4 @@
-"""The figures of one level as a table; columns without figures are left out."""
+"""Makes a table of the figures of one level; columns without figures are left out."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """Columns in groups, a row of cells per integrator, and the columns that were left out.
+    """A table: columns in groups, and a row of cells per integrator.
 
     Attributes:
         groups: Heading and number of columns.

@@ -1,4 +1,4 @@
-"""Numbers of camera rays that come from weighted sets."""
+"""Primary samples of camera rays, from weighted sets."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from ...transport.numbers import Numbers
 
 
 class PixelSets:
-    """Numbers for one purpose from weighted sets: each pixel chooses and shifts them at random.
+    """Numbers for one purpose (time, lens, …) from weighted sets, which each pixel chooses and
+    shifts at random.
 
     Parameters:
-        sets: After the last sample of a set, a pixel begins another.
-        seed: Integers; no two purposes may have the same.
+        sets: The sets. After the last sample of a set, a pixel begins another one.
+        seed: Integers, different for each purpose.
     """
 
     def __init__(self, sets: WeightedSets, seed: list[int]) -> None:
@@ -28,8 +29,8 @@ class PixelSets:
     def draw(
         self, sampler: Numbers, pixel: mi.UInt32, index: mi.UInt32
     ) -> tuple[Any, ...]:
-        """The point and its weights (:meth:`WeightedSets.draw`) of the sample ``index``, of those
-        of the whole render, of each pixel."""
+        """The point and its weights (:meth:`WeightedSets.draw`) for the sample number ``index`` of
+        each pixel, counted over the whole render."""
         turn = index // self._count
         a, b = mi.sample_tea_32(pixel, self._key + 0x9E3779B9 * turn)
         shift = mi.Point2f(mi.sample_tea_float32(a, b), mi.sample_tea_float32(b, a))

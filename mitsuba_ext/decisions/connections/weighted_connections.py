@@ -16,15 +16,14 @@ _GOLDEN = 0.6180339887
 
 
 class WeightedConnections(ConnectionCount):
-    """Each vertex draws a whole set of numbers for its connections, and moves it around the torus
-    at random. The BSDF sample that is taken there has its share by multiple importance sampling, as
-    one sample besides so many.
+    """Each vertex draws a whole set of numbers for its connections, and shifts it on the torus at
+    random. MIS weighs the one BSDF sample of the vertex against this number of connections.
 
-    A set chooses points on lights. Where the light is chosen by numbers of its own, these are those
-    of a lattice, moved independently.
+    A set chooses points on lights. Where the light is chosen by numbers of its own, these come from
+    a lattice, which has a random shift of its own.
 
     Parameters:
-        sets: Of two dimensions.
+        sets: Sets of two dimensions.
         everywhere: At all vertices, not only at the first of a path?
     """
 

@@ -15,7 +15,7 @@ from ...transport.path_decisions import DirectionSamples
 
 
 class Regions(Protocol):
-    """What decides which tree a sample is drawn from."""
+    """Decides from which tree a sample is drawn."""
 
     def begin(self, pixel: mi.UInt32 | None) -> Any:
         """The state of paths that begin in ``pixel``."""
@@ -23,7 +23,7 @@ class Regions(Protocol):
     def label(
         self, si: mi.SurfaceInteraction3f, pixel: mi.UInt32, active: mi.Bool
     ) -> mi.UInt32:
-        """The region by which a sample is recorded."""
+        """The region under which a sample is recorded."""
 
     def tree(self, state: Any, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
         """The tree for a vertex."""
@@ -35,13 +35,13 @@ class Regions(Protocol):
 
 
 class GuidedDirections(DirectionSamples):
-    """Draws the samples of a path's first directions from trees. Everything that a path brings
-    after a bounce is divided by the density of its sample; MIS weights remain those of uniform
-    samples, which is unbiased, as they add up to one in each direction.
+    """Draws the samples of a path's first directions from trees. The throughput after a bounce is
+    divided by the density of its sample. MIS weights remain those of uniform samples, which is
+    unbiased, as they add up to one in each direction.
 
     Parameters (and attributes):
         trees: Densities of samples.
-        regions: Which of them a sample is drawn from.
+        regions: Decides from which tree a sample is drawn.
         bounces: How many directions of a path are guided.
     """
 
@@ -51,7 +51,7 @@ class GuidedDirections(DirectionSamples):
         self._bounces = dr.opaque(mi.UInt32, bounces)
 
     def kernel_state(self) -> tuple:
-        """What kernels depend on."""
+        """The attributes on which kernels depend (``frozen.py``)."""
         return self.trees, self.regions, self._bounces
 
     def begin(self, sampler: mi.Sampler, ray: mi.Ray3f, pixel: mi.UInt32 | None) -> Any:
@@ -59,7 +59,7 @@ class GuidedDirections(DirectionSamples):
 
     def draw(self, state, sampler, vertex, active):
         sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
-        # A branch: later bounces are to cost nothing
+        # A branch, so that later bounces cost nothing
         sample_2, weight, state = dr.if_stmt(
             (state, vertex.si, sample_2),
             active & (vertex.depth < self._bounces),

@@ -1,13 +1,13 @@
-"""Partitions of an environment, one for each vertex: rectangles in which what the BSDF reflects is
-known at the corners.
+"""Partitions of an environment, one for each vertex: rectangles with the value of the BSDF at their
+corners.
 
-Source: Cline, PhD dissertation, section 5.2.2. In the place of a queue ordered by split potential,
-rectangles are looked at once, in the order in which they were made; in the place of neighbour
-cascades, BSDF samples that lie in a rectangle tell what its corners do not see.
+Source: Cline, PhD dissertation, section 5.2.2. Instead of a queue ordered by split potential,
+rectangles are visited once, in the order in which they were made. Instead of neighbour cascades,
+BSDF samples that lie in a rectangle find lobes that its corners miss.
 
-All writes to local memory have the count of the loop as their index, reads may differ: on CPUs,
-Dr.Jit 1.5 takes an index that begins a loop as a literal for the same in all lanes of a packet, and
-writes where the largest one points.
+Writes to local memory are indexed by the loop counter only, reads may use any index: on CPUs,
+Dr.Jit 1.5 assumes that an index that enters a loop as a literal is the same in all lanes of a
+packet, and writes at the largest one.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from ...maps.environment_visibility import Tile, WorldVisibility
 from ...transport.bsdfs import eval_bsdf, sample_bsdf
 from .partition_parts import Branch, Node, Partition, Peak
 
-#: The first rectangles of each partition: so many columns and rows at least.
+#: The first rectangles of each partition: at least this number of columns and rows.
 _GRID = (4, 2)
 
-#: Where the function varies by less than the root of this, relative to its mean, it does not say
-#: across which axis to divide.
+#: Where the values at the corners vary by less than the root of this, relative to their mean, they
+#: do not decide across which axis to divide.
 _LITTLE = 1e-2
 
 #: Splits of a partition, at most: local memory is small.
@@ -37,18 +37,19 @@ MOST_SPLITS = 1024
 #: BSDF samples that look for lobes.
 _PEAKS = 8
 
-#: A peak counts for a rectangle that is so much larger, and by so many half texels.
+#: A peak counts for a rectangle if it lies in the rectangle enlarged by this factor, and by this
+#: number of half texels.
 _REACH, _BORDER = 1.25, 2
 
-#: So much of what a BSDF sample has found inside a rectangle, beyond the corners, counts for all of
-#: it.
+#: Where a BSDF sample inside a rectangle exceeds the corners, this share of the excess is added to
+#: the whole rectangle.
 _LIFT = 0.25
 
-#: A rectangle is divided if its potential exceeds this share of all weight, times the number of
-#: divisions.
+#: A rectangle is divided if its potential exceeds this share of the total weight, divided by the
+#: largest number of divisions.
 _THRESHOLD = 0.25
 
-#: The share of the defensive part: what is emitted, without the BSDF.
+#: The share of defensive sampling, by emission without the BSDF.
 _DEFENSIVE = 0.01
 
 #: Steps of the lattice from which BSDF samples are drawn.
@@ -59,11 +60,10 @@ class Partitioner:
     """Makes partitions, and draws directions from them.
 
     Parameters:
-        sums: Of the environment.
-        ctx: For calls of BSDFs.
+        sums: Sums over the texels of the environment.
+        ctx: The context for calls of BSDFs.
         splits: How often rectangles of a partition are divided, at most, beyond the first ones.
-        visibility: What is known of what lies in between; rectangles count by how much of them is
-            visible.
+        visibility: The learned visibility of the environment, by which rectangles are weighted.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Partitioner:
     ) -> None:  # fmt: skip
         self._sums, self._ctx, self._texels = sums, ctx, sums.texels
         self._visibility = visibility
-        # The first rectangles are at most so large
+        # The largest size of the first rectangles
         self._width, self._height = (
             max(1, -(-count // parts))
             for count, parts in zip((self._texels.columns, self._texels.rows), _GRID)
@@ -87,7 +87,7 @@ class Partitioner:
     def partition(
         self, si: mi.SurfaceInteraction3f, active: mi.Bool, tile: Tile | None = None
     ) -> Partition:
-        """The partition of the vertex ``si``; ``tile`` tells the maps of what is visible."""
+        """The partition of the vertex ``si``; ``tile`` selects the maps of visibility."""
         nodes = dr.alloc_local(Node, 1 + 2 * self._splits)
         potentials = dr.alloc_local(mi.Float, 1 + 2 * self._splits)
         parents = dr.alloc_local(mi.UInt32, self._splits)
@@ -100,7 +100,7 @@ class Partitioner:
         nodes.write(whole, zero, active)
         potentials.write(potential, zero, active)
         total, split, next, count = mi.Float(whole.weight), mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-        # Local memory knows nothing of lanes that have left a loop: masks must say it
+        # Accesses to local memory do not apply the loop's own mask: it must be given
         working = mi.Bool(active)
         while dr.hint(working, label="partition"):
             end = 2 * split + 1
@@ -122,7 +122,7 @@ class Partitioner:
             split += 1
             count = dr.select(divides, split, count)
             working = divides & (split < self._splits)
-        # All texels emit 1 together
+        # The emission of all texels adds up to 1
         floor = dr.maximum(total * (_DEFENSIVE / (1 - _DEFENSIVE)), 1e-20)
         branches = self._branches(nodes, parents, count, floor, active)
         sun = mi.Float(0)
@@ -144,7 +144,7 @@ class Partitioner:
         return index
 
     def _value(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """What the BSDF reflects, cosine included, of light from the direction ``d``."""
+        """The brightness of the BSDF's value, cosine included, in the direction ``d``."""
         value = brightness(eval_bsdf(si.bsdf(), self._ctx, si, si.to_local(d), active)[0])
         return dr.select(active & (value > 0) & dr.isfinite(value), value, 0)
 
@@ -153,7 +153,7 @@ class Partitioner:
 
     @dr.syntax
     def _peaks(self, si, active) -> Any:
-        """Where BSDF samples meet the environment: column, row, and what is reflected."""
+        """The directions of BSDF samples: texel of the environment, and value of the BSDF."""
         peaks = dr.alloc_local(Peak, _PEAKS)
         bsdf, index, working = si.bsdf(), mi.UInt32(0), mi.Bool(active)
         while dr.hint(working, label="peaks"):
@@ -180,7 +180,7 @@ class Partitioner:
     def _divided(self, si, node: Node, active) -> tuple[Rectangle, Rectangle]:
         whole = self._rectangle(node, active)
         width, height = whole.x1 - whole.x0, whole.y1 - whole.y0
-        # Eq. 5.4 (Cline). Where corners tell little, the longer side
+        # Eq. 5.4 (Cline). Where corners hardly differ, the longer side
         f = whole.f
         dx = dr.square(f.v10 - f.v00) + dr.square(f.v11 - f.v01)
         dy = dr.square(f.v01 - f.v00) + dr.square(f.v11 - f.v10)
@@ -201,13 +201,13 @@ class Partitioner:
         return self._sums.rectangle(x0, y0, x1, y1, node.f, active)
 
     def _node(self, r: Rectangle, peaks, tile, active) -> tuple[Node, mi.Float]:
-        """A rectangle for local memory, and what is to be gained by dividing it: Eq. 5.3 (Cline),
-        with the range in the place of the deviation, and without the area."""
+        """A rectangle for local memory, and its split potential: Eq. 5.3 (Cline), with the range
+        instead of the deviation, and without the area."""
         values = (r.f.v00, r.f.v10, r.f.v01, r.f.v11)
         least, most, peak = values[0], values[0], mi.Float(0)
         for value in values[1:]:
             least, most = dr.minimum(least, value), dr.maximum(most, value)
-        # The lobe of a peak that lies just beyond the border reaches over it
+        # The lobe around a peak just outside of the border reaches into the rectangle
         x_sum, y_sum = mi.Float(r.x0 + r.x1), mi.Float(r.y0 + r.y1)
         width = _REACH * mi.Float(r.x1 - r.x0) + _BORDER
         height = _REACH * mi.Float(r.y1 - r.y0) + _BORDER
@@ -230,8 +230,8 @@ class Partitioner:
 
     @dr.syntax
     def _branches(self, nodes, parents, count: mi.UInt32, floor: mi.Float, active) -> Any:
-        """The tree: weights are added up from the leaves. Parts come after the whole, and wholes
-        were divided in their own order: so that each is met when its turn comes."""
+        """The tree, with weights summed from the leaves. Children have larger indices than their
+        parents, which were divided in the order of their indices: one backward pass suffices."""
         branches = dr.alloc_local(Branch, 1 + 2 * self._splits)
         sums = dr.alloc_local(mi.Float, self._splits)
         # Of the splits that are left, the last one
@@ -252,7 +252,7 @@ class Partitioner:
         return branches
 
     def _branch(self, nodes, parents, sums, index, last, floor, active):
-        """The branch of a rectangle, and what is left of the splits."""
+        """The branch of a rectangle, and the number of splits that are left."""
         is_left = active & (last > 0)
         is_divided = is_left & (parents.read(last - 1, is_left) == index)
         last = last - dr.select(is_divided, mi.UInt32(1), 0)
@@ -278,7 +278,7 @@ class Partitioner:
         working = active & (branch.link != 0)
         while dr.hint(working, label="tree"):
             low, high = (branches.read(branch.link + i, working) for i in (0, 1))
-            # Only one of x and y differs from the whole
+            # A part differs from the whole in only one of x and y
             of_low, of_high = (nodes.read(branch.link + i, working).x for i in (0, 1))
             by_x = of_low != columns
             is_low, number = _choose(low.weight / branch.weight, dr.select(by_x, x, y))
@@ -347,7 +347,7 @@ class Partitioner:
 
 
 def _choose(probability: mi.Float, number: mi.Float) -> tuple[mi.Bool, mi.Float]:
-    """Is the first of two chosen? And what is left of the random number, stretched to [0, 1)."""
+    """Is the first of two chosen? And the rest of the random number, stretched to [0, 1)."""
     is_first = number < probability
     number = number - dr.select(is_first, 0, probability)
     number /= dr.select(is_first, probability, 1 - probability)

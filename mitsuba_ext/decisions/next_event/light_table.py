@@ -22,7 +22,7 @@ TABLE_BYTES = 40
 
 
 class Rows(Protocol):
-    """What decides which row of a table a surface point uses."""
+    """Decides which row of a table a surface point uses."""
 
     count: int
 
@@ -49,7 +49,7 @@ class LightTable(EmitterSampling):
             zeros chooses uniformly.
     """
 
-    # What is left of one number, after choosing among many entries, is too coarse
+    # The rest of one number, after choosing among many entries, is too coarse
     choice_dimension = 2
 
     def __init__(self, rows: Rows, cells: LightCells, weights: mi.Float) -> None:
@@ -78,7 +78,7 @@ class LightTable(EmitterSampling):
         return ds, weight, Choice(row, cell, probability)
 
     def density(self, state, scene, ref, si, ds, active):
-        # Few rays run into a light: the others jump over all this
+        # Few rays hit a light: the others skip the lookups
         return _if(active, self._density, (state, ref, si, ds, active))
 
     def probability(self, state, scene, ref, emitter, active):

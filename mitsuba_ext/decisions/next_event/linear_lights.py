@@ -25,13 +25,13 @@ _LEAST_COSINE = 0.02
 #: Rounding errors, relative to the largest coordinate of the scene.
 _ROUNDING = 4e-6
 
-#: BSDFs that turn the tangent plane, as they appear in ``str(bsdf)``.
+#: BSDFs that perturb normals, as they appear in ``str(bsdf)``.
 _BUMPED = ("BumpMap[", "NormalMap[")
 
 
 @dataclass
 class Estimates:
-    """What the estimates at a vertex were made from.
+    """The inputs and the sum of the estimates at a vertex.
 
     Attributes:
         normal: Shading normal, on the side that is seen.
@@ -46,7 +46,7 @@ class Estimates:
 
 class LinearChoice(EmitterSampling):
     """Chooses emitter i with the probability α_i = e_i / Σ e_j, then a point on it; e_i estimates
-    what emitter i contributes to the vertex if nothing is in between.
+    what emitter i contributes to the vertex if it is not occluded.
 
     All emitters are visited at each vertex: the cost is linear in their number (hence the name). In
     exchange, the probabilities fit each vertex and its normal, and no table has to be learned. With

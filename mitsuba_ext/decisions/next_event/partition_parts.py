@@ -1,4 +1,4 @@
-"""What a partition of an environment is made of."""
+"""The data structures of a partition of an environment."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ...lights.texel_sums import Corners
 
 @dataclass
 class Peak:
-    """A direction in which a BSDF sample has found light.
+    """The direction of a BSDF sample.
 
     Attributes:
         column, row: Its texel.
-        value: What is reflected.
+        value: The brightness of the BSDF's value there, cosine included.
     """
 
     column: mi.UInt32
@@ -30,9 +30,9 @@ class Node:
 
     Attributes:
         x, y: First and last + 1 column (row), in 16 bits each.
-        f: The function at the corners.
-        lift: Is added to the function, as it is larger inside than at the corners.
-        share: What the texels emit.
+        f: The BSDF's value, cosine included, at the corners.
+        lift: Is added to ``f``, where BSDF samples inside found more than the corners.
+        share: The share of its texels in all emission, times their visibility where it is known.
     """
 
     x: mi.UInt32
@@ -51,7 +51,7 @@ class Branch:
     """The place of a rectangle in the tree.
 
     Attributes:
-        weight: Of the rectangle, or of its parts together.
+        weight: The weight of the rectangle, or the sum of those of its parts.
         link: The first of its two parts, which follow each other; 0 for a leaf.
     """
 
@@ -61,12 +61,12 @@ class Branch:
 
 @dataclass
 class Partition:
-    """A partition of one vertex.
+    """The partition of the environment at one vertex.
 
     Attributes:
         nodes, branches: Local memory (``dr.Local`` of :class:`Node` and :class:`Branch`).
-        floor: Is added to the function everywhere.
-        sun: The probability of the sun's disk.
+        floor: Is added to the BSDF's value everywhere.
+        sun: The probability of sampling the sun's disk.
     """
 
     nodes: Any

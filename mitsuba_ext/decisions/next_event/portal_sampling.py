@@ -1,4 +1,4 @@
-"""Directions of the environment through portals.
+"""Sampling an environment through portals.
 
 Source: B. Bitterli, J. Novák, W. Jarosz, *Portal-Masked Environment Map Sampling*, Computer
 Graphics Forum 34(4), 2015.
@@ -18,13 +18,13 @@ _NONE = 0xFFFFFFFF
 
 
 class PortalSampling(EmitterSampling):
-    """A share of the connections to the environment goes through portals, of which one is chosen by
-    the light that comes through it, and then a direction in proportion to what is emitted; the
-    others, and those to all other lights, are Mitsuba's choice.
+    """Samples a share of the connections to the environment through portals: chooses a portal by
+    the light that comes through it, then a direction in proportion to the emission. All other
+    connections are sampled as Mitsuba does.
 
     Parameters:
         scene: A scene with an environment emitter and portals.
-        share: Of the connections to the environment, those through portals.
+        share: The share of the connections to the environment that go through portals.
     """
 
     choice_dimension = 1
@@ -43,7 +43,7 @@ class PortalSampling(EmitterSampling):
 
     @dr.syntax
     def visit(self, state, scene, si, active) -> mi.Float64:
-        """What all portals together show."""
+        """The sum of the emission that is seen through each portal."""
         total, index = mi.Float64(0), mi.UInt32(0)
         while dr.hint(active & (index < self._count), label="portals"):
             total += self._maps.window(index, si.p, active).total
@@ -71,7 +71,7 @@ class PortalSampling(EmitterSampling):
         portal_ds.pdf = directions.emitter.pdf_direction(si, portal_ds, by_portal)
         ds = dr.select(by_portal, portal_ds, ds)
         value = dr.select(by_portal, directions.radiance(si, d, by_portal), value)
-        # At its edge, rounding could deny that the chosen portal shows the direction
+        # At the edge of the chosen portal, rounding could exclude the sampled direction
         emitted = dr.select(by_portal, emitted, 0)
         emitted += self._emitted(si.p, ds.d, chosen, to_sky & (place > 0))
         pdf = self._mixed(ds.pdf, emitted, place, to_sky) / inverse
@@ -92,7 +92,7 @@ class PortalSampling(EmitterSampling):
     def _mixed(
         self, ordinary: mi.Float, emitted: mi.Float64, total: mi.Float64, to_sky: mi.Bool
     ) -> mi.Float:
-        """The density of Mitsuba's choice and that of portals together."""
+        """The density of the mixture of Mitsuba's choice and portals."""
         is_mixed = to_sky & (total > 0)
         by_portal = mi.Float(emitted / dr.select(is_mixed, total, 1))
         return dr.lerp(ordinary, by_portal, dr.select(is_mixed, self._share, 0))
@@ -101,12 +101,12 @@ class PortalSampling(EmitterSampling):
     def _through_portal(
         self, p: mi.Point3f, goal: mi.Float64, point: mi.Point2f, active: mi.Bool
     ):
-        """A direction, the portal that was chosen, and what it shows there. ``goal`` is a part of
-        what all portals show."""
+        """A direction, the chosen portal, and the emission seen through it there. ``goal`` is a
+        random fraction of the result of :meth:`visit`."""
         index, chosen = mi.UInt32(0), mi.UInt32(_NONE)
         while dr.hint(active & (index < self._count) & (goal >= 0), label="choose a portal"):
             seen = self._maps.window(index, p, active).total
-            # Rounding may leave something behind the last one that is seen
+            # Rounding may leave a positive rest after the last visible portal
             chosen = dr.select(seen > 0, index, chosen)
             goal -= seen
             index += 1
@@ -118,7 +118,8 @@ class PortalSampling(EmitterSampling):
     def _emitted(
         self, p: mi.Point3f, d: mi.Vector3f, skipped: mi.UInt32, active: mi.Bool
     ) -> mi.Float64:
-        """The sum of what portals show in the direction ``d``, but for the ``skipped`` one."""
+        """The emission in the direction ``d``, summed over the portals through which it is seen,
+        without the ``skipped`` one."""
         sum, index = mi.Float64(0), mi.UInt32(0)
         while dr.hint(active & (index < self._count), label="densities"):
             sum += self._maps.emitted(index, p, d, active & (index != skipped))

@@ -1,4 +1,4 @@
-"""Choosing a light among candidates, by what each would bring if nothing were in between.
+"""Choosing a light among candidates, by the contribution of each without occlusion.
 
 Sources: J. Talbot, D. Cline, P. Egbert, *Importance Resampling for Global Illumination*, EGSR 2005;
 Cline, PhD dissertation, section 4.4.4 (whose Eq. 4.10 prints the weights inverted).
@@ -29,10 +29,10 @@ class _Reservoir:
 
     Attributes:
         total: Sum of the weights.
-        number: In [0, 1): what is left of the random number that chooses.
+        number: The rest of the random number that chooses, in [0, 1).
         ds: The chosen candidate. Its density is that of the candidates, times their number.
         value: Its radiance.
-        target: What it would bring.
+        target: Its contribution if it is not occluded.
     """
 
     total: mi.Float
@@ -44,9 +44,9 @@ class _Reservoir:
 
 class ResampledLights(EmitterSampling):
     """Resampled importance sampling. Light samples and, where there is an environment, BSDF samples
-    are the candidates of a connection. One of them is chosen in proportion to f / p: f is what it
-    brings if nothing is in between, p the density of all candidates together. Only to that one a
-    shadow ray is traced. It stands for all candidates:
+    are the candidates of a connection. One of them, y, is chosen in proportion to f̂ / p: f̂ is its
+    contribution without occlusion, p the density of all candidates together. Only to y, a shadow
+    ray is traced. With its contribution f(y), the estimate is
 
         f(y) / f̂(y) · Σ f̂(x_i) / (M_l p_l(x_i) + M_b p_b(x_i)),
 
@@ -54,15 +54,15 @@ class ResampledLights(EmitterSampling):
     long as each single candidate has its density: they may depend on each other, and are points of
     a lattice that is shifted at random.
 
-    **MIS.** Nobody knows the density with which a direction survives the choice. It is not needed:
-    the expectation above holds for f times any weight w(y) as well, so that weights are unbiased if
-    those of both techniques add up to one in each direction. Those of :class:`Weights` do, for any
-    function that both evaluate in place of the density. It is that of all candidates, M_l p_l + M_b
-    p_b, which is what the choice at least has.
+    **MIS.** The density of the chosen direction is unknown, and not needed: the expectation above
+    holds for f times any weight w(y) as well, so that weights are unbiased if those of both
+    techniques add up to one in each direction. Those of :class:`Weights` do, for any function that
+    both evaluate in place of the density. Here it is the density of all candidates, M_l p_l + M_b
+    p_b, which the choice improves upon.
 
     Parameters:
         scene: The scene whose emitters are chosen from, as Mitsuba does.
-        candidates: M_l + M_b.
+        candidates: The number of candidates, M_l + M_b.
     """
 
     choice_dimension = 2
@@ -127,8 +127,7 @@ class ResampledLights(EmitterSampling):
             ds, value = self._towards_environment(scene, si, si.to_world(bs.wo), is_smooth)
             reservoir = self._consider(reservoir, bsdf, si, ds, value, is_smooth)
             index += 1
-        # What the candidate stands for, per unit of what it would bring. Where it was chosen, its
-        # weight was positive
+        # The sum of all weights, per unit of the candidate's target: positive where it was chosen
         share = reservoir.total / reservoir.target
         is_chosen = active & (reservoir.total > 0) & dr.isfinite(share)
         ds = reservoir.ds
@@ -136,7 +135,8 @@ class ResampledLights(EmitterSampling):
         return ds, dr.select(is_chosen, reservoir.value * share, 0), place
 
     def _towards_environment(self, scene, si, d, active):
-        """The direction sample towards the environment, with Mitsuba's density, and its light."""
+        """The direction sample towards the environment, with Mitsuba's density, and its radiance.
+        """
         if self._environment is None:
             return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
         ds = self._environment.sample(si, d)
@@ -152,7 +152,7 @@ class ResampledLights(EmitterSampling):
         weight = target / ds.pdf
         weight = dr.select(active & (weight > 0) & dr.isfinite(weight), weight, 0)
         total = reservoir.total + weight
-        # The number is used up to one choice and stretched to [0, 1) for the next one
+        # The rest of the number after one choice is stretched to [0, 1) for the next one
         probability = dr.select(weight > 0, weight / total, 0)
         is_taken = reservoir.number < probability
         number = reservoir.number - dr.select(is_taken, 0, probability)

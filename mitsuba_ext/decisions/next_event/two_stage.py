@@ -1,4 +1,4 @@
-"""Two-stage importance sampling of an environment, and what it can know of visibility.
+"""Two-stage importance sampling of an environment, optionally with learned visibility.
 
 Source: Cline, PhD dissertation, chapters 5 and 6.
 """
@@ -29,11 +29,11 @@ class State:
     """What a path remembers of its last vertex.
 
     Attributes:
-        density: With which a connection to the environment would have found the direction in which
-            the path has left; where ``has_partition``.
-        has_partition: Did the last vertex have one?
+        density: The density with which a connection to the environment would have found the
+            direction in which the path has left; valid where ``has_partition``.
+        has_partition: Did the last vertex have a partition?
         is_first: Is there no last vertex?
-        tile: Number of that in which the path begins.
+        tile: Number of the film tile in which the path begins.
     """
 
     density: mi.Float
@@ -44,12 +44,12 @@ class State:
 
 @dataclass
 class Place:
-    """What is known of a vertex.
+    """What connections need to know about a vertex.
 
     Attributes:
-        partition: Of the environment, where ``has_partition``.
-        has_partition: Elsewhere lights are chosen as Mitsuba does.
-        tile: The maps of what is visible.
+        partition: The partition of the environment, where ``has_partition``.
+        has_partition: Has it a partition? Elsewhere, lights are chosen as Mitsuba does.
+        tile: Selects the maps of visibility.
     """
 
     partition: Partition
@@ -58,17 +58,17 @@ class Place:
 
 
 class TwoStage(EmitterSampling):
-    """Directions of the environment by the product of what it emits and what the BSDF reflects of
-    it; points of all other lights as Mitsuba chooses them.
+    """Samples the environment by the product of its emission and the BSDF, and all other lights as
+    Mitsuba does.
 
     Parameters:
         scene: A scene with an environment emitter.
         splits: See :class:`Partitioner`.
         everywhere: Are there partitions at all vertices of a path, not only at the first?
-        counts: Tells connections in which cell they lie.
-        in_primary_space: Are its cells those of random numbers, or of directions?
-        visibility: What was learned of what is visible from first vertices.
-        sums: Of the environment, if they are there.
+        counts: Finds the cell of a connection, for learning.
+        in_primary_space: Are its cells those of random numbers (or of directions)?
+        visibility: The learned visibility of the environment from first vertices.
+        sums: Sums over the texels of the environment; made here if ``None``.
     """
 
     def __init__(

@@ -1,5 +1,5 @@
-"""Output variables of shapes that move: what Mitsuba's ``aov`` says of them where they rest, as it
-is in the world at the time of the ray."""
+"""Output variables of moving shapes: Mitsuba's ``aov`` evaluates them for the shapes at rest, and
+points and vectors are then transformed to the world at the time of the ray."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import mitsuba as mi
 from ...motion.rigid_motion import Pose
 from .moving_scene import MovingSceneQuery
 
-#: The channels of the variables that are no single number, and which of these a motion changes.
+#: The channel counts of variables with several channels, and the variables that a motion changes.
 _CHANNELS = {"albedo": 3, "uv": 2, "duv_dx": 2, "duv_dy": 2}
 _POINTS, _VECTORS = ("position",), ("geo_normal", "sh_normal", "dp_du", "dp_dv")
 
@@ -28,7 +28,7 @@ def moving_aovs(
 
     Parameters:
         aov: Mitsuba's integrator, made with the list ``aovs``.
-        query: How rays meet the scene.
+        query: How rays intersect the scene.
     """
     pi = query.closest(scene, ray, coherent=True, active=mi.Bool(True))
     owner, moves = query.owner(pi)

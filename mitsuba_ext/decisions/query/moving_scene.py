@@ -21,7 +21,7 @@ _NOBODY = 0xFFFFFFFF
 
 
 def scene_query(scene: mi.Scene) -> SceneQuery:
-    """The query that sees all of ``scene``; the default one where nothing moves.
+    """The query that finds all shapes of ``scene``; the default one where nothing moves.
 
     Raises:
         ValueError: A shape belongs to two movers, or to one and to the static scene.
@@ -40,7 +40,7 @@ class MovingSceneQuery(SceneQuery):
         starts: Where rays start that leave a surface.
 
     Attributes:
-        scenes (list[mi.Scene]): What each of them moves, at rest.
+        scenes (list[mi.Scene]): The shapes of each mover, at rest.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class MovingSceneQuery(SceneQuery):
         return dr.if_stmt((owner, si), moves, self._to_world, lambda _owner, si: si)
 
     def owner(self, pi: mi.PreliminaryIntersection3f) -> tuple[mi.UInt32, mi.Bool]:
-        """The number of the mover that a ray has met, and whether it has met one."""
+        """The number of the mover that a ray has hit, and whether it has hit one."""
         shape = dr.select(pi.instance != None, pi.instance, pi.shape)  # noqa: E711
         owner = dr.gather(mi.UInt32, self._owners, _number(shape), pi.valid)
         return owner, pi.valid & (owner != _NOBODY)
@@ -141,8 +141,8 @@ class MovingSceneQuery(SceneQuery):
 
 
     def _find_lights(self, moving: Sequence[mi.Shape]) -> mi.UInt32 | None:
-        """The number of the light as the scene knows it, by the number of the shape that it belongs
-        to where it rests; ``None`` if no light moves."""
+        """The number of each moving light in the scene, by the number of its shape at rest;
+        ``None`` if no light moves."""
         lights = {}
         for mover in moving:
             if mover.is_emitter():
@@ -161,7 +161,7 @@ class _Box:
     transformation and the traversal of the mover's scene are skipped."""
 
     def __init__(self, bounds: mi.ScalarBoundingBox3f) -> None:
-        # For the rounding errors of the poses on the device
+        # Covers rounding errors of the poses on the device
         margin = 1e-5 * max(map(abs, [*bounds.min, *bounds.max]))
         self._low = mi.Point3f(bounds.min) - margin
         self._high = mi.Point3f(bounds.max) + margin

@@ -1,8 +1,8 @@
-"""Russian roulette by what a path is expected to bring.
+"""Russian roulette by the expected contribution of a path.
 
 Source: J. Vorba, J. Křivánek, *Adjoint-Driven Russian Roulette and Splitting in Light Transport
 Simulation*, 2016, sections 3 and 4. Without splitting: a lane of the walk is one path. The lower
-end of the weight window is ours.
+end of the weight window is not from the paper.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy as np
 
 from ...transport.path_decisions import Roulette
 
-#: A path that is expected to bring this share of its pixel's radiance goes on in any case. With
-#: 0.3, the efficiency by rays is 0.86 of this (lamp in a glass ball), 0.93 (veach-ajar) or the same
-#: (door_ajar, cornell_box).
+#: A path whose expected contribution is this share of its pixel's radiance always continues. With
+#: 0.3, the efficiency by rays is 0.86 of that with 0.15 (lamp in a glass ball), 0.93 (veach-ajar)
+#: or the same (door_ajar, cornell_box).
 _CERTAIN = 0.15
 
-#: The least probability: an estimate that is too low must not make the survivors too heavy.
+#: The least probability: where an estimate is too low, it bounds the weights of surviving paths.
 _LEAST = 0.1
 
 #: From this depth on, no path survives with certainty: some would never end.
@@ -28,7 +28,7 @@ _DEEP, _DEEP_PROBABILITY = 16, 0.95
 
 
 class Regions(Protocol):
-    """What mean radiances belong to."""
+    """The regions for which mean radiances are learned."""
 
     def label(
         self, si: mi.SurfaceInteraction3f, pixel: mi.UInt32 | None, active: mi.Bool
@@ -37,16 +37,16 @@ class Regions(Protocol):
 
 
 class AdjointRoulette(Roulette):
-    """Compares what a path is expected to bring with the radiance of the pixel it began in.
+    """Compares the expected contribution of a path with the radiance of its pixel.
 
     The expected contribution is the throughput times the mean radiance that bounces find in the
-    region of the vertex. (The density of the guided direction could tell more; it gained nothing.)
-    Mirrors and glass have no such mean, and no path ends there: what was expected before has not
-    changed.
+    region of the vertex. (Using the density of the guided direction as well gained nothing.)
+    Mirrors and glass have no such mean, and no path ends there: the expectation of the last vertex
+    has not changed.
 
     Parameters:
-        regions: Where the means belong to.
-        radiance: Mean incident radiance of each region, negative where nothing is known. [regions]
+        regions: Finds the region of a vertex.
+        radiance: Mean incident radiance of each region, negative where it is unknown. [regions]
         scale: 1 / radiance of each pixel of the film, row by row. [pixels]
     """
 
@@ -68,7 +68,7 @@ class AdjointRoulette(Roulette):
         p = dr.clip(expected * (1 / _CERTAIN), _LEAST, 1)
         p = dr.select(radiance < 0, 1, p)
         if vertex.medium is not None:
-            # Nothing is known of media, and paths scatter there often
+            # No mean is known in media, and paths scatter there often
             by_throughput, _ = super().survival((), vertex, path, active)
             p = dr.select(vertex.medium.scatters, by_throughput, p)
         return dr.select(path.depth >= _DEEP, dr.minimum(p, _DEEP_PROBABILITY), p), state

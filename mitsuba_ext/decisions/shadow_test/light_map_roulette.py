@@ -1,4 +1,4 @@
-"""Russian roulette on the shadow ray, by what a light map says of the chosen cell."""
+"""Russian roulette on the shadow ray, by the visibility of the chosen cell in a light map."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class LightMapRoulette(ShadowTest):
     the vertex's row. Lights at infinity have cells too.
 
     Parameters:
-        light_map: What was learned. The next event decision must choose from its rows and cells.
+        light_map: The learned map. The next event decision must choose from its rows and cells.
         slope, floor, law: See :class:`.rejection_law.RejectionLaw`.
 
     Attributes:
-        rejected_share (float): Share of the pilots' shadow rays that it would not trace.
+        rejected_share (float): Share of the pilots' shadow rays that the roulette would not trace.
     """
 
     def __init__(self, light_map: LightMap, slope: float, floor: float, law: str) -> None:

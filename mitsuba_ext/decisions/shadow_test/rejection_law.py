@@ -1,4 +1,4 @@
-"""With what probability a shadow ray is traced, as a function of the learned visibility.
+"""The probability of tracing a shadow ray, as a function of the learned visibility.
 
 Source: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, sections 3.2 and
 3.3.1 (= Guo's thesis, section 3.3.3.1).
@@ -31,7 +31,7 @@ class RejectionLaw:
     Attributes:
         law: ``affine`` for p = min(1, slope · V + floor), where V is an estimate with a prior;
             ``paper`` for p = max(V, 1e-4) (Eq. 2), where V is the plain share of successes.
-        slope, floor: Of the affine law; the other one ignores them.
+        slope, floor: Parameters of the affine law; the other one ignores them.
     """
 
     law: str

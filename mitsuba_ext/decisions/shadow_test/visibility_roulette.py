@@ -19,15 +19,15 @@ from .rejection_law import RejectionLaw, rejected_share
 class VisibilityRoulette(ShadowTest):
     """Tests a connection with a probability that grows with the visibility of its voxels.
 
-    Connections to points that the map does not know (at infinity, in voxels without geometry, on
-    lights that the pilot did not sample) are always tested.
+    Connections to points for which the map has no entry (at infinity, in voxels without geometry,
+    on lights that the pilot did not sample) are always tested.
 
     Parameters:
         visibility: The learned map, which must have seen a light.
         slope, floor, law: See :class:`.rejection_law.RejectionLaw`.
 
     Attributes:
-        rejected_share (float): Share of the segments that the map saw end on a light and that the
+        rejected_share (float): Of the recorded segments that end on a light, the share that the
             roulette would not test.
     """
 

@@ -17,7 +17,7 @@ class RegionTable(SubpathSelection):
     """Chooses a region with the probabilities of the region of the camera vertex.
 
     Parameters:
-        regions: Of camera vertices and light vertices.
+        regions: The regions of camera vertices and light vertices.
         probability: For each region of a camera vertex, the probability of each region of light
             vertices, all positive; shape [regions, regions].
         vertices: The expected number of vertices of a light path in each region, positive.

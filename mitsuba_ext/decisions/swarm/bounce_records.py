@@ -1,16 +1,17 @@
-"""What paths bring after each of their first bounces."""
+"""Records the radiance that paths gather after each of their first bounces."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
-#: Records of a pass, at most: of larger passes, a part of the paths is recorded.
+#: The most records of a pass: of larger passes, only a part of the paths is recorded.
 _MOST_RECORDS = 1 << 22
 
 
 class BounceRecords:
-    """Cells, densities, and radiance before the first bounces of the paths of a pass.
+    """For each of the first bounces of the paths of a pass: the chosen cell, its density, and the
+    radiance that the path had gathered before.
 
     Parameters:
         lanes: Paths of the pass.
@@ -19,7 +20,7 @@ class BounceRecords:
     Attributes:
         map, cell, density: As :class:`~mitsuba_ext.learning.swarm.tile_counts.Choices` says, for
             each record; density 0 where there is none.
-        lane: Whose record it is.
+        lane: The lane of each record.
     """
 
     def __init__(self, lanes: int, bounces: int) -> None:
@@ -49,16 +50,17 @@ class BounceRecords:
         dr.scatter(self.density, density, slot, active)
 
     def before(self, bounce: mi.UInt32, radiance: mi.Float, active: mi.Bool) -> None:
-        """Records what a path has brought before a bounce."""
+        """Records the radiance that a path has gathered before a bounce."""
         slot, active = self._slot(bounce, active)
         dr.scatter(self._before, radiance, slot, active)
 
     def after(self, total: mi.Float) -> mi.Float:
-        """What the paths of all records brought afterwards; ``total`` is that of each lane."""
+        """For each record, the radiance that its path gathered afterwards; ``total`` is that of
+        each whole path, by lane."""
         return dr.maximum(dr.gather(mi.Float, total, self.lane) - self._before, 0)
 
     def next_one(self, values: mi.Float) -> mi.Float:
-        """By record, the value of the next record of its path; 0 where there is none."""
+        """For each record, the value of the next record of its path; 0 where there is none."""
         result, later = [], mi.Float(0)
         for k in reversed(range(self._bounces)):
             result.insert(0, dr.zeros(mi.Float, self._paths) + later)
@@ -66,7 +68,7 @@ class BounceRecords:
         return dr.concat(result)
 
     def products(self, values: mi.Float) -> mi.Float:
-        """By record, the product of the values of the records of its path up to itself."""
+        """For each record, the product of the values of its path's records up to this one."""
         result, product = [], mi.Float(1)
         for k in range(self._bounces):
             factor = dr.select(self._part(self.density, k) > 0, self._part(values, k), 1)
@@ -75,6 +77,6 @@ class BounceRecords:
         return dr.concat(result)
 
     def _part(self, values: mi.Float, bounce: int) -> mi.Float:
-        """Those of one bounce."""
+        """The values of one bounce."""
         first = dr.opaque(mi.UInt32, bounce * self._paths)
         return dr.gather(mi.Float, values, first + dr.arange(mi.UInt32, self._paths))

@@ -16,7 +16,7 @@ import numpy as np
 from ...maps.swarm.cells import CellDensities, Cells
 from ...transport.path_decisions import EmitterSampling, LightNumbers
 
-#: Bits of a cell's number: of all, of those that tell the light, and of those of each axis of it.
+#: The most bits of a cell's number: in all, for the light, and for each axis of a point on it.
 _BITS, _LIGHT_BITS, _POINT_BITS = 11, 8, 5
 
 
@@ -24,8 +24,8 @@ def light_cells(scene: mi.Scene, choice_dimension: int) -> Cells:
     """The cells of the numbers of a connection.
 
     Parameters:
-        choice_dimension: Of the decision that uses the numbers. With 0, the first number chooses
-            the light, each with its probability, and what is left of it the point.
+        choice_dimension: That of the decision that uses the numbers. With 0, the first number
+            chooses the light, each with its probability; its rest chooses the point on the light.
     """
     emitters = scene.emitters()
     is_delta = all(mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in emitters)
@@ -39,7 +39,7 @@ def light_cells(scene: mi.Scene, choice_dimension: int) -> Cells:
     probability = scene.pdf_emitter(index).numpy().astype(np.float64)
     cumulative = np.cumsum(np.broadcast_to(probability, len(emitters)))
     edges = np.concatenate([[0], cumulative / cumulative[-1]])
-    # Groups of equal numbers of lights; those behind the last one are empty
+    # Groups of equal numbers of lights; groups after the last light are empty
     group = -(-len(emitters) // (1 << bits))
     edges = edges[np.minimum(np.arange((1 << bits) + 1) * group, len(emitters))]
     parts = np.arange(1 << each) / (1 << each)
@@ -51,10 +51,10 @@ def light_cells(scene: mi.Scene, choice_dimension: int) -> Cells:
 
 @dataclass
 class LightChoice:
-    """What :class:`MappedLights` has chosen.
+    """The choice of :class:`MappedLights`.
 
     Attributes:
-        cell, density: Of the numbers.
+        cell, density: The cell of the numbers in the map, and their density.
         is_mapped: Is this the connection whose numbers have a map?
     """
 
@@ -107,7 +107,7 @@ class LightMaps:
 
     Attributes:
         cells, maps, tiles: See :class:`~mitsuba_ext.decisions.swarm.mapped_numbers.MappedNumbers`.
-        is_recorded: Does somebody learn?
+        is_recorded: Are choices recorded for a learner?
     """
 
     def __init__(self, cells: Cells) -> None:
@@ -117,14 +117,14 @@ class LightMaps:
         self.is_recorded = False
 
     def around(self, inner: EmitterSampling) -> EmitterSampling:
-        """A decision with warped numbers, where there is something to warp or to learn."""
+        """``inner`` with warped numbers, where there are maps or a learner; else ``inner``."""
         is_needed = self.maps is not None or self.is_recorded
         return MappedLights(inner, self) if is_needed else inner
 
     def warp(
         self, tile: mi.UInt32, numbers: LightNumbers, active: mi.Bool
     ) -> tuple[LightNumbers, LightChoice]:
-        """The numbers that the map of a tile makes of uniform ones, where ``active``."""
+        """Warps uniform numbers by the map of a tile, where ``active``."""
         u, has_choice = [numbers.point.x, numbers.point.y], self.cells.dimension == 3
         if has_choice:
             u.insert(0, numbers.choice)

@@ -23,14 +23,15 @@ from ...maps.swarm.cells import CellDensities, Cells
 from ...transport.path_decisions import DirectionSamples
 from .bounce_records import BounceRecords
 
-#: Bounces with maps, and numbers of reflections before that have maps of their own.
+#: The number of bounces with maps, and of cases (0, 1, more reflections before) with maps of their
+#: own.
 BOUNCES, REFLECTIONS = 8, 3
 
 #: The share of the paths that draw uniform numbers.
 _UNIFORM_SHARE = 0.2
 
-#: Bits of a cell's number, and the end of the first cell. The others grow by a factor: reflectances
-#: of glass are small, and what a number decides changes where it equals them.
+#: Bits of a cell's number, and the end of the first cell. The others grow by a factor: the lobe
+#: changes where the number equals the reflectance, which is small for glass.
 _BITS, _FIRST_END = 5, 0.01
 
 
@@ -63,8 +64,8 @@ class MappedLobes(DirectionSamples):
 
     Attributes:
         cells, maps, tiles: See :class:`~mitsuba_ext.decisions.swarm.mapped_numbers.MappedNumbers`.
-        is_recorded: Does somebody learn?
-        records: What the running pass chose, if somebody learns.
+        is_recorded: Are choices recorded for a learner?
+        records: The choices of the running pass; ``None`` if they are not recorded.
     """
 
     def __init__(self) -> None:
@@ -81,7 +82,7 @@ class MappedLobes(DirectionSamples):
         is_uniform = mi.Bool(self.maps is None)
         if self.maps is not None:
             is_uniform = sampler.next_1d() < _UNIFORM_SHARE
-        # The tile, the number of reflections, from which side the last surface was met, whether the
+        # The tile, the number of reflections, from which side the last surface was hit, whether the
         # path draws uniform numbers, and the density of its numbers under the maps
         return self.tiles.tile(pixel), mi.UInt32(0), mi.Bool(False), is_uniform, mi.Float(1)
 
@@ -116,6 +117,6 @@ class MappedLobes(DirectionSamples):
 
 
 def path_density(product: mi.Float) -> mi.Float:
-    """The density of the numbers of a path, relative to uniform ones; ``product`` is that under the
-    maps of all bounces so far."""
+    """The density of the numbers of a path, relative to uniform ones; ``product`` is their density
+    under the maps of all bounces so far."""
     return dr.lerp(product, 1.0, _UNIFORM_SHARE)

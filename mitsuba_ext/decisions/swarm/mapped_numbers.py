@@ -20,14 +20,15 @@ class MappedNumbers:
     :class:`~mitsuba_ext.rendering.camera_samples.PixelNumbers`.
 
     Parameters:
-        periods: How often spectra that all wavelengths of a sample find repeat themselves: 4 for
-            the number that chooses wavelengths, which then has a second weight for them.
+        periods: 4 for the number u that chooses the wavelengths u + k/4 of a sample, else 1. A
+            spectrum that all four wavelengths find has the period 1/4 in u: the number then has a
+            second weight, for such spectra.
 
     Attributes:
         cells: The cells of the maps.
         maps: The maps; ``None`` for uniform numbers.
-        tiles: The tiles that have one each.
-        drawn: Cell and density of the last pass, for who learns from them.
+        tiles: The tiles of the film, each of which has a map.
+        drawn: Cell and density of the last pass, for learners.
     """
 
     def __init__(self, cells: Cells, periods: int = 1) -> None:

@@ -1,4 +1,4 @@
-"""Maps of directions in the world, beside the BSDF, at the first vertex of a path that is not
+"""Maps of directions in the world, mixed with the BSDF, at the first vertex of a path that is not
 specular.
 
 Source: D. Cline, PhD dissertation, BYU 2007, sections 9.2.1 (Eq. 9.2) and 9.2.2 (scatter
@@ -29,10 +29,10 @@ class MappedScattering(Scattering):
 
     Attributes:
         cells, maps, tiles: See :class:`~mitsuba_ext.decisions.swarm.mapped_numbers.MappedNumbers`.
-        is_recorded: Does somebody learn?
-        cell, density, inverse, lane: What each lane of the running pass chose, if somebody learns:
-            the cell, the density of the mixture over that of the BSDF, and uniform density over
-            that of the BSDF.
+        is_recorded: Are choices recorded for a learner?
+        cell, density, inverse, lane: The choices of the lanes of the running pass, if recorded: the
+            cell, the density of the mixture over that of the BSDF, uniform density over that of the
+            BSDF, and the lane.
     """
 
     def __init__(self) -> None:
@@ -82,7 +82,7 @@ class MappedScattering(Scattering):
         mixture = self._mixture(table, cell, pdf_of_bsdf, mixes)
         bs.pdf = dr.select(mixes, mixture, bs.pdf)
         found = dr.select(mixture > 0, bs_value / mixture, 0)
-        # What only the BSDF finds is found less often
+        # Directions that only the BSDF finds are sampled with the probability 1 − SHARE
         others = dr.select(is_first, weight / (1 - SHARE), weight)
         weight = dr.select(mixes, found, others)
         if self.is_recorded:
@@ -118,7 +118,7 @@ class MappedScattering(Scattering):
 
 
 def is_smooth(vertex: Vertex) -> mi.Bool:
-    """Has the BSDF anything that is no mirror?"""
+    """Has the BSDF a lobe that is not specular?"""
     return mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
 
 

@@ -1,4 +1,4 @@
-"""Learning which directions to choose."""
+"""Learning the densities of the primary samples that choose directions."""
 
 from __future__ import annotations
 
@@ -20,32 +20,33 @@ from ..pixel_estimates import PixelEstimates
 from .path_records import BYTES_PER_RECORD, PathRecords
 from .roulette_trial import BYTES_PER_PATH, RouletteTrial
 
-#: The share of the samples that trees decide in the second pilot, and those from which one is
-#: chosen as soon as it is known what they are worth.
+#: The share of the samples that trees decide in the second pilot, and the shares from which one is
+#: chosen once their effects have been measured.
 _FIRST_SHARE, _SHARES = 0.6, (0.4, 0.6, 0.8)
 
-#: Share of all pilots' paths from which the number of bounces is chosen, at least.
+#: The number of bounces is chosen from at least this share of all pilots' paths.
 _LEAST_SHARE = 0.2
 
-#: The efficiency that guiding must reach. Trees of all pilots are better than those tested, but
-#: only the last stage gains from them.
+#: The efficiency that guiding must reach. Trees built from all pilots are better than those tested,
+#: but only the last stage uses them.
 _LEAST_EFFICIENCY = 1.03
 
-#: Rays of a path for each segment, about: shadow rays too.
+#: About the number of rays per segment of a path, shadow rays included.
 _RAYS = 1.5
 
-#: The efficiency of trees of few samples that lets learning go on: those of more are better.
+#: The efficiency that trees of few samples must reach for learning to continue: trees of more
+#: samples are better.
 _TRIAL_EFFICIENCY = 0.95
 
 
 class Guidance(NamedTuple):
-    """How to guide, and what that is worth.
+    """How to guide, and the effect of that.
 
     Attributes:
         share: The share of the samples that trees decide.
         bounces: How many directions of a path are guided.
-        gain: By how much the variance is lower, relatively.
-        efficiency: Relative to no guide.
+        gain: The relative reduction of variance.
+        efficiency: The efficiency, relative to that without a guide.
     """
 
     share: float
@@ -56,14 +57,14 @@ class Guidance(NamedTuple):
 
 class GuideLearner(Learner):
     """Learns trees of primary samples in the pilots. The second pilot draws from the trees of the
-    first one, and so shows what they are worth: if too little, learning ends there. The same
-    samples tell how many bounces to guide, and how much is left to chance.
+    first one, from which their efficiency is estimated: if it is too low, learning ends there. The
+    same samples determine how many bounces to guide, and the share of uniform samples.
 
     Parameters:
         regions: Makes the regions that have a tree each, from the scout's vertices and normals.
-        wants_scout: Does it need these?
+        wants_scout: Does ``regions`` need these vertices?
         bounces: How many directions of a path are guided, at most.
-        max_memory: Bytes for what is recorded, and for what is built from it.
+        max_memory: Bytes for records, and for the trees built from them.
         pilot_samples: Samples of all pilots together.
         film_width: Pixels of a row of the film, with its border where that is sampled.
         always: Guide all ``bounces``, and learn the roulette, also where the pilots show that it
@@ -71,10 +72,10 @@ class GuideLearner(Learner):
 
     Attributes:
         guide (GuidedDirections): What was learned; ``None`` where nothing is guided.
-        roulette (Roulette): That of the next stage.
+        roulette (Roulette): The roulette of the next stage.
         guidance (Guidance): The last choice; ``None`` before the second pilot has shown a gain.
-        trial (RouletteTrial): What the roulette of the last pilot was worth; ``None`` where none is
-            learned.
+        trial (RouletteTrial): The measured effect of the roulette of the last pilot; ``None`` where
+            none is learned.
         sample_count (int): How many samples of directions the trees were built from.
     """
 
@@ -114,13 +115,13 @@ class GuideLearner(Learner):
         self._records = PathRecords(self._regions.label, self.bounces, stride, self._pixels)
 
     def learn_roulette(self, rr_depth: int) -> None:
-        """Asks for a roulette as well, which begins at that depth."""
+        """Makes this learner learn a roulette as well, which begins at the depth ``rr_depth``."""
         self._rr_depth = rr_depth
 
     # ---- Observer ----
 
     def kernel_state(self) -> list[Observer]:
-        """What kernels depend on."""
+        """The attributes on which kernels depend (``frozen.py``)."""
         return self._observers()
 
     def begin(self, *arguments: Any) -> None:
@@ -159,7 +160,7 @@ class GuideLearner(Learner):
         bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
         self.sample_count = records.count
         if self.guide is not None and records.count > records.first_new:
-            # A short trial tells whether guiding is hopeless, but not for how many bounces
+            # A short trial shows whether guiding is hopeless, but not how many bounces to guide
             is_trial = records.paths < _LEAST_SHARE * self.pilot_samples / records.stride
             least = _TRIAL_EFFICIENCY if is_trial else _LEAST_EFFICIENCY
             gains = self.gains(records)
@@ -220,9 +221,9 @@ class GuideLearner(Learner):
     def _against_path(
         self, gains: Mapping[float, np.ndarray], least: float
     ) -> tuple[float, float]:
-        """What uniform samples would have with the roulette of the next stage, in units of what
-        ``path`` has: variance, and length of paths. Takes the roulette of ``path`` again where the
-        last pilot shows that the learned one has not ``least`` times its efficiency."""
+        """Variance and path length of uniform samples with the roulette of the next stage, relative
+        to those of ``path``. Returns to the roulette of ``path`` where the last pilot shows that
+        the learned one does not reach ``least`` times its efficiency."""
         if self.trial is None:
             return 1.0, 1.0
         chosen, path = self.trial.drawn, self.trial.unguided
@@ -236,8 +237,8 @@ class GuideLearner(Learner):
         return chosen.variance / path.variance / guided, chosen.segments / path.segments
 
     def gains(self, records: PathRecords) -> dict[float, np.ndarray]:
-        """By how much, relatively, the trees that drew the last samples lower the variance
-        under the same roulette: for each share that they could decide, by bounce."""
+        """The relative reduction of variance by the trees that drew the last samples, under the
+        same roulette: for each share of samples that they could decide, by bounce."""
         new = dr.arange(mi.UInt32, records.count - records.first_new)
         new += dr.opaque(mi.UInt32, records.first_new)
         value, weight, importance, bounce = (
@@ -257,7 +258,7 @@ class GuideLearner(Learner):
             return sums.sum(axis=1)
 
         self._batches: list[np.ndarray] = []
-        # The mean squares under uniform samples, of those that were drawn, and of other shares
+        # The sums of squares with uniform samples, with those drawn, and with other shares
         uniform, actual = by_bounce(square * drawn), by_bounce(square)
         variance = max(records.variance + (uniform - actual).sum(), 1e-30)
         gains = {
@@ -265,11 +266,11 @@ class GuideLearner(Learner):
             / variance
             for share in _SHARES
         }
-        # Squares of large numbers overflow: that shows no gain
+        # Where squares of large numbers overflow, no gain is shown
         return {share: np.nan_to_num(gain, nan=0.0) for share, gain in gains.items()}
 
     def _error(self, records: PathRecords) -> float:
-        """The standard error of the logarithm of the variance that is left by what was chosen."""
+        """The standard error of the logarithm of the variance that remains with the guidance."""
         if len(self._batches) != 2 + len(_SHARES):
             return 0.0
         uniform, actual, *others = self._batches
@@ -292,10 +293,10 @@ def most_efficient(
     """The most efficient way to guide.
 
     Parameters:
-        gains: By how much, relatively, the variance is lower: for each share, by bounce.
-        all_bounces: Choose among those that guide all bounces?
-        rays: Of a path of ``path``.
-        variance, segments: Of uniform samples under the same roulette, in units of ``path``'s.
+        gains: The relative reductions of variance: for each share, by bounce.
+        all_bounces: Choose only among candidates that guide all bounces?
+        rays: The number of rays per path of ``path``.
+        variance, segments: Those of uniform samples under the same roulette, relative to ``path``.
     """
     candidates = []
     for share, by_bounce in gains.items():

@@ -1,4 +1,4 @@
-"""The roulette that path guiding learns, as the decision of its own slot."""
+"""The Russian roulette that path guiding learns, as a learner of its own."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from .guide_learner import GuideLearner
 
 
 class RouletteLearner(Learner):
-    """Takes the roulette from a learner of directions, which comes before this one: both judge the
-    same pilots, since guiding pays only as far as roulette does not end the guided paths.
+    """Takes the roulette from a learner of directions, which precedes this one. Both decisions are
+    judged by the same pilots, since guiding pays only if roulette does not end the guided paths.
 
     Parameters:
         guide: The learner of directions, by regions of surfaces.

@@ -22,25 +22,25 @@ class PathRecords(Observer):
     """Records the first bounces of paths.
 
     Parameters:
-        region: To which region the number of a vertex belongs (a surface interaction, the pixel of
-            each lane and a mask are given).
-        bounces: Bounces of a path that are recorded.
-        stride: One in so many paths is recorded.
-        pixels: Is told what the paths bring.
+        region: Finds the region of a vertex, from its surface interaction, the pixel of each lane,
+            and a mask.
+        bounces: Number of bounces of a path that are recorded.
+        stride: One in ``stride`` paths is recorded.
+        pixels: Receives the radiance of the paths.
 
     Attributes:
         paths (int): How many paths were recorded.
         region, code (mi.UInt32): Of each sample: its region, and the cell of the primary sample.
         history (mi.UInt32): The cells of the path's earlier samples, the last one in the low byte.
-        bounce (mi.UInt32): 0 for the first.
-        throughput (mi.Float): Of the path, with this bounce, before roulette.
+        bounce (mi.UInt32): The number of the bounce, 0 for the first.
+        throughput (mi.Float): The path's throughput after this bounce, before roulette.
         value (mi.Float): What the path contributed after the bounce, divided by the densities of
             its samples.
         weight (mi.Float): 1 / density of the sample.
-        importance (mi.Float): By how much a squared error counts, at the place in the image.
+        importance (mi.Float): The weight of a squared error in the pixel of the path.
         batch (mi.UInt32): The batch of paths (``benefit.py``).
-        variances (numpy.ndarray): Sums over the paths of the squared errors that they make,
-            weighted so; shape [batches].
+        variances (numpy.ndarray): Sums over the paths of their squared errors, with this weight;
+            shape [batches].
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class PathRecords(Observer):
         self.restart_counting()
 
     def restart_counting(self) -> None:
-        """Lets ``paths``, ``variance`` and ``first_new`` speak of what comes from now on."""
+        """Makes ``paths``, ``variance`` and ``first_new`` refer to later records only."""
         self.paths, self.variances = 0, np.zeros(BATCHES)
         self.first_new = self.count
 
@@ -67,11 +67,11 @@ class PathRecords(Observer):
 
     @property
     def count(self) -> int:
-        """How many samples there are, after :meth:`finish`."""
+        """The number of recorded samples, after :meth:`finish`."""
         return len(self.code) if self._passes else 0
 
     def kernel_state(self) -> tuple:
-        """What kernels depend on."""
+        """The attributes on which kernels depend (``frozen.py``)."""
         return (
             self._region, self.bounces, self._pixel, self._path, self._is_recorded, self._slots,
             self._keys, self._weights, self._before, self._throughput, self._total,
@@ -147,7 +147,7 @@ class PathRecords(Observer):
         bounce = slot // self._slots
         path = slot - bounce * self._slots
         value = dr.maximum(dr.gather(mi.Float, self._total, path) - before, 0)
-        # A path of infinite radiance must not decide
+        # Ignore infinite radiance: it would dominate the trees
         value = dr.select(dr.isfinite(value), value, 0)
         history = dr.zeros(mi.UInt32, len(slot))
         for earlier in range(min(self.bounces - 1, 32 // DEPTH)):

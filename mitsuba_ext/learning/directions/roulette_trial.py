@@ -1,4 +1,4 @@
-"""What other roulettes, or no guide, would have cost and brought."""
+"""Estimates variance and cost with other roulettes, or without a guide."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from ...transport.observer import Observer
 from ...transport.path_decisions import LARGEST_PROBABILITY, unguided_throughput
 from ..pixel_estimates import PixelEstimates, brightness
 
-#: Bounces of a path that are looked at: what comes later is as it was drawn. And paths of a pass,
-#: at most, about: sums of few numbers need no more.
+#: The number of bounces that are recorded (later ones count as they were drawn), and about the most
+#: paths of a pass, which suffice for the few sums.
 _BOUNCES, _MOST_PATHS = 12, 1 << 18
 
 #: Bytes that a path takes.
@@ -20,37 +20,38 @@ BYTES_PER_PATH = 4 * (4 * _BOUNCES + 1)
 
 
 class Effect(NamedTuple):
-    """Of a way to draw paths.
+    """The effect of a way to draw paths.
 
     Attributes:
-        variance: Sum over the paths of their squared errors, weighted by place.
-        segments: Of all paths together.
+        variance: Sum over the paths of their squared errors, weighted by pixel.
+        segments: The number of segments of all paths.
     """
 
     variance: float
     segments: float
 
     def efficiency(self, other: Effect) -> float:
-        """In units of another one's."""
+        """The efficiency, relative to that of ``other``."""
         return other.variance * other.segments / max(self.variance * self.segments, 1e-30)
 
 
 class RouletteTrial(Observer):
-    """Estimates from the paths that were drawn what others would have been worth.
+    """Estimates, from the paths that were drawn, the effects of other ways to draw them.
 
-    Let a path bring ``V_j`` after bounce j, ``V`` in all; other densities and other probabilities
-    of survival would multiply that by ``A_j``, and make such paths as much rarer. The mean square
-    would then be that of V² + Σ (A_j − A_{j−1}) V_j², with A before the first bounce 1.
+    Let a path gather the radiance ``V_j`` after bounce j, and ``V`` in all. Other densities and
+    survival probabilities would multiply ``V_j`` by ``A_j``, and make such paths rarer by the same
+    factor. The mean square would then be that of V² + Σ (A_j − A_{j−1}) V_j², where A is 1 before
+    the first bounce.
 
     Parameters:
-        stride: One in so many paths is looked at, at most.
+        stride: At most one in ``stride`` paths is recorded.
         rr_depth: Depth at which roulette begins.
-        pixels: Knows what the paths bring.
+        pixels: The estimates of the pixels' radiance.
 
     Attributes:
-        drawn: The effect of what was drawn.
-        by_throughput: Of the same directions with the roulette of ``path``.
-        unguided: Of that, and uniform samples.
+        drawn: The effect of the paths as they were drawn.
+        by_throughput: The effect of the same directions with the roulette of ``path``.
+        unguided: The effect of uniform samples with the roulette of ``path``.
     """
 
     def __init__(self, stride: int, rr_depth: int, pixels: PixelEstimates) -> None:
@@ -59,11 +60,11 @@ class RouletteTrial(Observer):
         self.restart()
 
     def restart(self) -> None:
-        """Lets the effects be those of the paths that come from now on."""
+        """Sets the effects to zero: they then refer to later paths only."""
         self.drawn = self.by_throughput = self.unguided = Effect(0.0, 0.0)
 
     def kernel_state(self) -> tuple:
-        """What kernels depend on."""
+        """The attributes on which kernels depend (``frozen.py``)."""
         return (
             self._path, self._is_recorded, self._slots, self._weight, self._before,
             self._throughput, self._probability, self._total,
@@ -131,7 +132,7 @@ class RouletteTrial(Observer):
     def _other(
         self, total: mi.Float, by_throughput: bool, is_guided: bool
     ) -> tuple[mi.Float, mi.Float]:
-        """By how much the square of each path would be larger, and its segments."""
+        """The increase of the square of each path with another way to draw it, and its segments."""
         path = dr.arange(mi.UInt32, self._paths)
         factor, throughput, reached = mi.Float(1), mi.Float(1), mi.Float(1)
         more, segments = mi.Float(0), mi.Float(1)
@@ -140,7 +141,7 @@ class RouletteTrial(Observer):
                 dr.gather(mi.Float, x, bounce * self._slots + path)
                 for x in (self._weight, self._before, self._throughput, self._probability)
             )
-            # Where the BSDF let nothing through, the path is at its end
+            # Where the BSDF's weight is zero, the path ends
             goes_on = (weight > 0) & (unguided > 0) & (p > 0)
             other = p
             if by_throughput and bounce + 1 >= self._rr_depth:
@@ -152,5 +153,5 @@ class RouletteTrial(Observer):
             segments += dr.select(goes_on, reached * density * other, 0)
             reached = dr.select(goes_on, reached * density / ratio, reached)
             throughput = dr.select(goes_on, throughput * ratio, throughput)
-        # Squares of large numbers overflow: they say nothing
+        # Ignore squares of large numbers that overflow
         return dr.select(dr.isfinite(more), more, 0), segments

@@ -43,7 +43,7 @@ class SurfaceRegions:
         return self._regions.state()
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Takes over the regions that :meth:`state` has made arrays of."""
+        """Restores the regions from the arrays of :meth:`state`."""
         self._set(NestedRegions.of_state(state))
 
     # ---- During the walk ----
@@ -65,7 +65,7 @@ class SurfaceRegions:
     # ---- What is learned ----
 
     def label(self, si: mi.SurfaceInteraction3f, pixel, active: mi.Bool) -> mi.UInt32:
-        """The region by which a sample is recorded."""
+        """The region under which a sample is recorded."""
         region = self._regions.number(si.p, lit_normal(si), active)
         is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
         return dr.select(is_smooth, region, self._specular)
@@ -74,8 +74,8 @@ class SurfaceRegions:
         """Builds the trees.
 
         Returns:
-            The builder, the root of each region, and ``None``: no tree stands below a leaf. The
-            tree of the surrounding region is the prior of a region's tree.
+            The builder, the root of each region's tree, and ``None``: leaves do not lead to other
+            trees. The tree of the surrounding region is the prior of a region's tree.
         """
         samples = Samples(records.code, records.value, records.weight)
         samples, region = samples.merged(records.region)
@@ -95,7 +95,7 @@ class SurfaceRegions:
         """The mean radiance that bounces find in each region; the surrounding region is the prior.
         −1 for mirrors and glass. Shape [regions]."""
         region = records.region.numpy()
-        # In double precision, one after the other: equal seeds make equal sums
+        # In double precision and a fixed order: equal seeds make equal sums
         value, throughput, count = (
             np.bincount(region, x, self.count + 1)
             for x in (records.value.numpy(), records.throughput.numpy(), np.ones(len(region)))

@@ -1,6 +1,6 @@
 """Trees for tiles of the film: the samples of a path's first bounces select the trees of the next.
 
-Source: Guo, PhD thesis, sections 2.3.1 to 2.3.5. One difference: all splits of a bounce stand above
+Source: Guo, PhD thesis, sections 2.3.1 to 2.3.5. One difference: all splits of a bounce are above
 those of the next, so that the density of the samples of the first bounces is known after each.
 """
 
@@ -18,7 +18,7 @@ from .tree_builder import DEPTH, UNIFORM, Samples, TreeBuilder
 #: Edges, in tiles, of the larger tiles whose trees are the priors of the smaller ones.
 _GROUPS = (8, 4, 2, 1)
 
-#: The most directions that a tree chooses: so many cells fit into a record's history.
+#: The most directions that a tree chooses: a record's history has room for all cells but the last.
 MOST_BOUNCES = 1 + 32 // DEPTH
 
 
@@ -27,7 +27,7 @@ class TileRegions:
     Below each leaf of these splits stands a tree for the sample of the second bounce, and so on.
 
     Parameters:
-        width, height: Of the film, with its border where that is sampled.
+        width, height: Size of the film in pixels, with its border where that is sampled.
         tile: Edge of a tile in pixels.
 
     Attributes:
@@ -43,11 +43,11 @@ class TileRegions:
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """What depends on the pilots: nothing."""
+        """The arrays that depend on the pilots: none."""
         return {}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Takes over what :meth:`state` has made arrays of."""
+        """Restores the result of :meth:`state`: nothing to do."""
 
     # ---- During the walk ----
 
@@ -69,7 +69,7 @@ class TileRegions:
     # ---- What is learned ----
 
     def label(self, si: mi.SurfaceInteraction3f, pixel: mi.UInt32, active: mi.Bool) -> mi.UInt32:
-        """The tile by which a sample is recorded."""
+        """The tile under which a sample is recorded."""
         return self.begin(pixel)
 
     def build(self, records: PathRecords) -> tuple[TreeBuilder, mi.UInt32, mi.UInt32]:
@@ -79,10 +79,10 @@ class TileRegions:
         below a leaf is the tree of all samples of its bounce in the tile.
 
         Returns:
-            The builder, the roots, and for each leaf the tree that stands below it.
+            The builder, the roots, and for each leaf the tree below it.
         """
         builder = TreeBuilder()
-        # After the tiles' trees stands one without splits, for leaves that no path has reached
+        # The tiles' trees are followed by one without splits, for leaves that no path has reached
         roots, below, tree_count = [], [dr.full(mi.UInt32, self.count, 1)], self.count + 1
         for bounce in range(records.bounces):
             chosen = dr.compress(records.bounce == bounce)

@@ -27,8 +27,8 @@ UNIFORM = 0
 #: The most splits from the root of a tree to a leaf.
 DEPTH = 8
 
-#: Certainty is measured in samples of equal contribution (the effective sample size): the least
-#: number in a cell that is split, and the weight of the prior.
+#: In samples of equal contribution (effective sample sizes): the least number in a cell that is
+#: split, and the weight of the prior.
 _SPLIT, _PRIOR = 4.0, 16.0
 
 #: A subtree that changes the mean square of the density by less than this share becomes a leaf.
@@ -162,7 +162,7 @@ class TreeBuilder:
         """Adds ``tree_count`` trees.
 
         Parameters:
-            samples: The samples from which the trees are built, and others.
+            samples: The samples from which the trees are built, and possibly others.
             tree: The tree to which each sample belongs; ``tree_count`` or more for none.
             expected: For each tree, the root of the earlier tree that is its prior.
 
@@ -218,7 +218,7 @@ class TreeBuilder:
         level.splits = splits
         level.probability = (evidence * found + _PRIOR * expected) / (evidence + _PRIOR)
         twin_l, twin_r = (dr.select(has_twins, x, twin) for x in (twins, twins + 1))
-        # Together: each of them alone would be a kernel of its own
+        # Evaluated together: each of them alone would be a kernel of its own
         dr.eval(
             begin, middle, end, code, middle_code, twin_l, twin_r, evidence_l, evidence_r,
             level.probability,
@@ -290,7 +290,7 @@ class _Level:
 
 
 def _evidence(value: mi.Float, square: mi.Float) -> mi.Float:
-    """The effective sample size: so many samples of equal contribution would be as uncertain."""
+    """The effective sample size: this number of samples of equal contribution is as uncertain."""
     return dr.select(square > 0, dr.square(value) / square, 0)
 
 

@@ -1,4 +1,4 @@
-"""Recording what a choice of lights contributes to the variance of the image."""
+"""Records how the choice of lights contributes to the variance of the image."""
 
 from __future__ import annotations
 
@@ -12,29 +12,28 @@ from ...transport.observer import Observer
 from ..benefit import BATCHES, TABLE, gain_of, trimmed_batches
 from ..pixel_estimates import PixelEstimates, brightness
 
-#: Connections of a path that are recorded, those of its first vertices; and paths of a pass, at
-#: most, about.
+#: The number of first vertices of a path whose connections are recorded, and about the most paths
+#: of a pass that are recorded.
 _VERTICES, _MOST_PATHS = 6, 1 << 18
 
 
 class ConnectionRecords(Observer):
-    """Records what paths bring by connections that were chosen from a light table, and by running
-    into lights that these could have found: what one of them finds less often, MIS leaves to the
-    other.
+    """Records the contributions of connections that were chosen from a light table, and of
+    scattered rays that hit lights which connections could have found: through MIS weights, the
+    choice of lights changes both.
 
     Parameters:
         scene: The scene.
-        pixels: Is told what the paths bring.
-        rows: Rows of the table.
-        as_path: The probabilities, for each cell, with which Mitsuba would choose.
+        pixels: Receives the radiance of the paths.
+        rows: Number of rows of the table.
+        as_path: The probability of each cell in Mitsuba's choice of lights.
 
     Attributes:
         samples (int): Paths of the last pilot, those that are not recorded included.
-        row_squares (mi.Float64): For each row, the sum of the squares of what its connections would
-            bring if Mitsuba had chosen, in the image, weighted by their place; shape
-            [rows].
-        variance (float): Sum of the squared errors of the paths, weighted so, if Mitsuba had
-            chosen.
+        row_squares (mi.Float64): For each row, the sum of the squared contributions that its
+            connections would make with Mitsuba's choice, weighted by pixel; shape [rows].
+        variance (float): Sum of the squared errors that the paths would have with Mitsuba's choice,
+            weighted by pixel.
     """
 
     def __init__(
@@ -45,7 +44,7 @@ class ConnectionRecords(Observer):
         self.restart()
 
     def restart(self) -> None:
-        """Forgets the last pilot."""
+        """Discards the records of the last pilot."""
         self.row_squares = dr.zeros(mi.Float64, self._rows)
         self.samples, self.variance = 0, 0.0
         self._error = self._removed = 0.0
@@ -53,7 +52,7 @@ class ConnectionRecords(Observer):
         self._batches, self._rays = np.zeros((2, BATCHES)), np.zeros(3)
 
     def kernel_state(self) -> tuple:
-        """What kernels depend on."""
+        """The attributes on which kernels depend (``frozen.py``)."""
         return (
             self._scene, self._as_path, self._path, self._is_recorded, self._slots, self._row,
             self._square, self._more, self._total, self._counts,
@@ -83,7 +82,7 @@ class ConnectionRecords(Observer):
         dr.eval(self._row, self._square, self._more, self._total, self._counts)
 
     def emission(self, path, ds, value, mis, pdf, active) -> None:
-        # A number that is not finite would hide those of the others in the sum
+        # A number that is not finite would make the whole sum so
         active = active & self._is_recorded & (pdf > 0) & (path.arrival.pdf > 0)
         as_path = self._scene.pdf_emitter_direction(path.arrival.ref, ds, active)
         change = power_heuristic(path.arrival.pdf, as_path)
@@ -146,18 +145,18 @@ class ConnectionRecords(Observer):
 
     @property
     def measured(self) -> tuple[float, float]:
-        """By how much, relatively, the choice of the last pilot has lowered the variance, and the
-        error of that (``benefit.py``)."""
+        """The relative reduction of variance by the choice of the last pilot, and its error
+        (``benefit.py``)."""
         return gain_of(self._batches)
 
     @property
     def cost(self) -> float:
-        """The time of a path with the choice of the last pilot, in units of that with Mitsuba's."""
+        """The time of a path with the choice of the last pilot, relative to Mitsuba's choice."""
         return self._cost(self._rays[1])
 
     @property
     def least_cost(self) -> float:
-        """The same, if no more connections had to be tested than with Mitsuba's choice."""
+        """The same, if it needed no more shadow rays than Mitsuba's choice."""
         return self._cost(self._rays[2])
 
     def _cost(self, shadow: float) -> float:
@@ -169,7 +168,7 @@ class ConnectionRecords(Observer):
         return (others + shadow + TABLE * connections) / (others + as_path)
 
     def predicted_gain(self, ratio: mi.Float) -> float:
-        """By how much, relatively, a choice lowers the variance with which the mean squares of the
-        connections of each row become ``ratio`` times those with Mitsuba's choice; shape [rows]."""
+        """The relative reduction of variance by a choice with which the mean squares of the
+        connections of each row are ``ratio`` times those of Mitsuba's choice; shape [rows]."""
         removed = float(dr.sum(self.row_squares * mi.Float64(1 - ratio))[0])
         return removed / max(self.variance, 1e-30)

@@ -1,4 +1,4 @@
-"""Learning what of an environment is visible."""
+"""Learning the visibility of an environment."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ CELLS = {"primary": (16, 16), "world": (32, 16)}
 
 
 class VisibilityLearner(Learner):
-    """Counts what is visible, in a pilot that samples by the product of light and BSDF.
+    """Counts unoccluded connections in a pilot that samples by the product of emission and BSDF.
 
     Parameters:
         space: ``primary`` for maps of random numbers, ``world`` for maps of directions.
         splits, everywhere: See :class:`TwoStage`.
         reallocated: The share of the connections that follow the maps.
-        width, height: Of the film, with its border where that is sampled.
+        width, height: Size of the film in pixels, with its border where that is sampled.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class VisibilityLearner(Learner):
         return self._decision(scene, visibility)
 
     def _emission(self, shape: tuple[int, int]) -> np.ndarray:
-        """What cells emit, in units of all."""
+        """The share of each cell in the emission of the environment."""
         node = self._sums.texels.nodes()
         weight = node[:-1, :-1] + node[:-1, 1:] + node[1:, :-1] + node[1:, 1:]
         rows, columns = (

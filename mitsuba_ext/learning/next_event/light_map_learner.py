@@ -24,33 +24,33 @@ from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
 from .connection_records import ConnectionRecords
 
-#: Share of the choices that what was learned does not decide: half of them go by the unoccluded
-#: contributions, half are those of ``path``, so that no choice is less likely than 1/20 of what it
-#: is there. Where a beam lights a small part of a voxel, the expectation may have missed it.
+#: Share of the choices that do not follow the learned map: half of them use the unoccluded
+#: contributions, half the probabilities of ``path``, so that no probability is below 1/20 of that
+#: of ``path``. The map may miss a beam that lights a small part of a voxel.
 _DEFENSIVE = 0.1
 
-#: Voxels along each axis where the scene's author leaves the choice to us, at most; and entries of
-#: the map for each sample of the pilots (with about three connections each), at most.
+#: The most voxels along each axis with ``grid=0``; and the most entries of the map per sample of
+#: the pilots (with about three connections each).
 _GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 
-#: Entries of the map of the first pilot for each sample of the render, at most: an entry takes a
-#: third of the time of a sample, all stages together. A finer map follows where the first pilot
-#: promises at least this efficiency.
+#: The most entries of the first pilot's map per sample of the render: an entry takes a third of the
+#: time of a sample, all stages together. And the efficiency that the first pilot must predict for a
+#: finer map to follow.
 _TRIAL_ENTRIES, _FINER_EFFICIENCY = 0.15, 1.2
 
-#: The efficiency that choosing from a table must reach; and that which, from few samples, lets
-#: learning go on: tables of more are little better.
+#: The efficiency that a light table must reach; and that which it must reach with few samples for
+#: learning to continue: tables of more samples are little better.
 _LEAST_EFFICIENCY, _TRIAL_EFFICIENCY = 1.03, 1.0
 
-#: Share of all pilots' samples that decide, at least.
+#: The final decision is based on at least this share of all pilots' samples.
 _LEAST_SHARE = 0.2
 
 
 class LightMapLearner(Learner):
     """Learns a light map in the pilots, and chooses lights with it.
 
-    Where the pilots show that choosing lights as ``path`` does is nearly as good, and nothing else
-    needs the map, learning ends there.
+    Where the pilots show that choosing lights as ``path`` does is nearly as efficient, and nothing
+    else needs the map, learning ends there.
 
     Parameters:
         target: ``visibility`` or ``contribution``.
@@ -61,10 +61,10 @@ class LightMapLearner(Learner):
         film_width: Pixels of a row of the film, with its border where that is sampled.
         render_samples: Samples of the render, pilots included.
         load, save: Files of a map to begin with, and of the map that was learned.
-        plugin: What errors call the plugin.
+        plugin: Name of the plugin in error messages.
 
     Attributes:
-        map (LightMap): What has been learned until now; ``None`` where nothing is.
+        map (LightMap): What has been learned so far; ``None`` if there is no map.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class LightMapLearner(Learner):
         self.render_samples = render_samples
         self.load, self.save, self.plugin = load, save, plugin
         self._pixels = PixelEstimates(film_width)
-        # A loaded map brings its region and its rows
+        # A loaded map contains its region and its rows
         self.wants_scout = load is None
         self._is_needed = grid > 0 or load is not None or save is not None
         self.map: LightMap | None = None
@@ -96,7 +96,7 @@ class LightMapLearner(Learner):
         self._finer_map: Callable[[], LightMap] | None = None
 
     def keep_map(self) -> None:
-        """Asks for the map also where it does not pay for the choice of lights."""
+        """Keeps the map even where it does not pay for the choice of lights."""
         self._is_needed, self._records = True, None
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> EmitterSampling | None:
@@ -119,7 +119,7 @@ class LightMapLearner(Learner):
         return self._begin_map()
 
     def _begin_map(self) -> LightTable:
-        """The choice of the first pilot that fills a map."""
+        """The decision of the first pilot that fills a map."""
         self._set_as_path(self._scene)
         self._is_tested = False
         if not self._is_needed:
@@ -166,7 +166,7 @@ class LightMapLearner(Learner):
     # ---- Observer ----
 
     def kernel_state(self) -> list[Observer]:
-        """What kernels depend on."""
+        """The attributes on which kernels depend (``frozen.py``)."""
         return self._observers()
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
@@ -231,16 +231,16 @@ class LightMapLearner(Learner):
         self._as_path = _normalized(uniform_weights(scene, cells), cells.count)
 
     def _pays(self, probabilities: mi.Float, is_last: bool) -> bool:
-        """Has the last pilot shown that learning pays, or may it still?"""
+        """Does the map pay by the samples of the last pilot, or may it pay with more samples?"""
         records = self._records
         records.finish()
         error = 0.0
         is_trial = records.samples < _LEAST_SHARE * self.pilot_samples and not is_last
         if self._is_tested:
-            # Samples that did not teach the table from which they were drawn
+            # The samples were drawn from the table, and it was not learned from them
             (gain, error), cost = records.measured, records.cost
         else:
-            # Too optimistic: the samples judge what they have taught
+            # Too optimistic: the table was learned from the same samples
             as_path = dr.tile(self._as_path, self.map.rows.count)
             gain = records.predicted_gain(self.map.square_ratios(as_path, probabilities))
             is_trial, cost = not is_last, records.least_cost
@@ -258,7 +258,7 @@ class LightMapLearner(Learner):
         return True
 
     def _probabilities(self, weights: mi.Float) -> mi.Float:
-        """Probabilities that no wrong expectation can keep from any cell."""
+        """The probabilities of cells, with a defensive share: errors of the map exclude no cell."""
         count, unoccluded = self.map.cells.count, self.map.unoccluded
         as_path = dr.tile(self._as_path, self.map.rows.count)
         safe = 0.5 * (_normalized(unoccluded, count) + as_path)

@@ -1,4 +1,4 @@
-"""Makes a roulette on the shadow ray of a light map that another learner fills."""
+"""Makes a Russian roulette on shadow rays from a light map that another learner fills."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from ..next_event.light_map_learner import LightMapLearner
 
 
 class LightMapRouletteLearner(Learner):
-    """Makes a roulette of the light map that another learner fills.
+    """Makes a Russian roulette on shadow rays from the light map that another learner fills.
 
     Parameters:
-        lights: Who learns the map; comes before this learner.
+        lights: The learner of the map, which precedes this learner.
         slope, floor, law: See :class:`.LightMapRoulette`.
     """
 
@@ -34,14 +34,14 @@ class LightMapRouletteLearner(Learner):
         return self._make_roulette()
 
     def state(self) -> dict[str, np.ndarray]:
-        # All of it is in the light map
+        # Everything else is in the light map
         return {} if self._lights.map is None else {"law": np.array(self._law["law"])}
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> ShadowTest | None:
         return self._make_roulette()
 
     def _make_roulette(self) -> ShadowTest | None:
-        """The roulette by the map; ``None`` if it does not pay."""
+        """The roulette from the map; ``None`` if it does not pay."""
         roulette = LightMapRoulette(self._lights.map, **self._law)
         pays = roulette.rejected_share >= WORTHWHILE
         verb = "rejects" if pays else "does not reject"

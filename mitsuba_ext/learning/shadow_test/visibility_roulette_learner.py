@@ -1,4 +1,4 @@
-"""Learns a visibility map, and makes a roulette on the shadow ray of it.
+"""Learns a visibility map, and makes a Russian roulette on shadow rays from it.
 
 Source: Guo, Eisemann and Eisemann, *Next Event Estimation++*, CGF 39(7), 2020, sections 3.3.1 and
 4.1 (= Guo's thesis, sections 3.3.3.1 and 3.4.1).
@@ -46,7 +46,7 @@ class VisibilityRouletteLearner(Learner):
         return self._make_roulette()
 
     def _make_roulette(self) -> ShadowTest | None:
-        """The roulette by the map; ``None`` if it does not pay."""
+        """The roulette from the map; ``None`` if it does not pay."""
         self._summary = str(self._map)
         roulette = None
         if len(self._map.light_voxels()) > 0:

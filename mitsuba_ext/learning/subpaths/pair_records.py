@@ -1,4 +1,4 @@
-"""What connections between regions bring to the image."""
+"""Records the contributions of connections between regions."""
 
 from __future__ import annotations
 
@@ -9,27 +9,28 @@ import numpy as np
 from ...transport.observer import Observer
 from ..pixel_estimates import PixelEstimates, brightness
 
-#: Connections of a path that are recorded, those of its first vertices.
+#: The number of first vertices of a path whose connections are recorded.
 _VERTICES = 6
 
-#: The largest gain of a connection that is recorded, in units of its pixel's radiance: a single one
-#: cannot decide.
+#: Contributions are clipped to this number of times their pixel's radiance, so that a single one
+#: does not dominate.
 _LIMIT = 1000.0
 
 
 class PairRecords(Observer):
     """Records, for each pair of regions, how often vertices of camera paths in the one were
-    connected to vertices of light paths in the other, and the squares of what that brought,
-    relative to the pixel.
+    connected to vertices of light paths in the other, and the squares of their contributions,
+    relative to the radiance of the pixel.
 
     Parameters:
         count: Number of regions.
-        pixels: Is told what the paths bring.
+        pixels: Receives the radiance of the paths.
 
     Attributes:
-        tests (np.ndarray): Connections, shape [camera region, light region].
-        squares (np.ndarray): The sum of their squares.
-        error (float): Sum of the squared errors of the paths, relative to the pixel.
+        tests (np.ndarray): Number of connections, shape [camera region, light region].
+        squares (np.ndarray): The sum of their squared contributions.
+        error (float): Sum of the squared errors of the paths, relative to the radiance of the
+            pixel.
     """
 
     def __init__(self, count: int, pixels: PixelEstimates) -> None:
@@ -38,13 +39,13 @@ class PairRecords(Observer):
         self.restart()
 
     def restart(self) -> None:
-        """Forgets the last pilot."""
+        """Discards the records of the last pilot."""
         shape = self._count, self._count
         self.tests, self.squares = np.zeros(shape), np.zeros(shape)
         self.error = 0.0
 
     def kernel_state(self) -> tuple:
-        """What kernels depend on."""
+        """The attributes on which kernels depend (``frozen.py``)."""
         return self._path, self._stride, self._size, self._pair, self._value, self._total
 
     # ---- Observer of the walk ----
@@ -64,7 +65,7 @@ class PairRecords(Observer):
     def subpath(self, vertex, region, probability, value, active) -> None:
         active = active & (vertex.depth < _VERTICES)
         slot = vertex.depth * self._stride + self._path
-        # Of several connections of a vertex, the last one stays
+        # Of several connections of a vertex, the last one is kept
         pair = vertex.path.sums.region * self._size + region
         dr.scatter(self._pair, pair, slot, active)
         dr.scatter(self._value, brightness(value), slot, active)
@@ -84,7 +85,7 @@ class PairRecords(Observer):
         square = dr.square(self._value) * dr.gather(mi.Float, weight, slot % self._stride)
         square = dr.select(dr.isfinite(square), dr.minimum(square, _LIMIT**2), 0)
         pair, square, size = self._pair.numpy(), square.numpy(), self._count**2
-        # One after the other: equal seeds make equal sums
+        # NumPy adds in a fixed order: equal seeds make equal sums
         tests = np.bincount(pair, minlength=size + 1)[:size]
         squares = np.bincount(pair, square, size + 1)[:size]
         self.tests += tests.reshape(self._count, -1)

@@ -1,4 +1,4 @@
-"""Learning in which regions the vertices of light paths are chosen."""
+"""Learning the probabilities of the regions from which vertices of light paths are chosen."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
 from .pair_records import PairRecords
 
-#: Share of the choices that go by the number of vertices alone: no vertex is chosen more rarely
-#: than a tenth as often as by a uniform choice.
+#: Share of the choices by the number of vertices alone: each vertex is chosen at least a tenth as
+#: often as by a uniform choice.
 _DEFENSIVE = 0.1
 
-#: The weight, in connections, of what is known of the pairs of larger regions.
+#: The weight, in connections, of the estimate for a pair of larger regions, as a prior.
 _PRIOR = 1.0
 
-#: Connections of the pilots for each pair of regions, about; and regions, at most.
+#: About the number of connections of the pilots for each pair of regions; and the most regions.
 _TESTS, _MOST_REGIONS = 2.0, 768
 
-#: Recorded connections of a path, about.
+#: About the number of recorded connections of a path.
 _CONNECTIONS = 3
 
-#: By how much the variance must be lower, by the first pilot's promise, for learning to go on. The
-#: truth is about twice the promise, because MIS weights then rely on the connections; a sample
+#: The relative reduction of variance that the first pilot must predict for learning to continue.
+#: The true one is about twice as large, because MIS weights then rely on the connections; a sample
 #: takes 1.2 times as long.
 _LEAST_GAIN = 0.12
 
@@ -41,7 +41,7 @@ class LightVertexSample:
     """Vertices of some light paths.
 
     Attributes:
-        p, n: Where they are, and normals on the side on which they are connected.
+        p, n: Their positions, and normals on the side on which they are connected.
         brightness: Radiance · throughput / density.
         paths: Number of light paths.
     """
@@ -53,10 +53,10 @@ class LightVertexSample:
 
 
 class RegionLearner(Learner):
-    """Learns, for each region of vertices of camera paths, to which regions of vertices of light
-    paths they are connected with success. The probability of a region becomes the root mean square
-    of what connections bring to the image: BSDFs, distance, visibility, MIS weight, and the
-    brightness of the pixel included.
+    """Learns, for each region of vertices of camera paths, the probabilities of the regions of
+    vertices of light paths to which they are connected. They become proportional to the root mean
+    square of the contributions of connections to the image: BSDFs, distance, visibility, MIS
+    weight, and the brightness of the pixel included.
 
     Where the first pilot shows that a uniform choice is nearly as good, learning ends there.
 
@@ -102,7 +102,7 @@ class RegionLearner(Learner):
     # ---- Observer ----
 
     def kernel_state(self) -> PairRecords | None:
-        """What kernels depend on."""
+        """The attributes on which kernels depend (``frozen.py``)."""
         return self._records
 
     def begin(self, lanes: int, pixel: mi.UInt32 | None) -> None:
@@ -142,15 +142,15 @@ class RegionLearner(Learner):
         return self._table()
 
     def _promise(self, drawn: np.ndarray) -> float:
-        """By how much, relatively, the new probabilities lower the variance of a pilot with the
-        probabilities ``drawn``, if its MIS weights stay."""
+        """The relative reduction of variance by the new probabilities, for a pilot with the
+        probabilities ``drawn`` and unchanged MIS weights."""
         squares = self._records.squares
         less = (squares * (1 - drawn / self._probability)).sum()
         return less / max(self._records.error, 1e-30)
 
     def _learned(self) -> np.ndarray:
-        """The probabilities that all pilots suggest, [camera region, light region]."""
-        # Relative to the light that there is in a region: neighbours are then alike
+        """The probabilities learned from all pilots, [camera region, light region]."""
+        # Relative to the power of a light region: neighbours are then alike
         tests, squares = self._tests, self._squares / self._power**2
         for axis in (0, 1):
             tests, squares = self._with_smaller(tests, axis), self._with_smaller(squares, axis)
@@ -158,7 +158,8 @@ class RegionLearner(Learner):
         mean = np.zeros_like(tests)
         for i, rows in enumerate(levels):
             for j, columns in enumerate(levels):
-                # Of a pair of different sizes, the smaller region has the larger one for its prior
+                # The prior is the pair in which the smaller region, or both regions of the same
+                # size, are replaced by the regions around them
                 row = parent[rows] if i >= j else np.arange(rows.start, rows.stop)
                 column = parent[columns] if j >= i else np.arange(columns.start, columns.stop)
                 prior = _PRIOR * mean[np.ix_(row, column)] if i + j > 0 else 0

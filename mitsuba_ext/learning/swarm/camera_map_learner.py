@@ -10,7 +10,7 @@ from .tile_counts import Choices
 
 
 class CameraMapLearner(MapLearner):
-    """Learns maps of :class:`MappedNumbers`, which is its ``decision``."""
+    """Learns the maps of :class:`MappedNumbers`, which is its ``decision``."""
 
     def __init__(self, name: str, decision: MappedNumbers, width: int, height: int, **how) -> None:
         super().__init__(name, decision, width, height, decision.cells, **how)

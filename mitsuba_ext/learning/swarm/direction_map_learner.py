@@ -31,7 +31,7 @@ class DirectionMapLearner(MapLearner):
 
     def direction(self, vertex, sample, weight, L, active) -> None:
         if self.is_learning:
-            # What a path has brought never falls: the least is that before the first bounce.
+            # The radiance of a path never decreases: its minimum is that before the first bounce.
             # Floats that are not negative have the order of their bits
             bits = dr.reinterpret_array(mi.UInt32, dr.maximum(brightness(L), 0))
             active = active & is_smooth(vertex)

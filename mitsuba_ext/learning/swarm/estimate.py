@@ -1,23 +1,23 @@
 """Estimates densities over cells for all tiles of a film, from few samples of each.
 
-What a tile has counted is drawn towards what larger tiles around it have counted, as far as these
-differ by no more than chance: an empirical Bayes estimate. It goes from large tiles, around which
-nothing is known but uniform numbers, to the smallest, and in each of them from the root of the tree
-of cells to its leaves. At a node, with ``h`` the share of the left half among ``n`` samples, and
-``p`` what the tile around expects, the estimate is the mean of a beta distribution::
+The estimate of a tile is a compromise between its own counts and those of the larger tile around
+it, which weigh more the less the two differ beyond chance: an empirical Bayes estimate. It proceeds
+from the largest tiles, whose prior is uniform, to the smallest, and in each tile from the root of
+the tree of cells to its leaves. At a node, with ``h`` the share of the left half among ``n``
+samples, and ``p`` its estimate in the tile around, it is the mean of a beta distribution::
 
     (n h + κ p) / (n + κ)
 
-How far tiles really differ from the ones around them, ρ = 1 / (κ + 1), is estimated from all nodes
-of a tile and its neighbours (the variance of ``h`` is p (1 − p) (1 / n + ρ (1 − 1 / n))). Where
-nothing exceeds chance, ρ is 0, and the tile has the map of the one around it.
+The true difference between tiles and the ones around them, ρ = 1 / (κ + 1), is estimated from all
+nodes of a tile and its neighbours (the variance of ``h`` is p (1 − p) (1 / n + ρ (1 − 1 / n))).
+Where no difference exceeds chance, ρ is 0, and the tile has the map of the one around it.
 
-What is drawn from a density of which we are not sure has the least variance where that is the root
-of the expected square of a share, and not its expectation: cells have a little more where little
-is known. Without that, a few samples that missed a bright cell leave spots.
+Samples from an uncertain density have the least variance where the density is the root of the
+expected square of a share, not its expectation: uncertain cells get slightly more. Without that,
+bright cells that the few samples of a tile have missed leave spots.
 
 All tiles of one size are estimated together, on the device: a map of 8 million cells takes a tenth
-of a second. What a node of a tree holds is the difference of two sums over the cells before.
+of a second. The sum over a node of a tree is the difference of two prefix sums over cells.
 
 Source: the propagation in two rows of D. Cline, PhD dissertation, BYU 2007, section 9.2.3, is
 replaced; the estimate is the beta-binomial one by moments (J. C. Kleinman, *Proportions with
@@ -36,12 +36,12 @@ from ...maps.swarm.nodes import Nodes, sums_before
 
 
 class Form(NamedTuple):
-    """How the density of a cell follows from what its samples bring.
+    """How the density of a cell follows from the contributions of its samples.
 
     Attributes:
         is_root: Is it in proportion to the root of the mean of a cell, and not to the mean? The
-            variance is least with the mean where all samples of a cell bring the same, and with the
-            root where some of them bring nothing.
+            variance is least with the mean where all samples of a cell contribute the same, and
+            with the root where some of them contribute nothing.
         floor: The share of uniform numbers.
     """
 
@@ -49,13 +49,13 @@ class Form(NamedTuple):
     floor: float
 
 
-#: Sizes of tiles, at most: the largest are 2^(this - 1) times as wide as the smallest.
+#: The most sizes of tiles: the largest are 2^(this - 1) times as wide as the smallest.
 _LEVELS = 6
 
-#: ρ, at most: with κ = 0, a single sample would decide.
+#: The largest ρ: with ρ = 1 (κ = 0), a single sample would decide.
 _LARGEST_DIFFERENCE = 0.5
 
-#: Probabilities closer to 0 or 1 are not believed when tiles are compared.
+#: When tiles are compared, probabilities are clipped to this distance from 0 and 1.
 _LEAST_PROBABILITY = 0.02
 
 
@@ -64,8 +64,8 @@ class Grid:
     """Tables of the tiles of a film, row by row.
 
     Attributes:
-        rows, columns: Of tiles.
-        maps: Tables of each tile.
+        rows, columns: Numbers of rows and columns of tiles.
+        maps: Number of tables of each tile.
     """
 
     rows: int
@@ -94,7 +94,7 @@ class Grid:
         return Grid(-(-self.rows // 2), -(-self.columns // 2), self.maps)
 
     def all_places(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """Those of all tables, one after the other."""
+        """:meth:`places` of all tables, one after the other."""
         return self.places(dr.arange(mi.UInt32, self.count))
 
     def places(self, table: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
@@ -112,7 +112,7 @@ class Grid:
         return (row <= self._last_row) & (column <= self._last_column)
 
     def nearest(self, row: mi.Int32, column: mi.Int32) -> tuple[mi.UInt32, mi.UInt32]:
-        """The nearest place of a tile."""
+        """Row and column of the tile that is nearest to a place."""
         return (
             mi.UInt32(dr.clip(row, 0, mi.Int32(self._last_row))),
             mi.UInt32(dr.clip(column, 0, mi.Int32(self._last_column))),
@@ -120,14 +120,13 @@ class Grid:
 
 
 def estimate(counts: mi.Float, squares: mi.Float, grid: Grid, widths: mi.Float) -> mi.Float:
-    """The share of each cell in what each tile brings.
+    """Estimates the share of each cell in the contributions of the samples of its table.
 
     Parameters:
-        counts: Sums of what samples brought, by table and cell.
-        squares: Sums of their squares, by table: they tell how many samples of equal size the sums
-            are worth.
+        counts: Sums of the contributions of samples, by table and cell.
+        squares: Sums of their squares, by table, which determine the effective sample size.
         grid: The tables.
-        widths: The share of each cell where nothing is known.
+        widths: The share of each cell among uniform numbers, which is the first prior.
 
     Returns:
         Shares, in the order of ``counts``; those of a table add up to one.
@@ -157,10 +156,10 @@ def estimate(counts: mi.Float, squares: mi.Float, grid: Grid, widths: mi.Float) 
 
 
 class Shares:
-    """What tables say of their cells.
+    """The estimated shares of cells, and densities that follow from them.
 
     Parameters:
-        shares: Of each cell in what the samples of a table bring, by table and cell.
+        shares: The share of each cell in the contributions of its table, by table and cell.
         widths: The share of each cell among uniform numbers.
     """
 
@@ -171,7 +170,7 @@ class Shares:
 
     @property
     def cells(self) -> int:
-        """Cells of a table."""
+        """Number of cells of a table."""
         return len(self._widths)
 
     @property
@@ -195,8 +194,8 @@ class Shares:
         return relative * self._every(self._widths)
 
     def expected_ratio(self, form: Form) -> mi.Float:
-        """The second moment, relative to that of uniform numbers, of what is in proportion to the
-        density and drawn from it; by table."""
+        """The second moment of an integrand in proportion to the density that is sampled from it,
+        relative to uniform numbers; by table."""
         mass = self.mass(form)
         width = self._every(self._widths)
         return dr.rcp(
@@ -213,8 +212,8 @@ def _updated(
     grid: Grid, nodes: Nodes, shares: mi.Float, variance: mi.Float, counts: mi.Float,
     squares: mi.Float,
 ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
-    """What a tile knows, where the tile around it expects these shares: by node, the share of the
-    left half, and its variance; ``variance`` is that of what is expected."""
+    """Combines the counts of each tile with ``shares``, those of the tile around it, which have
+    this ``variance``: by node, the share of the left half, and its variance."""
     cells = nodes.cells
     own_before, expected_before = sums_before(counts, cells), sums_before(shares, cells)
     dr.eval(own_before, expected_before)
@@ -233,7 +232,7 @@ def _updated(
     )
     dr.eval(excess, weight, chance)
     excess, weight, chance = _pooled(grid, (excess, weight, chance))
-    # One standard deviation of what chance brings is not believed, but it may be so
+    # A low estimate of ρ (by one standard deviation) for the shares, a high one for their variance
     deviation = dr.sqrt(chance)
     rho, most = (
         dr.clip(x / dr.maximum(weight, 1e-6), 0, _LARGEST_DIFFERENCE)
@@ -254,7 +253,7 @@ def _pooled(grid: Grid, values: tuple[mi.Float, ...]) -> list[mi.Float]:
     sums = [mi.Float(0) for _ in values]
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
-            # Before the first row comes the largest of all numbers
+            # The index before 0 is the largest integer, which is outside of the grid
             y, x = row + mi.UInt32(dy & 0xFFFFFFFF), column + mi.UInt32(dx & 0xFFFFFFFF)
             table, is_there = grid.table(y, x, which), grid.has(y, x)
             sums = [s + dr.gather(mi.Float, v, table, is_there) for s, v in zip(sums, values)]
@@ -287,7 +286,7 @@ def _halved(
 def _enlarged(
     grid: Grid, above: Grid, values: tuple[mi.Float, ...], cells: int
 ) -> list[mi.Float]:
-    """What tiles half as large would have: a bilinear interpolation."""
+    """Values of tiles half as large, by bilinear interpolation."""
     row, column, which = grid.all_places()
     nearest = mi.Int32(row >> 1), mi.Int32(column >> 1)
     towards = [mi.Int32(2 * (i & 1)) - 1 for i in (row, column)]

@@ -12,7 +12,7 @@ from .tile_counts import Choices
 
 
 class LightNumbersLearner(MapLearner):
-    """Learns :class:`LightMaps`, which are its ``decision``."""
+    """Learns the maps of :class:`LightMaps`, which is its ``decision``."""
 
     def __init__(self, name: str, decision: LightMaps, width: int, height: int, **how) -> None:
         super().__init__(name, decision, width, height, decision.cells, **how)

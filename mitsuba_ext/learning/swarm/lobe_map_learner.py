@@ -31,7 +31,7 @@ class LobeChoices(Choices):
 class LobeMapLearner(MapLearner):
     """Learns the maps of :class:`MappedLobes`, which is its ``decision``."""
 
-    #: What the maps of single bounces promise does not add up
+    #: The gains that are predicted for the maps of single bounces do not add up
     needs_measurement = True
 
     #: Maps of each bounce: by the number of reflections before it

@@ -18,24 +18,24 @@ from ..pixel_estimates import brightness
 from .estimate import Form, Grid, Shares, estimate
 from .tile_counts import Candidate, Choices, TileCounts
 
-#: How densities may follow from what was found; and how they do as long as nothing is known of
-#: what that brings.
+#: The forms of densities from which one is chosen; and the form before their gains are measured.
 _FORMS = (Form(True, 0.2), Form(False, 0.05))
 _FIRST_FORM = Form(False, 0.2)
 
-#: By how much a map is to lower the variance of the image, relatively, to be used: samples that are
+#: The relative reduction of the image's variance that a map must reach to be used: samples that are
 #: drawn from maps take about 5 % longer, and learning takes time.
 _LEAST_GAIN = 0.1
 
-#: Maps that do not pay after so many samples per pixel, and in so many stages, are given up.
+#: Maps are given up if they do not pay after this number of samples per pixel, in this number of
+#: stages.
 _ENOUGH_SAMPLES, _VAIN_STAGES = 2, 2
 
-#: Samples of all pilots that a tile has, at least, and one for each cell of its maps, which takes
-#: time. Tiles are as small as that allows. Before all are taken, there are maps of larger tiles,
-#: which have at least a part of these.
+#: In all pilots, a tile has at least this number of samples, and at least one for each cell of its
+#: maps, since cells take time. Tiles are as small as that allows. Earlier stages have larger tiles,
+#: with at least this part of these samples.
 _LEAST_SAMPLES, _EARLY_PART = 64, 0.25
 
-#: Samples per pixel of the first stage, about.
+#: About the number of samples per pixel of the first stage.
 _FIRST_SAMPLES = 0.25
 
 
@@ -44,8 +44,8 @@ def tile_edge(samples: float, cells: int, share: float = 1.0) -> int:
 
     Parameters:
         samples: Samples per pixel.
-        cells: Of all maps of a tile.
-        share: Of the samples that tiles are to have.
+        cells: Number of cells of all maps of a tile.
+        share: The part of the least number of samples that a tile must have.
     """
     wanted = share * max(_LEAST_SAMPLES, cells)
     edge = 1
@@ -58,28 +58,28 @@ class MapLearner(Learner):
     """Learns the maps of one decision from the samples of the pilots, and draws from them in all
     stages but the first.
 
-    The density of a cell follows from the mean of what numbers in it have brought. The samples of
-    each stage tell which of two forms would have been best for them, and what maps are worth: these
-    are used where that promises to lower the variance of the image, and given up for good after a
-    stage in which they did not.
+    The density of a cell follows from the mean contribution of the numbers in it. From the samples
+    of each stage, the learner estimates which of two forms of the density would have been better
+    for them, and the reduction of the image's variance by maps. Maps are used where that is large
+    enough, and given up for good after a stage in which it was not.
 
     Parameters:
-        name: What summaries call the maps.
-        decision: What draws from the maps: its attribute ``maps`` is theirs, or ``None`` where
-            numbers are to be uniform.
-        width, height: Of the film, with its border where that is sampled.
-        cells: Of a map.
+        name: Name of the maps in summaries.
+        decision: The decision that draws from the maps: its attribute ``maps`` is set to them, or
+            to ``None`` for uniform numbers.
+        width, height: Size of the film in pixels, with its border where that is sampled.
+        cells: The cells of a map.
         samples: Samples per pixel of all pilots.
-        maps: Maps of a tile.
-        always: Use them also where they do not pay?
+        maps: Number of maps of a tile.
+        always: Use maps also where they do not pay?
 
     Attributes:
         decision: See above.
-        total, importance: Of the pass that ends: what each lane has brought, and the factor from
-            that to what its pixel gets.
-        tiles: The tiles that share maps.
-        cells: The cells of each.
-        gain: By how much the maps are expected to lower the variance, or did so in the last pilot.
+        total, importance: At the end of a pass: the radiance of each lane, and the factor from it
+            to the contribution to its pixel.
+        tiles: The tiles whose pixels share maps.
+        cells: The cells of a map.
+        gain: The relative reduction of variance by the maps: expected, or that in the last pilot.
     """
 
     def __init__(
@@ -102,30 +102,30 @@ class MapLearner(Learner):
         self._pixel: mi.UInt32 | None = None
         self._radiance: mi.Float | None = None
 
-    # ---- What a subclass says ----
+    # ---- For subclasses ----
 
-    #: Are maps used only after a stage has shown what they are worth? Where something else takes
-    #: a part of the decisions, what maps promise over uniform numbers says nothing.
+    #: Are maps used only after a stage has measured their gain? Where another distribution takes a
+    #: part of the decisions, the gain that is predicted against uniform numbers means nothing.
     needs_measurement = False
 
     def choices(self, radiance: mi.Float) -> Choices:
-        """What the decision chose in each lane of the last pass; ``radiance`` is what each lane
-        brought to its pixel."""
+        """The choices of the decision in the last pass; ``radiance`` is the contribution of each
+        lane to its pixel."""
         raise NotImplementedError
 
     def drawn(self) -> Any:
-        """Variables of the running pass that :meth:`choices` needs, but for those into which it
+        """Variables of the running pass that :meth:`choices` needs, except those into which it
         scatters."""
         return None
 
     @property
     def is_learning(self) -> bool:
-        """Are the samples of the running stage wanted?"""
+        """Are the samples of the running stage recorded?"""
         return self._counts is not None
 
     # ---- Observer ----
 
-    #: It keeps arrays that a pass makes: rays, and what they bring
+    #: It keeps arrays that a pass makes: rays, and their radiance
     can_be_frozen = False
 
     def camera(self, rays: CameraRays) -> None:
@@ -143,8 +143,8 @@ class MapLearner(Learner):
         self._radiance = dr.sqrt(dr.squared_norm(mi.Color3f(rgb)) / 3)
         self.total = brightness(L)
         self.importance = dr.select(self.total > 0, self._radiance / self.total, 0)
-        # Choices are asked for once the pass is over: to read what it has scattered would start it,
-        # and what is not stored yet would be traced a second time
+        # `choices` is called once the pass is over: reading the scattered arrays now would start
+        # it, and variables that are not scheduled here would be traced a second time
         dr.schedule(self._radiance, self.total, self.importance, self._pixel, self.drawn())
 
     # ---- Between the stages ----
@@ -186,7 +186,7 @@ class MapLearner(Learner):
         if self.decision.maps is not None:
             self._memory += self.decision.maps.bytes
         if not is_last:
-            # The next stage has as many samples as all until now
+            # The next stage has as many samples as all stages so far
             tiles = self._tiles(2 * samples)
             counts.begin_stage([self._candidate(shares, form, tiles) for form in _FORMS])
             if tiles.edge < self.tiles.edge:
@@ -199,14 +199,14 @@ class MapLearner(Learner):
         self.stop()
 
     def _tiles(self, samples: float) -> FilmTiles:
-        """The tiles that have maps once each pixel has so many samples."""
+        """The tiles that have maps once each pixel has this number of samples."""
         cells = self.maps * self.cells.count
         edge = max(self._least_edge, tile_edge(samples, cells, _EARLY_PART))
         return FilmTiles.of_cells(*self._extent, edge, cells)
 
     def _candidate(self, shares: Shares, form: Form, tiles: FilmTiles) -> Candidate:
-        """A density that is tried; it is asked for tables of these tiles, which may be smaller than
-        its own."""
+        """A density to be tried in the next stage. It is called with tables of ``tiles``, which may
+        be smaller than the tiles of ``shares``."""
         own, grid = self.tiles, Grid(tiles.rows, tiles.columns, self.maps)
         columns, step = (dr.opaque(mi.UInt32, n) for n in (own.columns, own.edge // tiles.edge))
 
@@ -235,7 +235,7 @@ class MapLearner(Learner):
         self.stop()
 
     def stop(self) -> None:
-        """Learns nothing more."""
+        """Ends learning."""
         self._counts = self._rays = self._pixel = self._radiance = None
         self.total = self.importance = None
 

@@ -1,5 +1,5 @@
-"""What the samples of pilots have brought, by tile and cell: integers, so that equal seeds count
-equally."""
+"""Sums of the contributions of pilot samples, by tile and cell. They are integers, so that equal
+seeds give equal sums."""
 
 from __future__ import annotations
 
@@ -17,37 +17,36 @@ from ...maps.swarm.film_tiles import FilmTiles
 #: Fixed point of counts and of their squares, of radiance, and of squared radiance.
 _ONE, _ONE_X, _ONE_X2 = 2.0**12, 2.0**16, 2.0**12
 
-#: The largest count, in units of the root mean square of what samples of the tile bring; and the
-#: largest square that is believed when gains are measured.
+#: Contributions are clipped to the first, in units of the root mean square contribution of samples
+#: of the tile; their squares to the second when gains are measured.
 _LARGEST, _LARGEST_MEASURED = 32.0, 4096.0
 
 #: The largest radiance that is counted, in units of that of the film.
 _BRIGHTEST = 1024.0
 
-#: Squared radiance of a dark tile, in units of the squared mean of the film.
+#: Added to the squared radiance of a tile, in units of the squared mean of the film.
 _FLOOR = 1e-2
 
-#: The density of a cell of a table, relative to uniform numbers: of table and cell.
+#: (table, cell) → the density of the cell, relative to uniform numbers.
 Candidate = Callable[[Any, Any], Any]
 
 
 @dataclass
 class Choices:
-    """What a decision has chosen in a pass.
+    """The choices of a decision in a pass.
 
     Attributes:
-        map: Which map of the lane's tile was asked.
-        cell: Its cell.
+        map: Which map of the lane's tile was used.
+        cell: The chosen cell of the map.
         density: The density of the numbers, relative to uniform ones.
-        value: What followed from it, divided by all densities.
+        value: The contribution after the choice, divided by all densities.
         active: Where the decision was taken.
-        lane: Whose decision it was; ``None`` for one in each lane.
-        share: The share of the decisions that the maps take, beside others that something else
-            takes.
-        scale: A density of 1 relative to uniform numbers, in units of the density of that something
-            else; used where ``share`` is below 1. ``density`` is in these units then.
-        later: The part of ``value`` that follows from later choices of the same path, whose
-            ``density`` says how likely both were; it is not measured a second time here.
+        lane: The lane of each choice; ``None`` for one in each lane.
+        share: The share of the decisions that the maps take; another distribution takes the rest.
+        scale: The density of uniform numbers, in units of the density of that other distribution;
+            used where ``share`` is below 1. ``density`` is in these units then.
+        later: The part of ``value`` after later choices of the same path. It is measured with
+            these, whose ``density`` is that of both choices, and not a second time here.
     """
 
     map: mi.UInt32
@@ -70,12 +69,12 @@ class TileCounts:
 
     Parameters:
         tiles: Tiles of the film.
-        maps: Maps of a tile.
-        cells: Cells of a map.
+        maps: Number of maps of a tile.
+        cells: Number of cells of a map.
 
     Attributes:
         candidates: Densities that are tried on the samples of the running stage.
-        samples: Samples that were counted.
+        samples: Number of samples that were counted.
     """
 
     def __init__(self, tiles: FilmTiles, maps: int, cells: int) -> None:
@@ -95,26 +94,26 @@ class TileCounts:
         return 4 * len(self._counts) + 8 * len(self._squares)
 
     def begin_stage(self, candidates: Sequence[Candidate]) -> None:
-        """Tries ``candidates`` from now on."""
+        """Begins a stage, whose samples measure the gains of ``candidates``."""
         self.candidates = list(candidates)
         #: Squares as they were drawn, under uniform numbers, and under each candidate
         self._moments, self._stage_variance = np.zeros(2 + len(candidates)), 0.0
 
     def gains(self) -> np.ndarray:
-        """By how much each candidate lowers the variance of the image, relative to what it is with
-        uniform numbers; as the samples of the stage tell."""
+        """The reduction of the image's variance by each candidate, relative to the variance with
+        uniform numbers, estimated from the samples of the stage."""
         drawn, uniform, *tried = self._moments
         variance = self._stage_variance + uniform - drawn
         return (uniform - np.array(tried)) / variance if variance > 0 else np.zeros(len(tried))
 
     def expected_gain(self, ratios: np.ndarray) -> float:
         """The same for maps whose second moments, relative to uniform numbers, are ``ratios``, by
-        table; as all samples tell."""
+        table; estimated from all samples."""
         saved = (self._second * (1 - ratios)).sum()
         return float(saved) / self._variance if self._variance > 0 else 0.0
 
     def divide(self, tiles: FilmTiles) -> None:
-        """Goes on with smaller tiles, among which it divides evenly what it has counted."""
+        """Replaces the tiles by smaller ones, among which the counts are divided evenly."""
         parts = (self._tiles.edge // tiles.edge) ** 2
         source = self._larger(tiles)
         self._second = self._second[source.numpy()] / parts
@@ -127,7 +126,7 @@ class TileCounts:
         self._tiles = tiles
 
     def _larger(self, tiles: FilmTiles) -> mi.UInt32:
-        """By table of smaller tiles, that of the tile which they are a part of."""
+        """For each table of smaller tiles, the table of the tile that contains them."""
         step, which = self._tiles.edge // tiles.edge, np.arange(self._maps)
         rows, columns = np.arange(tiles.rows) // step, np.arange(tiles.columns) // step
         tile = rows[:, None] * self._tiles.columns + columns
@@ -138,14 +137,14 @@ class TileCounts:
         return mi.Float(self._counts), mi.Float(self._squares) * _ONE
 
     def add(self, pixel: mi.UInt32, radiance: mi.Float, choices: Choices) -> None:
-        """Adds the samples of a pass; ``radiance`` is what each brought to its pixel."""
+        """Adds the samples of a pass; ``radiance`` is the contribution of each to its pixel."""
         self.samples += len(pixel)
         tile, count = self._tiles.tile(pixel), self._tiles.count
         radiance = dr.select(dr.isfinite(radiance), radiance, 0)
         mean = float(dr.mean(radiance)[0])
         if not mean > 0:
             return
-        # A power of two: no sum that depends on the order of additions decides
+        # Rounded to a power of two: the mean depends on the order of additions
         inverse_unit = dr.opaque(mi.Float, 2.0 ** -round(np.log2(mean)))
         x = dr.minimum(radiance * inverse_unit, _BRIGHTEST)
         first, second, samples = _sums(
@@ -170,21 +169,21 @@ class TileCounts:
         self._stage_variance += total
 
     def _add_choices(self, tile, choices: Choices, value, later, weight: np.ndarray) -> None:
-        """``value`` and ``later`` are relative to the root mean square of what samples bring to the
-        tile; ``weight`` turns their squares into squares of relative errors, by table."""
+        """``value`` and ``later`` are relative to the root mean square contribution of samples of
+        the tile; ``weight`` turns their squares into squares of relative errors, by table."""
         table = tile * self._maps + choices.map
         cell = table * self._cells + choices.cell
-        # Drawn in proportion to the density, and divided by it: a sum of these is an integral
+        # Values are divided by the density of their samples: their sum estimates an integral
         fixed = mi.UInt32(dr.minimum(value, _LARGEST) * _ONE + 0.5)
         dr.scatter_add(self._counts, fixed, cell, choices.active)
         wide = mi.UInt64(fixed)
         dr.scatter_add(self._squares, (wide * wide) // int(_ONE), table, choices.active)
-        # The terms of a product of two sums have the density of what leads to the earlier one
+        # The square without that of the later part, which is measured with the later choice
         square, square_of_later = (
             dr.minimum(dr.square(x), _LARGEST_MEASURED) for x in (value, later)
         )
         square = dr.maximum(square - square_of_later, 0) * _ONE
-        # Mean over uniform numbers: what was drawn with a density stands for fewer of them
+        # The mean of value² · density is the second moment under uniform numbers
         uniform = square * choices.density
         tried = [
             uniform / dr.select(choices.active, choices.under(q(table, choices.cell)), 1)
@@ -199,7 +198,7 @@ class TileCounts:
 def _sums(
     size: int, index: mi.UInt32, values: Sequence[mi.Float], active: mi.Bool | bool = True
 ) -> list[np.ndarray]:
-    """Sums of values by their index; their fractions are lost."""
+    """Sums of values by their index; each value is rounded down to an integer."""
     totals = [dr.zeros(mi.UInt64, size) for _ in values]
     for total, value in zip(totals, values):
         dr.scatter_add(total, mi.UInt64(value), index, mi.Bool(active))

@@ -5,8 +5,8 @@ The cells of a map are the leaves of a complete binary tree. Each of its levels 
 along one axis, so that a one-dimensional map of 64 cells has six levels, and one of 32 x 32 cells
 has ten, which take turns. To draw, a number descends along its axis: it goes left where it is below
 the probability of the left half, and is stretched to [0, 1) again. Numbers that are stratified stay
-so, and the same cells serve counting, estimating and drawing. The cells of a node follow each
-other: its probability is the difference of two entries of a cumulative table.
+so, and the same cells serve counting, estimating and drawing. The cells of a node are consecutive:
+its probability is the difference of two entries of a cumulative table.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Cells:
         return index
 
     def place(self, axis: int, index: mi.UInt32, fraction: mi.Float) -> mi.Float:
-        """The number along an axis, at this fraction of a cell."""
+        """The coordinate along an axis, at this fraction of a cell."""
         if axis > 0 or self.bounds is None:
             u = (mi.Float(index) + fraction) * (0.5 ** self._bits[axis])
         else:
@@ -123,7 +123,7 @@ class CellDensities:
     def sample(
         self, table: mi.UInt32, u: Sequence[mi.Float], active: mi.Bool | bool = True
     ) -> tuple[list[mi.Float], mi.Float, mi.UInt32]:
-        """Turns uniform numbers into those of a table.
+        """Warps uniform numbers to the density of a table.
 
         Returns:
             The numbers; their density, relative to uniform ones; their cell. Where not ``active``,

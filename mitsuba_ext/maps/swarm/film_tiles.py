@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-#: Cells of all tiles of one map, at most: 32 MiB of counters, and as much for each of two tables.
+#: The most cells of all tiles of one map: 32 MiB of counters, and as much for each of two tables.
 _MOST_CELLS = 1 << 23
 
 
@@ -13,12 +13,12 @@ class FilmTiles:
     """Tiles of the film.
 
     Parameters:
-        width, height: Of the film in pixels, with its border where that is sampled.
-        edge: Of a tile in pixels.
+        width, height: Size of the film in pixels, with its border where that is sampled.
+        edge: Edge of a tile in pixels.
 
     Attributes:
         edge: See above.
-        rows, columns, count: How many tiles there are.
+        rows, columns, count: Numbers of rows, columns and tiles.
     """
 
     def __init__(self, width: int, height: int, edge: int) -> None:

@@ -1,6 +1,6 @@
 """Nodes of many equal binary trees over cells, evaluated all at once.
 
-A node stands for cells that follow each other, so that what it holds is a difference of two sums.
+The cells of a node are consecutive, so that its sum is the difference of two prefix sums.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import mitsuba as mi
 
 
 def sums_before(values: mi.Float | mi.UInt32, cells: int) -> mi.Float | mi.UInt32:
-    """By table and cell, the sum over all cells up to this one."""
+    """By table and cell, the sum over all cells up to and including this one."""
     return dr.block_prefix_reduce(dr.ReduceOp.Add, values, cells, exclusive=False)
 
 
@@ -24,7 +24,7 @@ class Nodes:
 
     Attributes:
         cells: See above.
-        table: Of each lane.
+        table: The table of each lane.
         exist: Is the lane a node?
     """
 
@@ -42,10 +42,10 @@ class Nodes:
         self._half = 1 << (shift - 1)
 
     def left_share(self, before: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """The share of the left half, 1/2 where there is nothing, and what both hold.
+        """The share of the left half in the sum of each node (1/2 where it is 0), and this sum.
 
         Parameters:
-            before: :func:`sums_before` of what the cells hold.
+            before: :func:`sums_before` of the values of cells.
         """
         begin, middle, end = (
             _sum_at(before, self._base, self._begin + k * self._half) for k in range(3)

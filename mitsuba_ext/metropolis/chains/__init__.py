@@ -1,5 +1,6 @@
-"""Markov chains of primary samples: the third core.
+"""Markov chains, in primary sample space and in path space.
 
-A chain walks through the vectors of random numbers that an estimator draws, and visits each in
-proportion to the luminance of what the estimator makes of it. The estimator is any of ours.
+A chain in primary sample space walks through the vectors of random numbers that an estimator draws,
+and visits each in proportion to the luminance of the estimate. It works with any estimator of this
+package.
 """

@@ -15,7 +15,8 @@ from .numbers import ProposedNumbers, StateNumbers, StratifiedNumbers, generator
 from .small_steps import SmallSteps
 from .target import Found, ImageTarget
 
-#: Samples that are evaluated at a time, without and with light paths: what these find is stored.
+#: Largest number of samples that are evaluated at a time, without and with light paths, whose
+#: contributions are stored.
 _MOST_LANES = {False: 1 << 20, True: 1 << 18}
 
 #: Streams of random numbers, which differ from those of the chains.
@@ -24,22 +25,23 @@ _CAMERA, _LIGHT, _CHOICE = 0, 1, 2
 
 class Bootstrap:
     """Samples of the target function, stratified over the film. Chains that start at some of them,
-    chosen in proportion to the target function, have no start-up bias: the product of the mean of
-    the samples and of what the chains find is right on average, from the first mutation on.
+    chosen in proportion to the target function, have no start-up bias: the mean of the samples
+    times the distribution of the chains' visits is unbiased from the first mutation on.
 
     Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997, section 3.2; D. Cline,
     PhD thesis, 2007, section 7.11.2.
 
     Parameters:
-        target: What is sampled.
-        seed: Of the random numbers.
-        count: How many samples there are at least.
-        take: Is given what they find, a part of the samples at a time.
+        target: The target function.
+        seed: Seed of the random numbers.
+        count: Least number of samples.
+        take: Is called with the contributions of the samples, a part of the samples at a time.
 
     Attributes:
-        count: How many there are: a square.
+        count: Number of samples: a square number.
         mean: The mean of the target function.
-        error: The standard error of ``mean``, relative to it, as of samples without strata.
+        error: The standard error of ``mean``, divided by ``mean``, as if the samples were not
+            stratified.
     """
 
     def __init__(
@@ -67,34 +69,36 @@ class Bootstrap:
         self.mean = float(self._sums[-1]) / self.count
         deviation = float(np.std(values)) / math.sqrt(self.count)
         self.error = deviation / self.mean if self.mean > 0 else 0.0
-        # Rounding must not choose a black sample
+        # The last sample that is not black: rounding must not choose one behind it
         self._last = int(np.searchsorted(self._sums, self._sums[-1]))
         self._offset = float(mi.sample_tea_float32(mi.UInt32(seed), _CHOICE)[0])
 
     def numbers(self, index: mi.UInt32, records: Sequence[StateNumbers] = ()) -> Numbers:
-        """The numbers of these samples; ``records`` are told what is drawn, by camera paths and by
-        light paths."""
+        """The random numbers of these samples. ``records`` are given the numbers that are drawn:
+        one those of camera paths, the other those of light paths."""
         camera, light = records or [StateNumbers(SmallSteps())] * 2
         seed = stream(self._seed, _CAMERA)
         numbers = StratifiedNumbers.begin(generator(seed, index), index, self._cells, camera)
         if not self._has_light:
             return numbers
         rng = generator(stream(self._seed, _LIGHT), index)
-        # No literal: recorded kernels (transport/frozen.py) would hold it until the first mutation,
-        # and the first render of a scene would differ from the second one by rounding
+        # Not a literal: recorded kernels (transport/frozen.py) would keep the constant until the
+        # first mutation, and the first render of a scene would differ from the second one by
+        # rounding
         known = dr.opaque(mi.UInt32, 0, dr.width(index))
         return BothEnds(
             numbers, ProposedNumbers(rng, dr.zeros(mi.UInt32, dr.width(index)), known, light)
         )
 
     def choose(self, count: int) -> mi.UInt32:
-        """The indices of ``count`` samples, in proportion to the target function. One random offset
-        for all of them keeps the numbers of choices near their expectation."""
+        """The indices of ``count`` samples, chosen in proportion to the target function by
+        systematic sampling: with one random offset for all, the number of times that a sample is
+        chosen is close to its expected value."""
         return self._at((np.arange(count) + self._offset) / count * self._sums[-1])
 
     def choose_by_energy(self, energy: float) -> mi.UInt32:
-        """The indices of samples, each as often as its value of the target function holds this
-        ``energy``, on average."""
+        """The indices of samples, chosen by systematic sampling: on average, each occurs target
+        function / ``energy`` times."""
         if self._sums[-1] == 0:
             return dr.zeros(mi.UInt32, 0)
         count = int(np.floor(self._sums[-1] / energy - self._offset)) + 1

@@ -1,4 +1,4 @@
-"""The image that chains add their visits to."""
+"""The image to which chains add their visits."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from .target import Contribution, Found
 
 
 class ChainImage:
-    """Two image blocks: visits of chains, whose factor is known in the end, and uniform samples.
+    """Two image blocks: the visits of chains, whose scale is known only at the end, and independent
+    samples.
 
     Parameters:
-        film: It must be prepared, and accept splats.
+        film: The film; it must be prepared, and accept splats.
     """
 
     def __init__(self, film: mi.Film) -> None:
@@ -23,7 +24,7 @@ class ChainImage:
         self._blocks = [film.create_block(), film.create_block()]
         self._visits, self._uniform = self._blocks
         for block in self._blocks:
-            # Positions of lanes have nothing to do with each other
+            # Neighbouring lanes have unrelated positions
             block.set_coalesce(False)
 
     def add(self, found: Contribution, weight: mi.Float) -> None:
@@ -31,11 +32,11 @@ class ChainImage:
         self._put(self._visits, found, weight)
 
     def add_uniform(self, found: Contribution, weight: mi.Float) -> None:
-        """Adds uniform samples with this weight."""
+        """Adds independent samples with this weight."""
         self._put(self._uniform, found, weight)
 
     def add_found(self, found: Found, weight: mi.Float) -> None:
-        """Adds uniform samples, with the weights of their lanes, and evaluates the image."""
+        """Adds independent samples, with the weights of their lanes, and evaluates the image."""
         dr.eval(weight)
         for part, lanes in zip(found.parts, found.lanes):
             self.add_uniform(part, dr.gather(mi.Float, weight, lanes, part.target > 0))
@@ -43,18 +44,18 @@ class ChainImage:
 
     def _put(self, block: mi.ImageBlock, found: Contribution, weight: mi.Float) -> None:
         value = found.value * weight
-        # Neither alpha, nor weight, nor other variables: they come from camera rays
+        # Alpha, weight and AOVs come from camera rays only
         others = [mi.Float(0)] * (block.channel_count() - 3)
         block.put(found.position, [value.x, value.y, value.z, *others], weight > 0)
 
     def add_tensors(self, tensors: Sequence[mi.TensorXf]) -> None:
-        """Adds all of another image of this film: its :meth:`tensors`."""
+        """Adds another image of this film, given as its :meth:`tensors`."""
         for block, tensor in zip(self._blocks, tensors):
             block.put_block(mi.ImageBlock(tensor, offset=block.offset()))
         dr.eval(self.tensors())
 
     def tensors(self) -> list[mi.TensorXf]:
-        """What a launch evaluates."""
+        """The pixels of each block. A launch evaluates them."""
         return [block.tensor() for block in self._blocks]
 
     def _filtered(self, visits: mi.TensorXf) -> mi.TensorXf:

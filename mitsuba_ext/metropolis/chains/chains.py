@@ -1,4 +1,4 @@
-"""What all kinds of chains have in common."""
+"""The base class of all kinds of chains."""
 
 from __future__ import annotations
 
@@ -15,29 +15,31 @@ from .small_steps import SmallSteps
 from .stored import Arrays, arrays_of, value_of
 from .target import ImageTarget
 
-#: Numbers of a state that a chain remembers, for the camera's end of its path and for the light's:
-#: 20 bounces, about. A path that draws more draws those anew for each proposal, which is a large
-#: step in them.
+#: Random numbers of a state that a chain stores, for the camera's end of its path and for the
+#: light's: about 20 bounces. Numbers beyond these are drawn anew for each proposal, which is a
+#: large step in these dimensions.
 MOST_NUMBERS, MOST_LIGHT_NUMBERS = 128, 96
 
-#: Mutations of all chains, about, between two looks at the clock (a second or two on two CPU cores:
-#: states are read and written in between); and of each, at least.
+#: Approximate number of mutations of a launch, of all chains together (a second or two on two CPU
+#: cores), and least number for each chain. States are read and written, and the clock is checked,
+#: between launches.
 _LAUNCH, _LEAST_LAUNCH = 1 << 21, 16
 
-#: Streams of random numbers, which differ from those of the bootstrap.
+#: Streams of random numbers, different from those of the bootstrap.
 CAMERA, LIGHT = 3, 4
 
 
 @dataclass
 class Counts:
-    """What chains did, in each lane.
+    """Statistics of chains, in each lane.
 
     Attributes:
-        large, accepted_large, accepted_small: Large steps, and accepted steps of each kind.
+        large, accepted_large, accepted_small: Number of large steps, and of accepted steps of each
+            kind.
         large_target: The sum of the target function over all proposals of large steps.
         scatter, shadow, connections: See :class:`~mitsuba_ext.transport.estimator.Sample`.
-        black: Proposals that add nothing to the image.
-        longest: Visits of one state, at most, that were added to the image at once.
+        black: Number of proposals whose target function is 0.
+        longest: Largest number of visits of one state that were added to the image at once.
     """
 
     large: mi.UInt32
@@ -56,7 +58,7 @@ class Counts:
         return cls(*(dr.zeros(kind, lanes) for kind in kinds))
 
     def plus(self, is_large, is_accepted, target, sample, visits) -> Counts:
-        """With one more proposal, in a state that had so many ``visits``."""
+        """The counts after one more proposal, from a state with ``visits`` visits so far."""
         return Counts(
             self.large + dr.select(is_large, 1, 0),
             self.accepted_large + dr.select(is_large & is_accepted, 1, 0),
@@ -72,14 +74,14 @@ class Counts:
 
 @dataclass(frozen=True)
 class ChainRules:
-    """How chains move.
+    """The parameters of the moves of chains.
 
     Attributes:
         large_step: The probability of a large step.
-        steps: How numbers are moved by the others.
-        uniform_weight: Uniform samples for each mutation · mean of the target function (about), by
-            which they count in the balance heuristic; 0 if they are not used. Where the target
-            function is what luminance is beyond a bound, the bound.
+        steps: The small steps.
+        uniform_weight: The weight of independent samples in the balance heuristic: their number per
+            mutation · approximate mean of the target function; 0 if they are not used. With a bound
+            of the luminance, it is the bound.
     """
 
     large_step: float
@@ -91,10 +93,10 @@ class Chains:
     r"""Metropolis chains that sample vectors of numbers in proportion to a target function, one in
     each lane.
 
-    With :math:`I` the target function, :math:`a` the probability of accepting a proposal
-    :math:`v` of the state :math:`u`, the expected visits are added to the image: :math:`a` of
-    them to the proposal, :math:`1 - a` to the state. Proposals of large steps are uniform samples
-    besides, which the balance heuristic combines with the visits (Kelemen et al. 2002).
+    Let :math:`a` be the probability of accepting a proposal. The expected visits are added to the
+    image: :math:`a` for the proposal, and :math:`1 - a` for the state. Proposals of large steps are
+    also independent samples; the balance heuristic combines them with the visits (Kelemen et al.
+    2002).
 
     A state is added to the image when the chain leaves it.
 
@@ -102,22 +104,22 @@ class Chains:
     Robust Mutation Strategy for the Metropolis Light Transport Algorithm*, Eurographics 2002.
 
     Parameters:
-        target: What is sampled.
-        image: Where visits are added.
-        rules: How chains move.
-        bootstrap, winners: Samples, and at which of these each chain starts.
-        seed: Of the random numbers.
-        energy: By how much a visit counts.
-        stored: From :meth:`stored` of chains with the same parameters, which these go on with;
-            ``bootstrap`` and ``winners`` are then not needed.
+        target: The target function.
+        image: The image to which visits are added.
+        rules: The parameters of the moves.
+        bootstrap, winners: Samples, and the index of the sample at which each chain starts.
+        seed: Seed of the random numbers.
+        energy: The factor of each visit's contribution.
+        stored: The result of :meth:`stored` of chains with the same parameters, from which these
+            continue; ``bootstrap`` and ``winners`` are then not needed.
 
     Attributes:
-        rules: How they move.
-        count: How many there are.
-        done: Mutations of each.
+        rules: The parameters of the moves.
+        count: Number of chains.
+        done: Number of mutations of each chain.
     """
 
-    #: What makes a state of all chains.
+    #: Names of the attributes that make up the state of all chains.
     _parts_of_state: tuple[str, ...]
 
     def __init__(
@@ -153,11 +155,12 @@ class Chains:
 
     @property
     def launch(self) -> int:
-        """Mutations of each chain between two looks at the clock, and for Ctrl-C."""
+        """Mutations of each chain in a launch. Time limit and Ctrl-C are checked between
+        launches."""
         return max(_LEAST_LAUNCH, _LAUNCH // self.count)
 
     def stored(self) -> Arrays:
-        """The chains as they are, between two launches."""
+        """The state of the chains between two launches."""
         parts = (arrays_of(getattr(self, name), name) for name in self._parts_of_state)
         own = {"count": np.array(self.count), "done": np.array(self.done)}
         return {key: array for part in (own, *parts) for key, array in part.items()}
@@ -171,7 +174,7 @@ class Chains:
         raise NotImplementedError
 
     def end(self) -> None:
-        """Adds the states to the image. The chains may go on."""
+        """Adds the current states to the image. The chains may continue afterwards."""
         raise NotImplementedError
 
     def _share(self, target: mi.Float) -> mi.Float:
@@ -180,6 +183,6 @@ class Chains:
 
 
 def acceptance(state: mi.Float, proposal: mi.Float) -> mi.Float:
-    """The probability of accepting a proposal, by the values of the target function. Whatever is
-    proposed is better than a state that adds nothing to the image."""
+    """The probability of accepting a proposal, from the values of the target function. It is 1 if
+    the state has the value 0."""
     return dr.select(state > proposal, proposal / state, mi.Float(1))

@@ -10,24 +10,25 @@ import mitsuba as mi
 from ...rendering.camera import film_extent
 from .target import Found
 
-#: Samples for each tile, about, that estimate its luminance.
+#: Approximate number of samples that estimate the luminance of a tile.
 _SAMPLES = 64
 
-#: A tile counts as no darker than this share of the mean: weights stay bounded.
+#: Darker tiles count as if they had this fraction of the mean luminance, which bounds the weights.
 _FLOOR = 0.05
 
 
 class EvenTiles:
-    """Weights of the target function: in inverse proportion to the luminance of the film's tiles,
-    as far as samples know it. Dark parts of the image then get as many visits as bright ones. The
-    image has the same mean with any weights.
+    """Weights of the target function in inverse proportion to the luminance of the film's tiles,
+    which is estimated from samples. Dark parts of the image then get about as many visits as bright
+    ones. The expected image is the same with any weights.
 
     Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997, section 5.3 (two-stage
     MLT).
 
     Parameters:
-        film: Its crop window is divided.
-        samples: How many will be taken of the whole film. The chains must start from others.
+        film: The film whose crop window is divided into tiles.
+        samples: Number of samples of the whole film that :meth:`take` will be given. The chains
+            must start from other samples.
     """
 
     def __init__(self, film: mi.Film, samples: int) -> None:
@@ -41,7 +42,7 @@ class EvenTiles:
         self._inverse = dr.full(mi.Float, 1, dr.width(self._sums))
 
     def take(self, found: Found) -> None:
-        """Learns from some of the samples."""
+        """Adds samples to the estimate, and updates the weights."""
         for part in found.parts:
             tile = self._tile(part.position)
             dr.scatter_add(self._sums, part.target, tile, part.target > 0)
@@ -52,7 +53,7 @@ class EvenTiles:
         dr.eval(self._inverse)
 
     def at(self, position: mi.Point2f) -> mi.Float:
-        """The weight at a place on the film."""
+        """The weight of a film position."""
         return dr.gather(mi.Float, self._inverse, self._tile(position))
 
     def _tile(self, position: mi.Point2f) -> mi.UInt32:

@@ -1,4 +1,4 @@
-"""Chains around an estimator that is one kernel."""
+"""Chains in primary sample space, for an estimator that is one kernel."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from .target import Contribution
 
 
 class LoopedChains(Chains):
-    """All mutations of a launch are one traced loop around the estimator. What it finds has one
-    place on the film: no splats. See :class:`Chains`."""
+    """All mutations of a launch are one traced loop around the estimator. A sample of the estimator
+    must contribute to one film position only: there are no splats. See :class:`Chains`."""
 
     _parts_of_state = ("_rngs", "_state", "_known", "_values", "_weight", "_earlier")
 
@@ -28,11 +28,11 @@ class LoopedChains(Chains):
         self._known = dr.minimum(numbers.index, MOST_NUMBERS)
         self._values = record.written
         self._earlier = dr.opaque(mi.Float, 0, self.count)
-        # Evaluated now, the first launch has the kernel of the others
+        # Evaluated now, so that the first launch has the same kernel as the others
         dr.eval(self._state, self._known, self._values, self._rngs)
 
     def kernel_state(self) -> tuple:
-        """What kernels depend on, but for the states."""
+        """The objects and constants that kernels depend on, without the states."""
         return (
             self._target, self._image, self.rules.steps, self.count, self._large_step,
             self._uses_uniform, self._uniform_weight, self._energy,
@@ -61,8 +61,8 @@ class LoopedChains(Chains):
         earlier: mi.Float,
         values: mi.Float,
     ) -> tuple[mi.PCG32, Contribution, mi.UInt32, mi.Float, mi.Float, Counts]:
-        """Makes ``steps`` mutations of each chain; the numbers of the states, ``values``, are
-        replaced."""
+        """Makes ``steps`` mutations of each chain. It overwrites ``values``, the random numbers of
+        the states."""
         count, none = dr.opaque(mi.UInt32, self.count), dr.zeros(mi.UInt32, self.count)
         lane = dr.arange(mi.UInt32, self.count)
         rng, known = mi.PCG32(rng), mi.UInt32(known)
@@ -91,7 +91,7 @@ class LoopedChains(Chains):
             is_accepted = threshold < a
             counts = counts.plus(is_large, is_accepted, proposal.target, sample, weight)
 
-            # ----- Add what is left behind to the image -----
+            # ----- Add the state that is left, or the rejected proposal, to the image -----
             left = dr.select(is_accepted, state, proposal)
             weight += 1 - a
             visits, earlier = self._added(state, proposal, is_accepted, weight, a, earlier)
@@ -102,7 +102,7 @@ class LoopedChains(Chains):
             weight = dr.select(is_accepted, a, weight)
             state = dr.select(is_accepted, proposal, state)
 
-            # ----- Remember the numbers of the new state: the same again -----
+            # ----- Store the numbers of the new state: draw them a second time -----
             again = ProposedNumbers(before, mi.UInt32(none), moved, numbers_now)
             drawn = dr.minimum(numbers.index, MOST_NUMBERS)
             index = dr.select(is_accepted, mi.UInt32(0), drawn)
@@ -122,13 +122,13 @@ class LoopedChains(Chains):
         self, state: Contribution, proposal: Contribution, is_accepted: mi.Bool,
         weight: mi.Float, a: mi.Float, earlier: mi.Float,
     ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
-        """How many visits are added to the image now: ``weight`` of a state that is left, or
-        ``a`` of a proposal. ``earlier`` is
-        for chains that remember visits of earlier states."""
+        """The number of visits that are added to the image now: ``weight`` for a state that is
+        left, or ``a`` for a rejected proposal; and the new ``earlier``, in which subclasses count
+        visits of earlier states."""
         return dr.select(is_accepted, weight, a), earlier
 
     def _last(self) -> mi.Float:
-        """How many visits of the last state are added."""
+        """The number of visits of the last state that are added."""
         return self._weight
 
     def end(self):

@@ -17,13 +17,15 @@ from .target import Contribution
 
 @dataclass(frozen=True)
 class NoiseFilters:
-    """Which filters there are.
+    """The noise filters that are used.
 
     Source: D. Cline, PhD thesis, 2007, section 8.4.4.
 
     Attributes:
-        width: In pixels, of the box that smooths the number of proposals; 0 for no such filter.
-        most_consecutive: Visits of a chain to a pixel, one after the other, that count; 0 for all.
+        width: Width in pixels of the box that smooths the number of proposals; 0 for no such
+            filter.
+        most_consecutive: Largest number of consecutive visits of a chain to a pixel that are added;
+            0 for no limit.
     """
 
     width: int = 0
@@ -34,18 +36,19 @@ class NoiseFilters:
 
 
 class FilteredImage(ChainImage):
-    """Scales what chains bring to a pixel by the number of proposals that are expected there, and
-    the inverse of the number that were made. The expected number is the mean of the neighbourhood.
+    """Multiplies the chains' contribution to a pixel by the expected number of proposals there, and
+    divides it by the number that were made. The expected number is the mean of the neighbourhood.
 
     Parameters:
-        width: Of the neighbourhood, in pixels.
+        width: Width of the neighbourhood, in pixels.
     """
 
     def __init__(self, film: mi.Film, width: int) -> None:
         super().__init__(film)
         self._film, self._width = film, width
         border = self._visits.border_size() > 0
-        # With the filter of the image: a visit has the same share of a pixel here and there
+        # With the film's reconstruction filter, so that a proposal and a visit have the same weight
+        # in a pixel
         self._proposals = mi.ImageBlock(
             film.crop_size(), film.crop_offset(), 1, film.rfilter(), border, coalesce=False
         )
@@ -61,18 +64,18 @@ class FilteredImage(ChainImage):
         made = np.maximum(np.array(self._proposals.tensor())[..., 0], 0)
         inside = uniform_filter(np.ones_like(made), self._width, mode="constant")
         expected = uniform_filter(made, self._width, mode="constant") / inside
-        # Where nothing was proposed, there is nothing, but for states in which chains began.
-        # Negative lobes of the image's filter can leave next to nothing of a number
+        # Pixels without proposals are not scaled: only the first states of chains contribute there.
+        # Negative lobes of the reconstruction filter can make the number of proposals tiny
         ratio = np.where(made > 0, expected / np.maximum(made, 1e-30), 1)
         ratio = np.minimum(ratio, self._width**2)
         return visits * mi.TensorXf(ratio[..., None].astype(np.float32))
 
 
 class FilteredChains(LoopedChains):
-    """Chains that count their proposals, and add no more than some consecutive visits to a pixel.
+    """Chains that count their proposals, and limit the consecutive visits to a pixel that they add.
 
     Parameters:
-        filters: Which filters there are.
+        filters: The noise filters that are used.
     """
 
     def __init__(self, filters: NoiseFilters, *chains: Any) -> None:
@@ -86,7 +89,7 @@ class FilteredChains(LoopedChains):
         self._image.propose(proposal)
         visits = dr.select(is_accepted, weight, a)
         is_same = dr.all(dr.floor(state.position) == dr.floor(proposal.position))
-        # Visits of the state come before those of a rejected proposal, but are added after them
+        # The visits of the state precede those of a rejected proposal, but are added later
         room = dr.maximum(self._most - earlier - dr.select(is_accepted, 0, weight), 0)
         added = dr.select(is_accepted | is_same, dr.minimum(visits, room), visits)
         remembered = dr.select(is_same, earlier + added, 0)

@@ -1,4 +1,5 @@
-"""The numbers of chains. Each stands in for a sampler (``transport/numbers.py``)."""
+"""The random numbers of chains. Each class takes the place of a sampler
+(``transport/numbers.py``)."""
 
 from __future__ import annotations
 
@@ -11,39 +12,39 @@ from .small_steps import SmallSteps
 
 
 def stream(seed: int, number: int) -> int:
-    """The seed of one of the streams of random numbers that a render needs."""
+    """The seed of stream ``number`` of the random numbers of a render."""
     return int(mi.sample_tea_32(mi.UInt32(seed), number)[0][0])
 
 
 def generator(seed: int, sequence: mi.UInt32) -> mi.PCG32:
-    """A generator of random numbers in each lane; ``sequence`` tells those of a seed apart."""
-    # As Mitsuba's samplers: neighbouring sequences of PCG32 itself are correlated
+    """A random number generator in each lane, one for each ``sequence`` of this seed."""
+    # Hashed, as in Mitsuba's samplers: neighbouring sequences of PCG32 itself are correlated
     state, stream = mi.sample_tea_32(dr.opaque(mi.UInt32, seed), sequence)
-    # A size would add the number of the lane
+    # Without ``size``, which would add the lane index to the sequence
     return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream))
 
 
 class StateNumbers:
-    """The numbers of a chain's state: here, none. No dataclass: loops of the estimator only read
-    it.
+    """The random numbers of a chain's state; this base class stores none. It is not a dataclass,
+    since Dr.Jit would take one for a part of the state of the estimator's loops.
 
     Parameters:
-        steps: How numbers are moved.
+        steps: The small steps that move numbers.
     """
 
     def __init__(self, steps: SmallSteps) -> None:
         self.steps = steps
 
     def read(self, index: mi.UInt32) -> mi.Float:
-        """A number of the state."""
+        """A random number of the state."""
         return mi.Float(0)
 
     def write(self, index: mi.UInt32, value: mi.Float) -> None:
-        """Is told what is drawn."""
+        """Is called with each number that is drawn."""
 
 
 class LocalNumbers(StateNumbers):
-    """Numbers in memory of the lane."""
+    """Random numbers in the local memory of the lane."""
 
     def __init__(self, values: dr.Local, steps: SmallSteps) -> None:
         super().__init__(steps)
@@ -54,11 +55,11 @@ class LocalNumbers(StateNumbers):
 
 
 class RecordedNumbers(StateNumbers):
-    """Numbers in global memory, from one array into another.
+    """Random numbers in global memory. They are read from one array and written to another one.
 
     Parameters:
-        values: Of all states: all first numbers, then all second ones, and so on.
-        lanes: How many states there are.
+        values: The numbers of all states: all first numbers, then all second ones, and so on.
+        lanes: Number of states.
     """
 
     def __init__(self, values: mi.Float, lanes: int, steps: SmallSteps) -> None:
@@ -66,7 +67,7 @@ class RecordedNumbers(StateNumbers):
         self._values, self._lanes = values, dr.opaque(mi.UInt32, lanes)
         self._count = dr.opaque(mi.UInt32, len(values) // lanes)
         self._lane = dr.arange(mi.UInt32, lanes)
-        #: What was told; numbers that were not stay 0.
+        #: The numbers that were written; 0 for all others.
         self.written = dr.zeros(mi.Float, len(values))
 
     def read(self, index):
@@ -79,15 +80,15 @@ class RecordedNumbers(StateNumbers):
 
 @dataclass
 class StratifiedNumbers:
-    """Independent numbers, the first two of which lie in a cell of a grid over the unit square:
-    they are the place on the film.
+    """Independent random numbers. The first two are the film position; they lie in a given cell of
+    a grid over the unit square.
 
     Attributes:
-        rng: Where they come from.
-        index: How many were drawn.
-        corner: Of the cell, in units of cells.
+        rng: The random number generator.
+        index: How many numbers were drawn.
+        corner: Corner of the cell, in units of cells.
         cells: Cells of the grid in each direction.
-        record: Is told what is drawn.
+        record: Is given the numbers that are drawn.
     """
 
     rng: mi.PCG32
@@ -100,7 +101,7 @@ class StratifiedNumbers:
     def begin(
         cls, rng: mi.PCG32, cell: mi.UInt32, cells: int, record: StateNumbers
     ) -> StratifiedNumbers:
-        """Before the first number. ``cell`` is the number of the cell, row by row."""
+        """The state before the first number. ``cell`` is the index of the cell, row by row."""
         side = dr.opaque(mi.UInt32, cells)
         corner = mi.Point2f(mi.Float(cell % side), mi.Float(cell // side))
         return cls(rng, dr.zeros(mi.UInt32, dr.width(cell)), corner, mi.Float(side), record)
@@ -121,14 +122,15 @@ class StratifiedNumbers:
 
 @dataclass
 class ProposedNumbers:
-    """The numbers of a proposal: those of the state, moved, and new ones after them.
+    """The random numbers of a proposal: those of the state, moved by small steps, and then new
+    ones.
 
-    Those that the state's path did not draw have no influence on it, so that a proposal that needs
-    more draws them anew: the move has the density 1 in both directions.
+    Numbers that the state's path did not draw have no influence on it. A proposal that needs more
+    numbers draws new ones: this has the density 1 in both directions.
 
     Attributes:
-        rng: Where new numbers and moves come from: one number for each.
-        index: How many were drawn.
+        rng: The random number generator. It gives one number for each move or new number.
+        index: How many numbers were drawn.
         known: How many of the state's numbers are moved; 0 in a large step.
         state: The state's numbers.
     """

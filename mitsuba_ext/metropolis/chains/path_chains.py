@@ -1,4 +1,4 @@
-"""Chains of light paths."""
+"""Chains in path space."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from .chains import Chains, Counts
 from .numbers import ProposedNumbers, StateNumbers, stream
 from .path_target import PathState
 
-#: Streams of numbers that all chains share: of the kinds of mutations, and of places on the film.
+#: Streams of random numbers that all chains share: for the kinds of mutations, and for film
+#: positions.
 _KIND, _FILM = 6, 7
 
 
 class PathChains(Chains):
-    """All mutations of a launch are one traced loop. All chains make the same kind of mutation at a
-    time, if their paths allow it: lanes of a processor then do the same. See :class:`Chains`."""
+    """Chains of paths. All mutations of a launch are one traced loop. In each step, all chains make
+    the same kind of mutation if their paths allow it, so that neighbouring lanes execute the same
+    code. See :class:`Chains`."""
 
     _parts_of_state = ("_rngs", "_state", "_places", "_logs", "_weight")
 
@@ -31,7 +33,7 @@ class PathChains(Chains):
 
     @frozen
     def _first(self, numbers: Numbers) -> tuple[PathState, Place, Logs]:
-        """New paths, and their vertices."""
+        """The paths of the samples at which chains start, and their vertices."""
         memory, at = PathMemory.of(self._target.most), dr.zeros(mi.UInt32, self.count)
         memory, _numbers, proposal = self._target.mutations.new_path(
             memory, at, copied(numbers), mi.Bool(True)
@@ -40,7 +42,7 @@ class PathChains(Chains):
         return state, *self._stored(memory, state.head)
 
     def kernel_state(self) -> tuple:
-        """What kernels depend on, but for the states."""
+        """The objects and constants that kernels depend on, without the states."""
         return (
             self._target, self._image, self.rules.large_step > 0, self.rules.steps, self.count,
             self._large_step, self._uses_uniform, self._uniform_weight, self._energy,
@@ -76,7 +78,7 @@ class PathChains(Chains):
         places: Place,
         logs: Logs,
     ) -> tuple[mi.PCG32, PathState, mi.Float, Place, Logs, Counts]:
-        """Makes ``steps`` mutations of each chain, after ``done`` earlier ones."""
+        """Makes ``steps`` mutations of each chain, which has made ``done`` mutations before."""
         mutations = self._target.mutations
         none, lane = dr.zeros(mi.UInt32, self.count), dr.arange(mi.UInt32, self.count)
         rng, weight = mi.PCG32(rng), mi.Float(weight)
@@ -98,7 +100,7 @@ class PathChains(Chains):
             new = self._as_state(proposal)
 
             # ----- Accept or reject -----
-            # Densities of states are those of new paths, times their contributions as such
+            # Target functions are divided by the density as a new path, which is undone here
             change = new.density - state.density + proposal.log_ratio
             ratio = new.found.target / state.found.target * dr.exp(change)
             ratio = dr.select(dr.isfinite(ratio), ratio, 0)
@@ -110,7 +112,7 @@ class PathChains(Chains):
                 is_large, is_accepted, new.found.target, self._target.sample(proposal), weight
             )
 
-            # ----- Add what is left behind to the image -----
+            # ----- Add the state that is left, or the rejected proposal, to the image -----
             left = dr.select(is_accepted, state.found, new.found)
             visits = dr.select(is_accepted, weight + (1 - a), a)
             self._image.add(left, visits * self._share(left.target))
@@ -118,7 +120,7 @@ class PathChains(Chains):
                 share = self._share(new.found.target)
                 self._image.add_uniform(new.found, dr.select(is_large, share, 0))
             weight = dr.select(is_accepted, a, weight + (1 - a))
-            # The vertices of the new path lie where those of the next proposal would
+            # The vertices stay where they are: ``head.at`` tells which path is the state
             state = dr.select(is_accepted, new, state)
             step += 1
 

@@ -1,4 +1,4 @@
-"""Light paths as what chains sample."""
+"""The target function of chains in path space."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .numbers import ProposedNumbers, StateNumbers, generator, stream
 from .small_steps import SmallSteps
 from .target import Contribution, Found, PlaceWeights, beyond_bound
 
-#: Rounds of learning, and paths of each.
+#: Rounds in which the techniques of new paths are learned, and paths of each round.
 _ROUNDS, _PATHS = 3, 1 << 15
 
 
@@ -26,7 +26,7 @@ class PathState:
 
     Attributes:
         head: The path.
-        found: What it adds to the image.
+        found: Its contribution to the image as a new path.
         density: The logarithm of its density as a new path.
     """
 
@@ -37,19 +37,20 @@ class PathState:
 
 @dataclass
 class PathTarget:
-    """Makes one path of a vector of numbers, and estimates the image by it.
+    """The target function of paths. A vector of random numbers makes a new path, whose contribution
+    to the image is divided by its density.
 
     Parameters:
-        mutations: Of the paths of the scene.
-        weights: Of places on the film; ``None`` where all count the same.
-        bound: The target function is what luminance is beyond it.
+        mutations: Makes the paths of the scene.
+        weights: Weights of film positions; ``None`` if all have the same weight.
+        bound: The target function is the part of the luminance that is beyond this.
     """
 
     mutations: Mutations
     weights: PlaceWeights | None = None
     bound: float = 0.0
 
-    #: Paths draw their numbers from one stream, and each has one place on the film.
+    #: Paths draw their numbers from one stream, and each contributes to one film position.
     has_light_paths = False
 
     @property
@@ -62,11 +63,12 @@ class PathTarget:
 
     @property
     def most(self) -> int:
-        """Vertices of a path, at most."""
+        """Largest number of vertices of a path."""
         return self.mutations.space.most
 
     def evaluate(self, numbers: Numbers, active: mi.Bool | bool = True) -> Found:
-        """What a new path brings; also the place that ``numbers`` have reached, evaluated."""
+        """The contributions of new paths. It evaluates them, and the state that ``numbers`` have
+        reached."""
         brought, target, sample, place = self._evaluated(numbers, mi.Bool(active))
         go_to(numbers, place)
         lane = dr.arange(mi.UInt32, dr.width(target))
@@ -77,15 +79,15 @@ class PathTarget:
     def _evaluated(
         self, numbers: Numbers, active: mi.Bool
     ) -> tuple[Contribution, mi.Float, Sample, Numbers]:
-        """What a new path brings, with its luminance; the target function; the place that the
-        numbers have reached."""
+        """The contribution of a new path, with its luminance; the target function; the state that
+        the numbers have reached."""
         proposal, numbers = self._new_path(copied(numbers), active)
         brought = self._brought(proposal)
         target = beyond_bound(brought.target, self.bound)
         return brought, target, self.sample(proposal), reached(numbers)
 
     def learn(self, seed: int) -> None:
-        """Learns from paths of its own how new paths should be made."""
+        """Learns the probabilities of the techniques that make new paths, from separate paths."""
         unused = StateNumbers(SmallSteps())
         for round in range(_ROUNDS):
             lane = dr.arange(mi.UInt32, _PATHS)
@@ -97,7 +99,7 @@ class PathTarget:
 
     @frozen
     def _tried(self, numbers: Numbers) -> tuple[mi.UInt32, mi.Float]:
-        """How new paths were made, and the target function."""
+        """Technique and target function of new paths."""
         proposal, _numbers = self._new_path(copied(numbers), mi.Bool(True))
         return proposal.technique, self.contribution(proposal).target
 
@@ -107,26 +109,26 @@ class PathTarget:
         return proposal, numbers
 
     def contribution(self, proposal: Proposal) -> Contribution:
-        """What a path adds to the image, as a new path, with the target function of that."""
+        """The contribution of a path as a new path, with the target function."""
         brought = self._brought(proposal)
         brought.target = beyond_bound(brought.target, self.bound)
         return brought
 
     def _brought(self, proposal: Proposal) -> Contribution:
-        """The same with its luminance, whatever the bound."""
+        """As :meth:`contribution`, but with the luminance instead of its part beyond the bound."""
         found = proposal.found
         factor = dr.exp(found.log_geometry - proposal.log_density)
         value = dr.select(found.active, found.value * factor, 0)
         is_sound = dr.all(dr.isfinite(value))
         value = dr.select(is_sound, value, 0)
-        # Negative components, which spectral variants have, count by their absolute value
+        # The absolute values, since components can be negative in spectral variants
         target = mi.luminance(dr.abs(value))
         if self.weights is not None:
             target *= self.weights.at(found.position)
         return Contribution(found.position, value, target)
 
     def sample(self, proposal: Proposal) -> Sample:
-        """The rays that it took."""
+        """A sample that counts the rays of a proposal."""
         found = proposal.found
         return Sample(
             mi.Spectrum(0), found.active, found.scatter, found.shadow, mi.UInt32(0)

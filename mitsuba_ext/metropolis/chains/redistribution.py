@@ -1,4 +1,4 @@
-"""Renders with short chains that spread the energy of bright samples: energy redistribution."""
+"""Energy redistribution: renders with short chains that spread the energy of bright samples."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from .small_steps import SmallSteps
 from .stored import Arrays, StateFile
 from .target import Found
 
-#: Samples of a batch, at most, and with a time limit. Each batch has chains of its own, which take
-#: long where they are few.
+#: Largest number of samples of a batch, without and with a time limit. Each batch starts its own
+#: chains, and few chains do not keep the processor busy.
 _BATCH, _TIMED_BATCH = 1 << 22, 1 << 19
 
-#: What is known of all batches, besides the image.
+#: The totals over all batches that are saved, besides the image.
 _SUMS = ("samples", "batches", "redistributed", "energy")
 
-#: Chains of a batch, at most.
+#: Largest number of chains of a batch.
 _MOST_CHAINS = 1 << 17
 
-#: Streams of random numbers of batches, besides all others: this one and the next ones.
+#: Index of the random number stream of the first batch; the next batches use the following ones.
 _BATCHES = 16
 
 
@@ -42,13 +42,13 @@ class RedistributionSettings:
 
     Attributes:
         chain_length: Mutations of a chain.
-        mutations: Mutations per pixel, if all energy were redistributed; 0 for as many as samples.
-        outliers: Samples so many times as bright as their neighbourhood lose what they have beyond
-            that to chains. 0 redistributes all energy.
+        mutations: Mutations per pixel if all energy is redistributed; 0 for as many as samples.
+        outliers: Chains redistribute the part of a sample's energy that is beyond this many times
+            the brightness of its neighbourhood. 0 redistributes all energy.
         luminance_samples: Samples that measure brightness first.
-        steps: How numbers are moved, where chains change those.
-        filters: Of the noise.
-        file: If it has a state, the render goes on from there; it has the last state afterwards.
+        steps: The small steps of chains in primary sample space.
+        filters: The noise filters.
+        file: If it holds a state, the render continues from it. The last state is saved to it.
     """
 
     chain_length: int
@@ -61,19 +61,22 @@ class RedistributionSettings:
 
 
 class RedistributionRender(ChainRender):
-    """Takes independent samples. From the energy that is beyond a bound, chains of a fixed length
-    start, and deposit equal shares of it where they go. ``spp`` are samples per pixel.
+    """Takes independent samples, and redistributes the part of their energy that is beyond a bound:
+    chains of a fixed length start at these samples, and deposit an equal share of energy at each
+    state. ``spp`` are samples per pixel.
 
-    The number of chains of a sample is that of the multiples of a common energy, shifted by a
-    random offset, between the sums of energies before and after it: right on average, so that
-    nothing is lost.
+    Samples are chosen by systematic sampling: their energies are added up, and a chain starts at a
+    sample for each multiple of a common energy, shifted by a random offset, that lies between the
+    sums before and after it. The expected number of chains is proportional to the energy, so that
+    no energy is lost on average.
 
     Source: D. Cline, PhD thesis, 2007, chapter 8 (equal deposition flow, section 8.3.2); B.
     Bitterli, W. Jarosz, *Selectively Metropolised Monte Carlo Light Transport Simulation*, ACM
     Transactions on Graphics 38(6), 2019 (chains for outliers only).
 
     Parameters:
-        settings: How.
+        settings: The parameters of energy redistribution.
+        render: The parameters of :class:`ChainRender`.
     """
 
     def __init__(self, settings: RedistributionSettings, *render: Any) -> None:
@@ -123,7 +126,7 @@ class RedistributionRender(ChainRender):
             settings.file.save(self._stored(image))
 
     def _stored(self, image: ChainImage) -> Arrays:
-        """Batches that are done. The next one begins with samples of its own."""
+        """The sums over completed batches. They suffice, since the next batch takes new samples."""
         tensors = {f"image{n}": np.array(tensor) for n, tensor in enumerate(image.tensors())}
         return {**tensors, **{key: np.array(getattr(self, f"_{key}")) for key in _SUMS}}
 
@@ -141,13 +144,13 @@ class RedistributionRender(ChainRender):
         return FilteredChains(filters, *chains) if filters else self._kind(*chains)
 
     def _batch(self, image: ChainImage, rules: ChainRules, size: int, deposit: float) -> None:
-        """Adds a batch to the image: all of it, or nothing if an exception ends it."""
+        """Adds a batch to the image: all of it, or nothing if there is an exception."""
         settings, target = self._settings, self._target
         part, energies = self._image(), []
         seed = stream(self._seed, _BATCHES + self._batches)
 
         def take(found: Found) -> None:
-            """Adds what is within the bound to the image."""
+            """Adds the energy that is within the bound to the image."""
             kept = mi.Float(dr.select(found.target > 0, 0, 1))
             if target.bound > 0:
                 kept = dr.rcp(1 + found.target / dr.opaque(mi.Float, target.bound))
@@ -157,7 +160,8 @@ class RedistributionRender(ChainRender):
         samples = Bootstrap(target, seed, size, take)
         self._statistics.rays["camera"] += samples.count
         energy = samples.mean * samples.count
-        # A very bright sample does not make more chains than all energy would: they carry more
+        # Very bright samples do not start more chains than if all energy were redistributed: each
+        # chain carries more energy instead
         wanted = samples.count * settings.mutations / self._spp or samples.count
         most = min(_MOST_CHAINS, max(1.0, wanted / settings.chain_length))
         spacing = max(deposit * settings.chain_length, energy / most)

@@ -1,4 +1,4 @@
-"""What renders with chains have in common."""
+"""The common base of renders with chains."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ from .path_target import PathTarget
 from .stepped import SteppedChains
 from .target import ImageTarget
 
-#: The stream of random numbers of a first stage, besides those of the bootstrap and of the chains.
+#: The stream of random numbers of a first stage, different from those of the bootstrap and the
+#: chains.
 FIRST_STAGE = 5
 
 
 class Stoppable(Protocol):
-    """What a render asks of its integrator."""
+    """The attributes of the integrator that a render reads."""
 
     timeout: float
     is_cancelled: bool
@@ -33,16 +34,17 @@ class Stoppable(Protocol):
 
 
 class ChainRender:
-    """One render. The film must hold camera samples, to which the light of the chains is added.
+    """One render. The film must already hold camera samples; the light of the chains is added to
+    them.
 
     Parameters:
-        integrator: Says when to stop.
-        target: What is sampled.
-        seed: Of the random numbers.
+        integrator: Has the time limit, and tells if the render was cancelled.
+        target: The target function of the chains.
+        seed: Seed of the random numbers.
         spp: Samples, or mutations, per pixel.
         camera_spp: Camera samples per pixel that the film holds.
-        statistics: Of the render so far; they are brought up to date.
-        start: When it began, by ``time.perf_counter``.
+        statistics: Statistics of the render so far; they are updated.
+        start: Start of the render, by ``time.perf_counter``.
     """
 
     def __init__(
@@ -65,7 +67,7 @@ class ChainRender:
         self._mutations = 0
 
     def run(self, interrupt: threading.Event) -> None:
-        """Renders, and adds what was found to the film: also if an exception ends it."""
+        """Renders, and adds the image to the film, even if an exception ends the render."""
         raise NotImplementedError
 
     @property
@@ -77,11 +79,14 @@ class ChainRender:
     def _repeat(
         self, count: int, width: int, interrupt: threading.Event, act: Callable[[int], int]
     ) -> bool:
-        """Calls ``act`` until ``count`` steps are made, or as many as the time allows. It is told
-        how many it may make, and says how many it made. Were all of them made?
+        """Calls ``act`` until ``count`` steps are made, or as many as the time limit allows.
 
         Parameters:
             width: Lanes of a step.
+            act: Is given the largest number of steps to make; returns the number that it made.
+
+        Returns:
+            False if the render was interrupted or cancelled before.
         """
         integrator, done = self._integrator, 0
         budget = TimeBudget(integrator.timeout, self._start, width, 0).stage(count, 0, True)
@@ -108,7 +113,7 @@ class ChainRender:
         self._mutations += mutations
 
     def _report(self, samples: int) -> None:
-        """Brings the statistics up to date, after so many samples per pixel."""
+        """Updates the statistics after ``samples`` samples per pixel."""
         counts, statistics = self._counts, self._statistics
         statistics.rays["camera"] += self._mutations
         statistics.rays["scatter"] += int(counts["scatter"])

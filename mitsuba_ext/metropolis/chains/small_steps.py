@@ -1,4 +1,4 @@
-"""Small changes of a primary sample."""
+"""Small steps: mutations that change a primary sample slightly."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ _BELOW_ONE = 1 - 2.0**-24
 @dataclass(frozen=True)
 class SmallSteps:
     """Moves a number in [0, 1) by a distance between ``low`` and ``high``, up or down with equal
-    probability; what leaves the interval enters it at the other end. The density of the distance
-    is in proportion to its inverse. A move and its reverse have the same density.
+    probability. A number that leaves the interval re-enters it at the other end. The density of the
+    distance is proportional to 1 / distance. A move and its reverse have the same density.
 
     Source: C. Kelemen, L. Szirmay-Kalos, G. Antal, F. Csonka, *A Simple and Robust Mutation
     Strategy for the Metropolis Light Transport Algorithm*, Eurographics 2002, section 3.2;
@@ -30,7 +30,7 @@ class SmallSteps:
     high: float = 1 / 64
 
     def move(self, value: mi.Float, sample: mi.Float) -> mi.Float:
-        """``value`` moved; ``sample``, in [0, 1), chooses where to."""
+        """The moved ``value``; the random number ``sample``, in [0, 1), chooses the move."""
         is_up = sample < 0.5
         sample = 2 * sample - dr.select(is_up, 0, 1)
         distance = self.high * dr.exp(-math.log(self.high / self.low) * sample)

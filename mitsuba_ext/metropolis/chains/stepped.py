@@ -1,4 +1,4 @@
-"""Chains around any estimator."""
+"""Chains in primary sample space, for any estimator."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .target import Contribution
 
 
 class SteppedChains(Chains):
-    """Each mutation is a call of the estimator, which may be several kernels, and bring light to
-    any number of places on the film. See :class:`Chains`."""
+    """Each mutation is a call of the estimator, which may be several kernels, and may contribute to
+    any number of film positions. See :class:`Chains`."""
 
     launch = 1
 
-    #: Numbers that are remembered, for each end of a path.
+    #: Random numbers that are stored, for each end of a path.
     _most = (MOST_NUMBERS, MOST_LIGHT_NUMBERS)
 
     _parts_of_state = ("_rngs", "_state", "_parts", "_lanes", "_known", "_values", "_weight")
@@ -55,7 +55,8 @@ class SteppedChains(Chains):
             ProposedNumbers(rng, mi.UInt32(none), dr.select(is_large, 0, known), record)
             for rng, known, record in zip(self._rngs, self._known, records)
         ]
-        # They are read again in the end; what the estimator evaluates must not make them twice
+        # Evaluated now: they are used again after the estimator, whose kernels would compute them a
+        # second time
         dr.eval(is_large, threshold, ends)
         found = self._target.evaluate(BothEnds(*ends) if len(ends) == 2 else ends[0])
         self._rngs = [end.rng for end in ends]
@@ -65,7 +66,7 @@ class SteppedChains(Chains):
         is_accepted = threshold < a
         counts = counts.plus(is_large, is_accepted, found.target, found.sample, self._weight)
 
-        # ----- Add what is left behind to the image -----
+        # ----- Add the state that is left, or the rejected proposal, to the image -----
         visits = self._weight + (1 - a)
         left = dr.select(is_accepted, visits * self._share(self._state), 0)
         rejected = dr.select(is_accepted, 0, a * self._share(found.target))
@@ -91,8 +92,8 @@ class SteppedChains(Chains):
         return counts
 
     def _remember(self, written: list[mi.Float], is_accepted: mi.Bool) -> None:
-        """Makes the numbers of accepted proposals those of the states: in place, since all of them
-        are hundreds of megabytes."""
+        """Copies the numbers of accepted proposals to the states. It works in place, since the
+        numbers of all states take hundreds of megabytes."""
         dr.eval(written)
         accepted = dr.compress(is_accepted)
         if len(accepted) == 0:
@@ -129,7 +130,7 @@ def _ends(numbers: Numbers) -> list[Any]:
 def _wanted(
     parts: list[Contribution], lanes: list[mi.UInt32], wanted: list[mi.Bool]
 ) -> tuple[Contribution, mi.UInt32]:
-    """One array of those contributions that are wanted in their lanes, and the lanes."""
+    """The contributions of lanes for which ``wanted`` is set, in one array, and their lanes."""
     kept = []
     for part, lane, want in zip(parts, lanes, wanted):
         index = dr.compress((part.target > 0) & dr.gather(mi.Bool, want, lane))

@@ -1,4 +1,4 @@
-"""The state of a render with chains as arrays of NumPy, for files."""
+"""The state of a render with chains as NumPy arrays, for files."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Arrays = dict[str, np.ndarray]
 
 
 class StateFile(Protocol):
-    """Where the state of a render is kept."""
+    """A file that holds the state of a render."""
 
     def load(self) -> Arrays | None:
-        """What was saved; ``None`` if nothing was yet."""
+        """The saved state; ``None`` if none was saved yet."""
 
     def save(self, arrays: Arrays) -> None:
-        """Keeps this, and nothing else."""
+        """Saves a state, which replaces the one before."""
 
 
 def arrays_of(value: Any, name: str) -> Arrays:
-    """The arrays of which ``value`` consists: an array of Dr.Jit, a generator of random numbers,
-    what chains keep of paths, or a list of such."""
+    """The arrays of which ``value`` consists. It may be a Dr.Jit array, a random number generator,
+    one of the structures of :func:`_kinds`, or a list of these."""
     kinds = {made: kind for kind, made in _kinds().items()}
     if isinstance(value, list):
         parts = {str(index): part for index, part in enumerate(value)}
@@ -44,7 +44,7 @@ def arrays_of(value: Any, name: str) -> Arrays:
 
 
 def value_of(arrays: Arrays, name: str) -> Any:
-    """What :func:`arrays_of` has taken apart."""
+    """The inverse of :func:`arrays_of`."""
     if name in arrays:
         return _array(arrays[name])
     prefix = f"{name}/"
@@ -56,14 +56,14 @@ def value_of(arrays: Arrays, name: str) -> Any:
     made = dr.zeros(_kinds()[kind])
     for key, part in parts.items():
         field = key.partition(".")[2]
-        # Arrays do not say whether they are points or colours
+        # An array alone does not tell if it is a point or a colour
         wanted = type(getattr(made, field))
         setattr(made, field, part if isinstance(part, wanted) else wanted(part))
     return made
 
 
 def _kinds() -> dict[str, type]:
-    """What files call structures."""
+    """The names of structures in files."""
     return {
         "rng": mi.PCG32, "found": Contribution, "path": PathState, "head": Head, "place": Place,
         "logs": Logs,

@@ -1,4 +1,4 @@
-"""The function that chains sample: from random numbers to what they add to the image."""
+"""The target function of chains: it maps random numbers to their contribution to the image."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from ...transport.numbers import Numbers, copied, go_to, reached
 
 @dataclass
 class Contribution:
-    """What a vector of numbers adds to the image at one place.
+    """The contribution of a vector of random numbers to the image at one position.
 
     Attributes:
-        position: Where on the film.
-        value: The colour, if the film were one pixel.
-        target: The luminance of ``value`` (negative components, which spectral variants have, count
-            by their absolute value), times the weight of the place on the film.
+        position: Position on the film.
+        value: The contribution as a colour, as if the film were one pixel.
+        target: The luminance of ``value`` (of the absolute values of its components, which can be
+            negative in spectral variants), times the weight of the film position.
     """
 
     position: mi.Point2f
@@ -34,13 +34,14 @@ class Contribution:
 
 @dataclass
 class Found:
-    """What vectors of numbers, one in each lane, add to the image.
+    """All contributions of vectors of random numbers, one vector in each lane.
 
     Attributes:
-        target: What chains sample in proportion to: the sum of the luminances of all contributions.
+        target: The target function: the sum of the ``target`` of all contributions of a lane; the
+            part of it beyond the bound if :class:`ImageTarget` has one.
         parts: The contributions, in arrays of any width.
         lanes: For each of the parts, the lanes to which its contributions belong.
-        sample: The estimator's.
+        sample: The sample of the estimator.
     """
 
     target: mi.Float
@@ -50,24 +51,24 @@ class Found:
 
 
 class PlaceWeights(Protocol):
-    """How much the target function prefers places on the film."""
+    """Weights of film positions in the target function."""
 
     def at(self, position: mi.Point2f) -> mi.Float:
-        """The weight of a place; positive."""
+        """The weight of a film position: larger than zero."""
 
 
 @dataclass
 class ImageTarget:
-    """Makes a camera ray of the first numbers, anywhere on the film, and an estimate of its
-    radiance of the others.
+    """The target function of an estimator. The first random numbers make a camera ray, anywhere on
+    the film; the others an estimate of its radiance.
 
     Parameters:
-        scene, sensor: What is rendered.
-        estimator: Of the radiance. The sample in a lane must not depend on other lanes.
+        scene, sensor: The scene and the sensor that are rendered.
+        estimator: Estimates the radiance. The sample in a lane must not depend on other lanes.
         spp: Samples per pixel of the whole render, for ray differentials.
-        has_light_paths: Does the estimator trace light paths, which draw numbers of their own?
-        weights: Of places on the film; ``None`` where all count the same.
-        bound: The target function is what the sum of luminances is beyond it.
+        has_light_paths: Does the estimator trace light paths, which draw from separate numbers?
+        weights: Weights of film positions; ``None`` if all have the same weight.
+        bound: The target function is the part of the sum of luminances that is beyond this.
     """
 
     scene: mi.Scene
@@ -79,13 +80,13 @@ class ImageTarget:
     bound: float = 0.0
 
     def __call__(self, numbers: Numbers) -> tuple[Contribution, Sample]:
-        """What the camera path finds, with the target function of that, and the whole sample."""
+        """The contribution of the camera path, with the target function, and the whole sample."""
         camera, sample = self._camera(numbers, mi.Bool(True))
         camera.target = beyond_bound(camera.target, self.bound)
         return camera, sample
 
     def evaluate(self, numbers: Numbers, active: mi.Bool | bool = True) -> Found:
-        """Everything, evaluated; also the place that ``numbers`` have reached."""
+        """All contributions. It evaluates them, and the state that ``numbers`` have reached."""
         camera, sample = self._found(numbers, mi.Bool(active))
         lane = dr.arange(mi.UInt32, dr.width(camera.target))
         parts, lanes = [camera], [lane]
@@ -122,10 +123,10 @@ class ImageTarget:
         return self._contribution(rays.position, dr.select(active, value, 0)), sample
 
     def learn(self, seed: int) -> None:
-        """Estimators of random walks have nothing to learn."""
+        """Does nothing: only the target function of paths learns."""
 
     def _contribution(self, position: mi.Point2f, value: mi.Color3f) -> Contribution:
-        """What is not finite counts as black: it is no place to stay."""
+        """A contribution. Values that are not finite become black, so that no chain stays there."""
         target = mi.luminance(dr.abs(value))
         is_sound = dr.isfinite(target)
         if self.weights is not None:
@@ -147,7 +148,7 @@ class ImageTarget:
 
 
 def beyond_bound(luminance: mi.Float, bound: float) -> mi.Float:
-    """What luminance is beyond a bound; all of it, if that is 0."""
+    """The part of a luminance that is beyond a bound; all of it if the bound is 0."""
     if bound == 0:
         return luminance
     return dr.maximum(luminance - dr.opaque(mi.Float, bound), 0)

@@ -21,27 +21,28 @@ from .small_steps import SmallSteps
 from .stored import Arrays, StateFile
 from .target import Found, ImageTarget
 
-#: Chains without and with light paths, at least and at most, and mutations of a chain, about, where
-#: these bounds allow it. Longer chains spread what a bright sample began with. Those with light
-#: paths need several kernels for each mutation, which take as long to trace as 65536 mutations.
+#: For estimators without and with light paths: the least and the largest number of chains, and the
+#: approximate number of mutations of a chain within these bounds. Longer chains forget the bright
+#: samples that they start from. With light paths, each mutation needs several kernels, which take
+#: as long to trace as 65536 mutations to run.
 _CHAINS, _LENGTH = {False: (1 << 10, 1 << 16), True: (1 << 16, 1 << 18)}, {False: 1024, True: 64}
 
-#: Samples of the bootstrap, in proportion to the mutations, and at most: their mean is the
-#: brightness of what chains find.
+#: Number of bootstrap samples: as a fraction of the mutations, and at most. Their mean gives the
+#: brightness of the chains' image.
 _BOOTSTRAP_SHARE, _MOST_BOOTSTRAP = 0.25, 1 << 24
 
-#: With a time limit, the share of the time that is left for the bootstrap, and samples that measure
-#: its speed.
+#: With a time limit: the fraction of the remaining time that the bootstrap takes, and the number of
+#: samples that measure its speed.
 _BOOTSTRAP_TIME, _SPEED_SAMPLES = 0.2, 1 << 16
 
-#: The largest standard error of the brightness without a warning.
+#: A larger relative standard error of the brightness gives a warning.
 _UNSURE = 0.05
 
-#: Visits of one state in a row that are worth a warning: at least so many, and this share of those
-#: of an average pixel.
+#: A state that a chain visits more often than this in a row gives a warning: both more often than
+#: this number, and than this fraction of the visits of an average pixel.
 _LONG, _STAY = 64, 0.5
 
-#: Samples that find the scale of MIS weights.
+#: Samples that estimate the scale of MIS weights.
 _SCALE_SAMPLES = 1 << 14
 
 
@@ -50,13 +51,14 @@ class ChainSettings:
     """The parameters of a Metropolis render.
 
     Attributes:
-        chains: Chains, at most; there are no more than mutations. 0 for as many as suit the render.
-        bootstrap: Samples from which they start, at least.
+        chains: Largest number of chains; there are never more than mutations. 0 for a number that
+            suits the render.
+        bootstrap: Least number of samples from which the starts are chosen.
         large_step: The probability of a large step.
-        steps: How numbers are moved by the others.
-        uses_uniform: Are large steps used as uniform samples besides?
-        is_even: Do a first stage's samples spread the visits evenly over the film?
-        file: If it has a state, the render goes on from there; it has the last state afterwards.
+        steps: The small steps.
+        uses_uniform: Are the proposals of large steps also used as independent samples?
+        is_even: Is there a first stage, whose samples make the visits even over the film?
+        file: If it holds a state, the render continues from it. The last state is saved to it.
     """
 
     chains: int
@@ -73,9 +75,9 @@ class Start:
     """The samples from which chains started.
 
     Attributes:
-        mean: Of the target function.
-        count: How many there are.
-        error: The standard error of the mean, relative to it.
+        mean: Mean of the target function.
+        count: Number of samples.
+        error: The standard error of the mean, divided by the mean.
     """
 
     mean: float
@@ -84,11 +86,12 @@ class Start:
 
 
 class MetropolisRender(ChainRender):
-    """Chains visit all of the image in proportion to its brightness. ``spp`` are mutations per
-    pixel.
+    """Metropolis light transport: long chains visit the film in proportion to the brightness of the
+    image. ``spp`` are mutations per pixel.
 
     Parameters:
-        settings: How.
+        settings: The parameters of the chains.
+        render: The parameters of :class:`ChainRender`.
     """
 
     def __init__(self, settings: ChainSettings, *render: Any) -> None:
@@ -137,12 +140,12 @@ class MetropolisRender(ChainRender):
     def _begun(
         self, total: int, image: ChainImage, interrupt: threading.Event
     ) -> tuple[Chains | None, Start]:
-        """New chains, if there is light."""
+        """New chains and their start; ``None`` instead of chains if no light was found."""
         settings, statistics = self._settings, self._statistics
         count = min(settings.chains or _suitable(total, self._target), total)
         mean = self._first_stage()
         samples = max(settings.bootstrap, count, self._bootstrap_share(total))
-        # Uniform samples are those of large steps and of the bootstrap
+        # Independent samples for each mutation: those of large steps and of the bootstrap
         share = settings.large_step + _BOOTSTRAP_SHARE
         rules = ChainRules(
             settings.large_step, settings.steps, share * mean if settings.uses_uniform else 0.0
@@ -152,7 +155,7 @@ class MetropolisRender(ChainRender):
             if interrupt.is_set() or self._integrator.is_cancelled:
                 raise _StoppedError
             if rules.uniform_weight > 0:
-                # Opaque: each render has another one, and would need another kernel
+                # Opaque, since a literal would need another kernel in each render
                 scale = dr.opaque(mi.Float, rules.uniform_weight)
                 weight = dr.select(found.target > 0, dr.rcp(found.target + scale), 0)
                 image.add_found(found, weight)
@@ -166,7 +169,7 @@ class MetropolisRender(ChainRender):
         return self._kind(self._target, image, rules, bootstrap, winners, self._seed), start
 
     def _restored(self, stored: Arrays, image: ChainImage) -> tuple[Chains, Start]:
-        """Chains that go on, with the image that they have made."""
+        """The stored chains and their start; the stored image is added to ``image``."""
         settings = self._settings
         if settings.is_even:
             self._first_stage()
@@ -189,8 +192,9 @@ class MetropolisRender(ChainRender):
         }  # fmt: skip
 
     def _first_stage(self) -> float:
-        """The mean of the target function, about, which scales MIS weights: any number makes them
-        unbiased, if the samples of the image do not decide it. Finds the weights of tiles too."""
+        """Estimates the mean of the target function, which scales MIS weights. Any scale is
+        unbiased if it does not depend on the samples of the image. Computes the weights of tiles
+        too."""
         settings = self._settings
         seed, samples = stream(self._seed, FIRST_STAGE), settings.bootstrap
         self._target.learn(seed)
@@ -208,13 +212,13 @@ class MetropolisRender(ChainRender):
         return min(share, _MOST_BOOTSTRAP)
 
     def _timed_share(self) -> int:
-        """Samples of the bootstrap that suit the time limit. Other samples measure the speed: the
-        number of those that count must not depend on what they find."""
+        """The number of bootstrap samples that suits the time limit. Separate samples measure the
+        speed: the number of samples that are used must not depend on their values."""
         # The first stage has compiled the kernels
         begin = time.perf_counter()
         seed = stream(self._seed, FIRST_STAGE)
         count = Bootstrap(self._target, seed, _SPEED_SAMPLES).count
-        # No clock is fine enough to be divided by, whatever it says
+        # The clock may measure 0 seconds, which must not divide
         seconds = max(time.perf_counter() - begin, 1e-6)
         left = self._integrator.timeout - (time.perf_counter() - self._start)
         return int(_BOOTSTRAP_TIME * max(0.0, left) * count / seconds)
@@ -222,7 +226,8 @@ class MetropolisRender(ChainRender):
     def _write(self, chains: Chains, image: ChainImage, start: Start) -> None:
         mutations = chains.done * chains.count
         camera_samples = self._pixel_count * self._camera_spp
-        # The mean of those samples from which the chains started: visits depend on it
+        # The mean of the samples from which the chains started, not a more precise one: the product
+        # with the visits is unbiased only with this mean
         visit_factor = start.mean * camera_samples / mutations
         uniform = self._settings.large_step * mutations + start.count
         uniform_factor = chains.rules.uniform_weight * camera_samples / uniform
@@ -237,14 +242,14 @@ class MetropolisRender(ChainRender):
             mi.Log(
                 mi.LogLevel.Warn,
                 f"A chain stayed at one path for {longest:.0f} of {chains.done} mutations: some "
-                f'pixels may be far too bright. "erpt" bounds what one path brings.',
+                f'pixels may be far too bright. "erpt" limits the contribution of one path.',
             )
         if start.error > _UNSURE:
             mi.Log(
                 mi.LogLevel.Warn,
-                f"What the chains found may be too bright or too dark as a whole: the standard "
-                f"error of its brightness is {start.error:.0%}. More "
-                f'"luminance_samples" know it better.',
+                f"The light that the chains found may be too bright or too dark as a whole: the "
+                f"standard error of its brightness is {start.error:.0%}. Use more "
+                f'"luminance_samples".',
             )
 
 
@@ -253,7 +258,7 @@ class _StoppedError(Exception):
 
 
 def _suitable(mutations: int, target: ImageTarget) -> int:
-    """A number of chains. Longer chains forget better where they began; more of them keep the
-    processor busy, above all where each mutation is several kernels."""
+    """A suitable number of chains. Longer chains depend less on where they began. More chains keep
+    the processor busy, above all if each mutation is several kernels."""
     fewest, most = _CHAINS[target.has_light_paths]
     return min(max(mutations // _LENGTH[target.has_light_paths], fewest), most)

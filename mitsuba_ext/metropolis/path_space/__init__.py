@@ -1,1 +1,2 @@
-"""Light paths as points of surfaces, the densities of the ways to make them, and mutations."""
+"""Light paths as lists of vertices, the densities of the techniques that make them, and
+mutations."""

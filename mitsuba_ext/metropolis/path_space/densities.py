@@ -1,4 +1,4 @@
-"""With what density bidirectional path tracing makes a part of a path."""
+"""The density with which bidirectional path tracing makes a part of a path."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ def log_density(
     active: mi.Bool,
     techniques: Techniques | None = None,
 ) -> mi.Float:
-    """The logarithm of the density with which the vertices between two that are kept are made.
+    """The logarithm of the density, summed over all techniques, with which the vertices between
+    ``keeps`` and ``rest`` are made.
 
     Parameters:
         keeps, rest: As in :class:`~mitsuba_ext.metropolis.path_space.plan.Plan`.
-        techniques: How often vertices are made from the camera, and how many of them; ``None`` if
-            each number has the same probability.
+        techniques: The probabilities of the techniques; ``None`` if each number of vertices made
+            from the camera has the same probability.
     """
     uniform = -dr.log(mi.Float(rest - keeps))
     can_be_hit = ~space.kinds.is_unhittable(path.emitter, active)
@@ -42,7 +43,7 @@ def log_density(
         impossible += dr.select(is_none, 1, 0)
         index += 1
 
-    # ----- One after the other is made from the camera instead -----
+    # ----- One more vertex at a time made from the camera instead -----
     index = keeps + 1
     largest, total = mi.Float(_NONE), mi.Float(0)
     while active & (index <= rest):
@@ -70,8 +71,8 @@ def _from_light(memory: PathMemory, path: Head, index: mi.UInt32) -> mi.Float:
 
 
 def _joins(space, memory, path, index, can_be_hit) -> mi.Bool:
-    """Can the vertex ``index``, made from the light, be joined to the one before it, made from the
-    camera?"""
+    """Can the vertex ``index``, made from the light, be connected to the vertex before it, made
+    from the camera?"""
     sees = mi.Bool(space.connectable is not None) & (path.length > 1)
     before = dr.select(index == 1, sees, memory.places[path.at + index - 1].is_discrete == 0)
     here = (index == path.length) | (memory.places[path.at + index].is_discrete == 0)
@@ -86,9 +87,9 @@ def log_factors(
     from_light: mi.Bool,
     active: mi.Bool,
 ) -> mi.Float:
-    """The sum of the logarithms of the geometric factors from the first vertex to ``last``: of the
-    directions from the camera, or of those from the light. A perturbation has the same density both
-    ways but for these."""
+    """The sum of the logarithms of the geometric factors from the first vertex to ``last``: for
+    directions from the camera, or for those from the light. Apart from these factors, a
+    perturbation and its reverse have the same density."""
     index, total = mi.UInt32(1), mi.Float(0)
     while active & (index <= last):
         logs = memory.logs[path.at + index]

@@ -1,4 +1,5 @@
-"""Tracing a path from the camera: what it brings, and with what densities it can be made."""
+"""Tracing a path from the camera: its contribution, and the densities of the techniques that make
+it."""
 
 from __future__ import annotations
 
@@ -18,25 +19,26 @@ from .memory import Head, Logs, PathMemory, Place, log
 from .plan import Plan
 from .space import PathSpace, towards, turned
 
-#: Stands for a surface that does not shine.
+#: The light index of a surface that does not emit.
 NO_LIGHT = 0xFFFFFFFF
 
-#: By how much the direction of a discrete lobe may miss the next vertex, squared: it shows that
-#: the path took another lobe. Rays begin at some distance from a surface, so that the next vertex,
-#: where it is near, does not lie exactly in the direction of a mirror.
+#: Largest squared difference between the direction of a delta lobe and the direction to the next
+#: vertex. A larger one shows that the path took another lobe. The difference is not 0, since rays
+#: start at an offset from the surface: the direction to a near vertex is not exactly the mirror
+#: direction.
 _MISS = 0.1
 
 
 @dataclass
 class Evaluation:
-    """What a path brings.
+    """The contribution of a path.
 
     Attributes:
-        position: Where on the film, in pixels.
-        value: The colour: the integrand without geometric factors.
-        log_geometry: The logarithm of these.
-        scatter, shadow: Rays traced between vertices, and to points of light.
-        active: Which paths bring anything.
+        position: Position on the film, in pixels.
+        value: The integrand without geometric factors, as a colour.
+        log_geometry: The logarithm of the geometric factors.
+        scatter, shadow: Number of rays traced between vertices, and of shadow rays.
+        active: Paths whose contribution is valid.
     """
 
     position: mi.Point2f
@@ -57,11 +59,12 @@ def trace_from_camera(
     numbers: Numbers,
     active: mi.Bool,
 ) -> tuple[PathMemory, Head, Numbers, Evaluation]:
-    """Makes the vertices up to ``plan.grown``, and evaluates the path. All others are in memory.
+    """Makes the vertices up to ``plan.grown``, and evaluates the path. Its other vertices are
+    already in memory.
 
     Returns:
         The memory, with the vertices and their densities; the new path with its light, which may
-        have been found here; the numbers; and what the path brings.
+        have been found here; the random numbers; and the contribution of the path.
     """
     scene, query, kinds, emission = space.scene, space.query, space.kinds, space.emission
     ctx = space.heroes.context()
@@ -78,10 +81,10 @@ def trace_from_camera(
     value = mi.Spectrum(rays.importance)
     hero_is_alone = space.heroes.begin()
     emitter = mi.UInt32(new.emitter)
-    # With a lane for each path: memory is written at it
+    # A lane for each path, since local memory is written at this index
     index = dr.full(mi.UInt32, 1, dr.width(new.film))
     geometry = mi.Float(0)
-    # Of the vertex before: its densities so far, and the cosine of the direction that leaves it
+    # For the previous vertex: its densities so far, and the cosine of the direction that leaves it
     before, cosine = _no_logs(), mi.Float(1)
     p_before = mi.Point3f(origin)
     light_weight = mi.Spectrum(1)
@@ -93,7 +96,7 @@ def trace_from_camera(
         is_end = index == length
         is_new = (index > plan.keeps) & (index <= plan.grown)
 
-        # ----- Is this the vertex that the path has? -----
+        # ----- Is this the stored vertex of the path? -----
         light = _light(space, si, active & is_end)
         emitter = dr.select(is_end & is_new & (light != NO_LIGHT), light, emitter)
         unhittable = kinds.is_unhittable(emitter, is_end)
@@ -134,14 +137,14 @@ def trace_from_camera(
         is_found |= active & is_end
         goes_on = active & ~is_end
 
-        # ----- Where does the path go on? -----
+        # ----- The direction to the next vertex -----
         bsdf = si.bsdf(ray)
         walks = grows & ~plan.perturbs
         number, sample = numbers.next_1d(), numbers.next_2d()
         lobe = dr.select(walks, number, place.lobe)
         joins = (index == plan.grown) | (index == plan.grown + 1)
         was_discrete = (place.is_discrete == 1) & ~joins
-        # Other directions are known
+        # All other directions follow from the stored vertices
         is_sampled = goes_on & (walks | was_discrete)
         bs, weight = sample_bsdf(bsdf, ctx, si, lobe, sample, is_sampled)
         is_sampled_discrete = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -169,7 +172,7 @@ def trace_from_camera(
         next_d = dr.select(grows, sampled_d, next_d)
         wo = si.to_local(next_d)
 
-        # ----- What does the vertex let through? -----
+        # ----- The BSDF and its densities -----
         smooth, pdf = eval_bsdf(bsdf, ctx, si, wo, goes_on & ~is_discrete)
         reverse = reverse_density(ctx, bsdf, si, wo, goes_on & ~is_discrete)
         agrees = is_sampled_discrete & (dr.squared_norm(bs.wo - wo) < _MISS)
@@ -185,7 +188,7 @@ def trace_from_camera(
         goes_on &= dr.max(dr.abs(value)) > 0
 
         ray = query.starts.along(si, next_d)
-        # From where the ray begins: it would miss a near vertex otherwise
+        # Aimed from the offset origin of the ray, which would miss a near vertex otherwise
         aimed = dr.normalize(target.p - ray.o)
         ray.d = dr.select(grows | given | is_given, next_d, aimed)
 
@@ -231,16 +234,16 @@ def _no_logs() -> Logs:
 
 
 def _light(space: PathSpace, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
-    """The number of the light that a ray has run into."""
+    """The index of the light that a ray has hit."""
     emitter = si.emitter(space.scene, active)
     index = space.emission.index(emitter, active)
     return dr.select(emitter != None, index, NO_LIGHT)  # noqa: E711
 
 
 def _lobe_ratio(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Float:
-    """The logarithm of the ratio of solid angles behind and before a discrete lobe: what a density
-    of directions gains when light goes through it the other way. It is 0 but for refraction, where
-    ``η² cos θ dω`` is the same on both sides; the lobe may have a normal of its own."""
+    """The logarithm of the ratio of solid angles behind and before a delta lobe: the factor of a
+    density of directions for the reverse direction through the lobe. It is 0 except for refraction,
+    where ``η² cos θ dω`` is the same on both sides. The lobe may have a normal of its own."""
     refracts = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
     n = si.wi + bs.eta * bs.wo
     ratio = dr.abs(dr.dot(n, si.wi)) / (dr.abs(dr.dot(n, bs.wo)) * dr.square(bs.eta))

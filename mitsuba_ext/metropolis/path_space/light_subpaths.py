@@ -11,8 +11,8 @@ from .memory import Head, PathMemory, Place
 from .plan import Plan
 from .space import PathSpace, turned
 
-#: Angles, in radians, by which perturbations turn directions. Displacements of light that comes
-#: from infinity, in units of the radius of the scene.
+#: Smallest and largest angle, in radians, by which perturbations turn directions. For light from
+#: infinity: smallest and largest displacement of the ray, in units of the scene's radius.
 LOW, HIGH = 1e-4, 0.1
 
 
@@ -30,11 +30,12 @@ def grow_from_light(
     """Makes the vertices from ``plan.rest`` − 1 down to ``plan.grown`` + 1.
 
     Parameters:
-        memory: Holds both paths; the kept vertices of the new one are there.
-        ray: Any camera ray of the new path.
+        memory: Holds the old path, and the kept vertices of the new one.
+        ray: Any camera ray of the new path, for its time and wavelengths.
 
     Returns:
-        The memory; the new path with its light; the numbers; and where all vertices were made.
+        The memory; the new path with its light; the random numbers; and the lanes in which all
+        vertices were made.
     """
     active = mi.Bool(active)
     begins = active & (plan.rest > new.length)
@@ -49,7 +50,7 @@ def grow_from_light(
     ctx.mode = mi.TransportMode.Importance
     last = plan.grown + 1
     active &= is_sound
-    # The light may be all that is made
+    # The vertex on the light may be the only one that is made
     is_done = active & (index < last)
     active &= ~is_done
     while dr.hint(active, label="light subpath"):
@@ -59,10 +60,10 @@ def grow_from_light(
         place = memory.places[head.at + index]
         is_kept = index == plan.rest
         is_last = index == last
-        # What is kept must be found again
+        # The ray must hit the kept vertex
         active &= si.is_valid() & (~is_kept | space.is_same(si, place.p, si.t))
 
-        # ----- Where does the path go on? -----
+        # ----- The direction to the next vertex -----
         lobe, sample = numbers.next_1d(), numbers.next_2d()
         lobe = dr.select(plan.perturbs, place.lobe, lobe)
         bs, weight = sample_bsdf(bsdf, ctx, si, lobe, sample, active & ~is_last)
@@ -72,7 +73,7 @@ def grow_from_light(
         turns = plan.perturbs & is_kept
         before = memory.places[old.at + index - 1]
         d = dr.select(turns, turned(dr.normalize(before.p - place.p), sample, LOW, HIGH), d)
-        # A perturbation goes through discrete lobes, from where it begins to where it ends
+        # Between its first and its last vertex, a perturbation only passes through delta lobes
         goes_on = ~is_last & (turns | (scatters & (~plan.perturbs | is_discrete)))
 
         # ----- Store the vertex -----
@@ -88,8 +89,9 @@ def grow_from_light(
 
 
 def _begin(space, memory, old, new, plan, ray, numbers, active, begins):
-    """The ray that leads to the first vertex of the walk, or back to the one at which it starts;
-    the number of that vertex, the emitter, and where there is such a ray."""
+    """The first ray of the walk: from a sampled point on a light, or a ray that hits the kept
+    vertex at which the walk starts. Returns it with the index of the vertex that it leads to, the
+    emitter, the lanes that have such a ray, and the memory."""
     emitted = space.emission.sample(numbers, ray.time, ray.wavelengths, begins)
     kinds = space.kinds
     is_infinite = kinds.is_infinite(emitted.index, begins)
@@ -112,12 +114,12 @@ def _begin(space, memory, old, new, plan, ray, numbers, active, begins):
     o, d = place.p + way, -dr.normalize(way)
     index = dr.select(begins, new.length - 1, plan.rest)
 
-    # ----- Light without a surface is perturbed here -----
+    # ----- Perturb the direction at a light without surface -----
     leaves = kept & is_end & (beyond | kinds.is_point(new.emitter, kept))
     sample = numbers.next_2d()
     aim = dr.normalize(neighbour.p - place.p)
     aside = _aside(place.p, sample) * space.radius
-    # As far away as light from infinity begins
+    # As far away as emitted rays of lights at infinity begin
     far = neighbour.p + aside + place.p * (2 * space.radius)
     o = dr.select(leaves, dr.select(beyond, far, place.p), o)
     aimed = dr.select(beyond, -place.p, turned(aim, sample, LOW, HIGH))
@@ -132,7 +134,7 @@ def _begin(space, memory, old, new, plan, ray, numbers, active, begins):
 
 
 def _aside(d: mi.Vector3f, sample: mi.Point2f) -> mi.Vector3f:
-    """A displacement at right angles to ``d``; the logarithm of its length is uniform."""
+    """A random displacement perpendicular to ``d``; the logarithm of its length is uniform."""
     length = LOW * dr.power(HIGH / LOW, sample.x)
     y, x = dr.sincos(dr.two_pi * sample.y)
     return mi.Frame3f(d).to_world(mi.Vector3f(length * x, length * y, 0))

@@ -1,4 +1,4 @@
-"""What kinds of lights paths end at."""
+"""The kinds of lights at which paths end."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ _POINT, _FIXED_DIRECTION, _INFINITE, _SURFACE = 1, 2, 4, 8
 
 
 class LightKinds:
-    """Tells the lights of a scene apart. What no light is, is a Python ``False``.
+    """The kind of each light of a scene. The attributes are Python booleans, so that the code of
+    kinds that do not occur is left out of kernels.
 
     Parameters:
         scene: A scene with lights.
 
     Attributes:
-        has_unhittable: Is there a light that no ray can run into?
+        has_unhittable: Is there a light that no ray can hit?
         has_surfaces, has_infinite, has_points: Are there area lights, lights at infinity, points?
     """
 
@@ -38,7 +39,7 @@ class LightKinds:
         return dr.gather(mi.EmitterPtr, self._emitters, index, active)
 
     def is_unhittable(self, index: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Can no ray run into it: a point, or light of one direction?"""
+        """Is it a light that no ray can hit: a point, or a light that shines in one direction?"""
         return self._has(_POINT | _FIXED_DIRECTION, index, active)
 
     def is_infinite(self, index: mi.UInt32, active: mi.Bool) -> mi.Bool:
@@ -79,23 +80,24 @@ def light_start_densities(
     ref: mi.Interaction3f,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:
-    """With what densities light paths begin as the last segment of a path.
+    """The densities with which light paths begin with the last segment of a path.
 
     Parameters:
         d: The direction of emission.
         n: Normal of the light.
-        ref: The vertex before it.
+        ref: The vertex before the light.
 
     Returns:
-        That of the last vertex (see :class:`Logs`), and what emission adds to that of the one
-        before it: the density of the direction, for lights at infinity that of the position.
+        The density of the last vertex (see :class:`Logs`), and the factor that emission contributes
+        to the density of the vertex before it: the density of the direction, or for lights at
+        infinity and beams that of the position.
     """
     emitter = kinds.emitter(index, active)
     position, direction = emission.densities(
         scene, emitter, d, n, ref, active, knows_normal=True
     )
     chance = emission.chance(index, active)
-    # The direction of a beam is given, as that of a light at infinity
+    # For beams and lights at infinity, the density of the last vertex is that of the direction
     by_direction = kinds.is_infinite(index, active) | kinds.is_beam(index, active)
     return (
         dr.select(by_direction, chance * direction, position),

@@ -1,4 +1,4 @@
-"""Light paths, vertex by vertex, in memory of the lane."""
+"""Storage of light paths, vertex by vertex, in the local memory of each lane."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ class Place:
 
     Attributes:
         p: The point; for a light at infinity, the direction towards it.
-        lobe: The number, in [0, 1), that chooses the lobe of the BSDF, where the path is scattered
-            by a discrete one.
-        is_discrete: Is it scattered by a mirror, smooth glass, or a hole of a mask? 0 or 1.
-        d: The direction of the ray from here to the next vertex, on the way from the camera. Rays
-            begin at a small distance from a surface, so that two points that lie close to each
-            other do not tell it.
+        lobe: The random number, in [0, 1), that chooses the lobe of the BSDF. It matters only for
+            delta lobes.
+        is_discrete: Does a delta lobe scatter the path: a mirror, smooth glass, or a hole of a
+            mask? 0 or 1.
+        d: The direction of the ray from here to the next vertex, on the way from the camera. It is
+            stored, since rays start at an offset from the surface: for vertices close to each other
+            it does not follow from their positions.
     """
 
     p: mi.Point3f
@@ -32,16 +33,17 @@ class Place:
 class Logs:
     """Natural logarithms of densities at a vertex; −∞ for 0.
 
-    A density of the vertex per area (of a light at infinity: per solid angle) is that of a
-    direction at its neighbour, times a geometric factor. Where a discrete lobe chose the direction,
-    the first counts as 1, and the second is such that both ways through the lobe agree.
+    The density of a vertex per area (of a light at infinity: per solid angle) is that of a
+    direction at its neighbour, times a geometric factor. If the direction was chosen by a delta
+    lobe, the density of the direction counts as 1, and the geometric factor is such that both ways
+    through the lobe agree.
 
     Attributes:
         from_camera, from_light: The geometric factors, for the neighbours on either side. At the
-            first vertex, ``from_camera`` is the density of a uniform place on the film; at the
-            last one, ``from_light`` is that with which light paths begin there.
-        to_light, to_camera: The densities per solid angle of the directions in which the path goes
-            on from here. At the last vertex, ``to_camera`` is what emission adds to the density of
+            first vertex, ``from_camera`` is the density of a uniform position on the film; at the
+            last one, ``from_light`` is the density with which light paths begin there.
+        to_light, to_camera: The densities per solid angle of the directions to the neighbours. At
+            the last vertex, ``to_camera`` is the factor that emission contributes to the density of
             the vertex before it.
     """
 
@@ -65,7 +67,7 @@ class PathMemory:
 
     @classmethod
     def of(cls, most: int) -> PathMemory:
-        """For paths of at most so many vertices."""
+        """Memory for paths of at most ``most`` vertices."""
         size = 2 * stride(most)
         return cls(
             dr.alloc_local(Place, size, value=dr.zeros(Place)),
@@ -74,21 +76,21 @@ class PathMemory:
 
 
 def stride(most: int) -> int:
-    """From one path in memory to the other, for paths of at most so many vertices. Some places are
-    read, without effect, before the first vertex and after the last one."""
+    """Distance between the two paths in memory, for paths of at most ``most`` vertices. Some places
+    before the first vertex and after the last one are read too, without effect."""
     return most + 3
 
 
 @dataclass
 class Head:
-    """What a path is besides its vertices.
+    """The data of a path besides its vertices.
 
     Attributes:
-        at: Where its vertices lie in the memory of the lane.
-        length: Segments, and vertices without the camera.
-        film: Where it meets the film: in [0, 1)² over the crop window.
-        aperture, time, wavelength: The other numbers of the camera ray.
-        emitter: The number of its light in ``scene.emitters()``.
+        at: Where its vertices begin in the memory of the lane.
+        length: Number of segments, which is the number of vertices without the camera.
+        film: Position on the film: in [0, 1)² over the crop window.
+        aperture, time, wavelength: The other random numbers of the camera ray.
+        emitter: The index of its light in ``scene.emitters()``.
     """
 
     at: mi.UInt32
@@ -101,5 +103,5 @@ class Head:
 
 
 def log(x: mi.Float) -> mi.Float:
-    """The logarithm, −∞ for 0 and what is below."""
+    """The logarithm of ``x``; −∞ for zero and negative numbers."""
     return dr.select(x > 0, dr.log(dr.maximum(x, 1e-38)), -dr.inf)

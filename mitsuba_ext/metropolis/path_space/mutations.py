@@ -19,25 +19,27 @@ from .techniques import Techniques
 #: Kinds of mutations.
 NEW_PATH, BIDIRECTIONAL, FROM_CAMERA, FROM_LIGHT = 0, 1, 2, 3
 
-#: Distances on the film, in pixels at least, and in units of its width at most, by which
-#: perturbations move paths.
+#: Distances on the film by which perturbations move paths: the smallest in pixels, and the largest
+#: in units of the film's width.
 _PIXELS, _WIDTH = 0.1, 0.1
 
-#: Multiples of these, modulo one, are evenly spread over the unit square (M. Roberts, 2018).
+#: Multiples of these, modulo one, are a low-discrepancy sequence in the unit square (M. Roberts,
+#: 2018).
 _EVENLY = (0.7548776662466927, 0.5698402909980532)
 
 
 @dataclass(frozen=True)
 class Switches:
-    """Which mutations there are, besides new paths.
+    """The mutations that are used, besides new paths. A vertex is *discrete* if a delta lobe of its
+    BSDF scatters the path (:attr:`Place.is_discrete`).
 
     Attributes:
-        bidirectional: A part of a path is replaced by a bidirectional random walk.
-        lens: The place on the film moves, and the path with it up to its first two vertices in a
-            row that are not discrete.
-        multi_chain: The same where directions at other vertices must move too.
-        caustic: The direction at the light, or at the last vertex but one that is not discrete,
-            moves, and the path with it as far as the camera.
+        bidirectional: Replace a part of a path by a bidirectional random walk.
+        lens: Move the position on the film, and trace the path from there up to its first two
+            consecutive vertices that are not discrete.
+        multi_chain: The same for paths on which directions at other vertices must change too.
+        caustic: Change the direction at the light, or at the second vertex from the camera that is
+            not discrete, and trace the path from there to the camera.
     """
 
     bidirectional: bool = True
@@ -48,14 +50,14 @@ class Switches:
 
 @dataclass
 class Proposal:
-    """A path that a chain may go to.
+    """A proposed path of a chain.
 
     Attributes:
         head: The path; its vertices are in memory.
-        found: What it brings.
+        found: Its contribution.
         log_density: The logarithm of its density as a new path.
-        log_ratio: That of the density of the opposite mutation / density of this one.
-        technique: The number of the technique that a new path is made by.
+        log_ratio: The logarithm of density of the reverse mutation / density of this mutation.
+        technique: The index of the technique that makes a new path.
     """
 
     head: Head
@@ -74,12 +76,12 @@ class Mutations:
 
     Parameters:
         space: The paths of the scene.
-        switches: Which mutations there are.
+        switches: The mutations that are used.
     """
 
     def __init__(self, space: PathSpace, switches: Switches) -> None:
         self.space, self._switches = space, switches
-        # Perturbations are the more frequent ones: they are accepted more often
+        # Perturbations are proposed more often, since they are accepted more often
         self.kinds = [
             kind for kind, shares in (
                 (BIDIRECTIONAL, 1 if switches.bidirectional else 0),
@@ -87,7 +89,7 @@ class Mutations:
                 (FROM_LIGHT, 2 if switches.caustic and space.connectable is not None else 0),
             ) for _ in range(shares)
         ]  # fmt: skip
-        #: How new paths are made.
+        #: The distribution of techniques that make new paths.
         self.techniques = Techniques(space.least, space.most)
 
     # ---- New paths ----
@@ -95,7 +97,8 @@ class Mutations:
     def new_path(
         self, memory: PathMemory, at: mi.UInt32, numbers: Numbers, active: mi.Bool
     ) -> tuple[PathMemory, Numbers, Proposal]:
-        """A path made anew. The first two numbers are its place on the film."""
+        """Makes a new path, independent of others. The first two numbers are its position on the
+        film."""
         film = numbers.next_2d()
         technique, head, plan = self._fresh(at, film, numbers)
         memory, numbers, head, found = self._make(memory, head, head, plan, numbers, active)
@@ -105,7 +108,7 @@ class Mutations:
     def _fresh(
         self, at: mi.UInt32, film: mi.Point2f, numbers: Numbers
     ) -> tuple[mi.UInt32, Head, Plan]:
-        """A path of which nothing is known yet but how it will be made: by which technique."""
+        """Chooses the technique and the camera numbers of a new path; it has no vertices yet."""
         technique, length, grown = self.techniques.choose(numbers.next_1d())
         aperture, time, wavelength = numbers.next_2d(), numbers.next_1d(), numbers.next_1d()
         head = Head(at, length, film, aperture, time, wavelength, dr.zeros(mi.UInt32, 1))
@@ -127,13 +130,13 @@ class Mutations:
         film: mi.Point2f,
         numbers: Numbers,
     ) -> tuple[PathMemory, Numbers, Proposal]:
-        """A proposal.
+        """Makes a proposal from ``path``.
 
         Parameters:
             density: :attr:`Proposal.log_density` of ``path``.
-            kind: Of the mutation that is wanted. Which one is made may depend on what the path and
-                the proposal have in common.
-            film: Where a new path begins on the film, if from the camera.
+            kind: The kind of mutation that is requested. A path that does not allow this kind gets
+                another one (:meth:`_possible`).
+            film: Film position of a new path, if its first vertex is made from the camera.
         """
         space = self.space
         technique, fresh, plan = self._fresh(stride(space.most) - path.at, film, numbers)
@@ -142,7 +145,7 @@ class Mutations:
         choice = numbers.next_2d()
         bidirectional = self._part(path, choice, numbers.next_1d())
         from_camera = kind == FROM_CAMERA
-        # The proposal's place on the film, unless it is seen from the light
+        # The proposal's film position, unless its first vertex is made from the light
         moved, is_inside = self._moved(path.film, choice)
         place = dr.select(is_new | (bidirectional.keeps == 0), fresh.film, path.film)
         place = dr.select(from_camera, moved, place)
@@ -172,7 +175,7 @@ class Mutations:
         memory = _copy(memory, path, head, active & ~is_new)
         memory, numbers, head, found = self._make(memory, path, head, plan, numbers, active)
 
-        # ----- The densities of this mutation and of the opposite one -----
+        # ----- The densities of this mutation and of the reverse one -----
         found_density = self._density(memory, head, found.active)
         ratio = density - found_density
         if BIDIRECTIONAL in self.kinds:
@@ -204,27 +207,28 @@ class Mutations:
         return dr.select(sample < new_path, NEW_PATH, kind)
 
     def place(self, lane: mi.UInt32, word: mi.UInt32, step: mi.UInt32) -> mi.Point2f:
-        """A place on the film for a new path in each lane: evenly spread over the lanes, and
-        uniform for each of them."""
+        """The film position of a new path in each lane: stratified over the lanes, and uniformly
+        distributed in each of them."""
         shift = hashed_2d(word, step)
-        # Integers: floats would lose the digits that matter
+        # Integers: floats would lose the fractional digits of large multiples
         x, y = (lane * mi.UInt32(round(c * 2**32) & 0xFFFFFFFF) for c in _EVENLY)
         place = mi.Point2f(mi.Float(x >> 8), mi.Float(y >> 8)) * 2.0**-24 + shift
         return dr.minimum(place - dr.floor(place), 1 - 2.0**-24)
 
-    # ---- Which vertices ----
+    # ---- Which vertices are replaced ----
 
     @dr.syntax
     def _possible(
         self, memory: PathMemory, path: Head, kind: mi.UInt32
     ) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """The kind of mutation that is made of a path; the last vertex that moves if it is
-        perturbed from the camera, and the first that stays if it is perturbed from the light.
+        """The kind of mutation that is made from a path; the last vertex that moves if it is
+        perturbed from the camera; and the first vertex that stays if it is perturbed from the
+        light.
 
-        All three depend on its length, and on which vertices are discrete: a perturbation changes
-        neither.
+        All three depend only on the path's length, and on which of its vertices are discrete. A
+        perturbation changes neither, so that the reverse mutation is of the same kind.
         """
-        # The first two vertices in a row that can be connected
+        # The first two consecutive vertices that can be connected
         index, turns, is_open = mi.UInt32(1), mi.UInt32(0), mi.Bool(True)
         while is_open & (index < path.length):
             here = memory.places[path.at + index].is_discrete == 1
@@ -234,7 +238,7 @@ class Mutations:
                 turns += dr.select(here, 0, 1)
                 index += 1
         first = index
-        # The first vertex behind the camera's that can be connected
+        # The first vertex after vertex 1 that can be connected
         second = mi.UInt32(2)
         while (second < path.length) & (memory.places[path.at + second].is_discrete == 1):
             second += 1
@@ -258,12 +262,13 @@ class Mutations:
         return made, first, second
 
     def _part(self, path: Head, choice: mi.Point2f, sample: mi.Float) -> Plan:
-        """Any part of a path, which may be the light alone. What is kept behind it is never the
-        light alone: the walk from the light cannot begin at a given point."""
+        """A random part of a path to replace, which may be the light alone. The part that is kept
+        at the light's end is never the light alone: a walk from the light cannot begin at a given
+        point."""
         length = path.length
-        # The first vertex that is replaced, and how many follow it
+        # The last vertex that is kept at the camera's end
         keeps = dr.minimum(mi.UInt32(choice.x * mi.Float(length)), length - 1)
-        # The rest begins at one of keeps + 2 … length − 1, or behind the path
+        # The first one that is kept at the light's end: keeps + 2 … length − 1, or none
         ends = dr.select(length > keeps + 2, length - keeps - 2, 0) + 1
         rest = keeps + 2 + dr.minimum(mi.UInt32(choice.y * mi.Float(ends)), ends - 1)
         rest = dr.select(rest >= length, length + 1, rest)
@@ -272,7 +277,7 @@ class Mutations:
         return Plan(keeps, grown, rest, mi.Bool(False))
 
     def _moved(self, film: mi.Point2f, sample: mi.Point2f) -> tuple[mi.Point2f, mi.Bool]:
-        """A place on the film near another one, and whether it is on the film."""
+        """A position near another one, and whether it is on the film."""
         width = float(self.space.size.x)
         high = max(_WIDTH * width, 2 * _PIXELS)
         pixels = _PIXELS * dr.power(high / _PIXELS, sample.x)
@@ -281,7 +286,7 @@ class Mutations:
         return moved, dr.all((moved >= 0) & (moved < 1))
 
     def _make(self, memory, old: Head, new: Head, plan: Plan, numbers: Numbers, active):
-        """Makes the vertices of a plan, and evaluates the path."""
+        """Makes the new vertices of a plan, and evaluates the path."""
         space = self.space
         ray = mi.Ray3f(space.camera_ray(new).ray)
         grows = active & (plan.grown + 1 < plan.rest)
@@ -293,7 +298,7 @@ class Mutations:
         first = memory.places[new.at + 1]
         film, is_seen = space.on_film(first.p, ray, new, seen_from_light)
         new = replace(new, film=dr.select(seen_from_light, film, new.film))
-        # Lights are seen by camera paths only
+        # Only camera paths find lights that are directly visible
         active &= ~seen_from_light | (is_seen & (new.length > 1))
         memory, new, numbers, found = trace_from_camera(
             space, memory, old, new, plan, numbers, active

@@ -1,4 +1,4 @@
-"""Which vertices of a path a mutation makes anew, and how."""
+"""The plan of a mutation: which vertices of a path it replaces, and how."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ class Plan:
     """How a proposal is made.
 
     Attributes:
-        keeps: The last vertex that is kept at the camera's end; 0 if all from the first on are new.
+        keeps: The last vertex that is kept at the camera's end; 0 if none is kept.
         grown: The last vertex that is made from the camera.
-        rest: The first vertex that is kept at the light's end; length + 1 if all are new. Those
-            between the last two are made from the light.
-        perturbs: Do the new vertices follow the old path at a small distance? Else they are a
-            random walk. At discrete lobes the new path is scattered as the old one.
+        rest: The first vertex that is kept at the light's end; length + 1 if none is kept. The
+            vertices between ``grown`` and ``rest`` are made from the light.
+        perturbs: Do the new vertices follow the old path at a small distance? Otherwise they are
+            sampled by a random walk. At delta lobes the new path takes the same lobe as the old
+            one.
     """
 
     keeps: mi.UInt32

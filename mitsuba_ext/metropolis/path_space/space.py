@@ -1,4 +1,4 @@
-"""The paths of a scene: what making and evaluating them needs to know."""
+"""The path space of a scene: the data that making and evaluating paths depends on."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ...transport.path_decisions import SceneQuery
 from .lights import LightKinds
 from .memory import Head, Place
 
-#: By how much, in units of the shortest segment that meets there, a ray may miss a vertex: more
-#: would change the geometric factors of the path.
+#: Largest distance by which a ray may miss a vertex, in units of the shortest segment that ends at
+#: the vertex. A larger one would change the geometric factors of the path.
 _MISS = 0.1
 
 
@@ -24,18 +24,19 @@ class PathSpace:
     """Paths from the camera to a light.
 
     Parameters (and attributes):
-        scene, sensor: What is rendered.
-        emission: Where light paths begin.
-        connectable: What they are connected to; ``None`` where they cannot be.
-        query: How a ray meets the scene.
+        scene, sensor: The scene and the sensor that are rendered.
+        emission: Samples the rays with which light paths begin.
+        connectable: The sensor as the end of connections; ``None`` if points of the scene cannot
+            be connected to it.
+        query: Intersects rays with the scene.
         spp: Samples per pixel of the whole render, for ray differentials.
         least, most: Lengths of paths, in segments.
         hides_emitters: Do camera rays pass through area lights, and is the sky invisible?
 
     Attributes:
         kinds: The kinds of lights.
-        heroes: What becomes of the wavelengths where light disperses.
-        radius: Of the scene, about.
+        heroes: Hero wavelength sampling for dispersive BSDFs.
+        radius: Approximate radius of the scene.
     """
 
     def __init__(
@@ -77,9 +78,9 @@ class PathSpace:
     def on_film(
         self, p: mi.Point3f, ray: mi.Ray3f, head: Head, active: mi.Bool
     ) -> tuple[mi.Point2f, mi.Bool]:
-        """Where on the film a point is seen by the path's point of the aperture, as
-        :attr:`Head.film`, and whether it is seen, if nothing is in between. ``ray`` is any camera
-        ray of the path."""
+        """The film position of a point, seen through the path's point of the aperture, as
+        :attr:`Head.film`; and whether the point is seen unless it is occluded. ``ray`` is any
+        camera ray of the path, for its time and wavelengths."""
         if self.connectable is None:
             return mi.Point2f(0), mi.Bool(False)
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
@@ -89,8 +90,8 @@ class PathSpace:
         return dr.clip(film, 0, 1 - 2.0**-24), seen.active
 
     def is_same(self, si: mi.SurfaceInteraction3f, p: mi.Point3f, reach: mi.Float) -> mi.Bool:
-        """Has a ray found the vertex at ``p``, as far as its numbers are exact? A surface close
-        before it is another vertex: the densities of the path hold for the one that was sampled.
+        """Has a ray hit the vertex at ``p``, up to rounding? A hit on a surface close in front of
+        it does not count: the densities of the path hold for the vertex that was sampled.
 
         Parameters:
             reach: The length of the shortest segment that ends at the vertex.
@@ -100,13 +101,15 @@ class PathSpace:
 
 
 def towards(p: mi.Point3f, place: Place, is_direction: mi.Bool) -> mi.Vector3f:
-    """The direction from ``p`` to a vertex, which may be a direction itself."""
+    """The direction from ``p`` to a vertex. The vertex of a light at infinity is a direction
+    itself (``is_direction``)."""
     return dr.select(is_direction, mi.Vector3f(place.p), dr.normalize(place.p - p))
 
 
 def turned(d: mi.Vector3f, sample: mi.Point2f, low: float, high: float) -> mi.Vector3f:
-    """A direction at an angle to ``d`` between ``low`` and ``high``, of which the logarithm is
-    uniformly distributed: the density depends on the angle alone, and is the same both ways.
+    """A direction at an angle to ``d`` between ``low`` and ``high``. The logarithm of the angle is
+    uniformly distributed. The density depends on the angle alone, so that the reverse perturbation
+    has the same density.
 
     Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997, section 5.3; D. Cline,
     PhD thesis, 2007, Fig. 7.26.

@@ -1,4 +1,4 @@
-"""The ways in which new paths are made: their lengths, and how many vertices from either end."""
+"""The techniques that make new paths: the length, and the number of vertices from either end."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 from ...arrays import from_numpy
 from ...discrete_sampling import ONE_MINUS_EPSILON, first_above
 
-#: At first, of the lengths of new paths, each is as frequent as the one before times this.
+#: In the initial distribution, the probability of a path length is that of the length before, times
+#: this.
 _DECAY = 0.7
 
-#: The share of the first distribution in one that is learned: no technique is left out, since some
-#: find little light, but bright paths.
+#: The weight of the initial distribution in a learned one. No technique is left out, since some
+#: rarely find light, but then find bright paths.
 _FLOOR = 0.3
 
 
@@ -32,7 +33,7 @@ class Techniques:
         self._lengths = np.repeat(lengths, lengths + 1)
         self._grown = np.concatenate([np.arange(n + 1) for n in lengths])
         chance = _DECAY ** (self._lengths - least) / (self._lengths + 1)
-        # Lights are seen by camera paths only
+        # Only camera paths find lights that are directly visible
         chance[(self._lengths == 1) & (self._grown == 0)] = 0
         self._first = chance / chance.sum()
         self._tables = [from_numpy(mi.UInt32, a) for a in (self._lengths, self._grown)]
@@ -48,19 +49,19 @@ class Techniques:
         dr.eval(self._sums, self._logs)
 
     def kernel_state(self) -> tuple:
-        """What kernels depend on."""
+        """The arrays and constants that kernels depend on."""
         return (
             self._least, self._most, len(self._first), self._sums, self._logs, self._tables,
             self._starts,
         )  # fmt: skip
 
     def learn(self, index: np.ndarray, target: np.ndarray) -> None:
-        """Makes the second moment of the light that is found smaller. It is least where those parts
-        of it that the techniques would find, each divided by its probability, are equal.
+        """Learns probabilities that reduce the second moment of the estimate. It is smallest where
+        each technique's part of the second moment, divided by its probability, is the same.
 
         Parameters:
             index: The technique of each of many independent paths.
-            target: What it has found, in units of its density.
+            target: The target function of each path divided by its density.
         """
         moments = np.bincount(index, target.astype(np.float64) ** 2, minlength=len(self._first))
         found = np.sqrt(moments * self._chance)
@@ -68,7 +69,8 @@ class Techniques:
             self._set(_FLOOR * self._first + (1 - _FLOOR) * found / found.sum())
 
     def choose(self, sample: mi.Float) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """A technique: its number, the length, and how many vertices are made from the camera."""
+        """Chooses a technique: its index, the length, and the number of vertices made from the
+        camera."""
         last = len(self._first) - 1
         index = first_above(
             self._sums, mi.UInt32(0), mi.UInt32(last), sample * ONE_MINUS_EPSILON, mi.Bool(True),
