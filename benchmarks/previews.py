@@ -1,4 +1,4 @@
-"""Renders the pictures of scenes/README.md (40 minutes): ``.venv/bin/python benchmarks/previews.py``."""
+"""Renders the pictures of scenes/README.md (40 minutes): ``python benchmarks/previews.py``."""
 
 from __future__ import annotations
 

@@ -102,8 +102,7 @@ class NoMedia:
         return bs, weight
 
     def scattered(self, bs, active) -> mi.Bool:
-        """Which of the ``active`` samples ``bs`` scatter, and do not pass index-matched surfaces?
-        """
+        """Which ``active`` samples ``bs`` scatter, and do not pass index-matched surfaces?"""
         return active
 
     def leave(self, vertex: Vertex, bs, path: PathState) -> PathState:
@@ -264,7 +263,7 @@ class Media(NoMedia):
         )
 
     def is_within(self, path, max_depth, active):
-        # `goes_on` allows paths that may pass a surface one vertex too many
+        # `goes_on` lets a path leave its last vertex if that may be index-matched
         return active & (path.depth < max_depth)
 
     def kept(self, bs, before, after):

@@ -121,9 +121,8 @@ class EmitterSampling:
         si: mi.SurfaceInteraction3f,
         active: mi.Bool,
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum, Any]:
-        """A direction sample towards a light, its radiance / pdf (visibility not tested), and a
-        description of the choice for shadow tests and observers. ``place`` is from :meth:`visit`.
-        """
+        """A direction sample towards a light, its radiance / pdf (visibility not tested), and the
+        choice as shadow tests and observers receive it. ``place`` is from :meth:`visit`."""
         ds, weight = scene.sample_emitter_direction(si, numbers.point, False, active)
         return ds, weight, place
 

@@ -34,8 +34,7 @@ class SceneQuery:
         return pi.compute_surface_interaction(ray, mi.RayFlags.All)
 
     def emitter(self, si: mi.SurfaceInteraction3f, emitter: mi.EmitterPtr) -> mi.EmitterPtr:
-        """The light of ``scene.emitters()`` that ``si`` lies on; ``emitter`` is Mitsuba's answer.
-        """
+        """The light of ``scene.emitters()`` at ``si``; ``emitter`` is Mitsuba's answer."""
         return emitter
 
     def occluded(

@@ -135,8 +135,7 @@ class ResampledLights(EmitterSampling):
         return ds, dr.select(is_chosen, reservoir.value * share, 0), place
 
     def _towards_environment(self, scene, si, d, active):
-        """The direction sample towards the environment, with Mitsuba's density, and its radiance.
-        """
+        """A direction sample towards the environment, with Mitsuba's density, and its radiance."""
         if self._environment is None:
             return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
         ds = self._environment.sample(si, d)

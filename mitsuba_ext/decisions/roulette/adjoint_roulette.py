@@ -15,9 +15,9 @@ import numpy as np
 
 from ...transport.path_decisions import Roulette
 
-#: A path whose expected contribution is this share of its pixel's radiance always continues. With
-#: 0.3, the efficiency by rays is 0.86 of that with 0.15 (lamp in a glass ball), 0.93 (veach-ajar)
-#: or the same (door_ajar, cornell_box).
+#: A path whose expected contribution is at least this share of its pixel's radiance continues with
+#: certainty. With 0.3, the efficiency by rays is 0.86 of that with 0.15 (lamp in a glass ball),
+#: 0.93 (veach-ajar) or the same (door_ajar, cornell_box).
 _CERTAIN = 0.15
 
 #: The least probability: where an estimate is too low, it bounds the weights of surviving paths.

@@ -14,8 +14,8 @@ _POINT, _FIXED_DIRECTION, _INFINITE, _SURFACE = 1, 2, 4, 8
 
 
 class LightKinds:
-    """The kind of each light of a scene. The attributes are Python booleans, so that the code of
-    kinds that do not occur is left out of kernels.
+    """The kind of each light of a scene. The attributes are Python booleans: kernels can leave out
+    the code for kinds that do not occur.
 
     Parameters:
         scene: A scene with lights.
