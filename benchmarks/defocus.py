@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 
 import click
+import defocus_rivals  # noqa: F401  (adds its filters)
 import numpy as np
 from equal_samples import load, print_header, print_row
 from scipy.ndimage import gaussian_filter

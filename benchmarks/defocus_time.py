@@ -13,6 +13,7 @@ import math
 import time
 
 import click
+import defocus_rivals  # noqa: F401  (adds its filters)
 import numpy as np
 from equal_samples import print_header, print_row
 

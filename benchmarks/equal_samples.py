@@ -94,13 +94,20 @@ class Renders:
 
 
 def render_in_turns(
-    scene: mi.Scene, integrators: dict[str, dict], max_depth: int | None, spp: int, seeds: int
+    scene: mi.Scene,
+    integrators: dict[str, dict | mi.Integrator],
+    max_depth: int | None,
+    spp: int,
+    seeds: int,
 ) -> dict[str, Renders]:
-    """Renders a scene with each integrator (as for ``mi.load_dict``) and so many seeds. A render
-    before, which compiles the kernels, does not count. ``max_depth`` is that of the integrators, if
+    """Renders a scene with each integrator (made, or as for ``mi.load_dict``) and so many seeds. A
+    render before, which compiles the kernels, does not count. ``max_depth`` is that of the integrators, if
     they do not say it themselves."""
     depth = {} if max_depth is None else {"max_depth": max_depth}
-    made = {k: mi.load_dict({**v, **depth}) for k, v in integrators.items()}
+    made = {
+        k: mi.load_dict({**v, **depth}) if isinstance(v, dict) else v
+        for k, v in integrators.items()
+    }
     renders = {kind: Renders() for kind in integrators}
     for seed in range(seeds + 1):
         for kind, integrator in made.items():

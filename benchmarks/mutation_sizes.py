@@ -14,6 +14,9 @@ import re
 import numpy as np
 from equal_samples import error, load, options, print_header, print_row, render_in_turns, title
 
+import mitsuba_ext  # noqa: F401
+from mitsuba_ext.metropolis.chains.small_steps import SmallSteps
+
 import click  # isort: skip
 import mitsuba as mi  # isort: skip
 
@@ -38,7 +41,7 @@ def main(
     for name in names:
         scene = load(name, size)
         for kind in kinds or INTEGRATORS:
-            made = {str(f): {**INTEGRATORS[kind], **sizes(f)} for f in FACTORS}
+            made = {str(f): with_sizes(kind, f, max_depth) for f in FACTORS}
             renders = render_in_turns(scene, made, max_depth, spp, seeds)
             mean = np.mean([r.mean for r in renders.values()], axis=0)
             errors = [error(r.variance, mean) for r in renders.values()]
@@ -49,8 +52,11 @@ def main(
             print_row([title(name), kind, *cells])
 
 
-def sizes(factor: float) -> dict[str, float]:
-    return {"mutation_size_low": factor / 1024, "mutation_size_high": factor / 64}
+def with_sizes(kind: str, factor: float, max_depth: int) -> mi.Integrator:
+    """An integrator whose sizes, which are no parameters, are multiplied by a factor."""
+    integrator = mi.load_dict({**INTEGRATORS[kind], "max_depth": max_depth})
+    integrator.steps = SmallSteps(factor * SmallSteps.low, factor * SmallSteps.high)
+    return integrator
 
 
 if __name__ == "__main__":

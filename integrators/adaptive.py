@@ -130,15 +130,10 @@ class AdaptiveSampling(WrappingIntegrator):
         self.threshold = self.parameter(props, "threshold", 0.0, minimum=0.0)
         self.pass_spp = self.parameter(props, "pass_spp", 0, minimum=0, maximum=MOST_SPP)
         self.counts_samples = self.parameter(props, "count_samples", False)
-        if reason := self.nested.needs_equal_samples if self._is_staged else "":
-            raise ValueError(
-                f'"{self.name}": pixels cannot get different numbers of samples of '
-                f'"{self.nested.name}": {reason}'
-            )
+        self.refuse_equal_samples("pixels cannot get different numbers of samples of {nested}")
 
     def accepts(self, nested: mi.SamplingIntegrator) -> bool:
-        # Not ``AdaptiveSampling``, which is another class once another variant is selected
-        return not isinstance(nested, type(self))
+        return not self.is_of_this_kind(nested)
 
     @property
     def needs_equal_samples(self) -> str:
@@ -149,7 +144,7 @@ class AdaptiveSampling(WrappingIntegrator):
             "threshold": self.threshold,
             "pass_spp": self.pass_spp or "an eighth",
             "count_samples": self.counts_samples,
-            "nested": str(self.nested).replace("\n", "\n  "),
+            "nested": self.nested_text(),
         }
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):

@@ -49,8 +49,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
        - |string|
        - :monosp:`lens` computes, for each of several points of the lens, which layer hides which.
          :monosp:`effective` is the filter of the source: a separable filter for near surfaces, and
-         a smaller and shifted circle of confusion for all others. For comparisons, :monosp:`gather`
-         and :monosp:`one_pass` filter the image without layers. (Default: lens)
+         a smaller and shifted circle of confusion for all others. (Default: lens)
      * - hidden_spp
        - |int|
        - Samples per pixel for hidden surfaces, and for surfaces outside of the film, where a part
@@ -134,22 +133,16 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
         super().__init__(props)
         self.aperture_radius = self.parameter(props, "aperture_radius", 0.0, minimum=0.0)
         self.focus_distance = self.parameter(props, "focus_distance", 0.0, minimum=0.0)
-        self.filter = self.parameter(props, "filter", "lens", choices=FILTERS)
+        self.filter = self.parameter(props, "filter", "lens", choices=tuple(FILTERS))
         self.hidden_spp = self.parameter(props, "hidden_spp", 0, minimum=0, maximum=MOST_SPP)
         self.denoise = self.parameter(props, "denoise", False)
         if self.denoise:
             denoiser()
         self._is_rendering = False
-        if reason := self.nested.needs_equal_samples if self._is_staged else "":
-            raise ValueError(
-                f'"{self.name}": the layers of "{self.nested.name}" cannot be rendered one by one: '
-                f"{reason}"
-            )
+        self.refuse_equal_samples("the layers of {nested} cannot be rendered one by one")
 
     def accepts(self, nested: mi.SamplingIntegrator) -> bool:
-        # Not ``EffectiveCircleOfConfusion``, which is another class once another variant is
-        # selected
-        return not isinstance(nested, type(self))
+        return not self.is_of_this_kind(nested)
 
     @property
     def needs_equal_samples(self) -> str:
@@ -162,7 +155,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
             "filter": self.filter,
             "hidden_spp": self.hidden_spp or "half",
             "denoise": self.denoise,
-            "nested": str(self.nested).replace("\n", "\n  "),
+            "nested": self.nested_text(),
         }
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):

@@ -26,8 +26,7 @@ from mitsuba_ext.startup import registry
 
 #: The parameters that only chains of primary samples have.
 _PRIMARY = (
-    "bidirectional", "next_event", "mutation_size_low", "mutation_size_high", "proposal_filter",
-    "most_consecutive",
+    "bidirectional", "next_event", "proposal_filter", "most_consecutive",
 )  # fmt: skip
 
 
@@ -71,12 +70,6 @@ class EnergyRedistribution(MetropolisIntegrator):
        - |int|
        - Number of independent samples, at least, that first measure the brightness of the image and
          of its parts. (Default: 100000)
-     * - mutation_size_low
-       - |float|
-       - Smallest change of a random number by a mutation. (Default: 1/1024)
-     * - mutation_size_high
-       - |float|
-       - Largest change of a random number by a mutation. (Default: 1/64)
      * - proposal_filter
        - |int|
        - Makes the noise of the chains' light more even, but is **biased**: each pixel is multiplied
@@ -114,7 +107,7 @@ class EnergyRedistribution(MetropolisIntegrator):
 
     With :monosp:`mutations=path`, chains use lens and caustic perturbations. They sample paths of
     up to 32 segments; camera samples find longer ones. The parameters :monosp:`bidirectional` and
-    :monosp:`next_event`, the sizes of mutations and the filters must not be given then.
+    :monosp:`next_event` and the filters must not be given then.
     Participating media are refused.
 
     Source: D. Cline, PhD thesis, 2007, chapter 8; D. Cline, J. Talbot, P. Egbert, *Energy
@@ -156,7 +149,7 @@ class EnergyRedistribution(MetropolisIntegrator):
         )
         self.luminance_samples = self.read_luminance_samples(props)
         self.switches = read_switches(self, props, bidirectional=False) if self.has_paths else None
-        self.steps = SmallSteps() if self.has_paths else self.read_steps(props)
+        self.steps = SmallSteps()
         self.filters = NoiseFilters() if self.has_paths else self._read_filters(props)
 
     def _read_filters(self, props: mi.Properties) -> NoiseFilters:
@@ -210,8 +203,6 @@ class EnergyRedistribution(MetropolisIntegrator):
             "mutations_per_pixel": self.mutations_per_pixel,
             "chain_length": self.chain_length,
             "luminance_samples": self.luminance_samples,
-            "mutation_size_low": self.steps.low,
-            "mutation_size_high": self.steps.high,
             "proposal_filter": self.filters.width,
             "most_consecutive": self.filters.most_consecutive,
         }

@@ -7,6 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext.composition.chain_integrator import ChainIntegrator
+from mitsuba_ext.composition.long_chains import LongChains
 from mitsuba_ext.composition.path_mutations import (
     MOST,
     camera_samples,
@@ -14,14 +15,11 @@ from mitsuba_ext.composition.path_mutations import (
     path_target,
     read_switches,
 )
-from mitsuba_ext.metropolis.chains.path_target import PathTarget
-from mitsuba_ext.metropolis.chains.small_steps import SmallSteps
-from mitsuba_ext.metropolis.chains.visits import ChainSettings, MetropolisRender
 from mitsuba_ext.startup import registry
 
 
 @registry.plugin
-class PathMetropolis(ChainIntegrator):
+class PathMetropolis(LongChains, ChainIntegrator):
     r"""
     .. _integrator-mlt:
 
@@ -98,10 +96,7 @@ class PathMetropolis(ChainIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.p_large = self.parameter(props, "p_large", 0.2, minimum=0.0, maximum=1.0)
-        self.luminance_samples = self.read_luminance_samples(props)
-        self.two_stage = self.parameter(props, "two_stage", False)
-        self.chains = self.parameter(props, "chains", 0, minimum=0, maximum=1 << 20)
+        self.read_chains(props, p_large=0.2)
         self.switches = read_switches(self, props)
 
     def schedule(self, scene, sensor, samples, seed):
@@ -112,19 +107,5 @@ class PathMetropolis(ChainIntegrator):
     def target(self, setting):
         return path_target(self, setting, self.switches)
 
-    def chain_render(self, target: PathTarget, seed: int, *render: Any) -> MetropolisRender:
-        settings = ChainSettings(
-            self.chains, self.luminance_samples, self.p_large, SmallSteps(), True, self.two_stage,
-            self.state_file(target, seed),
-        )  # fmt: skip
-        return MetropolisRender(settings, self, target, seed, *render)
-
     def parameters(self) -> dict[str, Any]:
-        return {
-            **super().parameters(),
-            "chains": self.chains,
-            "p_large": self.p_large,
-            "luminance_samples": self.luminance_samples,
-            **described(self.switches),
-            "two_stage": self.two_stage,
-        }
+        return {**super().parameters(), **described(self.switches)}

@@ -6,14 +6,13 @@ from typing import Any
 
 import mitsuba as mi
 
+from mitsuba_ext.composition.long_chains import LongChains
 from mitsuba_ext.composition.metropolis_integrator import MetropolisIntegrator
-from mitsuba_ext.metropolis.chains.target import ImageTarget
-from mitsuba_ext.metropolis.chains.visits import ChainSettings, MetropolisRender
 from mitsuba_ext.startup import registry
 
 
 @registry.plugin
-class PrimarySampleMetropolis(MetropolisIntegrator):
+class PrimarySampleMetropolis(LongChains, MetropolisIntegrator):
     r"""
     .. _integrator-pssmlt:
 
@@ -38,12 +37,6 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
        - Number of independent samples, at least, that estimate the brightness of the image, and
          from which chains start. It is a quarter of the number of mutations if that is more; with a
          time limit, as many as take a fifth of the time. (Default: 100000)
-     * - mutation_size_low
-       - |float|
-       - Smallest change of a random number by a small step. (Default: 1/1024)
-     * - mutation_size_high
-       - |float|
-       - Largest change of a random number by a small step. (Default: 1/64)
      * - kelemen_style_weights
        - |bool|
        - Use large steps also as independent samples, weighted by the balance heuristic? This
@@ -91,28 +84,8 @@ class PrimarySampleMetropolis(MetropolisIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.p_large = self.parameter(props, "p_large", 0.3, minimum=0.0, maximum=1.0)
-        self.luminance_samples = self.read_luminance_samples(props)
+        self.read_chains(props, p_large=0.3)
         self.kelemen_style_weights = self.parameter(props, "kelemen_style_weights", True)
-        self.two_stage = self.parameter(props, "two_stage", False)
-        self.steps = self.read_steps(props)
-        self.chains = self.parameter(props, "chains", 0, minimum=0, maximum=1 << 20)
-
-    def chain_render(self, target: ImageTarget, seed: int, *render: Any) -> MetropolisRender:
-        settings = ChainSettings(
-            self.chains, self.luminance_samples, self.p_large, self.steps,
-            self.kelemen_style_weights, self.two_stage, self.state_file(target, seed),
-        )  # fmt: skip
-        return MetropolisRender(settings, self, target, seed, *render)
 
     def parameters(self) -> dict[str, Any]:
-        return {
-            **super().parameters(),
-            "chains": self.chains,
-            "p_large": self.p_large,
-            "luminance_samples": self.luminance_samples,
-            "mutation_size_low": self.steps.low,
-            "mutation_size_high": self.steps.high,
-            "kelemen_style_weights": self.kelemen_style_weights,
-            "two_stage": self.two_stage,
-        }
+        return {**super().parameters(), "kelemen_style_weights": self.kelemen_style_weights}

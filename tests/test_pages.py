@@ -49,7 +49,6 @@ VALUES = {
     **dict.fromkeys(["bidirectional", "kelemen_style_weights", "two_stage", "blue_noise"], True),
     **dict.fromkeys(["chains", "chain_length", "direct_samples", "luminance_samples"], 3),
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
-    **dict.fromkeys(["mutation_size_low", "mutation_size_high"], 0.01),
     **dict.fromkeys(["sample_count", "seed", "dimensions", "film_width"], 6),
     "checkpoint": "kept", "checkpoint_every": "9s",
     "chain_file": "chains.npz", "mutations": "path", "outliers": 2.0, "p_large": 0.5,

@@ -324,8 +324,6 @@ def test_a_warning_tells_that_a_chain_stayed(monkeypatch: pytest.MonkeyPatch) ->
     ({"chains": -1}, "chains.*-1"),
     ({"p_large": 1.5}, r"p_large.*1\.5"),
     ({"luminance_samples": 0}, "luminance_samples.*0"),
-    ({"mutation_size_low": 0.1, "mutation_size_high": 0.01}, '"mutation_size_low" is 0.1'),
-    ({"mutation_size_high": 0.6}, r"mutation_size_high.*0\.6"),
     ({"next_event": "contribution"}, '"next_event".*pilots'),
     ({"pilot_spp": 3}, "unreferenced"),
 ])  # fmt: skip

@@ -11,7 +11,6 @@ from typing import Any
 import mitsuba as mi
 
 from ..bidirectional.path_tracer import BidirectionalPathTracer
-from ..metropolis.chains.small_steps import SmallSteps
 from ..metropolis.chains.target import ImageTarget
 from ..transport.path_decisions import Weights
 from ..transport.without_lengths import WithoutLengths
@@ -56,21 +55,6 @@ class MetropolisIntegrator(ChainIntegrator):
                 f"pilots; chains need a choice that does not, such as \"spatial\""
             )
         return parameters
-
-    def read_steps(self, props: mi.Properties) -> SmallSteps:
-        """Reads the parameters ``mutation_size_low`` and ``mutation_size_high``.
-
-        Raises:
-            ValueError: The first is larger than the second.
-        """
-        low = self.parameter(props, "mutation_size_low", 1 / 1024, minimum=1e-6, maximum=0.5)
-        high = self.parameter(props, "mutation_size_high", 1 / 64, minimum=1e-6, maximum=0.5)
-        if low > high:
-            raise ValueError(
-                f'"{self.name}": "mutation_size_low" is {low}; it must not be larger than '
-                f'"mutation_size_high", which is {high}'
-            )
-        return SmallSteps(low, high)
 
     def parameters(self) -> dict[str, Any]:
         return {

@@ -87,8 +87,7 @@ class ReweightedCamera(WrappingIntegrator):
         return _Reweighted(schedule, self.purpose, numbers) if numbers else schedule
 
     def parameters(self) -> dict[str, Any]:
-        nested = str(self.nested).replace("\n", "\n  ")
-        return {**self.numbers.parameters(), "nested": nested}
+        return {**self.numbers.parameters(), "nested": self.nested_text()}
 
 
 def _purposes(integrator: mi.Integrator) -> list[str]:

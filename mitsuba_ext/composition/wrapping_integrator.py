@@ -37,6 +37,29 @@ class WrappingIntegrator(StagedIntegrator):
         """Can this integrator be nested?"""
         return True
 
+    # ---- What a subclass calls ----
+
+    def is_of_this_kind(self, nested: mi.SamplingIntegrator) -> bool:
+        """Is the nested integrator an instance of the subclass?"""
+        # Not by the module's name: once another variant is selected, that is another class
+        return isinstance(nested, type(self))
+
+    def refuse_equal_samples(self, reason: str) -> None:
+        """
+        Parameters:
+            reason: What this integrator cannot do with ``{nested}``, the nested integrator.
+
+        Raises:
+            ValueError: All pixels must get the same number of samples of the nested integrator.
+        """
+        if why := self.nested.needs_equal_samples if self._is_staged else "":
+            name = f'"{self.nested.name}"'
+            raise ValueError(f'"{self.name}": {reason.format(nested=name)}: {why}')
+
+    def nested_text(self) -> str:
+        """The nested integrator, indented for ``str()``."""
+        return str(self.nested).replace("\n", "\n  ")
+
     # ---- What the base class calls ----
 
     def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:

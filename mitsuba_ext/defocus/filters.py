@@ -11,10 +11,9 @@ import mitsuba as mi
 import numpy as np
 
 from .effective import effective_filter, effective_limits
-from .images import Size, rgb
+from .images import Size
 from .layers import LayerSums, Limits, layers_from_sums, limits_of, sums_of_picture
 from .lens_filter import lens_filter
-from .rivals import gather_filter, one_pass_filter
 from .thin_lens import ThinLens
 
 
@@ -74,35 +73,8 @@ class _Effective:
         return effective_filter(near, layers, capture.size, self._cap)
 
 
-class _OfPicture:
-    has_layers = False
-
-    def __init__(self, function: Callable[[mi.Color3f, mi.Float, Size], mi.Color3f]) -> None:
-        self._function = function
-
-    def limits(self, blurs: np.ndarray) -> Limits:
-        return Limits([])
-
-    def picture(self, capture: Capture) -> mi.Color3f:
-        (only,) = layers_from_sums(capture.sums, capture.size)
-        color = dr.gather(mi.Vector4f, only.color, dr.arange(mi.UInt32, capture.size.count))
-        return self._function(rgb(color), capture.blur, capture.size)
-
-
-_MAKERS: dict[str, Callable[[], Filter]] = {
-    "lens": _Lens,
-    "effective": _Effective,
-    "gather": lambda: _OfPicture(gather_filter),
-    "one_pass": lambda: _OfPicture(one_pass_filter),
-}
-
-#: The names of the filters.
-FILTERS = tuple(_MAKERS)
-
-
-def make_filter(name: str) -> Filter:
-    """A filter by one of its names in ``FILTERS``."""
-    return _MAKERS[name]()
+#: The filters by name. A benchmark adds others, to compare with them.
+FILTERS: dict[str, Callable[[], Filter]] = {"lens": _Lens, "effective": _Effective}
 
 
 def defocus(
@@ -129,7 +101,7 @@ def defocus(
         )
     if filter not in FILTERS:
         raise ValueError(f'there is no filter "{filter}"; there are {", ".join(FILTERS)}')
-    size, found = Size(width, height), make_filter(filter)
+    size, found = Size(width, height), FILTERS[filter]()
     lane = dr.arange(mi.UInt32, size.count)
     seen = mi.Color3f(*(dr.gather(mi.Float, color.array, 3 * lane + k) for k in range(3)))
     blur = lens.blur(dr.gather(mi.Float, depth.array, lane))

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import from_numpy
 from ..defocus.denoised import denoised
-from ..defocus.filters import Capture, make_filter
+from ..defocus.filters import FILTERS, Capture
 from ..defocus.images import Size
 from ..defocus.layers import LayerSums
 from ..transport.colour import to_rgb
@@ -56,7 +56,7 @@ class LayeredJob(Job):
         self.lens = integrator.thin_lens(sensor)
         self._lens_view = LensView(scene, sensor, integrator.scene_query(scene))
         self.view = PinholeView(self._lens_view, scene, self.lens, integrator.denoise)
-        self.filter = make_filter(integrator.filter)
+        self.filter = FILTERS[integrator.filter]()
         self._crop = [int(n) for n in self.film.crop_size()]
         # The film and a margin around it
         self.margin = math.ceil(_WIDEST_MARGIN * max(self._crop))

@@ -3,12 +3,16 @@ surfaces by their whole circle of confusion."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .images import Pyramid, Size, rgb
-from .lens_points import LensPoints, ring_points
+from mitsuba_ext.defocus.filters import FILTERS, Capture
+from mitsuba_ext.defocus.images import Pyramid, Size, rgb
+from mitsuba_ext.defocus.layers import Limits, layers_from_sums
+from mitsuba_ext.defocus.lens_points import LensPoints, ring_points
 
 #: Points of the spiral of the filter of one pass.
 _SPIRAL = 96
@@ -141,3 +145,24 @@ def _largest_around(radius: mi.Float, size: Size) -> mi.Float:
         found = around
     del index
     return dr.gather(mi.Float, found, at)
+
+
+class OfPicture:
+    """A filter of what the camera sees first."""
+
+    has_layers = False
+
+    def __init__(self, function: Callable[[mi.Color3f, mi.Float, Size], mi.Color3f]) -> None:
+        self._function = function
+
+    def limits(self, blurs: np.ndarray) -> Limits:
+        return Limits([])
+
+    def picture(self, capture: Capture) -> mi.Color3f:
+        (only,) = layers_from_sums(capture.sums, capture.size)
+        color = dr.gather(mi.Vector4f, only.color, dr.arange(mi.UInt32, capture.size.count))
+        return self._function(rgb(color), capture.blur, capture.size)
+
+
+FILTERS["gather"] = lambda: OfPicture(gather_filter)
+FILTERS["one_pass"] = lambda: OfPicture(one_pass_filter)
