@@ -101,8 +101,8 @@ def render_in_turns(
     seeds: int,
 ) -> dict[str, Renders]:
     """Renders a scene with each integrator (made, or as for ``mi.load_dict``) and so many seeds. A
-    render before, which compiles the kernels, does not count. ``max_depth`` is that of the integrators, if
-    they do not say it themselves."""
+    render before, which compiles the kernels, does not count. ``max_depth`` is that of integrators
+    that are not made yet, if they do not say it themselves."""
     depth = {} if max_depth is None else {"max_depth": max_depth}
     made = {
         k: mi.load_dict({**v, **depth}) if isinstance(v, dict) else v

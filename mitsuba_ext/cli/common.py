@@ -102,6 +102,32 @@ def scene_options(command: Callable) -> Callable:
     return command
 
 
+def executor_options(what: str, note: str = "") -> Callable:
+    """Adds the options ``--workers`` and ``--dask``, which say where to do ``what``."""
+
+    def decorator(command: Callable) -> Callable:
+        dask = click.option(
+            "--dask", metavar="ADDRESS",
+            help=f"{what} on the workers of the Dask scheduler at ADDRESS: tcp://host:port.",
+        )  # fmt: skip
+        workers = click.option(
+            "--workers", type=click.IntRange(1, 1024), metavar="N",
+            help=f"{what} in N processes of this machine.{note}",
+        )  # fmt: skip
+        return workers(dask(command))
+
+    return decorator
+
+
+def check_executor(workers: int | None, dask: str | None) -> None:
+    """
+    Raises:
+        click.UsageError: Both options are given.
+    """
+    if workers is not None and dask is not None:
+        raise click.UsageError("--workers and --dask exclude each other")
+
+
 def kernels_compiled() -> int:
     """How many kernels were not in Dr.Jit's cache, so that this process had to compile them."""
     import drjit as dr

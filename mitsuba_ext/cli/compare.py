@@ -19,6 +19,8 @@ from .common import (
     INTERRUPTED,
     FilledPath,
     Numbers,
+    check_executor,
+    executor_options,
     say,
     scene_options,
 )
@@ -73,14 +75,7 @@ if TYPE_CHECKING:
     help="Seconds that a render may take, compilation included. An integrator that takes longer is "
     "ended and reported as failed, and the rest goes on. References have no limit.",
 )
-@click.option(
-    "--workers", type=click.IntRange(1, 1024), metavar="N",
-    help="Render references in N processes of this machine. Measured runs use one process.",
-)
-@click.option(
-    "--dask", metavar="ADDRESS",
-    help="Render references on the workers of the Dask scheduler at ADDRESS: tcp://host:port.",
-)
+@executor_options("Render references", " Measured runs use one process.")
 @click.option("--worker", type=click.Choice(supervisor.JOBS), hidden=True)
 @scene_options
 @click.argument(
@@ -126,8 +121,7 @@ def compare(
         raise click.UsageError(f"give one of {', '.join(given)}")
     if reference and reference_spp:
         raise click.UsageError("--reference and --reference-spp exclude each other")
-    if workers is not None and dask is not None:
-        raise click.UsageError("--workers and --dask exclude each other")
+    check_executor(workers, dask)
     scenes, integrators = _sort_out(names)
     if not plugins:
         for specification in (*integrators, reference_integrator):

@@ -19,6 +19,8 @@ from .common import (
     MAX_SEED,
     Every,
     FilledPath,
+    check_executor,
+    executor_options,
     scene_options,
 )
 from .frames import FrameRange, Sensors, pictures
@@ -91,14 +93,7 @@ from .frames import FrameRange, Sensors, pictures
     help="End when the relative error, estimated from the variance of the batches, is RELMSE. "
     "--spp and --time limit it.",
 )
-@click.option(
-    "--workers", type=click.IntRange(1, 1024), metavar="N",
-    help="Render in N processes of this machine.",
-)
-@click.option(
-    "--dask", metavar="ADDRESS",
-    help="Render on the workers of the Dask scheduler at ADDRESS: tcp://host:port.",
-)
+@executor_options("Render")
 @click.option(
     "--denoise", is_flag=True,
     help="Denoise the image in the end, guided by the albedo and the normals of what the camera "
@@ -171,8 +166,7 @@ def render(
         raise click.UsageError("--add needs --checkpoint: the folder with the samples so far")
     if add is not None and spp is not None:
         raise click.UsageError("--add and --spp exclude each other")
-    if workers is not None and dask is not None:
-        raise click.UsageError("--workers and --dask exclude each other")
+    check_executor(workers, dask)
     if preview is not None and preview.absolute() == output.absolute():
         raise click.UsageError("--preview must be another file than --output")
     is_long = checkpoint or until or workers or dask or preview

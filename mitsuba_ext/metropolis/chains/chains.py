@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...transport.frozen import frozen
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
 from .numbers import generator, stream
@@ -172,6 +174,14 @@ class Chains:
     def advance(self, steps: int) -> Counts:
         """Makes ``steps`` mutations of each chain."""
         raise NotImplementedError
+
+    def _mutated(self, *arguments: Any) -> tuple:
+        """The traced loop over the mutations of a launch."""
+        raise NotImplementedError
+
+    @frozen
+    def _launched(self, *arguments: Any) -> tuple:
+        return self._mutated(*arguments)
 
     def end(self) -> None:
         """Adds the current states to the image. The chains may continue afterwards."""

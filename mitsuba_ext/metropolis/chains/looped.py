@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
-from ...transport.frozen import frozen
 from .chains import MOST_NUMBERS, Chains, Counts, acceptance
 from .numbers import LocalNumbers, ProposedNumbers, RecordedNumbers
 from .target import Contribution
@@ -45,10 +42,6 @@ class LoopedChains(Chains):
         self._rngs, (self._state, self._known, self._weight, self._earlier) = [rng], after
         self.done += steps
         return counts
-
-    @frozen
-    def _launched(self, *arguments: Any) -> tuple:
-        return self._mutated(*arguments)
 
     @dr.syntax
     def _mutated(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
@@ -61,10 +59,6 @@ class PathChains(Chains):
         self._rngs, (self._state, self._weight, self._places, self._logs) = [rng], after
         self.done += steps
         return counts
-
-    @frozen
-    def _launched(self, *arguments: Any) -> tuple:
-        return self._mutated(*arguments)
 
     @dr.syntax
     def _mutated(

@@ -14,15 +14,14 @@ _POINT, _FIXED_DIRECTION, _INFINITE, _SURFACE = 1, 2, 4, 8
 
 
 class LightKinds:
-    """The kind of each light of a scene. The attributes are Python booleans: kernels can leave out
-    the code for kinds that do not occur.
+    """The kind of each light of a scene. The attribute is a Python boolean: kernels can leave out
+    the code for lights that do not occur.
 
     Parameters:
         scene: A scene with lights.
 
     Attributes:
         has_unhittable: Is there a light that no ray can hit?
-        has_surfaces, has_infinite, has_points: Are there area lights, lights at infinity, points?
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -31,9 +30,6 @@ class LightKinds:
         self._emitters = scene.emitters_dr()
         any_kind = int(np.bitwise_or.reduce(kinds))
         self.has_unhittable = bool(any_kind & (_POINT | _FIXED_DIRECTION))
-        self.has_surfaces = bool(any_kind & _SURFACE)
-        self.has_infinite = bool(any_kind & _INFINITE)
-        self.has_points = bool(any_kind & _POINT)
 
     def emitter(self, index: mi.UInt32, active: mi.Bool) -> mi.EmitterPtr:
         return dr.gather(mi.EmitterPtr, self._emitters, index, active)
