@@ -20,7 +20,8 @@ from statistical import (
     load,
     two_halves,
 )
-from techniques import DEFAULTS, FOLLOWERS, REFERENCE, SCENES, TECHNIQUES, pairs
+from technique import SCENES
+from techniques import DEFAULTS, FOLLOWERS, REFERENCE, TECHNIQUES, pairs
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from techniques import Technique
+from technique import Technique
 from test_furnace import check_furnace
 
 from mitsuba_ext import compare

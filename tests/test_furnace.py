@@ -7,8 +7,9 @@ import sys
 
 import pytest
 from statistical import MANY_SEEDS, SCENES, SEEDS, assert_exact, batches, load
-from techniques import FURNACES as NAMES
-from techniques import REFERENCE, TECHNIQUES, Technique, pairs
+from technique import FURNACES as NAMES
+from technique import Technique
+from techniques import REFERENCE, TECHNIQUES, pairs
 
 pytestmark = pytest.mark.usefixtures("variant")
 
