@@ -2,35 +2,12 @@
 
 from __future__ import annotations
 
-import functools
-from pathlib import Path
-from typing import Any
-
-import mitsuba as mi
-
-from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
-from mitsuba_ext.bidirectional.light_walk import STRIDE
-from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
-from mitsuba_ext.bidirectional.technique_images import TechniqueImages
-from mitsuba_ext.composition.light_paths import LightPathChoice
-from mitsuba_ext.composition.light_side import LightSide
-from mitsuba_ext.composition.slots import BIDIRECTIONAL_SLOTS, read_slot
-from mitsuba_ext.composition.walk_integrator import WalkIntegrator
-from mitsuba_ext.rendering.camera import film_extent
+from mitsuba_ext.composition.bidirectional_integrator import BidirectionalIntegrator
 from mitsuba_ext.startup import registry
-from mitsuba_ext.transport.estimator import Estimator
-from mitsuba_ext.transport.path_decisions import NoConnections, SubpathSelection
-
-#: The decisions that a scene can replace, of camera paths and of light paths.
-_SLOTS = ("directions", "next_event", "roulette", "shadow_test", *BIDIRECTIONAL_SLOTS)
-
-#: Bytes for what a pass stores; and bytes, about, that a path takes besides the vertices that are
-#: stored at a time.
-_PASS_BYTES, _PATH_BYTES = 1 << 29, 640
 
 
 @registry.plugin
-class BidirectionalIntegrator(WalkIntegrator):
+class BidirectionalPathTracing(BidirectionalIntegrator):
     r"""
     .. _integrator-bdpt:
 
@@ -141,113 +118,3 @@ class BidirectionalIntegrator(WalkIntegrator):
             'type': 'bdpt',
             'max_depth': 8
     """
-
-    has_light_paths = True
-
-    def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)
-        self.connections = self.parameter(props, "connections", 1, minimum=1, maximum=1024)
-        self.light_image = self.parameter(props, "light_image", True)
-        self.sample_direct = self.parameter(props, "sample_direct", True)
-        self.technique_images = self.parameter(props, "technique_images", "")
-        self.techniques: TechniqueImages | None = None
-        self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in _SLOTS})
-        without_direct = ("next_event", "shadow_test", "light_paths")
-        without_images = ("light_paths",) if self.technique_images else ()
-        for key, refused in (
-            ("sample_direct", () if self.sample_direct else without_direct),
-            ("technique_images", without_images),
-        ):
-            for slot in self.slots.keys() & set(refused):
-                raise ValueError(
-                    f'"{self.name}": the parameter "{slot}" cannot be combined with '
-                    f'"{key} = {getattr(self, key)}"; leave it out'
-                )
-        if self.technique_images and self.checkpoint:
-            raise ValueError(
-                f'"{self.name}": "technique_images" and "checkpoint" exclude each other: the '
-                f"images are those of one render"
-            )
-        if self.technique_images and not self.technique_images.endswith(".exr"):
-            raise ValueError(
-                f'"{self.name}": "technique_images" is "{self.technique_images}"; the name of the '
-                f'file must end with ".exr"'
-            )
-
-    def parameters(self) -> dict[str, Any]:
-        return {
-            "connections": self.connections,
-            "light_image": self.light_image,
-            "sample_direct": self.sample_direct,
-            "technique_images": self.technique_images or "none",
-            "light_paths": "always",
-            **super().parameters(),
-        }
-
-    @property
-    def needs_equal_samples(self) -> str:
-        if self.light_image:
-            return 'its light paths find light for all pixels: set "light_image" to false'
-        if self.technique_images:
-            return 'its images of techniques count all samples alike: leave "technique_images" out'
-        return super().needs_equal_samples
-
-    @property
-    def sample_cost(self) -> int:
-        return max(3, super().sample_cost)
-
-    @property
-    def most_lanes(self) -> int:
-        layout = Layout(len(mi.Spectrum()), 4, True)
-        return _PASS_BYTES // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
-
-    def estimators(self, scene: mi.Scene, sensor: mi.Sensor):
-        if not scene.emitters() or self.max_depth < 2:
-            return self.walk
-        side = LightSide.of(self.name, scene, sensor, self.light_image)
-        film = sensor.film()
-        if self.technique_images:
-            self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
-        return functools.partial(self._estimator, side)
-
-    def _estimator(self, side: LightSide, **decisions: Any) -> Estimator:
-        always = LightPathChoice(True, self.techniques)
-        choice: LightPathChoice = decisions.pop("light_paths", always)
-        selection = decisions.pop("subpath_selection", SubpathSelection())
-        next_event = decisions.pop("next_event", None)
-        if not self.sample_direct:
-            next_event = NoConnections()
-        elif choice.are_traced:
-            next_event = side.next_event(next_event)
-        else:
-            next_event = next_event or side.correct
-        if next_event:
-            decisions["next_event"] = next_event
-        walk = self.walk(**decisions)
-        if not choice.are_traced:
-            return walk
-        return BidirectionalPathTracer(
-            walk, side.emission, side.sensor, self.connections, selection, choice.observer
-        )
-
-    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
-        self.techniques = None
-        if self.technique_images:
-            self.check_target("technique_images", self.technique_images)
-        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
-        if self.techniques is not None:
-            self.techniques.write(Path(self.technique_images), self.statistics.spp)
-        elif self.technique_images:
-            mi.Log(
-                mi.LogLevel.Warn,
-                f'"{self.name}": without lights, or with "max_depth" below 2, there are no light '
-                f'paths: "{self.technique_images}" is not written.',
-            )
-        return image
-
-    def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
-        raise NotImplementedError(
-            f'"{self.name}": light paths do not end where a ray begins: it cannot be nested in an '
-            f'integrator that asks for single samples, such as "moment" or "aov"; "variance" can '
-            f'hold it, and it has a parameter "aovs" of its own'
-        )

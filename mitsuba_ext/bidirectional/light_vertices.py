@@ -186,6 +186,11 @@ class LightVertices:
         β = mi.Spectrum(*(w[i] for i in range(n)))
         return LightVertex(si, β, sums, depth, hero_is_alone, lane)
 
+    def position(self, slot: mi.UInt32, active: mi.Bool) -> mi.Point3f:
+        """The positions of the vertices at these places of the store."""
+        word = slot * self._layout.words + (self._layout.mark + 1)
+        return mi.Point3f(*(dr.gather(mi.Float, self._words, word + k, active) for k in range(3)))
+
     def wavelengths(self, vertex: LightVertex, active: mi.Bool) -> mi.Spectrum | None:
         """The wavelengths of a vertex's path; ``None`` in variants that are not spectral."""
         return self._of_lane(self._wavelengths, vertex.lane, active) if mi.is_spectral else None

@@ -63,6 +63,9 @@ class PartialSums:
         follows_camera: Is ``by_camera`` of :class:`Sums` computed?
         selection: Chooses the vertices of light paths by regions; its ``expected`` for a pair of
             regions multiplies ``connections``. ``None`` if the choice is uniform.
+        merging: The density of merging at a vertex, relative to the product of the densities with
+            which both subpaths sample it: π r² · number of light paths. ``None`` if vertices are
+            not merged.
     """
 
     def __init__(
@@ -72,11 +75,14 @@ class PartialSums:
         exponent: int = 2,
         follows_camera: bool = False,
         selection: SubpathSelection | None = None,
+        merging: mi.Float | None = None,
     ) -> None:
         self._next_event, self.exponent, self.selection = next_event, exponent, selection
         self.follows_camera = follows_camera
         #: ``connections``, raised to the exponent.
         self.count = self.ratio(mi.Float(connections))
+        #: ``merging``, raised to the exponent.
+        self.merging = None if merging is None else self.ratio(merging)
 
     def ratio(self, x: mi.Float) -> mi.Float:
         """A ratio of densities, raised to the exponent."""
@@ -125,7 +131,26 @@ class PartialSums:
             reverse_pdf: Density, per solid angle, of continuing from there to the previous vertex
                 of the subpath.
         """
-        return self.ratio(density) * (sums.last + self.ratio(reverse_pdf) * sums.dVC)
+        others = sums.last + self.ratio(reverse_pdf) * sums.dVC
+        if self.merging is not None:
+            others += self.merging
+        return self.ratio(density) * others
+
+    def merging_weight(
+        self, light: Sums, pdf: mi.Float, camera: Sums, reverse_pdf: mi.Float
+    ) -> mi.Float:
+        """The MIS weight of merging the last vertices of two subpaths. The sums over the other
+        techniques that merge (dVM in the report) are dVC / ``merging``.
+
+        Parameters:
+            pdf: Density, per solid angle, with which the camera path goes on to the vertex of the
+                light path before the last one.
+            reverse_pdf: Density with which the light path goes on to the vertex of the camera path
+                before the last one.
+        """
+        others = light.last + self.ratio(pdf) * light.dVC
+        others += camera.last + self.ratio(reverse_pdf) * camera.dVC
+        return weight(others / self.merging)
 
     def _connection_density(self, scene, emitted, si, active) -> mi.Float:
         """The density with which next event estimation at ``si`` samples the point on the light:

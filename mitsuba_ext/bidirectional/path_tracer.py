@@ -11,6 +11,7 @@ import mitsuba as mi
 from ..scene.movers import movers
 from ..transport.estimator import CameraRays, Sample
 from ..transport.frozen import frozen
+from ..transport.heroes import Heroes
 from ..transport.numbers import BothEnds, Numbers, copied, go_to, reached
 from ..transport.observer import Observers
 from ..transport.path_decisions import SubpathSelection
@@ -22,10 +23,12 @@ from .light_image import LightImage
 from .light_numbers import light_numbers
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
+from .merging import MergedSubpaths, MergingRadius
 from .partial_sums import PartialSums
 from .sensor import ConnectableSensor
 from .technique_observer import TechniqueObserver
 from .vertex_choice import OwnVertexChoice, RegionChoice, VertexChoice
+from .vertex_grid import VertexGrid
 from .weights import BidirectionalWeights
 
 #: The number of vertices of a light path that MIS weights assume. The true number would make the
@@ -50,6 +53,7 @@ class BidirectionalPathTracer:
         is_alone: Must the sample in a lane not depend on other lanes? If so, camera paths are
             connected to the light path in the same lane only.
         skips_direct: Are paths of one and two segments left out?
+        radius: Within what radius vertices are merged; ``None`` if they are not.
     """
 
     walk: Walk
@@ -60,6 +64,7 @@ class BidirectionalPathTracer:
     observer: TechniqueObserver | None = None
     is_alone: bool = False
     skips_direct: bool = False
+    radius: MergingRadius | None = None
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
@@ -75,9 +80,15 @@ class BidirectionalPathTracer:
             observer.start(rays)
             walk = replace(walk, observer=Observers([walk.observer, observer]))
             follows_camera = observer.compares_with_camera
+        lanes = dr.width(rays.ray)
+        radius, merging = None, None
+        if self.radius is not None:
+            radius = dr.opaque(mi.Float, self.radius.next(lanes))
+            merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, lanes)
+            dr.make_opaque(merging)
         sums = PartialSums(
             walk.next_event, dr.opaque(mi.Float, count), follows_camera=follows_camera,
-            selection=selection,
+            selection=selection, merging=merging,
         )  # fmt: skip
         image = None
         if self.sensor is not None:
@@ -90,7 +101,6 @@ class BidirectionalPathTracer:
         )
         # Evaluated now, since later kernels of the pass read the rays again
         dr.schedule(rays)
-        lanes = dr.width(rays.ray)
         rounds: list[LightVertices] = []
 
         def take(vertices: LightVertices) -> None:
@@ -117,6 +127,11 @@ class BidirectionalPathTracer:
                 scene, vertices, choice, sums, walk.query, self.connections, walk.max_depth,
                 walk.observer, observer,
             )  # fmt: skip
+            if radius is not None:
+                subpaths = MergedSubpaths(
+                    vertices, VertexGrid(vertices, radius), sums, Heroes(scene).context(),
+                    walk.max_depth, subpaths,
+                )  # fmt: skip
         if isinstance(sampler, BothEnds):
             sampler = sampler.camera
         sample = self._camera_paths(

@@ -1,0 +1,130 @@
+"""Merging: the radiance at the vertices of camera paths, estimated from nearby vertices of light
+paths (photons).
+
+Source: I. Georgiev, J. Křivánek, T. Davidovič, P. Slusallek, *Light Transport Simulation with
+Vertex Connection and Merging*, ACM Transactions on Graphics 31(6), 2012; I. Georgiev, *Implementing
+Vertex Connection and Merging*, technical report, 2012.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..transport.bsdfs import eval_bsdf
+from ..transport.path_decisions import Subpaths
+from ..transport.vertex import Vertex
+from .light_vertices import LightVertex, VertexCache
+from .partial_sums import PartialSums
+from .scattering import geometric_cosine, reverse_density
+from .vertex_grid import VertexGrid
+
+#: Vertices merge on surfaces that face about the same way: the least cosine between their normals;
+#: and within a flat cylinder: its half height in units of its radius. Light would otherwise leak
+#: around corners and through thin walls.
+_LEAST_COSINE, _HALF_HEIGHT = 0.7, 0.25
+
+
+@dataclass
+class MergingRadius:
+    """The radius of merging, which shrinks from pass to pass, so that bias vanishes.
+
+    Source: C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic Approach*, ACM
+    Transactions on Graphics 30(3), 2011, Eq. 15: with n samples per pixel, the squared radius is
+    proportional to n^(α − 1).
+
+    Parameters:
+        first: The radius with one sample per pixel.
+        decay: α, in (0, 1]; 1 for a constant radius.
+        pixels: Number of pixels.
+    """
+
+    first: float
+    decay: float
+    pixels: int
+    _samples: float = 0.0
+
+    def next(self, lanes: int) -> float:
+        """The radius of a pass of so many samples, which comes next."""
+        self._samples += lanes / self.pixels
+        return self.first * max(1.0, self._samples) ** (0.5 * (self.decay - 1))
+
+
+def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
+    """The width of a pixel where the camera sees the scene: the median over the film; 0 if it sees
+    no surface."""
+    count = 64
+    lane = dr.arange(mi.UInt32, count * count)
+    position = (mi.Point2f(lane % count, lane // count) + 0.5) / count
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
+    ray.scale_differential(1.0)
+    si = scene.ray_intersect(ray)
+    width = dr.norm((ray.o_x + ray.d_x * si.t) - (ray.o + ray.d * si.t))
+    found = width.numpy()[si.is_valid().numpy()]
+    found = found[np.isfinite(found)]
+    return float(np.median(found)) if len(found) else 0.0
+
+
+class MergedSubpaths(Subpaths):
+    """Adds to each vertex of a camera path what light paths bring to the vertices near it.
+
+    Parameters:
+        vertices: The vertices of the light paths, at least one.
+        grid: Finds them.
+        sums: Computes the MIS weights; ``None`` if merging is the only technique that finds what it
+            finds.
+        ctx: The context in which BSDFs are evaluated.
+        max_depth: Longest path in segments.
+        others: Other techniques at the same vertices; ``None`` if there are none.
+    """
+
+    def __init__(
+        self,
+        vertices: VertexCache,
+        grid: VertexGrid,
+        sums: PartialSums,
+        ctx: mi.BSDFContext,
+        max_depth: int,
+        others: Subpaths | None = None,
+    ) -> None:
+        self._vertices, self._grid, self._sums, self._others = vertices, grid, sums, others
+        self._ctx, self._max_depth = ctx, dr.opaque(mi.UInt32, max_depth)
+        paths = dr.opaque(mi.Float, len(vertices.first))
+        # The density of light paths per area, for one vertex in the disk
+        self._per_vertex = dr.rcp(dr.pi * dr.square(grid.radius) * paths)
+        dr.make_opaque(self._per_vertex)
+
+    @dr.syntax
+    def gather(self, scene, sampler, vertex, active):
+        total, shadow_count = mi.Spectrum(0), mi.UInt32(0)
+        if dr.hint(self._others is not None, mode="scalar"):
+            total, shadow_count = self._others.gather(scene, sampler, vertex, active)
+        merges = active & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
+        merged = mi.Spectrum(0)
+        state = self._grid.begin()
+        while dr.hint(merges, label="merge"):
+            state, index, merges = self._grid.next(state, vertex.si.p, merges)
+            merged += self._merged(vertex, self._vertices.at(index, merges), merges)
+        total += merged * vertex.path.β * self._per_vertex
+        return total, shadow_count
+
+    def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:
+        """BSDF · flux of one light path, with the MIS weight."""
+        si, far = vertex.si, other.si
+        active = active & (vertex.depth + other.depth + 1 <= self._max_depth)
+        height = dr.abs(dr.dot(si.n, far.p - si.p))
+        active &= height < _HALF_HEIGHT * self._grid.radius
+        active &= dr.dot(si.n, far.n) > _LEAST_COSINE
+        wo = si.to_local(far.to_world(far.wi))
+        value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, active)
+        value = si.to_world_mueller(value, -wo, si.wi)
+        # Flux arrives per area of the surface; the value holds the shading cosine
+        arrives = geometric_cosine(far, far.wi)
+        value *= other.β * dr.select(arrives > 0, dr.rcp(arrives), 0)
+        reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
+        value *= self._sums.merging_weight(other.sums, pdf, vertex.path.sums, reverse)
+        active &= dr.all(dr.isfinite(value))
+        return dr.select(active, value, 0)
