@@ -7,12 +7,13 @@ described here (:class:`_Description`): the classes of our objects and the value
 attributes, the parameters of the scene that are not arrays, the number of threads. A recording is
 used again only where all of this is the same.
 
-Nothing is recorded in spectral variants, whose colour tables are not arguments of any function; with
-a ``thinlens``, which does not tell Dr.Jit of all its arrays; and where kernels call plugins that are
-written in Python: while these are traced, they may read arrays, or free memory of NumPy, at which
-Dr.Jit ends the process. A function with an argument that cannot be described (a sampler in Python)
-is not frozen either. The log says why (level ``Debug``). If Dr.Jit cannot record a function, the render
-begins anew, nothing more is recorded in that scene, and the log says so (level ``Info``).
+Nothing is recorded in spectral variants, whose colour tables are not arguments of any function;
+with a ``thinlens``, which does not tell Dr.Jit of all its arrays; and where kernels call plugins
+that are written in Python: while these are traced, they may read arrays, or free memory of NumPy,
+at which Dr.Jit ends the process. A function with an argument that cannot be described (a sampler in
+Python) is not frozen either. The log says why (level ``Debug``). If Dr.Jit cannot record a
+function, the render begins anew, nothing more is recorded in that scene, and the log says so (level
+``Info``).
 
 Rules for a frozen function:
 
