@@ -55,7 +55,8 @@ def main(
 def with_sizes(kind: str, factor: float, max_depth: int) -> mi.Integrator:
     """An integrator whose sizes, which are no parameters, are multiplied by a factor."""
     integrator = mi.load_dict({**INTEGRATORS[kind], "max_depth": max_depth})
-    integrator.steps = SmallSteps(factor * SmallSteps.low, factor * SmallSteps.high)
+    owner = getattr(integrator, "long_chains", integrator)
+    owner.steps = SmallSteps(factor * SmallSteps.low, factor * SmallSteps.high)
     return integrator
 
 

@@ -15,11 +15,13 @@ from mitsuba_ext.composition.path_mutations import (
     path_target,
     read_switches,
 )
+from mitsuba_ext.metropolis.chains.path_target import PathTarget
+from mitsuba_ext.metropolis.chains.visits import MetropolisRender
 from mitsuba_ext.startup import registry
 
 
 @registry.plugin
-class PathMetropolis(LongChains, ChainIntegrator):
+class PathMetropolis(ChainIntegrator):
     r"""
     .. _integrator-mlt:
 
@@ -96,7 +98,7 @@ class PathMetropolis(LongChains, ChainIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.read_chains(props, p_large=0.2)
+        self.long_chains = LongChains.read(self, props, p_large=0.2)
         self.switches = read_switches(self, props)
 
     def schedule(self, scene, sensor, samples, seed):
@@ -107,5 +109,12 @@ class PathMetropolis(LongChains, ChainIntegrator):
     def target(self, setting):
         return path_target(self, setting, self.switches)
 
+    def chain_render(self, target: PathTarget, seed: int, *render: Any) -> MetropolisRender:
+        return self.long_chains.render(self, target, seed, *render)
+
     def parameters(self) -> dict[str, Any]:
-        return {**super().parameters(), **described(self.switches)}
+        return {
+            **super().parameters(),
+            **self.long_chains.parameters(),
+            **described(self.switches),
+        }

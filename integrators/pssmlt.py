@@ -8,11 +8,13 @@ import mitsuba as mi
 
 from mitsuba_ext.composition.long_chains import LongChains
 from mitsuba_ext.composition.metropolis_integrator import MetropolisIntegrator
+from mitsuba_ext.metropolis.chains.target import ImageTarget
+from mitsuba_ext.metropolis.chains.visits import MetropolisRender
 from mitsuba_ext.startup import registry
 
 
 @registry.plugin
-class PrimarySampleMetropolis(LongChains, MetropolisIntegrator):
+class PrimarySampleMetropolis(MetropolisIntegrator):
     r"""
     .. _integrator-pssmlt:
 
@@ -84,8 +86,16 @@ class PrimarySampleMetropolis(LongChains, MetropolisIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.read_chains(props, p_large=0.3)
-        self.kelemen_style_weights = self.parameter(props, "kelemen_style_weights", True)
+        self.long_chains = LongChains.read(self, props, p_large=0.3)
+        uses_uniform = self.parameter(props, "kelemen_style_weights", True)
+        self.long_chains.uses_uniform = uses_uniform
+
+    def chain_render(self, target: ImageTarget, seed: int, *render: Any) -> MetropolisRender:
+        return self.long_chains.render(self, target, seed, *render)
 
     def parameters(self) -> dict[str, Any]:
-        return {**super().parameters(), "kelemen_style_weights": self.kelemen_style_weights}
+        return {
+            **super().parameters(),
+            **self.long_chains.parameters(),
+            "kelemen_style_weights": self.long_chains.uses_uniform,
+        }

@@ -265,7 +265,7 @@ def test_integrators_that_need_equal_samples_are_refused(nested, message):
 
 @pytest.mark.parametrize("parameters, message", [
     ({"threshold": -1.0}, "at least 0"), ({"pass_spp": -1}, "at least 0"),
-    ({"hide_emitters": True}, "nested integrator to know"), ({"passspp": 4}, "passspp"),
+    ({"hide_emitters": True}, "in the nested integrator"), ({"passspp": 4}, "passspp"),
 ])  # fmt: skip
 def test_wrong_parameters_are_refused(parameters, message):
     with pytest.raises(RuntimeError, match=message):

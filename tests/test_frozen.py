@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from stage import area, sensor, stage
 
+from mitsuba_ext.rendering.render import Job
 from mitsuba_ext.transport import frozen
 from mitsuba_ext.transport.walk import Walk
 
@@ -57,6 +58,22 @@ def test_images_are_those_of_traced_kernels(name: str) -> None:
     scene, integrator = _scene(), mi.load_dict(parameters)
     for seed in (1, 2):
         _assert_same(_image(scene, integrator, seed), _traced(scene, integrator, seed))
+
+
+@pytest.mark.parametrize(("known", "renders"), [(True, [1, 2]), (False, [2, 3])])
+def test_a_render_with_a_thin_lens_begins_once(monkeypatch, known: bool, renders: list) -> None:
+    """And where it is not known before that nothing can be recorded, only the first one twice."""
+    if not known:
+        monkeypatch.setattr(frozen, "_UNKNOWN", frozenset())
+    jobs, start = [], Job.run
+    monkeypatch.setattr(Job, "run", lambda job, *more: jobs.append(job) or start(job, *more))
+    scene = _scene(camera=sensor("thinlens", aperture_radius=0.1, focus_distance=3.0))
+    images, counts = [], []
+    for _ in renders:
+        images.append(_image(scene, mi.load_dict({"type": "composed_path", "max_depth": 3})))
+        counts.append(len(jobs))
+    assert counts == renders
+    _assert_same(*images)
 
 
 def test_a_second_render_traces_nothing(monkeypatch) -> None:

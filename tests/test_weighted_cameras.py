@@ -118,7 +118,7 @@ def test_a_purpose_is_served_once():
 
 @pytest.mark.parametrize("name", ["lens", "time"])
 def test_emitters_are_hidden_by_the_nested_integrator(name):
-    with pytest.raises(Exception, match="nested integrator to know"):
+    with pytest.raises(Exception, match="in the nested integrator"):
         mi.load_dict(nest((name,), hide_emitters=True))
 
 

@@ -7,11 +7,12 @@ described here (:class:`_Description`): the classes of our objects and the value
 attributes, the parameters of the scene that are not arrays, the number of threads. A recording is
 used again only where all of this is the same.
 
-Nothing is recorded in spectral variants, whose colour tables are not arguments of any function, and
-where kernels call plugins written in Python: while these are traced, they may read arrays, or free
-memory of NumPy, at which Dr.Jit ends the process. A function with an argument that cannot be
-described (a sampler in Python) is not frozen either. The log says why (level ``Debug``). If Dr.Jit
-cannot record a function, the render begins anew without recordings, and the log says so (level
+Nothing is recorded in spectral variants, whose colour tables are not arguments of any function;
+with a ``thinlens``, which does not tell Dr.Jit of all its arrays; and where kernels call plugins
+that are written in Python: while these are traced, they may read arrays, or free memory of NumPy,
+at which Dr.Jit ends the process. A function with an argument that cannot be described (a sampler in
+Python) is not frozen either. The log says why (level ``Debug``). If Dr.Jit cannot record a
+function, the render begins anew, nothing more is recorded in that scene, and the log says so (level
 ``Info``).
 
 Rules for a frozen function:
@@ -50,6 +51,9 @@ from ..startup.garbage import garbage_left_alone
 #: The largest number of scenes whose recordings are kept, and of recordings of each.
 _MOST_SCENES, _MOST_RECORDINGS = 8, 256
 
+#: Sensors of Mitsuba 3.9.1 that hold an array of which Dr.Jit is not told.
+_UNKNOWN = frozenset({"ThinLensCamera"})
+
 #: Values that are their own description.
 _VALUES = (int, float, str, bytes, bool, type(None), enum.Enum, range)
 
@@ -72,12 +76,15 @@ class _SceneRecordings:
         held: Objects outside of the scene that descriptions name by their address.
         recordings: The recordings, by description.
         refused: Functions that are not frozen.
+        cannot_be_recorded: Has Dr.Jit failed to record a function? Others would fail too, when the
+            render has taken many samples already.
     """
 
     mark: Any
     held: dict[int, Any] = field(default_factory=dict)
     recordings: OrderedDict[Any, _Recording] = field(default_factory=OrderedDict)
     refused: set[Any] = field(default_factory=set)
+    cannot_be_recorded: bool = False
 
 
 @dataclass
@@ -157,6 +164,9 @@ def _can_freeze() -> bool:
 
 
 def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
+    if sensor.class_name() in _UNKNOWN:
+        mi.Log(mi.LogLevel.Debug, f"nothing is recorded: the sensor is a {sensor.class_name()}")
+        return None
     parameters = mi.traverse(scene)
     nodes = (*parameters.hierarchy, *mi.traverse(sensor).hierarchy)
     if registry.is_any_called() or any(map(_is_foreign, nodes)):
@@ -169,6 +179,8 @@ def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
     _scenes.move_to_end(mark.index)
     while len(_scenes) > _MOST_SCENES:
         _scenes.popitem(last=False)
+    if kept.cannot_be_recorded:
+        return None
     sensors = scene.sensors()
     own = frozenset(_address(o) for o in (*sensors, *scene.emitters(), *scene.shapes()))
     # Kernels whose threads accumulate separately have memory for this number of threads
@@ -230,8 +242,8 @@ def _call(current: _Current, function: Callable, args: tuple, any_width: bool) -
             _check_result(function, result)
     except NotRecordableError as error:
         # The next render will not try
-        kept.recordings.pop(key, None)
-        kept.refused.add(key)
+        kept.recordings.clear()
+        kept.cannot_be_recorded = True
         raise NotRecordableError(f"{function.__qualname__} cannot be recorded: {error}") from error
     except BaseException:
         kept.recordings.pop(key, None)

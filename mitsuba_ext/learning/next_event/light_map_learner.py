@@ -202,10 +202,10 @@ class LightMapLearner(Learner):
         if self._records is not None and not self._pays(probabilities, is_last):
             self.map = self._records = self._finer_map = None
             return EmitterSampling()
-        if self._finer_map is not None and not is_last:
-            make, self._finer_map = self._finer_map, None
-            if self._records is not None and self._efficiency >= _FINER_EFFICIENCY:
-                self.map = make()
+        # The records are kept in trials: most pilot samples come later
+        if self._finer_map is not None and self._records is not None and not is_last:
+            if self._efficiency >= _FINER_EFFICIENCY:
+                self.map, self._finer_map = self._finer_map(), None
                 return self._begin_map()
         if is_last:
             self._summary = f"{self.map}, {self._effect}"
