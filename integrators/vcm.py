@@ -6,13 +6,10 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.bidirectional.merging import MergingRadius, median_footprint
+from mitsuba_ext.bidirectional.merging import MergingRadius
 from mitsuba_ext.composition.bidirectional_integrator import BidirectionalIntegrator
-from mitsuba_ext.rendering.camera import film_extent
+from mitsuba_ext.composition.merging_parameters import MergingParameters
 from mitsuba_ext.startup import registry
-
-#: The default radius, in widths of a pixel.
-_PIXELS = 2.0
 
 
 @registry.plugin
@@ -22,25 +19,80 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
 
     Vertex connection and merging (:monosp:`vcm`)
     ---------------------------------------------
+
+    Bidirectional path tracing (:class:`bdpt`) and photon mapping in one: light that reaches the
+    surroundings of a vertex of a camera path counts there as well (merging), with MIS weights over
+    all techniques.
+
+    .. pluginparameters::
+
+     * - merging
+       - |bool|
+       - Merge vertices? Without it, the integrator is :class:`bdpt`. (Default: true)
+     * - radius
+       - |float|
+       - Radius in which vertices are merged with one sample per pixel, in units of the scene; 0 for
+         two widths of a pixel where the camera sees the scene, in the median over the film.
+         (Default: 0)
+     * - radius_decay
+       - |float|
+       - α, in (0, 1]: after n samples per pixel, the squared radius is that of the beginning times
+         n to the power of α − 1. With 1 it stays. (Default: 0.75)
+     * - (Parameters of bdpt)
+       - |several|
+       - Those of :class:`bdpt`: connections, light_image, subpath_selection, sample_direct,
+         next_event, directions, roulette, shadow_test.
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
+
+    **Use it when** caustics are seen through water or glass, or in mirrors: no connection finds
+    these. **Not when** :class:`bdpt` or :monosp:`path` finds all light: merging takes time, and
+    adds a little bias.
+
+    Merging is biased with any number of samples: light is blurred over the radius. The bias falls
+    with the squared radius, which shrinks from pass to pass, so that the image converges. Where
+    other techniques have large weights, there is little of it.
+
+    Spectral variants, moving shapes and participating media are refused, and so are
+    ``light_paths`` and ``technique_images`` of :class:`bdpt` with merging.
+
+    Source: I. Georgiev, J. Křivánek, T. Davidovič, P. Slusallek, *Light Transport Simulation with
+    Vertex Connection and Merging*, ACM Transactions on Graphics 31(6), 2012; I. Georgiev,
+    *Implementing Vertex Connection and Merging*, technical report, 2012; C. Knaus, M. Zwicker,
+    *Progressive Photon Mapping: A Probabilistic Approach*, ACM Transactions on Graphics 30(3),
+    2011 (radius).
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="vcm">
+                <integer name="max_depth" value="12"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'vcm',
+            'max_depth': 12
     """
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.merging = self.parameter(props, "merging", True)
-        self.radius = self.parameter(props, "radius", 0.0, minimum=0.0)
-        self.radius_decay = self.parameter(props, "radius_decay", 0.75, minimum=0.01, maximum=1.0)
+        self.merges = self.parameter(props, "merging", True)
+        self.merging = MergingParameters.read(self, props)
+        refused = "technique_images" if self.technique_images else "light_paths"
+        if self.merges and (self.technique_images or "light_paths" in self.slots):
+            raise ValueError(
+                f'"{self.name}": the parameter "{refused}" cannot be combined with merging; leave '
+                f"it out, or use \"bdpt\""
+            )
 
     def parameters(self) -> dict[str, Any]:
-        return {
-            "merging": self.merging,
-            "radius": self.radius or "automatic",
-            "radius_decay": self.radius_decay,
-            **super().parameters(),
-        }
+        return {"merging": self.merges, **self.merging.parameters(), **super().parameters()}
 
     def merging_radius(self, scene: mi.Scene, sensor: mi.Sensor) -> MergingRadius | None:
-        radius = self.radius or _PIXELS * median_footprint(scene, sensor)
-        if not self.merging or radius == 0:
+        if not self.merges:
             return None
-        width, height = film_extent(sensor.film())
-        return MergingRadius(radius, self.radius_decay, width * height)
+        self.merging.check(self.name, scene)
+        return self.merging.radius_of(scene, sensor)

@@ -85,7 +85,7 @@ class MergedSubpaths(Subpaths):
         self,
         vertices: VertexCache,
         grid: VertexGrid,
-        sums: PartialSums,
+        sums: PartialSums | None,
         ctx: mi.BSDFContext,
         max_depth: int,
         others: Subpaths | None = None,
@@ -124,7 +124,8 @@ class MergedSubpaths(Subpaths):
         # Flux arrives per area of the surface; the value holds the shading cosine
         arrives = geometric_cosine(far, far.wi)
         value *= other.β * dr.select(arrives > 0, dr.rcp(arrives), 0)
-        reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
-        value *= self._sums.merging_weight(other.sums, pdf, vertex.path.sums, reverse)
+        if self._sums is not None:
+            reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
+            value *= self._sums.merging_weight(other.sums, pdf, vertex.path.sums, reverse)
         active &= dr.all(dr.isfinite(value))
         return dr.select(active, value, 0)

@@ -1,0 +1,125 @@
+"""Stochastic progressive photon mapping."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
+from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
+from mitsuba_ext.bidirectional.photon_mapper import PhotonMapper
+from mitsuba_ext.composition.merging_parameters import MergingParameters
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.rendering.stages import OneStage
+from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.path_decisions import NoConnections
+from mitsuba_ext.transport.walk import Walk
+
+#: Bytes for what a pass stores; and bytes, about, that a path takes besides the vertices that are
+#: stored at a time.
+_PASS_BYTES, _PATH_BYTES = 1 << 29, 512
+
+
+@registry.plugin
+class ProgressivePhotonMapping(WalkIntegrator):
+    r"""
+    .. _integrator-sppm:
+
+    Stochastic progressive photon mapping (:monosp:`sppm`)
+    ------------------------------------------------------
+
+    Traces photons from the lights in each pass, and estimates the light that leaves the first rough
+    surface of each camera path from the photons around it. The radius shrinks from pass to pass, so
+    that the image converges.
+
+    .. pluginparameters::
+
+     * - radius
+       - |float|
+       - Radius in which photons are looked for with one sample per pixel, in units of the scene; 0
+         for two widths of a pixel where the camera sees the scene, in the median over the film.
+         (Default: 0)
+     * - radius_decay
+       - |float|
+       - α, in (0, 1]: after n samples per pixel, the squared radius is that of the beginning times
+         n to the power of α − 1. With 1 it stays. (Default: 0.75)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
+
+    **Use it when** caustics are seen through water or glass, or in mirrors, of lamps however small.
+    **Not when** the scene is large and well lit: each surface needs photons of its own. The
+    integrator :class:`vcm` has all other techniques beside this one.
+
+    The image is biased with any number of samples: light is blurred over the radius, dark at edges
+    and in creases that are narrower than that. The bias falls with the squared radius. There are as
+    many photon paths as camera samples. Vertices merge only on surfaces that face about the same
+    way, so that light does not leak through thin walls.
+
+    Spectral variants, moving shapes and participating media are refused: photons of other
+    wavelengths and times cannot be merged. Gradients are not supported (use :monosp:`prb`), nor
+    nesting in :monosp:`moment` and :monosp:`aov`.
+
+    Source: T. Hachisuka, H. W. Jensen, *Stochastic Progressive Photon Mapping*, ACM Transactions on
+    Graphics 28(5), 2009; C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic
+    Approach*, ACM Transactions on Graphics 30(3), 2011; D. Cline, PhD thesis, 2007, section 7.7.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="sppm">
+                <integer name="max_depth" value="12"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'sppm',
+            'max_depth': 12
+    """
+
+    has_light_paths = True
+    sees_media = False
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.merging = MergingParameters.read(self, props)
+        self.fill(props)
+
+    def parameters(self) -> dict[str, Any]:
+        return {**self.merging.parameters(), **super().parameters()}
+
+    @property
+    def sample_cost(self) -> int:
+        return 3
+
+    @property
+    def most_lanes(self) -> int:
+        layout = Layout(len(mi.Spectrum()), 0, True)
+        return _PASS_BYTES // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
+
+    def schedule(self, scene, sensor, samples, seed) -> OneStage:
+        query = self.query(scene)
+        self.merging.check(self.name, scene)
+        walk = Walk(
+            self.max_depth, self.rr_depth, self.hide_emitters, next_event=NoConnections(),
+            query=query,
+        )  # fmt: skip
+        radius = self.merging.radius_of(scene, sensor)
+        if not scene.emitters() or self.max_depth < 2 or radius is None:
+            return OneStage(walk)
+        try:
+            emission = LightEmission(scene)
+        except NotImplementedError as error:
+            raise NotImplementedError(f'"{self.name}": {error}') from None
+        light_walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
+        return OneStage(PhotonMapper(walk, light_walk, radius))
+
+    def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
+        raise NotImplementedError(
+            f'"{self.name}": light paths do not end where a ray begins: it cannot be nested in an '
+            f'integrator that asks for single samples, such as "moment" or "aov"; "variance" can '
+            f'hold it, and it has a parameter "aovs" of its own'
+        )

@@ -1,0 +1,77 @@
+"""The estimator of progressive photon mapping: merging alone.
+
+Source: T. Hachisuka, H. W. Jensen, *Stochastic Progressive Photon Mapping*, ACM Transactions on
+Graphics 28(5), 2009; C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic Approach*,
+ACM Transactions on Graphics 30(3), 2011 (passes are independent of each other).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.estimator import CameraRays, Sample
+from ..transport.heroes import Heroes
+from ..transport.numbers import Numbers
+from ..transport.path_decisions import Roulette, Weights
+from ..transport.walk import Walk
+from .light_numbers import light_numbers
+from .light_vertices import LightVertices, PackedVertices, VertexCache
+from .light_walk import LightWalk
+from .merging import MergedSubpaths, MergingRadius
+from .vertex_grid import VertexGrid
+
+
+class OnlySpecular(Roulette):
+    """Ends a path where it was scattered by a lobe that is not a delta distribution."""
+
+    def survival(self, state, vertex, path, active):
+        return dr.select(path.arrival.is_delta, mi.Float(1), 0), state
+
+
+class FoundByCamera(Weights):
+    """Nothing else finds the lights that a camera path hits by way of mirrors and clear glass."""
+
+    def emission(self, scene, si, ds, path, pdf):
+        return mi.Float(1)
+
+
+@dataclass
+class PhotonMapper:
+    """Traces light paths, and camera paths up to the first vertex that they can be merged with; it
+    is an :class:`Estimator`.
+
+    Parameters:
+        walk: Traces the camera paths; it makes no connections.
+        light_walk: Traces the light paths; ``None`` if the scene has no light.
+        radius: Within what radius vertices are merged.
+    """
+
+    walk: Walk
+    light_walk: LightWalk | None
+    radius: MergingRadius
+
+    def __call__(
+        self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
+    ) -> Sample:
+        if self.light_walk is None:
+            return self.walk(scene, sampler, rays, active)
+        dr.schedule(rays)
+        lanes = dr.width(rays.ray)
+        rounds: list[LightVertices] = []
+        scatter_count = self.light_walk.run(
+            scene, light_numbers(sampler, lanes), rays.ray.time, rays.ray.wavelengths, active,
+            lambda vertices: rounds.append(PackedVertices(vertices)),
+        )  # fmt: skip
+        walk = replace(self.walk, mis=FoundByCamera(), roulette=OnlySpecular(), rr_depth=0)
+        if rounds:
+            vertices = VertexCache(rounds, lanes)
+            grid = VertexGrid(vertices, dr.opaque(mi.Float, self.radius.next(lanes)))
+            subpaths = MergedSubpaths(
+                vertices, grid, None, Heroes(scene).context(), walk.max_depth
+            )
+            walk = replace(walk, subpaths=subpaths)
+        sample = walk(scene, sampler, rays, active)
+        return replace(sample, scatter_count=sample.scatter_count + scatter_count)

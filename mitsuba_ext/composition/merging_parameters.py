@@ -1,0 +1,59 @@
+"""The parameters of merging, which ``vcm`` and ``sppm`` share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+
+from ..bidirectional.merging import MergingRadius, median_footprint
+from ..rendering.camera import film_extent
+from ..scene.movers import movers
+
+#: The default radius, in widths of a pixel.
+_PIXELS = 2.0
+
+
+@dataclass
+class MergingParameters:
+    """
+    Attributes:
+        radius: Radius with one sample per pixel; 0 for one that suits the scene.
+        decay: See :class:`MergingRadius`.
+    """
+
+    radius: float
+    decay: float
+
+    @classmethod
+    def read(cls, integrator: Any, props: mi.Properties) -> MergingParameters:
+        """Reads ``radius`` and ``radius_decay``."""
+        return cls(
+            integrator.parameter(props, "radius", 0.0, minimum=0.0),
+            integrator.parameter(props, "radius_decay", 0.75, minimum=0.01, maximum=1.0),
+        )
+
+    def parameters(self) -> dict[str, Any]:
+        """What ``str()`` of the integrator shows."""
+        return {"radius": self.radius or "automatic", "radius_decay": self.decay}
+
+    def check(self, plugin: str, scene: mi.Scene) -> None:
+        """
+        Raises:
+            NotImplementedError: Vertices of different paths cannot be merged in this scene.
+        """
+        reason = "the variant is spectral" if mi.is_spectral else "shapes or lights move"
+        if mi.is_spectral or movers(scene):
+            raise NotImplementedError(
+                f'"{plugin}": {reason}: vertices of paths of other wavelengths and times cannot be '
+                f'merged; use "bdpt"'
+            )
+
+    def radius_of(self, scene: mi.Scene, sensor: mi.Sensor) -> MergingRadius | None:
+        """The radius for a render; ``None`` if the camera sees no surface."""
+        radius = self.radius or _PIXELS * median_footprint(scene, sensor)
+        if radius == 0:
+            return None
+        width, height = film_extent(sensor.film())
+        return MergingRadius(radius, self.decay, width * height)
