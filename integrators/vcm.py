@@ -27,8 +27,10 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     .. pluginparameters::
 
      * - merging
-       - |bool|
-       - Merge vertices? Without it, the integrator is :class:`bdpt`. (Default: true)
+       - |string|
+       - Where vertices are merged: :monosp:`caustics`, where light arrives from a mirror or smooth
+         glass; :monosp:`all`, on all rough surfaces, as in the source; :monosp:`none`, which makes
+         the integrator :class:`bdpt`. (Default: caustics)
      * - radius
        - |float|
        - Radius in which vertices are merged with one sample per pixel, in units of the scene; 0 for
@@ -79,20 +81,26 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.merges = self.parameter(props, "merging", True)
+        self.where = self.parameter(
+            props, "merging", "caustics", choices=("caustics", "all", "none")
+        )
         self.merging = MergingParameters.read(self, props)
         refused = "technique_images" if self.technique_images else "light_paths"
-        if self.merges and (self.technique_images or "light_paths" in self.slots):
+        if self.where != "none" and (self.technique_images or "light_paths" in self.slots):
             raise ValueError(
                 f'"{self.name}": the parameter "{refused}" cannot be combined with merging; leave '
                 f"it out, or use \"bdpt\""
             )
 
+    @property
+    def merges_all(self) -> bool:
+        return self.where == "all"
+
     def parameters(self) -> dict[str, Any]:
-        return {"merging": self.merges, **self.merging.parameters(), **super().parameters()}
+        return {"merging": self.where, **self.merging.parameters(), **super().parameters()}
 
     def merging_radius(self, scene: mi.Scene, sensor: mi.Sensor) -> MergingRadius | None:
-        if not self.merges:
+        if self.where == "none":
             return None
         self.merging.check(self.name, scene)
         return self.merging.radius_of(scene, sensor)

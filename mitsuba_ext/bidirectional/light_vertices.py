@@ -176,6 +176,8 @@ class LightVertices:
         depth = mark & (_HERO_IS_ALONE - 1)
         if layout.has_region:
             depth, sums.region = _depth_and_region(mark)
+        if layout.sums > 0:
+            sums.is_caustic = (depth > 1) & (sums.dVCM == 0)
         lane = self._lane_of(slot, active)
         si = from_words([w[i] for i in range(layout.mark + 1, layout.words)], layout.is_whole)
         si.t = dr.select(active, mi.Float(0), dr.inf)
@@ -190,6 +192,16 @@ class LightVertices:
         """The positions of the vertices at these places of the store."""
         word = slot * self._layout.words + (self._layout.mark + 1)
         return mi.Point3f(*(dr.gather(mi.Float, self._words, word + k, active) for k in range(3)))
+
+    def is_caustic(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        """Does light arrive from a delta lobe at the vertices at these places of the store?"""
+        first = slot * self._layout.words
+        mark = dr.gather(mi.Float, self._words, first + self._layout.mark, active)
+        depth = dr.reinterpret_array(mi.UInt32, mark) & (_HERO_IS_ALONE - 1)
+        if self._layout.has_region:
+            depth &= (1 << _DEPTH_BITS) - 1
+        dVCM = dr.gather(mi.Float, self._words, first + self._layout.spectrum, active)
+        return (depth > 1) & (dVCM == 0)
 
     def wavelengths(self, vertex: LightVertex, active: mi.Bool) -> mi.Spectrum | None:
         """The wavelengths of a vertex's path; ``None`` in variants that are not spectral."""

@@ -263,6 +263,7 @@ class LightWalk:
             later.by_camera,
             later.region,
             later.count,
+            ~is_first & (paths.sums.dVCM == 0) if self.sums.merging is not None else (),
         )
 
     def _scatter(self, heroes, paths, bsdf, si, bs, weight, sums, active):

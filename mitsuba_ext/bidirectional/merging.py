@@ -30,14 +30,15 @@ _LEAST_COSINE, _HALF_HEIGHT = 0.7, 0.25
 
 @dataclass
 class MergingRadius:
-    """The radius of merging, which shrinks from pass to pass, so that bias vanishes.
+    """The radius of merging. It shrinks from pass to pass, so that bias vanishes, and suits the
+    number of light paths of a pass: a disk holds about as many vertices whatever that is.
 
     Source: C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic Approach*, ACM
-    Transactions on Graphics 30(3), 2011, Eq. 15: with n samples per pixel, the squared radius is
-    proportional to n^(α − 1).
+    Transactions on Graphics 30(3), 2011: the squared radius of pass i is proportional to i^(α − 1)
+    (in the limit of their Eq. 15).
 
     Parameters:
-        first: The radius with one sample per pixel.
+        first: The radius of a first pass that has one light path per pixel.
         decay: α, in (0, 1]; 1 for a constant radius.
         pixels: Number of pixels.
     """
@@ -45,12 +46,12 @@ class MergingRadius:
     first: float
     decay: float
     pixels: int
-    _samples: float = 0.0
+    _passes: int = 0
 
-    def next(self, lanes: int) -> float:
-        """The radius of a pass of so many samples, which comes next."""
-        self._samples += lanes / self.pixels
-        return self.first * max(1.0, self._samples) ** (0.5 * (self.decay - 1))
+    def next(self, paths: int) -> float:
+        """The radius of the next pass, of so many light paths."""
+        self._passes += 1
+        return self.first * (self.pixels / paths * self._passes ** (self.decay - 1)) ** 0.5
 
 
 def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:

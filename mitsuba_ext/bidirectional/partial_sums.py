@@ -36,6 +36,8 @@ class Sums:
         region, count: Only if the light path vertices for connections are chosen by regions
             (otherwise ``()``): the region of the last vertex; and the factor of ``dVCM`` where the
             technique that connects the last two vertices is such a connection.
+        is_caustic: Only for light paths: was the direction that led to the last vertex sampled
+            from a delta lobe?
     """
 
     dVCM: mi.Float
@@ -43,6 +45,7 @@ class Sums:
     by_camera: mi.Vector2f | tuple[()] = ()
     region: Any = ()
     count: Any = ()
+    is_caustic: Any = ()
 
     @property
     def last(self) -> mi.Float:
@@ -66,6 +69,8 @@ class PartialSums:
         merging: The density of merging at a vertex, relative to the product of the densities with
             which both subpaths sample it: π r² · number of light paths. ``None`` if vertices are
             not merged.
+        merges_all: Are vertices merged wherever their BSDF is smooth? If not, only where light
+            arrives from a delta lobe.
     """
 
     def __init__(
@@ -76,6 +81,7 @@ class PartialSums:
         follows_camera: bool = False,
         selection: SubpathSelection | None = None,
         merging: mi.Float | None = None,
+        merges_all: bool = False,
     ) -> None:
         self._next_event, self.exponent, self.selection = next_event, exponent, selection
         self.follows_camera = follows_camera
@@ -83,6 +89,7 @@ class PartialSums:
         self.count = self.ratio(mi.Float(connections))
         #: ``merging``, raised to the exponent.
         self.merging = None if merging is None else self.ratio(merging)
+        self.merges_all = merges_all
 
     def ratio(self, x: mi.Float) -> mi.Float:
         """A ratio of densities, raised to the exponent."""
@@ -132,8 +139,10 @@ class PartialSums:
                 of the subpath.
         """
         others = sums.last + self.ratio(reverse_pdf) * sums.dVC
-        if self.merging is not None:
+        if self.merging is not None and self.merges_all:
             others += self.merging
+        elif self.merging is not None and not isinstance(sums.is_caustic, tuple):
+            others += dr.select(sums.is_caustic, self.merging, 0)
         return self.ratio(density) * others
 
     def merging_weight(
@@ -151,6 +160,23 @@ class PartialSums:
         others = light.last + self.ratio(pdf) * light.dVC
         others += camera.last + self.ratio(reverse_pdf) * camera.dVC
         return weight(others / self.merging)
+
+    def merging_before(
+        self, sums: Sums, squared_distance: mi.Float, cosine: mi.Float
+    ) -> mi.Float | float:
+        """For a camera path that leaves a vertex by a delta lobe: the term of dVC there for merging
+        at the vertex before, to which light then comes from that lobe.
+
+        Parameters:
+            sums: At the vertex that is left.
+            squared_distance, cosine: Of the segment to the vertex before, and there with the
+                geometric normal.
+        """
+        if self.merging is None or self.merges_all:
+            return 0.0
+        # dVCM is 0 if the vertex before was left by a delta lobe too
+        ratio = self.ratio(cosine / squared_distance)
+        return dr.select(squared_distance > 0, sums.dVCM / self.count * ratio * self.merging, 0)
 
     def _connection_density(self, scene, emitted, si, active) -> mi.Float:
         """The density with which next event estimation at ``si`` samples the point on the light:

@@ -54,6 +54,7 @@ class BidirectionalPathTracer:
             connected to the light path in the same lane only.
         skips_direct: Are paths of one and two segments left out?
         radius: Within what radius vertices are merged; ``None`` if they are not.
+        merges_all: See :class:`PartialSums`.
     """
 
     walk: Walk
@@ -65,6 +66,7 @@ class BidirectionalPathTracer:
     is_alone: bool = False
     skips_direct: bool = False
     radius: MergingRadius | None = None
+    merges_all: bool = False
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
@@ -88,7 +90,7 @@ class BidirectionalPathTracer:
             dr.make_opaque(merging)
         sums = PartialSums(
             walk.next_event, dr.opaque(mi.Float, count), follows_camera=follows_camera,
-            selection=selection, merging=merging,
+            selection=selection, merging=merging, merges_all=self.merges_all,
         )  # fmt: skip
         image = None
         if self.sensor is not None:
@@ -129,8 +131,8 @@ class BidirectionalPathTracer:
             )  # fmt: skip
             if radius is not None:
                 subpaths = MergedSubpaths(
-                    vertices, VertexGrid(vertices, radius), sums, Heroes(scene).context(),
-                    walk.max_depth, subpaths,
+                    vertices, VertexGrid(vertices, radius, not self.merges_all), sums,
+                    Heroes(scene).context(), walk.max_depth, subpaths,
                 )  # fmt: skip
         if isinstance(sampler, BothEnds):
             sampler = sampler.camera

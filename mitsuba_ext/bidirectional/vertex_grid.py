@@ -23,9 +23,12 @@ class VertexGrid:
     Parameters:
         vertices: The vertices, at least one.
         radius: Radius of the balls in which vertices are looked for.
+        only_caustic: Leave out vertices to which light does not come from a delta lobe?
     """
 
-    def __init__(self, vertices: VertexCache, radius: mi.Float) -> None:
+    def __init__(
+        self, vertices: VertexCache, radius: mi.Float, only_caustic: bool = False
+    ) -> None:
         self.radius = radius
         self._scale = 0.5 / radius
         dr.make_opaque(self._scale)
@@ -34,6 +37,8 @@ class VertexGrid:
         buckets = 1 << (vertices.room - 1).bit_length()
         index = dr.arange(mi.UInt32, vertices.room)
         active = index < dr.opaque(mi.UInt32, vertices.count)
+        if only_caustic:
+            active &= vertices.is_caustic(index, active)
         p = vertices.position(index, active)
         bucket = self._bucket(self._cell(p))
         counts = dr.zeros(mi.UInt32, buckets)

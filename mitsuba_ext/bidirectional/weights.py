@@ -106,5 +106,16 @@ class BidirectionalWeights(Weights):
         active = si.is_valid() & ~is_delta
         reverse = reverse_density(self._ctx, vertex.bsdf, si, bs.wo, active)
         cosine = geometric_cosine(si, bs.wo)
-        return self.sums.leave(vertex.path.sums, cosine, bs.pdf, reverse, is_delta)
+        sums = self.sums.leave(vertex.path.sums, cosine, bs.pdf, reverse, is_delta)
+        if self.sums.merging is not None:
+            ref = vertex.path.arrival.ref
+            d = si.p - ref.p
+            squared = dr.squared_norm(d)
+            before = self.sums.merging_before(
+                vertex.path.sums, squared, dr.abs(dr.dot(ref.n, d)) * dr.rsqrt(squared)
+            )
+            # The vertex before the first one is the sensor
+            merges = si.is_valid() & is_delta & (vertex.depth > 0) & (squared > 0)
+            sums.dVC += dr.select(merges, self.sums.ratio(cosine) * before, 0)
+        return sums
 

@@ -104,6 +104,9 @@ class BidirectionalIntegrator(WalkIntegrator):
             self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
         return functools.partial(self._estimator, side, self.merging_radius(scene, sensor))
 
+    #: Are all vertices merged, or only those to which light comes from a delta lobe?
+    merges_all = False
+
     def merging_radius(self, scene: mi.Scene, sensor: mi.Sensor) -> MergingRadius | None:
         """Within what radius vertices of a render are merged; ``None`` if they are not."""
         return None
@@ -128,7 +131,7 @@ class BidirectionalIntegrator(WalkIntegrator):
             return walk
         return BidirectionalPathTracer(
             walk, side.emission, side.sensor, self.connections, selection, choice.observer,
-            radius=radius,
+            radius=radius, merges_all=self.merges_all,
         )
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):
