@@ -38,13 +38,14 @@ class ProgressivePhotonMapping(WalkIntegrator):
 
      * - radius
        - |float|
-       - Radius in which photons are looked for with one sample per pixel, in units of the scene; 0
-         for two widths of a pixel where the camera sees the scene, in the median over the film.
+       - Radius in which photons are looked for in a first pass of one sample per pixel, in
+         units of the scene. 0 stands for one in which a disk holds about eight of the vertices of
+         such a pass, where there are any: light paths that are traced before measure it.
          (Default: 0)
      * - radius_decay
        - |float|
-       - α, in (0, 1]: after n samples per pixel, the squared radius is that of the beginning times
-         n to the power of α − 1. With 1 it stays. (Default: 0.75)
+       - α, in (0, 1]: the squared radius of pass i is that of the first times i to the power of
+         α − 1. With 1 it stays. (Default: 0.75)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
@@ -107,15 +108,15 @@ class ProgressivePhotonMapping(WalkIntegrator):
             self.max_depth, self.rr_depth, self.hide_emitters, next_event=NoConnections(),
             query=query,
         )  # fmt: skip
-        radius = self.merging.radius_of(scene, sensor)
-        if not scene.emitters() or self.max_depth < 2 or radius is None:
+        if not scene.emitters() or self.max_depth < 2:
             return OneStage(walk)
         try:
             emission = LightEmission(scene)
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
         light_walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
-        return OneStage(PhotonMapper(walk, light_walk, radius))
+        radius = self.merging.radius_of(scene, sensor, light_walk, only_caustic=False)
+        return OneStage(PhotonMapper(walk, light_walk, radius) if radius else walk)
 
     def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
         raise NotImplementedError(

@@ -6,10 +6,14 @@ from typing import Any
 
 import mitsuba as mi
 
+from mitsuba_ext.bidirectional.light_walk import LightWalk
 from mitsuba_ext.bidirectional.merging import MergingRadius
+from mitsuba_ext.bidirectional.partial_sums import PartialSums
 from mitsuba_ext.composition.bidirectional_integrator import BidirectionalIntegrator
+from mitsuba_ext.composition.light_side import LightSide
 from mitsuba_ext.composition.merging_parameters import MergingParameters
 from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.path_decisions import EmitterSampling
 
 
 @registry.plugin
@@ -38,8 +42,8 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
          (Default: 0)
      * - radius_decay
        - |float|
-       - α, in (0, 1]: after n samples per pixel, the squared radius is that of the beginning times
-         n to the power of α − 1. With 1 it stays. (Default: 0.75)
+       - α, in (0, 1]: the squared radius of pass i is that of the first times i to the power of
+         α − 1. With 1 it stays. (Default: 0.75)
      * - (Parameters of bdpt)
        - |several|
        - Those of :class:`bdpt`: connections, light_image, subpath_selection, sample_direct,
@@ -99,8 +103,14 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     def parameters(self) -> dict[str, Any]:
         return {"merging": self.where, **self.merging.parameters(), **super().parameters()}
 
-    def merging_radius(self, scene: mi.Scene, sensor: mi.Sensor) -> MergingRadius | None:
+    def merging_radius(
+        self, scene: mi.Scene, sensor: mi.Sensor, side: LightSide
+    ) -> MergingRadius | None:
         if self.where == "none":
             return None
         self.merging.check(self.name, scene)
-        return self.merging.radius_of(scene, sensor)
+        sums = PartialSums(EmitterSampling(), merging=mi.Float(1))
+        light_walk = LightWalk(
+            side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)
+        )
+        return self.merging.radius_of(scene, sensor, light_walk, not self.merges_all)

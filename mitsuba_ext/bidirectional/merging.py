@@ -8,6 +8,7 @@ Vertex Connection and Merging*, technical report, 2012.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import drjit as dr
@@ -17,7 +18,8 @@ import numpy as np
 from ..transport.bsdfs import eval_bsdf
 from ..transport.path_decisions import Subpaths
 from ..transport.vertex import Vertex
-from .light_vertices import LightVertex, VertexCache
+from .light_vertices import LightVertex, LightVertices, PackedVertices, VertexCache
+from .light_walk import LightWalk
 from .partial_sums import PartialSums
 from .scattering import geometric_cosine, reverse_density
 from .vertex_grid import VertexGrid
@@ -26,6 +28,14 @@ from .vertex_grid import VertexGrid
 #: and within a flat cylinder: its half height in units of its radius. Light would otherwise leak
 #: around corners and through thin walls.
 _LEAST_COSINE, _HALF_HEIGHT = 0.7, 0.25
+
+#: Light paths that measure how dense vertices are, how often the radius of that is doubled at most,
+#: and the number of vertices that a disk is to hold.
+_PATHS, _DOUBLINGS, _HANDFUL = 1 << 16, 8, 8.0
+
+#: With fewer vertices of these paths, nothing is merged; and the largest radius, in footprints of
+#: pixels.
+_FEW, _WIDEST = 64, 20.0
 
 
 @dataclass
@@ -67,6 +77,45 @@ def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
     found = width.numpy()[si.is_valid().numpy()]
     found = found[np.isfinite(found)]
     return float(np.median(found)) if len(found) else 0.0
+
+
+def suitable_radius(
+    scene: mi.Scene,
+    light_walk: LightWalk,
+    footprint: float,
+    pixels: int,
+    only_caustic: bool,
+) -> float | None:
+    """The radius in which a disk holds a handful of the vertices of one light path per pixel, where
+    there are vertices: measured by a few light paths. ``None`` if these leave too few vertices.
+
+    Parameters:
+        light_walk: Traces the light paths.
+        footprint: The width of a pixel where the camera sees the scene.
+        only_caustic: See :class:`VertexGrid`.
+    """
+    rounds: list[LightVertices] = []
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(dr.opaque(mi.UInt32, 0), _PATHS)
+    rays = dr.zeros(mi.Ray3f, _PATHS)
+    light_walk.run(
+        scene, sampler, rays.time, rays.wavelengths, dr.full(mi.Bool, True, _PATHS),
+        lambda vertices: rounds.append(PackedVertices(vertices)),
+    )  # fmt: skip
+    if not rounds:
+        return None
+    vertices, radius = VertexCache(rounds, _PATHS), footprint
+    for _ in range(_DOUBLINGS):
+        radius *= 2
+        grid = VertexGrid(vertices, dr.opaque(mi.Float, radius), only_caustic)
+        if grid.count < _FEW:
+            return None
+        others = grid.occupancy
+        if others > 4:
+            break
+    # Cells are squares of two radii where they cut a surface
+    per_area = max(others, 1e-6) / (4 * radius**2 * _PATHS)
+    return min(_WIDEST * footprint, math.sqrt(_HANDFUL / (math.pi * per_area * pixels)))
 
 
 class MergedSubpaths(Subpaths):

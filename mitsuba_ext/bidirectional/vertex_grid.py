@@ -47,12 +47,26 @@ class VertexGrid:
         ends = dr.cumsum(counts)
         place = dr.gather(mi.UInt32, ends, bucket, active)
         place = place - dr.gather(mi.UInt32, counts, bucket, active) + rank
+        self._counts = counts
         #: Of each bucket, the places of its first vertex and behind its last one.
         self._ranges = dr.ravel(mi.Vector2u(ends - counts, ends))
         self._sorted = dr.empty(mi.Float, 4 * vertices.room)
         packet = mi.Vector4f(p.x, p.y, p.z, dr.reinterpret_array(mi.Float, index))
         dr.scatter(self._sorted, packet, place, active)
         dr.eval(self._ranges, self._sorted)
+
+    @property
+    def count(self) -> int:
+        """Number of vertices."""
+        return int(dr.sum(self._counts)[0])
+
+    @property
+    def occupancy(self) -> float:
+        """The number of other vertices in the cell of a vertex, on average over the vertices; of a
+        grid of few vertices, as buckets stand for cells."""
+        counts = mi.Float64(self._counts)
+        total, squares = dr.sum(counts), dr.sum(dr.square(counts))
+        return float((squares / dr.maximum(total, 1))[0]) - 1
 
     def kernel_state(self) -> tuple:
         """The arrays that kernels depend on."""

@@ -102,12 +102,14 @@ class BidirectionalIntegrator(WalkIntegrator):
         film = sensor.film()
         if self.technique_images:
             self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
-        return functools.partial(self._estimator, side, self.merging_radius(scene, sensor))
+        return functools.partial(self._estimator, side, self.merging_radius(scene, sensor, side))
 
     #: Are all vertices merged, or only those to which light comes from a delta lobe?
     merges_all = False
 
-    def merging_radius(self, scene: mi.Scene, sensor: mi.Sensor) -> MergingRadius | None:
+    def merging_radius(
+        self, scene: mi.Scene, sensor: mi.Sensor, side: LightSide
+    ) -> MergingRadius | None:
         """Within what radius vertices of a render are merged; ``None`` if they are not."""
         return None
 

@@ -7,12 +7,10 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..bidirectional.merging import MergingRadius, median_footprint
+from ..bidirectional.light_walk import LightWalk
+from ..bidirectional.merging import MergingRadius, median_footprint, suitable_radius
 from ..rendering.camera import film_extent
 from ..scene.movers import movers
-
-#: The default radius, in widths of a pixel.
-_PIXELS = 2.0
 
 
 @dataclass
@@ -50,10 +48,19 @@ class MergingParameters:
                 f'merged; use "bdpt"'
             )
 
-    def radius_of(self, scene: mi.Scene, sensor: mi.Sensor) -> MergingRadius | None:
-        """The radius for a render; ``None`` if the camera sees no surface."""
-        radius = self.radius or _PIXELS * median_footprint(scene, sensor)
-        if radius == 0:
+    def radius_of(
+        self, scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk, only_caustic: bool
+    ) -> MergingRadius | None:
+        """The radius for a render; ``None`` if there is nothing to merge. The other parameters are
+        those of :func:`suitable_radius`."""
+        footprint = median_footprint(scene, sensor)
+        if footprint == 0:
             return None
         width, height = film_extent(sensor.film())
-        return MergingRadius(radius, self.decay, width * height)
+        pixels = width * height
+        radius = self.radius
+        if radius == 0:
+            radius = suitable_radius(scene, light_walk, footprint, pixels, only_caustic)
+        if radius is None:
+            return None
+        return MergingRadius(radius, self.decay, pixels)
