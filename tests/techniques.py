@@ -299,6 +299,16 @@ TECHNIQUES: dict[str, Technique] = {
             [2, -1], _LIGHT_PATHS,
         ),
     ),
+    # ``test_merging.py`` has the bias of merging, and what is merged everywhere
+    "vcm": Technique(
+        "vcm", {"radius": 0.01}, is_plugin=True, makes_splats=True,
+        checks=Checks(cases=["no_light"]),
+        thorough=Checks(
+            ["cornell_box", "mirrors_and_glass"], ["llvm_ad_mono"], FURNACES[2:4], [2, -1],
+            ("plain", "materials", "mirror_ring", "floor_under_water", "scaled_by_1e4",
+             "film_of_one_pixel", "one_sample", "max_depth_0", "thin_lens", "hidden_emitters"),
+        ),
+    ),
     "light_tracer": Technique(
         "light_tracer", is_plugin=True, makes_splats=True,
         checks=Checks(cases=["no_light"]),

@@ -27,7 +27,7 @@ SEQUENCES = sorted(set(FOLDERS["samplers"]) - set(DECISIONS))
 #: The integrators that nest no other one.
 WALKS = [
     "auto_path", "composed_path", "erpt", "mlt", "neepp", "pss_guided", "pssmlt",
-    "reweighted_direct", "two_stage",
+    "reweighted_direct", "sppm", "two_stage",
 ]
 
 #: A value that each parameter accepts, besides the words that its row begins with.
@@ -50,6 +50,7 @@ VALUES = {
     **dict.fromkeys(["chains", "chain_length", "direct_samples", "luminance_samples"], 3),
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
     **dict.fromkeys(["sample_count", "seed", "dimensions", "film_width"], 6),
+    "radius": 0.5, "radius_decay": 0.5, "merging": "all",
     "checkpoint": "kept", "checkpoint_every": "9s",
     "chain_file": "chains.npz", "mutations": "path", "outliers": 2.0, "p_large": 0.5,
     **dict.fromkeys(["bidirectional_mutation", "lens_perturbation"], True),

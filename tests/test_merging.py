@@ -1,0 +1,203 @@
+"""Merging: the grid that finds vertices, the radius, and the images of ``vcm`` and ``sppm``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from stage import area, film, stage
+from statistical import assert_same_mean, batches, load
+from test_furnace import FURNACES
+
+from mitsuba_ext.bidirectional.merging import MergingRadius, median_footprint
+from mitsuba_ext.bidirectional.vertex_grid import VertexGrid
+from mitsuba_ext.composition import merging_parameters
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def make(name: str, max_depth: int = 4, **parameters: Any) -> mi.Integrator:
+    return mi.load_dict({"type": name, "max_depth": max_depth, **parameters})
+
+
+# ---- The grid ----
+
+
+@dataclass
+class Points:
+    """Points in the place of vertices."""
+
+    p: np.ndarray
+
+    @property
+    def count(self) -> int:
+        return len(self.p)
+
+    @property
+    def room(self) -> int:
+        return self.count + 5
+
+    def position(self, index: mi.UInt32, active: mi.Bool) -> mi.Point3f:
+        columns = (mi.Float(column.tolist()) for column in self.p.T)
+        return mi.Point3f(*(dr.gather(mi.Float, column, index, active) for column in columns))
+
+
+@dr.syntax
+def sum_of_found(grid: VertexGrid, p: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32]:
+    """How many are found, and the sum of their squared indices."""
+    state, active = grid.begin(), mi.Bool(True) & (dr.arange(mi.UInt32, dr.width(p)) >= 0)
+    count, total = dr.zeros(mi.UInt32, dr.width(p)), dr.zeros(mi.UInt32, dr.width(p))
+    while active:
+        state, index, active = grid.next(state, p, active)
+        count += dr.select(active, 1, 0)
+        total += dr.select(active, index * index, 0)
+    return count, total
+
+
+@pytest.mark.parametrize(("scale", "radius"), [(1.0, 0.2), (1e-3, 5e-5), (1e4, 3000.0), (1.0, 5.0)])
+def test_the_grid_finds_each_point_within_the_radius_once(scale: float, radius: float) -> None:
+    random = np.random.default_rng(1)
+    points = scale * random.uniform(-1, 1, (300, 3)).astype(np.float32)
+    places = scale * random.uniform(-1.1, 1.1, (64, 3)).astype(np.float32)
+    grid = VertexGrid(Points(points), dr.opaque(mi.Float, radius))
+    count, total = sum_of_found(grid, mi.Point3f(*(mi.Float(c.tolist()) for c in places.T)))
+    distance = np.linalg.norm(places[:, None].astype(float) - points[None], axis=2)
+    near = distance < radius
+    # Where rounding does not decide
+    clear = (abs(distance - radius) > 1e-5 * radius).all(axis=1)
+    assert (count.numpy() == near.sum(axis=1))[clear].all() and near[clear].any()
+    assert (total.numpy() == (near * np.arange(300) ** 2).sum(axis=1))[clear].all()
+    assert grid.count == 300
+
+
+# ---- The radius ----
+
+
+def test_the_radius_shrinks_as_its_source_says_whatever_the_size_of_a_pass() -> None:
+    radius = MergingRadius(2.0, 0.75, pixels=100)
+    found = [radius.next(100) for _ in range(16)]
+    assert found[0] == 2 and found[15] == pytest.approx(2 * 16 ** (-1 / 8))
+    # Four times as many light paths: a disk of a quarter of the area holds as many vertices
+    assert MergingRadius(2.0, 0.75, pixels=100).next(400) == pytest.approx(1)
+    constant = MergingRadius(2.0, 1.0, pixels=100)
+    assert [constant.next(100) for _ in range(3)] == [2, 2, 2]
+
+
+@pytest.mark.parametrize("scale", [0.01, 100])
+def test_the_radius_scales_with_the_scene(monkeypatch, scale: float) -> None:
+    found = []
+    measure = merging_parameters.suitable_radius
+    monkeypatch.setattr(
+        merging_parameters, "suitable_radius",
+        lambda *arguments: found.append(measure(*arguments)) or found[-1],
+    )  # fmt: skip
+    for size in (1.0, scale):
+        scene = mi.load_dict(stage(mi.ScalarTransform4f().scale(size)), optimize=False)
+        mi.render(scene, integrator=make("sppm"), spp=1)
+    assert found[1] == pytest.approx(scale * found[0], rel=0.1)
+
+
+def test_the_footprint_is_the_width_of_a_pixel() -> None:
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100)}
+    camera = {
+        "type": "perspective", "fov": 10.0, "film": film(32, 32),
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+    }  # fmt: skip
+    scene = mi.load_dict({"type": "scene", "wall": wall, "sensor": camera})
+    width = 2 * 4 * math.tan(math.radians(5)) / 32
+    assert median_footprint(scene, scene.sensors()[0]) == pytest.approx(width, rel=0.01)
+
+
+# ---- Images ----
+
+
+@pytest.mark.parametrize("parameters", [{"merging": "none"}, {}])
+def test_without_caustics_the_image_is_that_of_bdpt(parameters: dict) -> None:
+    scene = load("cornell_box", width=16, height=12)
+    images = [
+        batches(scene, make(name, **more), 8, [1])
+        for name, more in (("bdpt", {}), ("vcm", parameters))
+    ]
+    np.testing.assert_allclose(*images, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(("name", "parameters"), [
+    ("vcm", {}), pytest.param("vcm", {"merging": "all"}, marks=pytest.mark.slow),
+    pytest.param("sppm", {}, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_caustics_have_the_mean_of_path(name: str, parameters: dict) -> None:
+    """A large lamp, a ball of glass, and a mirror: ``path`` finds the caustics too."""
+    ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.4, "bsdf": {"type": "dielectric"}}
+    mirror = {
+        "type": "rectangle", "bsdf": {"type": "conductor"},
+        "to_world": mi.ScalarTransform4f().translate([0, 1.5, 0.5]).rotate([1, 0, 0], 90),
+    }  # fmt: skip
+    scene = mi.load_dict(stage(ball=ball, mirror=mirror), optimize=False)
+    radius = 0.03 if name == "vcm" else 0.01
+    found = batches(scene, make(name, 6, radius=radius, **parameters), 128, range(1, 9))
+    expected = batches(scene, make("path", 6), 2048, range(101, 109))
+    # The bias of the radius, at edges
+    assert_same_mean(found, expected, 0.03, tolerance=0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["vcm", "sppm"])
+def test_the_bias_falls_with_the_radius(name: str) -> None:
+    furnace = FURNACES["furnace_box"]
+    (region,) = [r for r in furnace.regions if r.exact(3) is not None][:1]
+    parameters = {"merging": "all"} if name == "vcm" else {}
+    scene = load("furnace_box", width=16, height=16)
+    biases = []
+    for radius in (0.8, 0.4):
+        integrator = make(name, 3, radius=radius, radius_decay=1.0, **parameters)
+        images = batches(scene, integrator, 16, range(1, 65))
+        biases.append(1 - images.mean() / region.exact(3))
+    # In the corners of the box a part of the disk is missing: in proportion to the radius
+    assert 0.005 < biases[0] < 0.1 and biases[1] < 0.7 * biases[0]
+
+
+def test_light_does_not_leak_through_a_thin_wall() -> None:
+    T = mi.ScalarTransform4f
+    wall = {"type": "diffuse"}
+    lit = {"type": "rectangle", "bsdf": wall, "to_world": T().translate([0, 0, 1e-4])}
+    dark = {"type": "rectangle", "bsdf": wall, "to_world": T().rotate([1, 0, 0], 180)}
+    light = {"type": "rectangle", "emitter": area(5.0),
+             "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(0.2)}  # fmt: skip
+    camera = {"type": "perspective", "fov": 30.0, "film": film(8, 8),
+              "to_world": T().look_at([0, 0, -3], [0, 0, 0], [0, 1, 0])}  # fmt: skip
+    scene = mi.load_dict({"type": "scene", "lit": lit, "dark": dark, "light": light,
+                          "sensor": camera}, optimize=False)  # fmt: skip
+    for integrator in (make("sppm", radius=0.1), make("vcm", merging="all", radius=0.1)):
+        assert np.array(mi.render(scene, integrator=integrator, spp=16)).max() == 0
+
+
+# ---- Errors ----
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+@pytest.mark.parametrize("name", ["vcm", "sppm"])
+def test_spectral_variants_are_refused(variant: str, name: str) -> None:
+    scene = mi.load_dict(stage(), optimize=False)
+    with pytest.raises((NotImplementedError, RuntimeError), match=f'"{name}": the variant is spec'):
+        make(name).render(scene, spp=1)
+
+
+@pytest.mark.parametrize("name", ["vcm", "sppm"])
+def test_moving_shapes_are_refused(name: str) -> None:
+    ball = {"type": "moving", "translate": [0, 0, 1], "in": {"type": "sphere", "radius": 0.1}}
+    scene = mi.load_dict(stage(ball=ball), optimize=False)
+    with pytest.raises((NotImplementedError, RuntimeError), match=f'"{name}": shapes or lights'):
+        make(name).render(scene, spp=1)
+
+
+@pytest.mark.parametrize("parameters", [{"light_paths": "auto"}, {"technique_images": "a.exr"}])
+def test_what_merging_does_not_know_is_refused(parameters: dict) -> None:
+    (key,) = parameters
+    with pytest.raises((ValueError, RuntimeError), match=f'"vcm": the parameter "{key}"'):
+        make("vcm", **parameters)
+    make("vcm", merging="none", **parameters)
