@@ -99,7 +99,7 @@ def test_the_radius_scales_with_the_scene(monkeypatch, scale: float) -> None:
     for size in (1.0, scale):
         scene = mi.load_dict(stage(mi.ScalarTransform4f().scale(size)), optimize=False)
         mi.render(scene, integrator=make("sppm"), spp=1)
-    assert found[1] == pytest.approx(scale * found[0], rel=0.1)
+    assert found[1] == pytest.approx(scale * found[0], rel=0.3)
 
 
 def test_the_footprint_is_the_width_of_a_pixel() -> None:
