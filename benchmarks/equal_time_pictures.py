@@ -24,7 +24,7 @@ OURS = {
     "rooms": ({"type": "auto_path"}, 8),
     "door_ajar": ({"type": "auto_path"}, 8),
     "glass_lamp": ({"type": "bdpt"}, 12),
-    "pool": ({"type": "erpt"}, 8),
+    "pool": ({"type": "vcm"}, 8),
     "caustic": ({"type": "bdpt"}, 8),
 }
 

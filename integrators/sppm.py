@@ -93,6 +93,10 @@ class ProgressivePhotonMapping(WalkIntegrator):
         return {**self.merging.parameters(), **super().parameters()}
 
     @property
+    def needs_equal_samples(self) -> str:
+        return "the radius of its photons suits the number of light paths of a pass"
+
+    @property
     def sample_cost(self) -> int:
         return 3
 
@@ -116,7 +120,7 @@ class ProgressivePhotonMapping(WalkIntegrator):
             raise NotImplementedError(f'"{self.name}": {error}') from None
         light_walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
         radius = self.merging.radius_of(scene, sensor, light_walk, only_caustic=False)
-        return OneStage(PhotonMapper(walk, light_walk, radius) if radius else walk)
+        return OneStage(PhotonMapper(walk, light_walk, radius))
 
     def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
         raise NotImplementedError(

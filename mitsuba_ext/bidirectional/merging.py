@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..scene.bounds import scene_bounds
 from ..transport.bsdfs import eval_bsdf
 from ..transport.path_decisions import Subpaths
 from ..transport.vertex import Vertex
@@ -35,7 +36,7 @@ _PATHS, _DOUBLINGS, _HANDFUL = 1 << 16, 8, 8.0
 
 #: With fewer vertices of these paths, nothing is merged; and the largest radius, in footprints of
 #: pixels.
-_FEW, _WIDEST = 64, 20.0
+_FEW, WIDEST = 64, 20.0
 
 
 @dataclass
@@ -65,8 +66,8 @@ class MergingRadius:
 
 
 def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
-    """The width of a pixel where the camera sees the scene: the median over the film; 0 if it sees
-    no surface."""
+    """The width of a pixel where the camera sees the scene: the median over the film. If rays
+    through a grid of places on the film hit nothing, a thousandth of the diagonal of the scene."""
     count = 64
     lane = dr.arange(mi.UInt32, count * count)
     position = (mi.Point2f(lane % count, lane // count) + 0.5) / count
@@ -76,7 +77,10 @@ def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
     width = dr.norm((ray.o_x + ray.d_x * si.t) - (ray.o + ray.d * si.t))
     found = width.numpy()[si.is_valid().numpy()]
     found = found[np.isfinite(found)]
-    return float(np.median(found)) if len(found) else 0.0
+    if len(found) and np.median(found) > 0:
+        return float(np.median(found))
+    bounds = scene_bounds(scene)
+    return float(dr.norm(bounds.extents())) / 1000 if bounds.valid() else 1.0
 
 
 def suitable_radius(
@@ -115,7 +119,7 @@ def suitable_radius(
             break
     # Cells are squares of two radii where they cut a surface
     per_area = max(others, 1e-6) / (4 * radius**2 * _PATHS)
-    return min(_WIDEST * footprint, math.sqrt(_HANDFUL / (math.pi * per_area * pixels)))
+    return min(WIDEST * footprint, math.sqrt(_HANDFUL / (math.pi * per_area * pixels)))
 
 
 class MergedSubpaths(Subpaths):

@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..bidirectional.light_walk import LightWalk
-from ..bidirectional.merging import MergingRadius, median_footprint, suitable_radius
+from ..bidirectional.merging import WIDEST, MergingRadius, median_footprint, suitable_radius
 from ..rendering.camera import film_extent
 from ..scene.movers import movers
 
@@ -51,16 +51,15 @@ class MergingParameters:
     def radius_of(
         self, scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk, only_caustic: bool
     ) -> MergingRadius | None:
-        """The radius for a render; ``None`` if there is nothing to merge. The other parameters are
-        those of :func:`suitable_radius`."""
+        """The radius for a render; ``None`` if there are no caustics to merge. The other
+        parameters are those of :func:`suitable_radius`."""
         footprint = median_footprint(scene, sensor)
-        if footprint == 0:
-            return None
         width, height = film_extent(sensor.film())
         pixels = width * height
         radius = self.radius
         if radius == 0:
             radius = suitable_radius(scene, light_walk, footprint, pixels, only_caustic)
-        if radius is None:
+        if radius is None and only_caustic:
             return None
+        radius = radius or WIDEST * footprint
         return MergingRadius(radius, self.decay, pixels)
