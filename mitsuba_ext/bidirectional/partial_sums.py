@@ -67,8 +67,8 @@ class PartialSums:
         selection: Chooses the vertices of light paths by regions; its ``expected`` for a pair of
             regions multiplies ``connections``. ``None`` if the choice is uniform.
         merging: The density of merging at a vertex, relative to the product of the densities with
-            which both subpaths sample it: π r² · number of light paths. ``None`` if vertices are
-            not merged.
+            which both subpaths sample it: π r² · number of light paths, or in proportion to that.
+            ``None`` if vertices are not merged.
         merges_all: Are vertices merged wherever their BSDF is smooth? If not, only where light
             arrives from a delta lobe.
     """

@@ -23,7 +23,7 @@ from .light_image import LightImage
 from .light_numbers import light_numbers
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
-from .merging import MergedSubpaths, MergingRadius
+from .merging import HANDFUL, MergedSubpaths, MergingRadius
 from .partial_sums import PartialSums
 from .sensor import ConnectableSensor
 from .technique_observer import TechniqueObserver
@@ -86,7 +86,7 @@ class BidirectionalPathTracer:
         radius, merging = None, None
         if self.radius is not None:
             radius = dr.opaque(mi.Float, self.radius.next(lanes))
-            merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, lanes)
+            merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, lanes / HANDFUL)
             dr.make_opaque(merging)
         sums = PartialSums(
             walk.next_event, dr.opaque(mi.Float, count), follows_camera=follows_camera,
