@@ -99,6 +99,8 @@ REGRESSIONS = {
         Regression("bdpt", "corridor"),
         Regression("bdpt", "night_classroom"),
         Regression("light_tracer", "glass_lamp"),
+        Regression("vcm", "pool", max_depth=8),
+        Regression("sppm", "pool", max_depth=8, spp=256, is_slow=True),
         Regression("pssmlt", "cornell_box", {"bidirectional": False, "chains": 1024}),
         Regression("erpt", "cornell_box", {"outliers": 2.0}),
         Regression("mlt", "cornell_box", {"chains": 1024}, is_slow=True),
