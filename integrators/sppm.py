@@ -60,6 +60,9 @@ class ProgressivePhotonMapping(WalkIntegrator):
     many photon paths as camera samples. Vertices merge only on surfaces that face about the same
     way, so that light does not leak through thin walls.
 
+    A render in batches (:monosp:`checkpoint`, or several workers) begins each batch with the first
+    radius: its bias does not vanish.
+
     Spectral variants, moving shapes and participating media are refused: photons of other
     wavelengths and times cannot be merged. Gradients are not supported (use :monosp:`prb`), nor
     nesting in :monosp:`moment` and :monosp:`aov`.

@@ -61,6 +61,9 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     with the squared radius, which shrinks from pass to pass, so that the image converges. Where
     other techniques have large weights, there is little of it.
 
+    A render in batches (:monosp:`checkpoint`, or several workers) begins each batch with the first
+    radius: its bias does not vanish.
+
     Spectral variants, moving shapes and participating media are refused, and so are
     ``light_paths`` and ``technique_images`` of :class:`bdpt` with merging.
 
