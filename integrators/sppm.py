@@ -40,7 +40,8 @@ class ProgressivePhotonMapping(WalkIntegrator):
        - |float|
        - Radius in which photons are looked for in a first pass of one sample per pixel, in
          units of the scene. 0 stands for one in which a disk holds about eight of the vertices of
-         such a pass, where there are any: light paths that are traced before measure it.
+         such a pass, where there are any, but at most 20 widths of a pixel: light paths that are
+         traced before the render measure it. A pass of k samples per pixel has 1/k of the area.
          (Default: 0)
      * - radius_decay
        - |float|

@@ -37,8 +37,10 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
          the integrator :class:`bdpt`. (Default: caustics)
      * - radius
        - |float|
-       - Radius in which vertices are merged with one sample per pixel, in units of the scene; 0 for
-         two widths of a pixel where the camera sees the scene, in the median over the film.
+       - Radius in which vertices are merged in a first pass of one sample per pixel, in
+         units of the scene. 0 stands for one in which a disk holds about eight of the vertices of
+         such a pass, where there are any, but at most 20 widths of a pixel: light paths that are
+         traced before the render measure it. A pass of k samples per pixel has 1/k of the area.
          (Default: 0)
      * - radius_decay
        - |float|
