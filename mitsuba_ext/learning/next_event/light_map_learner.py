@@ -38,6 +38,9 @@ _GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 #: finer map to follow.
 _TRIAL_ENTRIES, _FINER_EFFICIENCY = 0.15, 1.2
 
+#: So many entries may the first pilot's map have in any render: they take about 20 ms.
+_FEW_ENTRIES = 1 << 17
+
 #: The efficiency that a light table must reach; and that which it must reach with few samples for
 #: learning to continue: tables of more samples are little better.
 _LEAST_EFFICIENCY, _TRIAL_EFFICIENCY = 1.03, 1.0
@@ -131,7 +134,8 @@ class LightMapLearner(Learner):
     def _first_map(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightMap:
         """The map of the first pilot."""
         limit = math.inf if self.grid else self.pilot_samples * _ENTRIES_PER_SAMPLE
-        trial = math.inf if self._is_needed else self.render_samples * _TRIAL_ENTRIES
+        trial = max(_FEW_ENTRIES, self.render_samples * _TRIAL_ENTRIES)
+        trial = math.inf if self._is_needed else trial
         light_map = self._new_map(scene, p, n, min(limit, trial))
         if trial < limit and light_map.rows.resolution < _GRID:
             self._finer_map = lambda: self._new_map(scene, p, n, limit)
