@@ -145,6 +145,19 @@ def test_caustics_have_the_mean_of_path(name: str, parameters: dict) -> None:
     assert_same_mean(found, expected, 0.03, tolerance=0.0)
 
 
+@pytest.mark.parametrize("name", ["bdpt", "vcm"])
+def test_a_sensor_of_one_ray_has_the_radiance_of_path(name: str) -> None:
+    """Mitsuba samples a single ray for all lanes of a ``radiancemeter``."""
+    camera = {
+        "type": "radiancemeter", "film": film(1, 1),
+        "to_world": mi.ScalarTransform4f().look_at([0, -4, 1.2], [0, 0, 0.6], [0, 0, 1]),
+    }  # fmt: skip
+    scene = mi.load_dict(stage(camera=camera), optimize=False)
+    images = [batches(scene, make(kind), 4096, range(1, 9)) for kind in (name, "path")]
+    means = [image[..., :3].mean() for image in images]
+    assert means[0] == pytest.approx(means[1], rel=0.1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["vcm", "sppm"])
 def test_the_bias_falls_with_the_radius(name: str) -> None:

@@ -44,6 +44,9 @@ HANDFUL = 8.0
 #: pixels.
 _FEW, WIDEST = 64, 20.0
 
+#: The largest radius in units of the diagonal of the scene: pixels of very small films are wide.
+_LARGEST = 0.04
+
 
 @dataclass
 class MergingRadius:
@@ -73,20 +76,25 @@ class MergingRadius:
 
 def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
     """The width of a pixel where the camera sees the scene: the median over the film. If rays
-    through a grid of places on the film hit nothing, a thousandth of the diagonal of the scene."""
+    through a grid of places on the film hit nothing, or the sensor does not tell how far pixels are
+    apart, a thousandth of the diagonal of the scene."""
     count = 64
     lane = dr.arange(mi.UInt32, count * count)
     position = (mi.Point2f(lane % count, lane // count) + 0.5) / count
     ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
-    ray.scale_differential(1.0)
-    si = scene.ray_intersect(ray)
-    width = dr.norm((ray.o_x + ray.d_x * si.t) - (ray.o + ray.d * si.t))
-    found = width.numpy()[si.is_valid().numpy()]
-    found = found[np.isfinite(found)]
-    if len(found) and np.median(found) > 0:
-        return float(np.median(found))
+    if ray.has_differentials:
+        si = scene.ray_intersect(ray)
+        width = dr.norm((ray.o_x + ray.d_x * si.t) - (ray.o + ray.d * si.t))
+        found = width.numpy()[si.is_valid().numpy()]
+        found = found[np.isfinite(found)]
+        if len(found) and np.median(found) > 0:
+            return float(np.median(found))
+    return _diagonal(scene) / 1000
+
+
+def _diagonal(scene: mi.Scene) -> float:
     bounds = scene_bounds(scene)
-    return float(dr.norm(bounds.extents())) / 1000 if bounds.valid() else 1.0
+    return float(dr.norm(bounds.extents())) if bounds.valid() else 1000.0
 
 
 def suitable_radius(
@@ -125,7 +133,8 @@ def suitable_radius(
             break
     # Cells are squares of two radii where they cut a surface
     per_area = max(others, 1e-6) / (4 * radius**2 * _PATHS)
-    return min(WIDEST * footprint, math.sqrt(HANDFUL / (math.pi * per_area * pixels)))
+    radius = math.sqrt(HANDFUL / (math.pi * per_area * pixels))
+    return min(radius, WIDEST * footprint, _LARGEST * _diagonal(scene))
 
 
 class MergedSubpaths(Subpaths):

@@ -45,19 +45,17 @@ class PhotonMapper:
 
     Parameters:
         walk: Traces the camera paths; it makes no connections.
-        light_walk: Traces the light paths; ``None`` if the scene has no light.
+        light_walk: Traces the light paths.
         radius: Within what radius vertices are merged.
     """
 
     walk: Walk
-    light_walk: LightWalk | None
+    light_walk: LightWalk
     radius: MergingRadius
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
     ) -> Sample:
-        if self.light_walk is None:
-            return self.walk(scene, sampler, rays, active)
         dr.schedule(rays)
         lanes = dr.width(rays.ray)
         rounds: list[LightVertices] = []

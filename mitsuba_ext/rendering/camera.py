@@ -222,6 +222,9 @@ def camera_rays(
     # A box filter ignores the offset inside the pixel: it would only add rounding errors
     if film.rfilter().is_box_filter():
         position = mi.Point2f(lanes.corner)
+    if dr.width(ray.o) == 1:
+        # A "radiancemeter" has one ray; light paths need a lane for each sample
+        ray.o = ray.o + dr.zeros(mi.Vector3f, dr.width(position))
     return CameraRays(
         ray, lanes.pixel, importance, position, numbers.weight, numbers.hero_weight,
         sensor.get_medium(), numbers.distance,
