@@ -189,6 +189,30 @@ def test_light_does_not_leak_through_a_thin_wall() -> None:
         assert np.array(mi.render(scene, integrator=integrator, spp=16)).max() == 0
 
 
+def test_a_plate_does_not_light_what_lies_under_it() -> None:
+    """Both face up, and lie within the radius: half of that above the other."""
+    T = mi.ScalarTransform4f
+    light = {"type": "rectangle", "emitter": area(5.0),
+             "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(0.2)}  # fmt: skip
+    camera = {"type": "perspective", "fov": 20.0, "film": film(8, 8), "near_clip": 0.001,
+              "to_world": T().look_at([0, -0.2, 0.1], [0, 0, 0], [0, 0, 1])}  # fmt: skip
+    plate = {"type": "rectangle", "bsdf": {"type": "diffuse"}}
+    above = {**plate, "to_world": T().translate([0, 0, 0.2])}
+    scene = mi.load_dict({"type": "scene", "below": plate, "above": above, "light": light,
+                          "sensor": camera}, optimize=False)  # fmt: skip
+    # With 16 light paths per pixel, the radius is 0.4
+    image = np.array(mi.render(scene, integrator=make("sppm", 2, radius=1.6), spp=16))
+    assert image.max() == 0
+
+
+def test_weights_add_up_to_one_behind_mirrors_and_glass() -> None:
+    """In a closed room of one temperature, each pixel has the radiance 1."""
+    scene = load("furnace_isothermal", width=32, height=32)
+    integrator = make("vcm", -1, radius=0.2, radius_decay=1.0)
+    images = batches(scene, integrator, 16, range(1, 9))[..., :3]
+    assert images.mean() == pytest.approx(1, abs=0.004)
+
+
 # ---- Errors ----
 
 
