@@ -53,9 +53,9 @@ def sum_of_found(grid: VertexGrid, p: mi.Point3f) -> tuple[mi.UInt32, mi.UInt32]
     state, active = grid.begin(), mi.Bool(True) & (dr.arange(mi.UInt32, dr.width(p)) >= 0)
     count, total = dr.zeros(mi.UInt32, dr.width(p)), dr.zeros(mi.UInt32, dr.width(p))
     while active:
-        state, index, active = grid.next(state, p, active)
-        count += dr.select(active, 1, 0)
-        total += dr.select(active, index * index, 0)
+        state, index, found, active = grid.next(state, p, active)
+        count += dr.select(found, 1, 0)
+        total += dr.select(found, index * index, 0)
     return count, total
 
 

@@ -9,8 +9,10 @@ import mitsuba as mi
 
 from .light_vertices import VertexCache
 
-#: Cells that a ball of one radius can overlap: cells are two radii wide.
-_CELLS = 8
+#: Cells are two radii wide in y and z, so that a ball overlaps four rows of cells along x. In x,
+#: this number of cells is two radii wide. Cells of a row have buckets next to each other: one range
+#: of vertices holds all of them that a ball overlaps.
+_PER_DIAMETER, _ROWS = 2, 4
 
 
 class VertexGrid:
@@ -30,88 +32,115 @@ class VertexGrid:
         self, vertices: VertexCache, radius: mi.Float, only_caustic: bool = False
     ) -> None:
         self.radius = radius
-        self._scale = 0.5 / radius
+        scale = 0.5 / radius
+        self._scale = mi.Vector3f(_PER_DIAMETER * scale, scale, scale)
         dr.make_opaque(self._scale)
         # As many buckets as there is room for vertices, a power of two: kernels are shared
-        self._mask = dr.opaque(mi.UInt32, (1 << (vertices.room - 1).bit_length()) - 1)
         buckets = 1 << (vertices.room - 1).bit_length()
+        self._mask = dr.opaque(mi.UInt32, buckets - 1)
         index = dr.arange(mi.UInt32, vertices.room)
         active = index < dr.opaque(mi.UInt32, vertices.count)
         if only_caustic:
             active &= vertices.is_caustic(index, active)
         p = vertices.position(index, active)
-        bucket = self._bucket(self._cell(p))
-        counts = dr.zeros(mi.UInt32, buckets)
-        rank = dr.scatter_inc(counts, bucket, active)
-        dr.eval(rank, counts)
-        ends = dr.cumsum(counts)
-        place = dr.gather(mi.UInt32, ends, bucket, active)
-        place = place - dr.gather(mi.UInt32, counts, bucket, active) + rank
-        self._counts = counts
-        #: Of each bucket, the places of its first vertex and behind its last one.
-        self._ranges = dr.ravel(mi.Vector2u(ends - counts, ends))
+        cell = self._cell(p)
+        hashed = _hash(cell)
+        bucket = (hashed + mi.UInt32(cell.x)) & self._mask
+        self._counts, tags = dr.zeros(mi.UInt32, buckets), dr.zeros(mi.UInt32, buckets)
+        rank = dr.scatter_inc(self._counts, bucket, active)
+        dr.scatter_reduce(dr.ReduceOp.Or, tags, _tag(hashed), bucket, active)
+        dr.eval(rank, self._counts, tags)
+        ends = dr.cumsum(self._counts)
+        starts = ends - self._counts
+        place = dr.gather(mi.UInt32, starts, bucket, active) + rank
         self._sorted = dr.empty(mi.Float, 4 * vertices.room)
         packet = mi.Vector4f(p.x, p.y, p.z, dr.reinterpret_array(mi.Float, index))
         dr.scatter(self._sorted, packet, place, active)
-        dr.eval(self._ranges, self._sorted)
+        self._total = dr.gather(mi.UInt32, ends, buckets - 1)
+        # Of each bucket, the range of places from its first vertex to the last one of the buckets
+        # that a ball overlaps, and the tags of their cells. Behind the last bucket comes the first
+        first = dr.arange(mi.UInt32, buckets)
+        last = first + _PER_DIAMETER
+        end = dr.gather(mi.UInt32, ends, last & self._mask)
+        end += dr.select(last > self._mask, self._total, 0)
+        for k in range(1, _PER_DIAMETER + 1):
+            tags = tags | dr.gather(mi.UInt32, tags, (first + k) & self._mask)
+        self._ranges = dr.ravel(mi.Vector4u(starts, end, tags, 0))
+        dr.eval(self._ranges, self._sorted, self._total)
 
     @property
     def count(self) -> int:
         """Number of vertices."""
-        return int(dr.sum(self._counts)[0])
+        return int(self._total[0])
 
     @property
     def occupancy(self) -> float:
-        """The number of other vertices in the cell of a vertex, on average over the vertices; of a
-        grid of few vertices, as buckets stand for cells."""
-        counts = mi.Float64(self._counts)
+        """The number of other vertices in a cube around a vertex, two radii wide, on average over
+        the vertices; of a grid of few vertices, as buckets stand for cells."""
+        # The two buckets of such a cube follow each other, since hashes are even
+        even = 2 * dr.arange(mi.UInt32, len(self._counts) // 2)
+        counts = dr.gather(mi.UInt32, self._counts, even)
+        counts = mi.Float64(counts + dr.gather(mi.UInt32, self._counts, even + 1))
         total, squares = dr.sum(counts), dr.sum(dr.square(counts))
         return float((squares / dr.maximum(total, 1))[0]) - 1
 
     def kernel_state(self) -> tuple:
         """The arrays that kernels depend on."""
-        return self.radius, self._scale, self._mask, self._ranges, self._sorted
+        return self.radius, self._scale, self._mask, self._total, self._ranges, self._sorted
 
     def _cell(self, p: mi.Point3f) -> mi.Vector3i:
         return mi.Vector3i(dr.floor(mi.Vector3f(p) * self._scale))
 
-    def _bucket(self, cell: mi.Vector3i) -> mi.UInt32:
-        c = mi.Vector3u(cell)
-        return (c.x * 73856093 ^ c.y * 19349663 ^ c.z * 83492791) & self._mask
-
     def begin(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """The state of a search before its first vertex: the number of the next cell, and the
-        places of the next vertex and behind the last one of the current cell."""
+        """The state of a search before its first vertex: the number of the next row of cells, and
+        the places of the next vertex and behind the last one of the current row."""
         return mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
 
-    @dr.syntax
     def next(
         self, state: tuple[mi.UInt32, mi.UInt32, mi.UInt32], p: mi.Point3f, active: mi.Bool
-    ) -> tuple[Any, mi.UInt32, mi.Bool]:
-        """The next vertex within the radius of ``p``.
+    ) -> tuple[Any, mi.UInt32, mi.Bool, mi.Bool]:
+        """Looks at one more vertex.
 
         Returns:
-            The new state; the index of the vertex; and where there was one.
+            The new state; the index of the vertex; whether there was one within the radius of
+            ``p``; and whether the search goes on.
         """
-        number, place, end = mi.UInt32(state[0]), mi.UInt32(state[1]), mi.UInt32(state[2])
-        first = mi.Vector3i(dr.floor(mi.Vector3f(p) * self._scale - 0.5))
-        index, is_found, searches = mi.UInt32(0), mi.Bool(False), mi.Bool(active)
-        while dr.hint(searches, label="grid"):
-            is_empty = place >= end
-            # ----- Go on to the next cell, or look at the next vertex of this one -----
-            is_new = is_empty & (number < _CELLS)
-            cell = first + mi.Vector3i(number & 1, (number >> 1) & 1, (number >> 2) & 1)
-            bounds = dr.gather(mi.Vector2u, self._ranges, self._bucket(cell), is_new)
-            packet = dr.gather(mi.Vector4f, self._sorted, place, ~is_empty)
-            q = mi.Point3f(packet.x, packet.y, packet.z)
-            last = number - 1
-            own = first + mi.Vector3i(last & 1, (last >> 1) & 1, (last >> 2) & 1)
-            # Other cells may have the same bucket
-            is_found = ~is_empty & dr.all(self._cell(q) == own)
-            is_found &= dr.squared_norm(q - p) < dr.square(self.radius)
-            index = dr.select(is_found, dr.reinterpret_array(mi.UInt32, packet.w), index)
-            searches = ~is_found & (~is_empty | is_new)
-            place = dr.select(is_new, bounds.x, place + dr.select(is_empty, 0, 1))
-            end = dr.select(is_new, bounds.y, end)
-            number += dr.select(is_new, 1, 0)
-        return (number, place, end), index, is_found
+        number, place, end = state
+        first = self._cell(p - self.radius)
+
+        # ----- Go on to the next row if this one is at its end -----
+        is_new = active & (place >= end)
+        cell = first + mi.Vector3i(0, number & 1, number >> 1)
+        hashed = _hash(cell)
+        bucket = (hashed + mi.UInt32(cell.x)) & self._mask
+        bounds = dr.gather(mi.Vector4u, self._ranges, bucket, is_new)
+        holds = (bounds.z & _tag(hashed)) != 0
+        place = dr.select(is_new, bounds.x, place)
+        end = dr.select(is_new, dr.select(holds, bounds.y, bounds.x), end)
+        number += dr.select(is_new, 1, 0)
+
+        # ----- Look at the next vertex -----
+        exists = active & (place < end)
+        wrapped = place - dr.select(place < self._total, 0, self._total)
+        packet = dr.gather(mi.Vector4f, self._sorted, wrapped, exists)
+        q = mi.Point3f(packet.x, packet.y, packet.z)
+        # Other rows may have the same buckets
+        last, own = number - 1, self._cell(q)
+        is_found = exists & (own.y == first.y + mi.Int32(last & 1))
+        is_found &= own.z == first.z + mi.Int32(last >> 1)
+        is_found &= dr.squared_norm(q - p) < dr.square(self.radius)
+        index = dr.reinterpret_array(mi.UInt32, packet.w)
+        place += dr.select(exists, 1, 0)
+        goes_on = active & ((place < end) | (number < _ROWS))
+        return (number, place, end), index, is_found, goes_on
+
+
+def _hash(cell: mi.Vector3i) -> mi.UInt32:
+    """An even number for the row of cells along x that this cell lies in."""
+    word = mi.UInt32(cell.y) * 0x9E3779B1 ^ mi.UInt32(cell.z) * 0x85EBCA77
+    return ((word ^ (word >> 15)) * 0xC2B2AE3D) & 0xFFFFFFFE
+
+
+def _tag(hashed: mi.UInt32) -> mi.UInt32:
+    """A bit of 32 that tells rows of cells apart that share buckets."""
+    return mi.UInt32(1) << (hashed >> 27)
