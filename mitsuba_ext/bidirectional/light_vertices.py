@@ -193,15 +193,17 @@ class LightVertices:
         word = slot * self._layout.words + (self._layout.mark + 1)
         return mi.Point3f(*(dr.gather(mi.Float, self._words, word + k, active) for k in range(3)))
 
+    def depth(self, slot: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """The depths of the vertices at these places of the store."""
+        word = slot * self._layout.words + self._layout.mark
+        mark = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, word, active))
+        return _depth_and_region(mark)[0] if self._layout.has_region else mark & (_HERO_IS_ALONE - 1)
+
     def is_caustic(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Does light arrive from a delta lobe at the vertices at these places of the store?"""
-        first = slot * self._layout.words
-        mark = dr.gather(mi.Float, self._words, first + self._layout.mark, active)
-        depth = dr.reinterpret_array(mi.UInt32, mark) & (_HERO_IS_ALONE - 1)
-        if self._layout.has_region:
-            depth &= (1 << _DEPTH_BITS) - 1
-        dVCM = dr.gather(mi.Float, self._words, first + self._layout.spectrum, active)
-        return (depth > 1) & (dVCM == 0)
+        word = slot * self._layout.words + self._layout.spectrum
+        dVCM = dr.gather(mi.Float, self._words, word, active)
+        return (self.depth(slot, active) > 1) & (dVCM == 0)
 
     def wavelengths(self, vertex: LightVertex, active: mi.Bool) -> mi.Spectrum | None:
         """The wavelengths of a vertex's path; ``None`` in variants that are not spectral."""

@@ -19,6 +19,7 @@ from ..transport.vertex import Arrival, PathState, Vertex
 from .emission import LightEmission
 from .light_vertices import Layout, LightVertices, VertexStore, bytes_per_vertex
 from .partial_sums import PartialSums, Sums
+from .photon_history import PhotonHistory
 from .scattering import delta_correction, evaluate, geometric_cosine
 
 #: Vertices of a path that are stored in a round; most paths have fewer. Fewer are stored if those
@@ -76,14 +77,17 @@ class LightWalk:
         roulette: The Russian roulette. It is given the throughput without the light's power, since
             dim lights are already chosen rarely.
         query: Intersects rays with the scene.
+        stored_lobes: Flags of BSDFs: vertices are stored where the BSDF has one of these
+            (``None``: a smooth one). For ``sums``, other vertices are as specular ones.
     """
 
     emission: LightEmission
     max_depth: int
     rr_depth: int
-    sums: PartialSums | None = None
+    sums: PartialSums | PhotonHistory | None = None
     roulette: Roulette = field(default_factory=Roulette)
     query: SceneQuery = field(default_factory=SceneQuery)
+    stored_lobes: int | None = None
 
     @property
     def layout(self) -> Layout:
@@ -212,7 +216,7 @@ class LightWalk:
             sums = self._arrive(paths, si)
 
             # ----- Store the vertex if it can be connected -----
-            connectable = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            connectable = active & self._stores(bsdf)
             store.write(
                 place, si, paths.emitted * paths.β, sums, paths.depth, paths.hero_is_alone,
                 connectable,
@@ -280,10 +284,16 @@ class LightWalk:
         weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
         if self.sums is not None:
             sums = self.sums.leave(
-                sums, geometric_cosine(si, bs.wo), bs.pdf, reverse_pdf, is_delta,
+                sums, geometric_cosine(si, bs.wo), bs.pdf, reverse_pdf,
+                is_delta | ~self._stores(bsdf),
                 paths.depth == 1,
             )  # fmt: skip
         return dr.select(active, weight, 0), sums, hero_count, hero_is_alone
+
+    def _stores(self, bsdf: mi.BSDFPtr) -> mi.Bool:
+        """Are vertices with this BSDF stored?"""
+        lobes = mi.BSDFFlags.Smooth if self.stored_lobes is None else self.stored_lobes
+        return mi.has_flag(bsdf.flags(), lobes)
 
     def _survival(self, paths, si, bsdf, β, sampling_weight, depth, hero_is_alone, active):
         """The survival probability of Russian roulette. η is 1, since refraction does not scale

@@ -9,6 +9,7 @@ Vertex Connection and Merging*, technical report, 2012.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -93,10 +94,11 @@ def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
         found = found[np.isfinite(found)]
         if len(found) and np.median(found) > 0:
             return float(np.median(found))
-    return _diagonal(scene) / 1000
+    return scene_diagonal(scene) / 1000
 
 
-def _diagonal(scene: mi.Scene) -> float:
+def scene_diagonal(scene: mi.Scene) -> float:
+    """The diagonal of the scene's bounds; 1000 if it has no surfaces."""
     bounds = scene_bounds(scene)
     return float(dr.norm(bounds.extents())) if bounds.valid() else 1000.0
 
@@ -114,7 +116,7 @@ def suitable_radius(
     Parameters:
         light_walk: Traces the light paths.
         footprint: The width of a pixel where the camera sees the scene.
-        only_caustic: See :class:`VertexGrid`.
+        only_caustic: Are vertices merged only where light arrives from a delta lobe?
     """
     rounds: list[LightVertices] = []
     sampler = mi.load_dict({"type": "independent"})
@@ -126,19 +128,39 @@ def suitable_radius(
     )  # fmt: skip
     if not rounds:
         return None
-    vertices, radius = VertexCache(rounds, _PATHS), footprint
+    vertices = VertexCache(rounds, _PATHS)
+    kept = vertices.is_caustic if only_caustic else None
+    radius = disk_radius(vertices, kept, HANDFUL * _PATHS / pixels, 2 * footprint)
+    if radius is None:
+        return None
+    return min(radius, WIDEST * footprint, _LARGEST * scene_diagonal(scene))
+
+
+def disk_radius(
+    vertices: VertexCache,
+    kept: Callable[[mi.UInt32, mi.Bool], mi.Bool] | None,
+    count: float,
+    least: float,
+) -> float | None:
+    """The radius in which a disk around a vertex holds ``count`` vertices, on average over the
+    vertices. ``None`` if there are too few of them to tell.
+
+    Parameters:
+        kept: See :class:`VertexGrid`.
+        least: The radius, at least, of the disks that are looked at.
+    """
+    radius = least
     for _ in range(_DOUBLINGS):
-        radius *= 2
-        grid = VertexGrid(vertices, dr.opaque(mi.Float, radius), only_caustic)
+        grid = VertexGrid(vertices, dr.opaque(mi.Float, radius), kept)
         if grid.count < _FEW:
             return None
         others = grid.occupancy
         if others > 4:
             break
-    # Cells are squares of two radii where they cut a surface
-    per_area = max(others, 1e-6) / (4 * radius**2 * _PATHS)
-    radius = math.sqrt(HANDFUL / (math.pi * per_area * pixels))
-    return min(radius, WIDEST * footprint, _LARGEST * _diagonal(scene))
+        radius *= 2
+    # Cubes cut squares of two radii out of a surface
+    per_area = max(others, 1e-6) / (4 * radius**2)
+    return math.sqrt(count / (math.pi * per_area))
 
 
 def _pushed(stack: list[mi.UInt32], value: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:

@@ -130,9 +130,10 @@ class BidirectionalPathTracer:
                 walk.observer, observer,
             )  # fmt: skip
             if radius is not None:
+                kept = None if self.merges_all else vertices.is_caustic
                 subpaths = MergedSubpaths(
-                    vertices, VertexGrid(vertices, radius, not self.merges_all), sums,
-                    Heroes(scene).context(), walk.max_depth, subpaths,
+                    vertices, VertexGrid(vertices, radius, kept), sums, Heroes(scene).context(),
+                    walk.max_depth, subpaths,
                 )  # fmt: skip
         if isinstance(sampler, BothEnds):
             sampler = sampler.camera

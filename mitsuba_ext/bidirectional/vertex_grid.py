@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -25,11 +26,15 @@ class VertexGrid:
     Parameters:
         vertices: The vertices, at least one.
         radius: Radius of the balls in which vertices are looked for.
-        only_caustic: Leave out vertices to which light does not come from a delta lobe?
+        kept: Tells which vertices, given by their indices and a mask, are in the grid; all of them
+            if it is ``None``.
     """
 
     def __init__(
-        self, vertices: VertexCache, radius: mi.Float, only_caustic: bool = False
+        self,
+        vertices: VertexCache,
+        radius: mi.Float,
+        kept: Callable[[mi.UInt32, mi.Bool], mi.Bool] | None = None,
     ) -> None:
         self.radius = radius
         scale = 0.5 / radius
@@ -40,8 +45,8 @@ class VertexGrid:
         self._mask = dr.opaque(mi.UInt32, buckets - 1)
         index = dr.arange(mi.UInt32, vertices.room)
         active = index < dr.opaque(mi.UInt32, vertices.count)
-        if only_caustic:
-            active &= vertices.is_caustic(index, active)
+        if kept is not None:
+            active &= kept(index, active)
         p = vertices.position(index, active)
         cell = self._cell(p)
         hashed = _hash(cell)
