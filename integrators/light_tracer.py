@@ -152,13 +152,6 @@ class LightTracerIntegrator(WalkIntegrator):
         directly = Walk(min(self.max_depth, 1), self.rr_depth, self.hide_emitters, query=query)
         return OneStage(LightTracer(directly, walk, target))
 
-    def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
-        raise NotImplementedError(
-            f'"{self.name}": light paths do not end where a ray begins: it cannot be nested in an '
-            f'integrator that asks for single samples, such as "moment" or "aov"; "variance" can '
-            f'hold it, and it has a parameter "aovs" of its own'
-        )
-
     def _warn_of_hidden(self, scene: mi.Scene) -> None:
         """Warns of surfaces that are black; only once, because this is called for every batch of a
         render."""

@@ -10,7 +10,7 @@ from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.photon_mapper import PhotonMapper
-from mitsuba_ext.composition.merging_parameters import MergingParameters
+from mitsuba_ext.composition.merging_parameters import MergingParameters, check_can_merge
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.stages import OneStage
 from mitsuba_ext.startup import registry
@@ -111,7 +111,7 @@ class ProgressivePhotonMapping(WalkIntegrator):
 
     def schedule(self, scene, sensor, samples, seed) -> OneStage:
         query = self.query(scene)
-        self.merging.check(self.name, scene)
+        check_can_merge(self.name, scene)
         walk = Walk(
             self.max_depth, self.rr_depth, self.hide_emitters, next_event=NoConnections(),
             query=query,
@@ -125,10 +125,3 @@ class ProgressivePhotonMapping(WalkIntegrator):
         light_walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
         radius = self.merging.radius_of(scene, sensor, light_walk, only_caustic=False)
         return OneStage(PhotonMapper(walk, light_walk, radius))
-
-    def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
-        raise NotImplementedError(
-            f'"{self.name}": light paths do not end where a ray begins: it cannot be nested in an '
-            f'integrator that asks for single samples, such as "moment" or "aov"; "variance" can '
-            f'hold it, and it has a parameter "aovs" of its own'
-        )

@@ -11,7 +11,7 @@ from mitsuba_ext.bidirectional.merging import MergingRadius
 from mitsuba_ext.bidirectional.partial_sums import PartialSums
 from mitsuba_ext.composition.bidirectional_integrator import BidirectionalIntegrator
 from mitsuba_ext.composition.light_side import LightSide
-from mitsuba_ext.composition.merging_parameters import MergingParameters
+from mitsuba_ext.composition.merging_parameters import MergingParameters, check_can_merge
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.path_decisions import EmitterSampling
 
@@ -113,7 +113,7 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     ) -> MergingRadius | None:
         if self.where == "none":
             return None
-        self.merging.check(self.name, scene)
+        check_can_merge(self.name, scene)
         sums = PartialSums(EmitterSampling(), merging=mi.Float(1))
         light_walk = LightWalk(
             side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)

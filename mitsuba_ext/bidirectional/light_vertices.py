@@ -197,7 +197,9 @@ class LightVertices:
         """The depths of the vertices at these places of the store."""
         word = slot * self._layout.words + self._layout.mark
         mark = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, word, active))
-        return _depth_and_region(mark)[0] if self._layout.has_region else mark & (_HERO_IS_ALONE - 1)
+        if self._layout.has_region:
+            return _depth_and_region(mark)[0]
+        return mark & (_HERO_IS_ALONE - 1)
 
     def is_caustic(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Does light arrive from a delta lobe at the vertices at these places of the store?"""

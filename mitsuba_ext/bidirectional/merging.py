@@ -31,8 +31,9 @@ from .vertex_grid import VertexGrid
 #: around corners and through thin walls.
 _LEAST_COSINE, _HALF_HEIGHT = 0.7, 0.25
 
-#: So many vertices are found before they are evaluated. Lanes of a kernel search for different times,
-#: and all of them wait for the last one. (With 1, pool takes 1.2 times as long; 8 gain nothing.)
+#: So many vertices are found before they are evaluated. Lanes of a kernel search for different
+#: times, and all of them wait for the last one. (With 1, pool takes 1.2 times as long; 8 gain
+#: nothing.)
 _BATCH = 4
 
 #: Light paths that measure how dense vertices are, and how often the radius of that is doubled at

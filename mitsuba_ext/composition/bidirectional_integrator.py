@@ -150,10 +150,3 @@ class BidirectionalIntegrator(WalkIntegrator):
                 f'paths: "{self.technique_images}" is not written.',
             )
         return image
-
-    def sample(self, scene, sampler, ray, medium=None, active=True) -> Any:
-        raise NotImplementedError(
-            f'"{self.name}": light paths do not end where a ray begins: it cannot be nested in an '
-            f'integrator that asks for single samples, such as "moment" or "aov"; "variance" can '
-            f'hold it, and it has a parameter "aovs" of its own'
-        )

@@ -13,6 +13,19 @@ from ..rendering.camera import film_extent
 from ..scene.movers import movers
 
 
+def check_can_merge(plugin: str, scene: mi.Scene) -> None:
+    """
+    Raises:
+        NotImplementedError: Vertices of different paths cannot be merged in this scene.
+    """
+    reason = "the variant is spectral" if mi.is_spectral else "shapes or lights move"
+    if mi.is_spectral or movers(scene):
+        raise NotImplementedError(
+            f'"{plugin}": {reason}: vertices of paths of other wavelengths and times cannot be '
+            f'merged; use "bdpt"'
+        )
+
+
 @dataclass
 class MergingParameters:
     """
@@ -35,18 +48,6 @@ class MergingParameters:
     def parameters(self) -> dict[str, Any]:
         """What ``str()`` of the integrator shows."""
         return {"radius": self.radius or "automatic", "radius_decay": self.decay}
-
-    def check(self, plugin: str, scene: mi.Scene) -> None:
-        """
-        Raises:
-            NotImplementedError: Vertices of different paths cannot be merged in this scene.
-        """
-        reason = "the variant is spectral" if mi.is_spectral else "shapes or lights move"
-        if mi.is_spectral or movers(scene):
-            raise NotImplementedError(
-                f'"{plugin}": {reason}: vertices of paths of other wavelengths and times cannot be '
-                f'merged; use "bdpt"'
-            )
 
     def radius_of(
         self, scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk, only_caustic: bool

@@ -214,7 +214,17 @@ class WalkIntegrator(StagedIntegrator):
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """One sample, for integrators that nest this one and draw its samples (``moment``; ``aov``
         calls :meth:`render`). Nothing is learned there: each decision that needs a pilot falls
-        back to its default."""
+        back to its default.
+
+        Raises:
+            NotImplementedError: The integrator has light paths.
+        """
+        if self.has_light_paths:
+            raise NotImplementedError(
+                f'"{self.name}": light paths do not end where a ray begins: it cannot be nested '
+                f'in an integrator that asks for single samples, such as "moment" or "aov"; '
+                f'"variance" can hold it, and it has a parameter "aovs" of its own'
+            )
         self.check_sampled()
         setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1)
         decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}

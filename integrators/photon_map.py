@@ -1,0 +1,192 @@
+"""Photon mapping in two passes, with a final gather."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.bidirectional.light_walk import LightWalk
+from mitsuba_ext.bidirectional.merging import MergedSubpaths, median_footprint
+from mitsuba_ext.bidirectional.photon_maps import (
+    ENDED,
+    GATHERS_ON,
+    EndsWithTheGather,
+    Phases,
+    PhotonMaps,
+    PhotonSubpaths,
+    first_vertex,
+    is_diffuse,
+    photon_walk,
+)
+from mitsuba_ext.composition.merging_parameters import check_can_merge
+from mitsuba_ext.composition.slots import read_slot
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.path_decisions import Roulette
+from mitsuba_ext.transport.walk import Walk
+
+#: The names of the maps, in the order in which they are made.
+_MAPS = ("caustic", "global")
+
+
+@registry.plugin
+class PhotonMapping(WalkIntegrator):
+    r"""
+    .. _integrator-photon_map:
+
+    Photon mapping (:monosp:`photon_map`)
+    -------------------------------------
+
+    Traces photons once, before the render. Camera paths then end early: what light leaves the
+    second diffuse surface of a path, and what caustics fall on the first one, is estimated from the
+    photons nearby. Direct light is sampled as by :monosp:`path`.
+
+    .. pluginparameters::
+
+     * - photons
+       - |integer|
+       - Number of light paths. (Default: 250000)
+     * - final_gather
+       - |boolean|
+       - Is indirect light found by one more segment from the first diffuse surface? If not, the
+         global map is shown there directly: less noise, and blotches. (Default: true)
+     * - lookup_size
+       - |integer|
+       - Number of photons that an estimate uses, on average over the photons; it chooses radii that
+         are 0. (Default: 30)
+     * - global_radius, caustic_radius
+       - |float|
+       - Radius in which photons of the two maps are looked for, in units of the scene. (Default: 0,
+         one that suits the photons)
+     * - photon_aovs
+       - |boolean|
+       - Writes what the two maps alone tell of the surface that a pixel shows, to the channels
+         :monosp:`global.R`, :monosp:`caustic.R`, … (Default: false)
+     * - next_event, shadow_test
+       - |string| or decision
+       - How lights are chosen for direct light; see :class:`composed_path`.
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
+
+    **Use it when** a smooth preview is wanted within seconds, of a scene with indirect light and
+    caustics. **Not when** the image must be right: :class:`vcm` and :class:`sppm` converge, and
+    this does not.
+
+    The image is biased with any number of samples: photons are traced once, and light is blurred
+    over the radius, which does not shrink. More photons make the radius smaller. Photons are found
+    within a radius, not the k nearest: a loop needs neither a heap nor a second look, and all disks
+    take about the same time. Where there are few photons, an estimate has few.
+
+    Photons are stored where a BSDF has a diffuse lobe. Glossy surfaces without one (rough metal and
+    glass) scatter camera paths and photons, as mirrors do, so that reflections in them are sharp.
+
+    Spectral variants, moving shapes and participating media are refused: photons of other
+    wavelengths and times cannot be merged. Gradients are not supported (use :monosp:`prb`), nor
+    nesting in :monosp:`moment` and :monosp:`aov`.
+
+    Source: H. W. Jensen et al., *State of the Art in Monte Carlo Global Illumination*, SIGGRAPH
+    course, 2004, section 10.5; D. Cline, PhD thesis, 2007, section 7.7.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="photon_map">
+                <integer name="photons" value="1000000"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'photon_map',
+            'photons': 1000000
+    """
+
+    has_light_paths = True
+    sees_media = False
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.photons = self.parameter(props, "photons", 250_000, minimum=1, maximum=1 << 24)
+        self.final_gather = self.parameter(props, "final_gather", True)
+        self.lookup_size = self.parameter(props, "lookup_size", 30, minimum=1)
+        self.radii = {
+            name: self.parameter(props, f"{name}_radius", 0.0, minimum=0.0)
+            for name in _MAPS
+        }
+        self.photon_aovs = self.parameter(props, "photon_aovs", False)
+        #: The photons of the last render (:class:`PhotonMaps`).
+        self.maps = PhotonMaps()
+        slots = {key: read_slot(self.name, props, key) for key in ("next_event", "shadow_test")}
+        self.fill(props, **slots)
+
+    def parameters(self) -> dict[str, Any]:
+        return {
+            "photons": self.photons,
+            "final_gather": self.final_gather,
+            "lookup_size": self.lookup_size,
+            **{f"{name}_radius": value or "automatic" for name, value in self.radii.items()},
+            "photon_aovs": self.photon_aovs,
+            **super().parameters(),
+        }
+
+    def schedule(self, scene, sensor, samples, seed):
+        self.maps = self._traced(scene, sensor, seed)
+        return super().schedule(scene, sensor, samples, seed)
+
+    def _traced(self, scene: mi.Scene, sensor: mi.Sensor, seed: int) -> PhotonMaps:
+        query = self.query(scene)
+        check_can_merge(self.name, scene)
+        if not scene.emitters() or self.max_depth < 2:
+            return PhotonMaps()
+        try:
+            emission = LightEmission(scene)
+        except NotImplementedError as error:
+            raise NotImplementedError(f'"{self.name}": {error}') from None
+        walk = photon_walk(LightWalk(emission, self.max_depth, self.rr_depth, query=query))
+        return PhotonMaps.trace(
+            scene, walk, self.photons, seed, self.final_gather,
+            lambda name, measured: self.radii[name] or measured(), self.lookup_size,
+            median_footprint(scene, sensor),
+        )  # fmt: skip
+
+    def estimators(self, scene, sensor):
+        return functools.partial(self._estimator, scene)
+
+    def _estimator(self, scene: mi.Scene, **decisions: Any) -> Walk:
+        # Without a final gather, one more segment finds direct light
+        last = ENDED if self.final_gather else GATHERS_ON
+        return replace(
+            self.walk(**decisions), mis=Phases(), rr_depth=0,
+            roulette=EndsWithTheGather(Roulette(), self.rr_depth, last),
+            subpaths=PhotonSubpaths(*self._estimates(scene), self.final_gather),
+        )  # fmt: skip
+
+    def _estimates(self, scene: mi.Scene) -> list[MergedSubpaths | None]:
+        """Estimate radiance from the map of caustics, and from the global one."""
+        grids = self.maps.caustics, self.maps.gathered
+        return [self.maps.subpaths(grid, scene, self.max_depth) for grid in grids]
+
+    def aov_names(self) -> list[str]:
+        if not self.photon_aovs:
+            return super().aov_names()
+        channels = "RGB" if len(mi.Spectrum()) > 1 else "Y"
+        return super().aov_names() + [f"{name}.{c}" for name in _MAPS for c in channels]
+
+    def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
+        values = super().sample_aovs(scene, sampler, ray)
+        if self.photon_aovs:
+            si = scene.ray_intersect(ray)
+            vertex = first_vertex(scene, si, ray)
+            active = si.is_valid() & is_diffuse(vertex.bsdf)
+            for estimate in self._estimates(scene):
+                L = dr.zeros(mi.Spectrum, dr.width(si))
+                if estimate is not None:
+                    L = estimate.gather(scene, sampler, vertex, active)[0]
+                values += list(L)
+        return values
