@@ -12,16 +12,15 @@ import mitsuba as mi
 from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_walk import LightWalk
 from mitsuba_ext.bidirectional.merging import MergedSubpaths, median_footprint
-from mitsuba_ext.bidirectional.photon_maps import (
+from mitsuba_ext.bidirectional.photon_directions import PhotonDirections
+from mitsuba_ext.bidirectional.photon_maps import PhotonMaps, PhotonSubpaths, photon_walk
+from mitsuba_ext.bidirectional.photon_phases import (
     ENDED,
     GATHERS_ON,
     EndsWithTheGather,
     Phases,
-    PhotonMaps,
-    PhotonSubpaths,
     first_vertex,
     is_diffuse,
-    photon_walk,
 )
 from mitsuba_ext.composition.merging_parameters import check_can_merge
 from mitsuba_ext.composition.slots import read_slot
@@ -114,6 +113,7 @@ class PhotonMapping(WalkIntegrator):
         super().__init__(props)
         self.photons = self.parameter(props, "photons", 250_000, minimum=1, maximum=1 << 24)
         self.final_gather = self.parameter(props, "final_gather", True)
+        self.guided = self.parameter(props, "guided", False) and self.final_gather
         self.lookup_size = self.parameter(props, "lookup_size", 30, minimum=1)
         self.radii = {
             name: self.parameter(props, f"{name}_radius", 0.0, minimum=0.0)
@@ -129,6 +129,7 @@ class PhotonMapping(WalkIntegrator):
         return {
             "photons": self.photons,
             "final_gather": self.final_gather,
+            "guided": self.guided,
             "lookup_size": self.lookup_size,
             **{f"{name}_radius": value or "automatic" for name, value in self.radii.items()},
             "photon_aovs": self.photon_aovs,
@@ -161,6 +162,8 @@ class PhotonMapping(WalkIntegrator):
     def _estimator(self, scene: mi.Scene, **decisions: Any) -> Walk:
         # Without a final gather, one more segment finds direct light
         last = ENDED if self.final_gather else GATHERS_ON
+        if self.guided and self.maps.gathered is not None:
+            decisions["scattering"] = PhotonDirections(self.maps.vertices, self.maps.gathered)
         return replace(
             self.walk(**decisions), mis=Phases(), rr_depth=0,
             roulette=EndsWithTheGather(Roulette(), self.rr_depth, last),
