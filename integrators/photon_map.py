@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_walk import LightWalk
-from mitsuba_ext.bidirectional.merging import MergedSubpaths, median_footprint
+from mitsuba_ext.bidirectional.merging import median_footprint
 from mitsuba_ext.bidirectional.photon_directions import PhotonDirections
 from mitsuba_ext.bidirectional.photon_maps import PhotonMaps, PhotonSubpaths, photon_walk
 from mitsuba_ext.bidirectional.photon_phases import (
@@ -54,14 +54,17 @@ class PhotonMapping(WalkIntegrator):
        - |boolean|
        - Is indirect light found by one more segment from the first diffuse surface? If not, the
          global map is shown there directly: less noise, and blotches. (Default: true)
+     * - guided
+       - |boolean|
+       - Do half of the segments of the final gather follow the directions from which photons have
+         come? This takes longer, and seldom pays. (Default: false)
      * - lookup_size
        - |integer|
-       - Number of photons that an estimate uses, on average over the photons; it chooses radii that
-         are 0. (Default: 30)
+       - Number of photons that an estimate is to use; it chooses radii that are 0. (Default: 30)
      * - global_radius, caustic_radius
        - |float|
-       - Radius in which photons of the two maps are looked for, in units of the scene. (Default: 0,
-         one that suits the photons)
+       - Radius in which photons of the two maps are looked for, in units of the scene. (Default: 0:
+         one of three that suits the photons around the place)
      * - photon_aovs
        - |boolean|
        - Writes what the two maps alone tell of the surface that a pixel shows, to the channels
@@ -80,8 +83,8 @@ class PhotonMapping(WalkIntegrator):
 
     The image is biased with any number of samples: photons are traced once, and light is blurred
     over the radius, which does not shrink. More photons make the radius smaller. Photons are found
-    within a radius, not the k nearest: a loop needs neither a heap nor a second look, and all disks
-    take about the same time. Where there are few photons, an estimate has few.
+    within one of three radii, 1, 3 and 9 times what suits dense photons, and not the k nearest: a
+    loop then needs no heap, and estimates adapt as well.
 
     Photons are stored where a BSDF has a diffuse lobe. Glossy surfaces without one (rough metal and
     glass) scatter camera paths and photons, as mirrors do, so that reflections in them are sharp.
@@ -152,7 +155,7 @@ class PhotonMapping(WalkIntegrator):
         walk = photon_walk(LightWalk(emission, self.max_depth, self.rr_depth, query=query))
         return PhotonMaps.trace(
             scene, walk, self.photons, seed, self.final_gather,
-            lambda name, measured: self.radii[name] or measured(), self.lookup_size,
+            (self.radii["caustic"], self.radii["global"]), self.lookup_size,
             median_footprint(scene, sensor),
         )  # fmt: skip
 
@@ -163,17 +166,14 @@ class PhotonMapping(WalkIntegrator):
         # Without a final gather, one more segment finds direct light
         last = ENDED if self.final_gather else GATHERS_ON
         if self.guided and self.maps.gathered is not None:
-            decisions["scattering"] = PhotonDirections(self.maps.vertices, self.maps.gathered)
+            decisions["scattering"] = PhotonDirections(self.maps)
         return replace(
             self.walk(**decisions), mis=Phases(), rr_depth=0,
             roulette=EndsWithTheGather(Roulette(), self.rr_depth, last),
-            subpaths=PhotonSubpaths(*self._estimates(scene), self.final_gather),
+            subpaths=PhotonSubpaths(
+                *self.maps.estimates(scene, self.max_depth), self.final_gather
+            ),
         )  # fmt: skip
-
-    def _estimates(self, scene: mi.Scene) -> list[MergedSubpaths | None]:
-        """Estimate radiance from the map of caustics, and from the global one."""
-        grids = self.maps.caustics, self.maps.gathered
-        return [self.maps.subpaths(grid, scene, self.max_depth) for grid in grids]
 
     def aov_names(self) -> list[str]:
         if not self.photon_aovs:
@@ -187,7 +187,7 @@ class PhotonMapping(WalkIntegrator):
             si = scene.ray_intersect(ray)
             vertex = first_vertex(scene, si, ray)
             active = si.is_valid() & is_diffuse(vertex.bsdf)
-            for estimate in self._estimates(scene):
+            for estimate in self.maps.estimates(scene, self.max_depth):
                 L = dr.zeros(mi.Spectrum, dr.width(si))
                 if estimate is not None:
                     L = estimate.gather(scene, sampler, vertex, active)[0]

@@ -15,9 +15,9 @@ import mitsuba as mi
 from ..transport.bsdfs import eval_and_sample_bsdf, eval_bsdf
 from ..transport.path_decisions import Scattering
 from ..transport.vertex import Vertex
-from .light_vertices import LightVertex, VertexCache
+from .light_vertices import LightVertex
+from .photon_maps import PhotonMaps
 from .photon_phases import BEFORE, is_diffuse
-from .vertex_grid import VertexGrid
 
 #: Concentration of the lobe around the direction of a photon (von Mises and Fisher's κ: half of the
 #: lobe lies within 15 degrees); and the share of directions that follow photons.
@@ -30,12 +30,11 @@ class PhotonDirections(Scattering):
     Only indirect photons count that are not of a caustic: for other light, there is no gather.
 
     Parameters:
-        vertices: The photons.
-        grid: Finds them.
+        maps: The photons.
     """
 
-    def __init__(self, vertices: VertexCache, grid: VertexGrid) -> None:
-        self._vertices, self._grid = vertices, grid
+    def __init__(self, maps: PhotonMaps) -> None:
+        self._vertices, self._grid = maps.vertices, maps.gathered.grids[0]
 
     def sample(self, state, ctx, vertex, wo, sample_1, sample_2):
         si, guides = vertex.si, self._guides(vertex)

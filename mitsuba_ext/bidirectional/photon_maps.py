@@ -22,10 +22,32 @@ from ..transport.heroes import Heroes
 from ..transport.path_decisions import Subpaths
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
-from .merging import MergedSubpaths, disk_radius
+from .merging import MergedSubpaths, disk_radius, scene_diagonal
 from .photon_history import PhotonHistory
 from .photon_phases import BEFORE, is_diffuse
 from .vertex_grid import VertexGrid
+
+#: The radii of a map: how many, and the ratio of one to the one before; and the largest, in units of
+#: the diagonal of the scene.
+_LEVELS, _STEP, _WIDEST = 4, 2.0, 0.05
+
+#: Tells which vertices are in a grid.
+Kept = Callable[[mi.UInt32, mi.Bool], mi.Bool]
+
+
+@dataclass
+class PhotonMap:
+    """Photons, in grids of increasing radius. An estimate takes the first one that holds enough
+    photons around its place: so that it needs no list of the nearest ones, and adapts to how dense
+    they are.
+
+    Attributes:
+        grids: The grids.
+        enough: Number of photons, in the cells around a place, that suffice for the smaller radius.
+    """
+
+    grids: list[VertexGrid]
+    enough: mi.UInt32 | int = 0
 
 
 @dataclass
@@ -35,15 +57,14 @@ class PhotonMaps:
     Attributes:
         vertices: The photons: vertices of light paths on diffuse surfaces; ``None`` if there are
             none.
-        caustics: Those that have met nothing but surfaces that are not diffuse; ``None`` if there
-            are too few.
-        gathered: Those of the global map. With a final gather, all photons; without, the indirect
-            ones that are not in ``caustics``. ``None`` if there are too few.
+        caustics: The map of those that have met nothing but surfaces that are not diffuse.
+        gathered: The global map. With a final gather, all photons; without, the indirect ones that
+            are not in ``caustics``.
     """
 
     vertices: VertexCache | None = None
-    caustics: VertexGrid | None = None
-    gathered: VertexGrid | None = None
+    caustics: PhotonMap | None = None
+    gathered: PhotonMap | None = None
 
     @classmethod
     def trace(
@@ -53,7 +74,7 @@ class PhotonMaps:
         paths: int,
         seed: int,
         final_gather: bool,
-        radius_of: Callable[[str, Callable[[float], float | None]], float | None],
+        radii: tuple[float, float],
         lookup_size: int,
         least: float,
     ) -> PhotonMaps:
@@ -62,9 +83,10 @@ class PhotonMaps:
         Parameters:
             light_walk: Traces the light paths; see :func:`photon_walk`.
             paths: Number of light paths.
-            radius_of: Gives the radius of a map (``global`` or ``caustic``), from its name
-                and a function that measures a suitable one; ``None`` if the map is empty.
-            lookup_size: Number of photons that an estimate uses, on average.
+            final_gather: See :class:`PhotonSubpaths`.
+            radii: Radii of the maps of caustics and of all light; 0 for those that suit the
+                photons.
+            lookup_size: Number of photons that an estimate is to use.
             least: See :func:`disk_radius`.
         """
         rounds: list[LightVertices] = []
@@ -82,23 +104,33 @@ class PhotonMaps:
         def indirect(index: mi.UInt32, active: mi.Bool) -> mi.Bool:
             return (vertices.depth(index, active) > 1) & ~vertices.is_caustic(index, active)
 
-        grids = []
-        for name, kept in (
-            ("caustic", vertices.is_caustic), ("global", None if final_gather else indirect)
-        ):  # fmt: skip
-            radius = radius_of(
-                name, lambda kept=kept: disk_radius(vertices, kept, lookup_size, least)
-            )
-            grids.append(radius and VertexGrid(vertices, dr.opaque(mi.Float, radius), kept))
-        return cls(vertices, *grids)
+        widest = _WIDEST * scene_diagonal(scene)
 
-    def subpaths(
-        self, grid: VertexGrid | None, scene: mi.Scene, max_depth: int
-    ) -> MergedSubpaths | None:
-        """Estimates radiance from the photons of one of the grids."""
-        if grid is None:
-            return None
-        return MergedSubpaths(self.vertices, grid, None, Heroes(scene).context(), max_depth)
+        def photon_map(given: float, kept: Kept | None) -> PhotonMap | None:
+            if given > 0:
+                return PhotonMap([VertexGrid(vertices, dr.opaque(mi.Float, given), kept)])
+            radius = disk_radius(vertices, kept, lookup_size, least)
+            if radius is None:
+                return None
+            wider = [radius * _STEP**k for k in range(1, _LEVELS)]
+            grids = [
+                VertexGrid(vertices, dr.opaque(mi.Float, r), kept)
+                for r in (radius, *(r for r in wider if r < widest))
+            ]
+            return PhotonMap(grids, dr.opaque(mi.UInt32, lookup_size))
+
+        caustics = photon_map(radii[0], vertices.is_caustic)
+        return cls(vertices, caustics, photon_map(radii[1], None if final_gather else indirect))
+
+    def estimates(self, scene: mi.Scene, max_depth: int) -> list[PhotonEstimate | None]:
+        """Estimates of radiance from the map of caustics and the global one."""
+        ctx = Heroes(scene).context()
+        return [
+            m and PhotonEstimate(m, [
+                MergedSubpaths(self.vertices, grid, None, ctx, max_depth) for grid in m.grids
+            ])
+            for m in (self.caustics, self.gathered)
+        ]  # fmt: skip
 
 
 def photon_walk(light_walk: LightWalk) -> LightWalk:
@@ -106,6 +138,26 @@ def photon_walk(light_walk: LightWalk) -> LightWalk:
     light_walk.sums = PhotonHistory()
     light_walk.stored_lobes = mi.BSDFFlags.Diffuse
     return light_walk
+
+
+class PhotonEstimate(Subpaths):
+    """Estimates the radiance that a vertex reflects, from one photon map.
+
+    Parameters:
+        photon_map: The map.
+        levels: Estimates within the radius of each of its grids.
+    """
+
+    def __init__(self, photon_map: PhotonMap, levels: list[MergedSubpaths]) -> None:
+        self._map, self._levels = photon_map, levels
+
+    def gather(self, scene, sampler, vertex, active):
+        total, rest, p = mi.Spectrum(0), active, vertex.si.p
+        for grid, level in zip(self._map.grids[:-1], self._levels[:-1]):
+            suffices = rest & (grid.crowd(p, rest) >= self._map.enough)
+            total += level.gather(scene, sampler, vertex, suffices)[0]
+            rest = rest & ~suffices
+        return total + self._levels[-1].gather(scene, sampler, vertex, rest)[0], mi.UInt32(0)
 
 
 class PhotonSubpaths(Subpaths):
@@ -119,8 +171,8 @@ class PhotonSubpaths(Subpaths):
 
     def __init__(
         self,
-        caustics: MergedSubpaths | None,
-        gathered: MergedSubpaths | None,
+        caustics: PhotonEstimate | None,
+        gathered: PhotonEstimate | None,
         final_gather: bool,
     ) -> None:
         self._caustics, self._gathered, self._final = caustics, gathered, final_gather

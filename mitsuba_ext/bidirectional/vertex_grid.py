@@ -96,6 +96,25 @@ class VertexGrid:
     def _cell(self, p: mi.Point3f) -> mi.Vector3i:
         return mi.Vector3i(dr.floor(mi.Vector3f(p) * self._scale))
 
+    def crowd(self, p: mi.Point3f, active: mi.Bool) -> mi.UInt32:
+        """The number of vertices in the cells that a ball around ``p`` overlaps: on a surface, they
+        cover about four times the area of its disk."""
+        count, first = mi.UInt32(0), self._cell(p - self.radius)
+        for row in range(_ROWS):
+            bounds, holds = self._range(first, mi.UInt32(row), active)
+            count += dr.select(holds, bounds.y - bounds.x, 0)
+        return count
+
+    def _range(
+        self, first: mi.Vector3i, row: mi.UInt32, active: mi.Bool
+    ) -> tuple[mi.Vector4u, mi.Bool]:
+        """The range of a row of cells, from its first cell on, and whether it may hold vertices."""
+        cell = first + mi.Vector3i(0, row & 1, row >> 1)
+        hashed = _hash(cell)
+        bucket = (hashed + mi.UInt32(cell.x)) & self._mask
+        bounds = dr.gather(mi.Vector4u, self._ranges, bucket, active)
+        return bounds, (bounds.z & _tag(hashed)) != 0
+
     def begin(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
         """The state of a search before its first vertex: the number of the next row of cells, and
         the places of the next vertex and behind the last one of the current row."""
@@ -115,11 +134,7 @@ class VertexGrid:
 
         # ----- Go on to the next row if this one is at its end -----
         is_new = active & (place >= end)
-        cell = first + mi.Vector3i(0, number & 1, number >> 1)
-        hashed = _hash(cell)
-        bucket = (hashed + mi.UInt32(cell.x)) & self._mask
-        bounds = dr.gather(mi.Vector4u, self._ranges, bucket, is_new)
-        holds = (bounds.z & _tag(hashed)) != 0
+        bounds, holds = self._range(first, number, is_new)
         place = dr.select(is_new, bounds.x, place)
         end = dr.select(is_new, dr.select(holds, bounds.y, bounds.x), end)
         number += dr.select(is_new, 1, 0)
