@@ -64,7 +64,7 @@ class PhotonMapping(WalkIntegrator):
      * - global_radius, caustic_radius
        - |float|
        - Radius in which photons of the two maps are looked for, in units of the scene. (Default: 0:
-         one of three that suits the photons around the place)
+         one of four that suits the photons around the place)
      * - photon_aovs
        - |boolean|
        - Writes what the two maps alone tell of the surface that a pixel shows, to the channels
@@ -83,7 +83,7 @@ class PhotonMapping(WalkIntegrator):
 
     The image is biased with any number of samples: photons are traced once, and light is blurred
     over the radius, which does not shrink. More photons make the radius smaller. Photons are found
-    within one of three radii, 1, 3 and 9 times what suits dense photons, and not the k nearest: a
+    within one of four radii, 1, 2, 4 and 8 times what suits dense photons, and not the k nearest: a
     loop then needs no heap, and estimates adapt as well.
 
     Photons are stored where a BSDF has a diffuse lobe. Glossy surfaces without one (rough metal and

@@ -309,6 +309,16 @@ TECHNIQUES: dict[str, Technique] = {
              "film_of_one_pixel", "one_sample", "max_depth_0", "thin_lens", "hidden_emitters"),
         ),
     ),
+    "photon_map": Technique(
+        "photon_map", {"photons": 1 << 16}, is_plugin=True,
+        checks=Checks(cases=["no_light"]),
+        thorough=Checks(
+            variants=["llvm_ad_mono"], depths=[-1],
+            cases=("plain", "materials", "mirror_ring", "floor_under_water", "scaled_by_1e4",
+                   "film_of_one_pixel", "one_sample", "max_depth_0", "thin_lens",
+                   "hidden_emitters"),
+        ),
+    ),
     "light_tracer": Technique(
         "light_tracer", is_plugin=True, makes_splats=True,
         checks=Checks(cases=["no_light"]),

@@ -26,7 +26,7 @@ DECISIONS = registry.decision_names()
 SEQUENCES = sorted(set(FOLDERS["samplers"]) - set(DECISIONS))
 #: The integrators that nest no other one.
 WALKS = [
-    "auto_path", "composed_path", "erpt", "mlt", "neepp", "pss_guided", "pssmlt",
+    "auto_path", "composed_path", "erpt", "mlt", "neepp", "pss_guided", "photon_map", "pssmlt",
     "reweighted_direct", "sppm", "two_stage",
 ]
 
@@ -51,6 +51,8 @@ VALUES = {
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
     **dict.fromkeys(["sample_count", "seed", "dimensions", "film_width"], 6),
     "radius": 0.5, "radius_decay": 0.5, "merging": "all",
+    **dict.fromkeys(["photons", "lookup_size"], 16), "global_radius": 0.5, "caustic_radius": 0.5,
+    **dict.fromkeys(["final_gather", "guided", "photon_aovs"], True),
     "checkpoint": "kept", "checkpoint_every": "9s",
     "chain_file": "chains.npz", "mutations": "path", "outliers": 2.0, "p_large": 0.5,
     **dict.fromkeys(["bidirectional_mutation", "lens_perturbation"], True),

@@ -27,8 +27,8 @@ from .photon_history import PhotonHistory
 from .photon_phases import BEFORE, is_diffuse
 from .vertex_grid import VertexGrid
 
-#: The radii of a map: how many, and the ratio of one to the one before; and the largest, in units of
-#: the diagonal of the scene.
+#: The radii of a map: how many, and the ratio of one to the one before; and the largest, in units
+#: of the diagonal of the scene.
 _LEVELS, _STEP, _WIDEST = 4, 2.0, 0.05
 
 #: Tells which vertices are in a grid.

@@ -1,0 +1,102 @@
+"""Photon mapping in two passes: its images against ``path``, its maps, and what it refuses.
+(``techniques.py`` has the tests that all integrators share.)"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from stage import stage
+from statistical import assert_same_mean, batches, load
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def make(max_depth: int = 6, **parameters: Any) -> mi.Integrator:
+    return mi.load_dict({"type": "photon_map", "max_depth": max_depth, **parameters})
+
+
+def things() -> dict[str, Any]:
+    """A ball of glass, a mirror, and a rough one; a ball with a diffuse and a delta lobe."""
+    T = mi.ScalarTransform4f
+    ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.4, "bsdf": {"type": "dielectric"}}
+    plastic = {"type": "sphere", "center": [-0.8, 0.2, 0.3], "radius": 0.3,
+               "bsdf": {"type": "plastic"}}  # fmt: skip
+    rough = {"type": "sphere", "center": [0.9, 0.2, 0.3], "radius": 0.3,
+             "bsdf": {"type": "roughconductor", "alpha": 0.2}}  # fmt: skip
+    mirror = {"type": "rectangle", "bsdf": {"type": "conductor"},
+              "to_world": T().translate([0, 1.5, 0.5]).rotate([1, 0, 0], 90)}  # fmt: skip
+    return {"ball": ball, "plastic": plastic, "rough": rough, "mirror": mirror}
+
+
+@pytest.mark.parametrize("parameters", [
+    {}, {"guided": True}, pytest.param({"final_gather": False}, marks=pytest.mark.slow),
+    pytest.param({"next_event": "power"}, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_the_mean_is_that_of_path(parameters: dict) -> None:
+    """Each path from a light to the camera belongs to one part of the estimate: direct light,
+    caustics, gathered light, by way of all kinds of surfaces."""
+    scene = mi.load_dict(stage(**things()), optimize=False)
+    found = batches(scene, make(photons=1 << 17, **parameters), 32, range(1, 9))
+    expected = batches(scene, mi.load_dict({"type": "path", "max_depth": 6}), 1024, range(101, 109))
+    assert_same_mean(found, expected, 0.03, tolerance=0.0)
+
+
+@pytest.mark.parametrize("parameters", [{"guided": True}, {"final_gather": False}])
+def test_direct_light_is_that_of_path(parameters: dict) -> None:
+    scene = mi.load_dict(stage(**things()), optimize=False)
+    found = batches(scene, make(2, photons=1 << 14, **parameters), 256, range(1, 9))
+    expected = batches(scene, mi.load_dict({"type": "path", "max_depth": 2}), 256, range(101, 109))
+    assert_same_mean(found, expected, 0.03, tolerance=0.0)
+
+
+def test_more_photons_have_less_bias() -> None:
+    """In the corners of a box, a part of the disk is missing."""
+    scene = load("furnace_box", width=16, height=16)
+    expected = batches(scene, mi.load_dict({"type": "path", "max_depth": 3}), 256, [1]).mean()
+    biases = [
+        1 - batches(scene, make(3, photons=photons), 32, range(1, 5)).mean() / expected
+        for photons in (1 << 12, 1 << 17)
+    ]
+    assert abs(biases[1]) < 0.01 and biases[1] < 0.5 * biases[0]
+
+
+def test_the_maps_are_visible() -> None:
+    """The channels of the maps hold what photons tell of the surfaces that pixels show."""
+    scene = mi.load_dict(stage(**things()), optimize=False)
+    integrator = make(photons=1 << 16, photon_aovs=True, aovs="d:depth")
+    names = integrator.aov_names()
+    assert names == ["d.T", *(f"{m}.{c}" for m in ("caustic", "global") for c in "RGB")]
+    image = np.array(mi.render(scene, integrator=integrator, spp=4))[..., -7:]
+    caustic, everything = image[..., 1:4], image[..., 4:7]
+    assert (caustic >= 0).all() and 0 < caustic.mean() < everything.mean()
+    maps = integrator.maps
+    assert 0 < maps.caustics.grids[0].count < maps.vertices.count
+
+
+def test_a_given_radius_is_used() -> None:
+    scene = mi.load_dict(stage(**things()), optimize=False)
+    integrator = make(photons=1 << 12, global_radius=0.25, caustic_radius=0.125)
+    mi.render(scene, integrator=integrator, spp=1)
+    maps = integrator.maps
+    found = [[float(grid.radius[0]) for grid in m.grids] for m in (maps.caustics, maps.gathered)]
+    assert found == [[0.125], [0.25]]
+
+
+# ---- Errors ----
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_spectral_variants_are_refused(variant: str) -> None:
+    scene = mi.load_dict(stage(), optimize=False)
+    with pytest.raises((NotImplementedError, RuntimeError), match='"photon_map": the variant is'):
+        make().render(scene, spp=1)
+
+
+def test_moving_shapes_are_refused() -> None:
+    ball = {"type": "moving", "translate": [0, 0, 1], "in": {"type": "sphere", "radius": 0.1}}
+    scene = mi.load_dict(stage(ball=ball), optimize=False)
+    with pytest.raises((NotImplementedError, RuntimeError), match='"photon_map": shapes or lights'):
+        make().render(scene, spp=1)
