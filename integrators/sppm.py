@@ -61,8 +61,8 @@ class ProgressivePhotonMapping(WalkIntegrator):
     many photon paths as camera samples. Vertices merge only on surfaces that face about the same
     way, so that light does not leak through thin walls.
 
-    A render in batches (:monosp:`checkpoint`, or several workers) begins each batch with the first
-    radius: its bias does not vanish.
+    In a render in batches (:monosp:`checkpoint`, or several workers), the radius of a batch goes on
+    where that of the one before ended.
 
     Spectral variants, moving shapes and participating media are refused: photons of other
     wavelengths and times cannot be merged. Gradients are not supported (use :monosp:`prb`), nor
@@ -123,5 +123,5 @@ class ProgressivePhotonMapping(WalkIntegrator):
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
         light_walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
-        radius = self.merging.radius_of(scene, sensor, light_walk, only_caustic=False)
+        radius = self.merging.radius_of(scene, sensor, light_walk, False, self.samples_before)
         return OneStage(PhotonMapper(walk, light_walk, radius))

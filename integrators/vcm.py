@@ -63,8 +63,8 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     with the squared radius, which shrinks from pass to pass, so that the image converges. Where
     other techniques have large weights, there is little of it.
 
-    A render in batches (:monosp:`checkpoint`, or several workers) begins each batch with the first
-    radius: its bias does not vanish.
+    In a render in batches (:monosp:`checkpoint`, or several workers), the radius of a batch goes on
+    where that of the one before ended.
 
     Spectral variants, moving shapes and participating media are refused, and so are
     ``light_paths`` and ``technique_images`` of :class:`bdpt` with merging.
@@ -118,4 +118,6 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
         light_walk = LightWalk(
             side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)
         )
-        return self.merging.radius_of(scene, sensor, light_walk, not self.merges_all)
+        return self.merging.radius_of(
+            scene, sensor, light_walk, not self.merges_all, self.samples_before
+        )

@@ -88,6 +88,24 @@ def test_the_radius_shrinks_as_its_source_says_whatever_the_size_of_a_pass() -> 
     assert [constant.next(100) for _ in range(3)] == [2, 2, 2]
 
 
+def test_a_batch_goes_on_with_the_radius_of_the_one_before() -> None:
+    whole = MergingRadius(2.0, 0.75, pixels=100)
+    found = [whole.next(200) for _ in range(6)]
+    batch = MergingRadius(2.0, 0.75, pixels=100, before=8)  # 4 passes of 2 samples per pixel
+    assert [batch.next(200), batch.next(200)] == pytest.approx(found[4:])
+
+
+def test_the_batches_of_a_render_shrink_the_radius(
+    batches_of_sixteen_samples, monkeypatch, tmp_path
+) -> None:
+    scene, found = mi.load_dict(stage(), optimize=False), []
+    monkeypatch.setattr(
+        MergingRadius, "next", lambda self, paths: found.append(self.before) or self.first
+    )
+    mi.render(scene, integrator=make("sppm", checkpoint=str(tmp_path / "kept")), spp=48)
+    assert sorted(set(found)) == [0, 16, 32]
+
+
 @pytest.mark.parametrize("scale", [0.01, 100])
 def test_the_radius_scales_with_the_scene(monkeypatch, scale: float) -> None:
     found = []

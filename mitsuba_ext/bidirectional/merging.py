@@ -67,17 +67,21 @@ class MergingRadius:
         first: The radius of a first pass that has one light path per pixel.
         decay: α, in (0, 1]; 1 for a constant radius.
         pixels: Number of pixels.
+        before: Light paths per pixel of passes that other renders have made before.
     """
 
     first: float
     decay: float
     pixels: int
+    before: int = 0
     _passes: int = 0
 
     def next(self, paths: int) -> float:
         """The radius of the next pass, of so many light paths."""
         self._passes += 1
-        return self.first * (self.pixels / paths * self._passes ** (self.decay - 1)) ** 0.5
+        share = self.pixels / paths
+        number = self._passes + self.before * share
+        return self.first * (share * number ** (self.decay - 1)) ** 0.5
 
 
 def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:

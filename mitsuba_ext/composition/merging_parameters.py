@@ -50,10 +50,16 @@ class MergingParameters:
         return {"radius": self.radius or "automatic", "radius_decay": self.decay}
 
     def radius_of(
-        self, scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk, only_caustic: bool
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        light_walk: LightWalk,
+        only_caustic: bool,
+        before: int,
     ) -> MergingRadius | None:
-        """The radius for a render; ``None`` if there are no caustics to merge. The other
-        parameters are those of :func:`suitable_radius`."""
+        """The radius for a render, before which others have made ``before`` samples per pixel;
+        ``None`` if there are no caustics to merge. The other parameters are those of
+        :func:`suitable_radius`."""
         footprint = median_footprint(scene, sensor)
         width, height = film_extent(sensor.film())
         pixels = width * height
@@ -63,4 +69,4 @@ class MergingParameters:
         if radius is None and only_caustic:
             return None
         radius = radius or WIDEST * footprint
-        return MergingRadius(radius, self.decay, pixels)
+        return MergingRadius(radius, self.decay, pixels, before)

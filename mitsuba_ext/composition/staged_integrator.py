@@ -73,6 +73,8 @@ class StagedIntegrator(mi.SamplingIntegrator):
         if self.checkpoint:
             self.checkpoint_every = self._interval(props)
         self._is_batch = False
+        #: If a render is one of several batches: samples per pixel of those with smaller numbers.
+        self.samples_before = 0
         self.progress: Callable[[float], None] | None = None
         self.statistics = rendering.RenderStatistics()
         self.is_cancelled = False

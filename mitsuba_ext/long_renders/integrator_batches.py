@@ -27,6 +27,9 @@ _SAMPLES = {dr.JitBackend.LLVM: 1 << 22, dr.JitBackend.CUDA: 1 << 25}
 #: and with one that stratifies.
 _SPP, _STRUCTURED_SPP = 16, 64
 
+#: More samples per pixel than a batch has.
+_ANY = 1 << 24
+
 #: Samples per pixel of the batch that learns for the others, if the render has as many.
 _LEARNING_SPP = 128
 
@@ -108,7 +111,15 @@ class IntegratorBatches:
         seed = batch_seeds(batch.seed, 1, batch.index)[0]
         forget_memory_peak()
         begin = time.perf_counter()
-        images = next(each_batch(integrator, self._scene, self.sensor, batch.spp, [seed]))
+        # Batches may be rendered in any order: the number counts as if all had the usual length
+        before = batch.index * max(batch.spp, self.length(_ANY, False))
+        if hasattr(integrator, "samples_before"):
+            integrator.samples_before = before
+        try:
+            images = next(each_batch(integrator, self._scene, self.sensor, batch.spp, [seed]))
+        finally:
+            if hasattr(integrator, "samples_before"):
+                integrator.samples_before = 0
         totals = RenderTotals.of(integrator, film, images.spp, time.perf_counter() - begin)
         sums = FilmSums()
         sums.add(film, images.spp, getattr(integrator, "film_counts_samples", True))
