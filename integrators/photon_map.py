@@ -22,9 +22,9 @@ from mitsuba_ext.bidirectional.photon_phases import (
     first_vertex,
     is_diffuse,
 )
-from mitsuba_ext.composition.merging_parameters import check_can_merge
 from mitsuba_ext.composition.slots import read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.path_decisions import Roulette
 from mitsuba_ext.transport.walk import Walk
@@ -145,7 +145,7 @@ class PhotonMapping(WalkIntegrator):
 
     def _traced(self, scene: mi.Scene, sensor: mi.Sensor, seed: int) -> PhotonMaps:
         query = self.query(scene)
-        check_can_merge(self.name, scene)
+        self._check(scene)
         if not scene.emitters() or self.max_depth < 2:
             return PhotonMaps()
         try:
@@ -158,6 +158,18 @@ class PhotonMapping(WalkIntegrator):
             (self.radii["caustic"], self.radii["global"]), self.lookup_size,
             median_footprint(scene, sensor),
         )  # fmt: skip
+
+    def _check(self, scene: mi.Scene) -> None:
+        """
+        Raises:
+            NotImplementedError: Photons cannot be shared by all camera paths in this scene.
+        """
+        reason = "the variant is spectral" if mi.is_spectral else "shapes or lights move"
+        if mi.is_spectral or movers(scene):
+            raise NotImplementedError(
+                f'"{self.name}": {reason}: photons of other wavelengths and times cannot be '
+                f'merged; use "sppm" or "vcm"'
+            )
 
     def estimators(self, scene, sensor):
         return functools.partial(self._estimator, scene)

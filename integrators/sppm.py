@@ -10,8 +10,9 @@ from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.photon_mapper import PhotonMapper
-from mitsuba_ext.composition.merging_parameters import MergingParameters, check_can_merge
+from mitsuba_ext.composition.merging_parameters import MergingParameters, share_rays
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.rendering.camera_samples import CameraSamples
 from mitsuba_ext.rendering.stages import OneStage
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.path_decisions import NoConnections
@@ -64,9 +65,12 @@ class ProgressivePhotonMapping(WalkIntegrator):
     In a render in batches (:monosp:`checkpoint`, or several workers), the radius of a batch goes on
     where that of the one before ended.
 
-    Spectral variants, moving shapes and participating media are refused: photons of other
-    wavelengths and times cannot be merged. Gradients are not supported (use :monosp:`prb`), nor
-    nesting in :monosp:`moment` and :monosp:`aov`.
+    In spectral variants, sample k of each pixel has the same wavelengths, and with moving shapes
+    the same time: photons of others cannot be merged. Errors of colour and of motion blur are then
+    alike in all pixels; they fall faster than noise.
+
+    Participating media are refused. Gradients are not supported (use :monosp:`prb`), nor nesting in
+    :monosp:`moment` and :monosp:`aov`.
 
     Source: T. Hachisuka, H. W. Jensen, *Stochastic Progressive Photon Mapping*, ACM Transactions on
     Graphics 28(5), 2009; C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic
@@ -111,7 +115,6 @@ class ProgressivePhotonMapping(WalkIntegrator):
 
     def schedule(self, scene, sensor, samples, seed) -> OneStage:
         query = self.query(scene)
-        check_can_merge(self.name, scene)
         walk = Walk(
             self.max_depth, self.rr_depth, self.hide_emitters, next_event=NoConnections(),
             query=query,
@@ -124,4 +127,6 @@ class ProgressivePhotonMapping(WalkIntegrator):
             raise NotImplementedError(f'"{self.name}": {error}') from None
         light_walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
         radius = self.merging.radius_of(scene, sensor, light_walk, False, self.samples_before)
-        return OneStage(PhotonMapper(walk, light_walk, radius))
+        camera = CameraSamples()
+        share_rays(camera, scene, seed)
+        return OneStage(PhotonMapper(walk, light_walk, radius), camera)

@@ -11,7 +11,7 @@ from mitsuba_ext.bidirectional.merging import MergingRadius
 from mitsuba_ext.bidirectional.partial_sums import PartialSums
 from mitsuba_ext.composition.bidirectional_integrator import BidirectionalIntegrator
 from mitsuba_ext.composition.light_side import LightSide
-from mitsuba_ext.composition.merging_parameters import MergingParameters, check_can_merge
+from mitsuba_ext.composition.merging_parameters import MergingParameters, share_rays
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.path_decisions import EmitterSampling
 
@@ -66,8 +66,12 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     In a render in batches (:monosp:`checkpoint`, or several workers), the radius of a batch goes on
     where that of the one before ended.
 
-    Spectral variants, moving shapes and participating media are refused, and so are
-    ``light_paths`` and ``technique_images`` of :class:`bdpt` with merging.
+    In spectral variants, sample k of each pixel has the same wavelengths, and with moving shapes
+    the same time: vertices of other paths cannot be merged. Errors of colour and of motion blur are
+    then alike in all pixels; they fall faster than noise.
+
+    Participating media are refused, and so are ``light_paths`` and ``technique_images`` of
+    :class:`bdpt` with merging.
 
     Source: I. Georgiev, J. Křivánek, T. Davidovič, P. Slusallek, *Light Transport Simulation with
     Vertex Connection and Merging*, ACM Transactions on Graphics 31(6), 2012; I. Georgiev,
@@ -113,11 +117,19 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     ) -> MergingRadius | None:
         if self.where == "none":
             return None
-        check_can_merge(self.name, scene)
         sums = PartialSums(EmitterSampling(), merging=mi.Float(1))
         light_walk = LightWalk(
             side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)
         )
-        return self.merging.radius_of(
+        radius = self.merging.radius_of(
             scene, sensor, light_walk, not self.merges_all, self.samples_before
         )
+        self._merges = radius is not None
+        return radius
+
+    def schedule(self, scene, sensor, samples, seed):
+        self._merges = False
+        schedule = super().schedule(scene, sensor, samples, seed)
+        if self._merges:
+            share_rays(schedule.camera, scene, seed)
+        return schedule

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from stage import area, film, stage
+from stage import area, film, sensor, stage
 from statistical import assert_same_mean, batches, load
 from test_furnace import FURNACES
 
@@ -100,7 +100,7 @@ def test_the_batches_of_a_render_shrink_the_radius(
 ) -> None:
     scene, found = mi.load_dict(stage(), optimize=False), []
     monkeypatch.setattr(
-        MergingRadius, "next", lambda self, paths: found.append(self.before) or self.first
+        MergingRadius, "next", lambda self, *counts: found.append(self.before) or self.first
     )
     mi.render(scene, integrator=make("sppm", checkpoint=str(tmp_path / "kept")), spp=48)
     assert sorted(set(found)) == [0, 16, 32]
@@ -231,23 +231,44 @@ def test_weights_add_up_to_one_behind_mirrors_and_glass() -> None:
     assert images.mean() == pytest.approx(1, abs=0.004)
 
 
-# ---- Errors ----
+# ---- Wavelengths and times ----
+
+
+def test_groups_shrink_the_radius_as_so_many_passes() -> None:
+    apart, together = (MergingRadius(2.0, 0.75, pixels=100) for _ in range(2))
+    found = [apart.next(100) for _ in range(9)]
+    assert [together.next(100, 4) for _ in range(3)] == pytest.approx(found[::4])
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
-@pytest.mark.parametrize("name", ["vcm", "sppm"])
-def test_spectral_variants_are_refused(variant: str, name: str) -> None:
-    scene = mi.load_dict(stage(), optimize=False)
-    with pytest.raises((NotImplementedError, RuntimeError), match=f'"{name}": the variant is spec'):
-        make(name).render(scene, spp=1)
-
-
-@pytest.mark.parametrize("name", ["vcm", "sppm"])
-def test_moving_shapes_are_refused(name: str) -> None:
-    ball = {"type": "moving", "translate": [0, 0, 1], "in": {"type": "sphere", "radius": 0.1}}
+@pytest.mark.parametrize("name", ["vcm", pytest.param("sppm", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("glass", [
+    "dielectric", pytest.param("dispersive_dielectric", marks=pytest.mark.slow),
+])  # fmt: skip
+def test_spectral_caustics_have_the_mean_of_path(variant: str, name: str, glass: str) -> None:
+    """Only vertices of the same wavelengths merge."""
+    ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.4, "bsdf": {"type": glass}}
     scene = mi.load_dict(stage(ball=ball), optimize=False)
-    with pytest.raises((NotImplementedError, RuntimeError), match=f'"{name}": shapes or lights'):
-        make(name).render(scene, spp=1)
+    found = batches(scene, make(name, 5, radius=0.03), 128, range(1, 9))
+    reference = "composed_path" if glass == "dispersive_dielectric" else "path"
+    expected = batches(scene, make(reference, 5), 1024, range(101, 109))
+    assert_same_mean(found, expected, 0.03, tolerance=0.1)
+
+
+@pytest.mark.parametrize("name", ["vcm", pytest.param("sppm", marks=pytest.mark.slow)])
+def test_moving_glass_has_the_mean_of_path(name: str) -> None:
+    """Only vertices of the same time merge."""
+    ball = {"type": "sphere", "center": [-0.3, 0, 0.5], "radius": 0.4,
+            "bsdf": {"type": "dielectric"}}  # fmt: skip
+    moving = {"type": "moving", "translate": [0.6, 0, 0], "in": ball}
+    camera = sensor(shutter_open=0.0, shutter_close=1.0)
+    scene = mi.load_dict(stage(camera=camera, ball=moving), optimize=False)
+    found = batches(scene, make(name, 5, radius=0.03), 128, range(1, 9))
+    expected = batches(scene, make("composed_path", 5), 1024, range(101, 109))
+    assert_same_mean(found, expected, 0.03, tolerance=0.0)
+
+
+# ---- Errors ----
 
 
 @pytest.mark.parametrize("parameters", [{"light_paths": "auto"}, {"technique_images": "a.exr"}])

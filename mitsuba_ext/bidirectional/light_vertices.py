@@ -207,6 +207,12 @@ class LightVertices:
         dVCM = dr.gather(mi.Float, self._words, word, active)
         return (self.depth(slot, active) > 1) & (dVCM == 0)
 
+    def group(self, slot: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """:func:`group_of` time and wavelengths of the vertices at these places of the store."""
+        lane = self._lane_of(slot, active)
+        time = self._of_lane(self._time, lane, active)
+        return group_of(time, self._of_lane(self._wavelengths, lane, active))
+
     def wavelengths(self, vertex: LightVertex, active: mi.Bool) -> mi.Spectrum | None:
         """The wavelengths of a vertex's path; ``None`` in variants that are not spectral."""
         return self._of_lane(self._wavelengths, vertex.lane, active) if mi.is_spectral else None
@@ -303,6 +309,14 @@ class VertexCache(PackedVertices):
         index = dr.arange(mi.UInt32, self.count) * layout.words + layout.mark
         mark = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, index))
         return _depth_and_region(mark)[1]
+
+
+def group_of(time: mi.Float, wavelengths: mi.Spectrum) -> mi.UInt32:
+    """A number that paths of the same time and the same wavelengths have in common."""
+    word = dr.reinterpret_array(mi.UInt32, mi.Float(time)) * 0x27D4EB2F
+    if mi.is_spectral:
+        word ^= dr.reinterpret_array(mi.UInt32, wavelengths[0]) * 0x165667B1
+    return word ^ (word >> 16)
 
 
 def room_for(count: int) -> int:

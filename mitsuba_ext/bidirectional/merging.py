@@ -18,9 +18,10 @@ import numpy as np
 
 from ..scene.bounds import scene_bounds
 from ..transport.bsdfs import eval_bsdf
+from ..transport.heroes import Heroes
 from ..transport.path_decisions import Subpaths
 from ..transport.vertex import Vertex
-from .light_vertices import LightVertex, LightVertices, PackedVertices, VertexCache
+from .light_vertices import LightVertex, LightVertices, PackedVertices, VertexCache, group_of
 from .light_walk import LightWalk
 from .partial_sums import PartialSums
 from .scattering import geometric_cosine, reverse_density
@@ -76,11 +77,12 @@ class MergingRadius:
     before: int = 0
     _passes: int = 0
 
-    def next(self, paths: int) -> float:
-        """The radius of the next pass, of so many light paths."""
-        self._passes += 1
+    def next(self, paths: int, groups: int = 1) -> float:
+        """The radius of the next pass, of so many light paths; or of so many groups, of so many
+        light paths each, whose vertices are not merged with those of other groups."""
         share = self.pixels / paths
-        number = self._passes + self.before * share
+        number = self._passes + 1 + self.before * share
+        self._passes += groups
         return self.first * (share * number ** (self.decay - 1)) ** 0.5
 
 
@@ -110,6 +112,7 @@ def scene_diagonal(scene: mi.Scene) -> float:
 
 def suitable_radius(
     scene: mi.Scene,
+    sensor: mi.Sensor,
     light_walk: LightWalk,
     footprint: float,
     pixels: int,
@@ -126,7 +129,12 @@ def suitable_radius(
     rounds: list[LightVertices] = []
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(dr.opaque(mi.UInt32, 0), _PATHS)
-    rays = dr.zeros(mi.Ray3f, _PATHS)
+    # Times and wavelengths are those of rays of the sensor
+    numbers = sampler.next_2d()
+    rays, _ = sensor.sample_ray_differential(
+        sensor.shutter_open() + numbers.x * sensor.shutter_open_time(), numbers.y,
+        mi.Point2f(0.5), mi.Point2f(0.5),
+    )  # fmt: skip
     light_walk.run(
         scene, sampler, rays.time, rays.wavelengths, dr.full(mi.Bool, True, _PATHS),
         lambda vertices: rounds.append(PackedVertices(vertices)),
@@ -181,8 +189,11 @@ class MergedSubpaths(Subpaths):
         grid: Finds them.
         sums: Computes the MIS weights; ``None`` if merging is the only technique that finds what it
             finds.
-        ctx: The context in which BSDFs are evaluated.
+        heroes: Joins the wavelengths of two paths.
         max_depth: Longest path in segments.
+        paths: Number of light paths that a vertex can be merged with.
+        shares_rays: Are vertices merged only with those of paths of the same time and wavelengths?
+            ``grid`` then has these groups.
         others: Other techniques at the same vertices; ``None`` if there are none.
     """
 
@@ -191,15 +202,18 @@ class MergedSubpaths(Subpaths):
         vertices: VertexCache,
         grid: VertexGrid,
         sums: PartialSums | None,
-        ctx: mi.BSDFContext,
+        heroes: Heroes,
         max_depth: int,
+        paths: int,
+        shares_rays: bool = False,
         others: Subpaths | None = None,
     ) -> None:
         self._vertices, self._grid, self._sums, self._others = vertices, grid, sums, others
-        self._ctx, self._max_depth = ctx, dr.opaque(mi.UInt32, max_depth)
-        paths = dr.opaque(mi.Float, len(vertices.first))
+        self._heroes, self._ctx = heroes, heroes.context()
+        self._max_depth, self._shares_rays = dr.opaque(mi.UInt32, max_depth), shares_rays
         # The density of light paths per area, for one vertex in the disk
-        self._per_vertex = dr.rcp(dr.pi * dr.square(grid.radius) * paths)
+        count = dr.opaque(mi.Float, paths)
+        self._per_vertex = dr.rcp(dr.pi * dr.square(grid.radius) * count)
         dr.make_opaque(self._per_vertex)
 
     @dr.syntax
@@ -209,12 +223,13 @@ class MergedSubpaths(Subpaths):
             total, shadow_count = self._others.gather(scene, sampler, vertex, active)
         merges = active & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
         merged = mi.Spectrum(0)
-        state = self._grid.begin()
+        state, si = self._grid.begin(), vertex.si
+        group = group_of(si.time, si.wavelengths) if self._shares_rays else mi.UInt32(0)
         near = [mi.UInt32(0) for _ in range(_BATCH)]
         while dr.hint(merges, label="merge"):
             count, searches = mi.UInt32(0), mi.Bool(merges)
             while dr.hint(searches, label="search"):
-                state, index, found, merges = self._grid.next(state, vertex.si.p, searches)
+                state, index, found, merges = self._grid.next(state, si.p, searches, group)
                 near = _pushed(near, index, found)
                 count += dr.select(found, 1, 0)
                 searches = merges & (count < _BATCH)
@@ -232,11 +247,16 @@ class MergedSubpaths(Subpaths):
         si, far = vertex.si, other.si
         active = active & (vertex.depth + other.depth + 1 <= self._max_depth)
         height = dr.abs(dr.dot(si.n, far.p - si.p))
+        if self._shares_rays:
+            active &= (far.time == si.time) & dr.all(far.wavelengths == si.wavelengths)
         active &= height < _HALF_HEIGHT * self._grid.radius
         active &= dr.dot(si.n, far.n) > _LEAST_COSINE
         wo = si.to_local(far.to_world(far.wi))
         value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, active)
         value = si.to_world_mueller(value, -wo, si.wi)
+        value = self._heroes.merge(
+            vertex.path.hero_is_alone, other.hero_is_alone, value, vertex.bsdf, si, wo
+        )
         # Flux arrives per area of the surface; the value holds the shading cosine
         arrives = geometric_cosine(far, far.wi)
         value *= other.β * dr.select(arrives > 0, dr.rcp(arrives), 0)

@@ -85,8 +85,10 @@ class BidirectionalPathTracer:
         lanes = dr.width(rays.ray)
         radius, merging = None, None
         if self.radius is not None:
-            radius = dr.opaque(mi.Float, self.radius.next(lanes))
-            merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, lanes / HANDFUL)
+            # Of paths of different times or wavelengths, those of one sample of each pixel merge
+            paths = min(lanes, self.radius.pixels) if own_lane else lanes
+            radius = dr.opaque(mi.Float, self.radius.next(paths, lanes // paths))
+            merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / HANDFUL)
             dr.make_opaque(merging)
         sums = PartialSums(
             walk.next_event, dr.opaque(mi.Float, count), follows_camera=follows_camera,
@@ -131,10 +133,10 @@ class BidirectionalPathTracer:
             )  # fmt: skip
             if radius is not None:
                 kept = None if self.merges_all else vertices.is_caustic
+                grid = VertexGrid(vertices, radius, kept, vertices.group if own_lane else None)
                 subpaths = MergedSubpaths(
-                    vertices, VertexGrid(vertices, radius, kept), sums, Heroes(scene).context(),
-                    walk.max_depth, subpaths,
-                )  # fmt: skip
+                    vertices, grid, sums, Heroes(scene), walk.max_depth, paths, own_lane, subpaths
+                )
         if isinstance(sampler, BothEnds):
             sampler = sampler.camera
         sample = self._camera_paths(

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..scene.movers import movers
 from ..transport.estimator import CameraRays, Sample
 from ..transport.heroes import Heroes
 from ..transport.numbers import Numbers
@@ -66,9 +67,13 @@ class PhotonMapper:
         walk = replace(self.walk, mis=FoundByCamera(), roulette=OnlySpecular(), rr_depth=0)
         if rounds:
             vertices = VertexCache(rounds, lanes)
-            grid = VertexGrid(vertices, dr.opaque(mi.Float, self.radius.next(lanes)))
+            # Of paths of different times or wavelengths, those of one sample of each pixel merge
+            groups = mi.is_spectral or bool(movers(scene))
+            paths = min(lanes, self.radius.pixels) if groups else lanes
+            radius = dr.opaque(mi.Float, self.radius.next(paths, lanes // paths))
+            grid = VertexGrid(vertices, radius, None, vertices.group if groups else None)
             subpaths = MergedSubpaths(
-                vertices, grid, None, Heroes(scene).context(), walk.max_depth
+                vertices, grid, None, Heroes(scene), walk.max_depth, paths, groups
             )
             walk = replace(walk, subpaths=subpaths)
         sample = walk(scene, sampler, rays, active)

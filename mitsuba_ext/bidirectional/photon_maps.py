@@ -124,10 +124,11 @@ class PhotonMaps:
 
     def estimates(self, scene: mi.Scene, max_depth: int) -> list[PhotonEstimate | None]:
         """Estimates of radiance from the map of caustics and the global one."""
-        ctx = Heroes(scene).context()
+        heroes, paths = Heroes(scene), len(self.vertices.first) if self.vertices else 0
         return [
             m and PhotonEstimate(m, [
-                MergedSubpaths(self.vertices, grid, None, ctx, max_depth) for grid in m.grids
+                MergedSubpaths(self.vertices, grid, None, heroes, max_depth, paths)
+                for grid in m.grids
             ])
             for m in (self.caustics, self.gathered)
         ]  # fmt: skip

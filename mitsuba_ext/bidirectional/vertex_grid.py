@@ -28,6 +28,9 @@ class VertexGrid:
         radius: Radius of the balls in which vertices are looked for.
         kept: Tells which vertices, given by their indices and a mask, are in the grid; all of them
             if it is ``None``.
+        group: Gives the number of a vertex's group, as ``kept``: vertices are looked for in one
+            group at a time. (Different groups may have the same number: callers check.) ``None`` if
+            there is only one.
     """
 
     def __init__(
@@ -35,6 +38,7 @@ class VertexGrid:
         vertices: VertexCache,
         radius: mi.Float,
         kept: Callable[[mi.UInt32, mi.Bool], mi.Bool] | None = None,
+        group: Callable[[mi.UInt32, mi.Bool], mi.UInt32] | None = None,
     ) -> None:
         self.radius = radius
         scale = 0.5 / radius
@@ -49,7 +53,7 @@ class VertexGrid:
             active &= kept(index, active)
         p = vertices.position(index, active)
         cell = self._cell(p)
-        hashed = _hash(cell)
+        hashed = _hash(cell, mi.UInt32(0) if group is None else group(index, active))
         bucket = (hashed + mi.UInt32(cell.x)) & self._mask
         self._counts, tags = dr.zeros(mi.UInt32, buckets), dr.zeros(mi.UInt32, buckets)
         rank = dr.scatter_inc(self._counts, bucket, active)
@@ -101,16 +105,16 @@ class VertexGrid:
         cover about four times the area of its disk."""
         count, first = mi.UInt32(0), self._cell(p - self.radius)
         for row in range(_ROWS):
-            bounds, holds = self._range(first, mi.UInt32(row), active)
+            bounds, holds = self._range(first, mi.UInt32(row), mi.UInt32(0), active)
             count += dr.select(holds, bounds.y - bounds.x, 0)
         return count
 
     def _range(
-        self, first: mi.Vector3i, row: mi.UInt32, active: mi.Bool
+        self, first: mi.Vector3i, row: mi.UInt32, group: mi.UInt32, active: mi.Bool
     ) -> tuple[mi.Vector4u, mi.Bool]:
         """The range of a row of cells, from its first cell on, and whether it may hold vertices."""
         cell = first + mi.Vector3i(0, row & 1, row >> 1)
-        hashed = _hash(cell)
+        hashed = _hash(cell, group)
         bucket = (hashed + mi.UInt32(cell.x)) & self._mask
         bounds = dr.gather(mi.Vector4u, self._ranges, bucket, active)
         return bounds, (bounds.z & _tag(hashed)) != 0
@@ -121,7 +125,11 @@ class VertexGrid:
         return mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
 
     def next(
-        self, state: tuple[mi.UInt32, mi.UInt32, mi.UInt32], p: mi.Point3f, active: mi.Bool
+        self,
+        state: tuple[mi.UInt32, mi.UInt32, mi.UInt32],
+        p: mi.Point3f,
+        active: mi.Bool,
+        group: mi.UInt32 | None = None,
     ) -> tuple[Any, mi.UInt32, mi.Bool, mi.Bool]:
         """Looks at one more vertex.
 
@@ -134,7 +142,8 @@ class VertexGrid:
 
         # ----- Go on to the next row if this one is at its end -----
         is_new = active & (place >= end)
-        bounds, holds = self._range(first, number, is_new)
+        group = mi.UInt32(0) if group is None else group
+        bounds, holds = self._range(first, number, group, is_new)
         place = dr.select(is_new, bounds.x, place)
         end = dr.select(is_new, dr.select(holds, bounds.y, bounds.x), end)
         number += dr.select(is_new, 1, 0)
@@ -155,9 +164,9 @@ class VertexGrid:
         return (number, place, end), index, is_found, goes_on
 
 
-def _hash(cell: mi.Vector3i) -> mi.UInt32:
+def _hash(cell: mi.Vector3i, group: mi.UInt32) -> mi.UInt32:
     """An even number for the row of cells along x that this cell lies in."""
-    word = mi.UInt32(cell.y) * 0x9E3779B1 ^ mi.UInt32(cell.z) * 0x85EBCA77
+    word = mi.UInt32(cell.y) * 0x9E3779B1 ^ mi.UInt32(cell.z) * 0x85EBCA77 ^ group
     return ((word ^ (word >> 15)) * 0xC2B2AE3D) & 0xFFFFFFFE
 
 

@@ -9,21 +9,19 @@ import mitsuba as mi
 
 from ..bidirectional.light_walk import LightWalk
 from ..bidirectional.merging import WIDEST, MergingRadius, median_footprint, suitable_radius
+from ..decisions.camera.shared_numbers import TIME_STEP, WAVELENGTH_STEP, SharedNumbers
 from ..rendering.camera import film_extent
+from ..rendering.camera_samples import CameraSamples
 from ..scene.movers import movers
 
 
-def check_can_merge(plugin: str, scene: mi.Scene) -> None:
-    """
-    Raises:
-        NotImplementedError: Vertices of different paths cannot be merged in this scene.
-    """
-    reason = "the variant is spectral" if mi.is_spectral else "shapes or lights move"
-    if mi.is_spectral or movers(scene):
-        raise NotImplementedError(
-            f'"{plugin}": {reason}: vertices of paths of other wavelengths and times cannot be '
-            f'merged; use "bdpt"'
-        )
+def share_rays(camera: CameraSamples, scene: mi.Scene, seed: int) -> None:
+    """Gives sample k of each pixel the same time where things move, and the same wavelengths: only
+    paths that have these in common can be merged."""
+    if movers(scene):
+        camera.time = SharedNumbers(TIME_STEP, seed, 1)
+    if mi.is_spectral:
+        camera.wavelength = SharedNumbers(WAVELENGTH_STEP, seed, 2)
 
 
 @dataclass
@@ -65,7 +63,9 @@ class MergingParameters:
         pixels = width * height
         radius = self.radius
         if radius == 0:
-            radius = suitable_radius(scene, light_walk, footprint, pixels, only_caustic)
+            radius = suitable_radius(
+                scene, sensor, light_walk, footprint, pixels, only_caustic
+            )
         if radius is None and only_caustic:
             return None
         radius = radius or WIDEST * footprint

@@ -93,6 +93,7 @@ class Schedule:
     Attributes:
         learners: The learners, by slot.
         decisions: The decisions of the next stage that differ from those of ``path``, by slot.
+        camera: Chooses points of the aperture, times and wavelengths.
     """
 
     def __init__(
@@ -110,10 +111,10 @@ class Schedule:
         self._stages = list(stages)
         self.decisions: dict[str, Any] = {"query": query}
         self.learners: dict[str, Learner] = {}
-        self._camera = CameraSamples()
+        self.camera = CameraSamples()
         for slot, parameters in slots.items():
             if isinstance(parameters, WeightedNumbers):
-                setattr(self._camera, slot, parameters.numbers(plugin, slot, setting))
+                setattr(self.camera, slot, parameters.numbers(plugin, slot, setting))
                 continue
             decision = parameters.decision(setting)
             if decision is not None:
@@ -161,7 +162,7 @@ class Schedule:
         observer = _one_observer(learners)
         return Stage(
             self._estimator(observer=observer, **self.decisions),
-            camera=self._camera,
+            camera=self.camera,
             weight=self._weights[self._finished_stages],
             most_lanes=_MAP_LANES if self._learns_maps else 0,
             observer=observer,
@@ -177,7 +178,7 @@ class Schedule:
 
     def _last_stage(self) -> Stage:
         learned = "; ".join(filter(None, map(str, self.learners.values())))
-        return Stage(self._estimator(**self.decisions), learned, camera=self._camera)
+        return Stage(self._estimator(**self.decisions), learned, camera=self.camera)
 
     def _scout_stage(self) -> Stage:
         depth = min(SCOUT_DEPTH, self._setting.max_depth)
@@ -200,8 +201,8 @@ class Schedule:
     def _replace(self, slot: str, decision: Any | None) -> None:
         if decision is None:
             return
-        if hasattr(self._camera, slot):
-            setattr(self._camera, slot, decision)
+        if hasattr(self.camera, slot):
+            setattr(self.camera, slot, decision)
         else:
             self.decisions[slot] = decision
 

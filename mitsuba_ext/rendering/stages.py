@@ -57,8 +57,8 @@ class DivisibleSchedule(Schedule, Protocol):
 class OneStage:
     """The schedule of an estimator that learns nothing."""
 
-    def __init__(self, estimator: Estimator) -> None:
-        self._estimator = estimator
+    def __init__(self, estimator: Estimator, camera: CameraSamples | None = None) -> None:
+        self._estimator, self._camera = estimator, camera or CameraSamples()
 
     def next_stage(self) -> Stage:
-        return Stage(self._estimator)
+        return Stage(self._estimator, camera=self._camera)

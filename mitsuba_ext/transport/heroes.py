@@ -130,8 +130,25 @@ class Heroes:
         if not self._is_needed:
             return value
         refracts = self._refracts(*one[2:]) | self._refracts(*other[2:])
+        return self._joined(value, refracts, one[0], other[0])
+
+    def merge(
+        self,
+        is_alone: Any,
+        other_is_alone: Any,
+        bsdf_value: mi.Spectrum,
+        bsdf: mi.BSDFPtr,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+    ) -> mi.Spectrum:
+        """As :meth:`join`, for two paths that meet at one vertex."""
+        if not self._is_needed:
+            return bsdf_value
+        return self._joined(bsdf_value, self._refracts(bsdf, si, wo), is_alone, other_is_alone)
+
+    def _joined(self, value, refracts, one_alone, other_alone) -> mi.Spectrum:
         # The factor for lost wavelengths is applied once, even if both paths have lost them
-        both, any_alone = one[0] & other[0], one[0] | other[0]
+        both, any_alone = one_alone & other_alone, one_alone | other_alone
         hero = value[0] * dr.select(
             both, 1 / self._factor, dr.select(any_alone, 1, self._factor)
         )
