@@ -162,15 +162,14 @@ def disk_radius(
         kept: See :class:`VertexGrid`.
         least: The radius, at least, of the disks that are looked at.
     """
-    radius = least
-    for _ in range(_DOUBLINGS):
+    for doublings in range(_DOUBLINGS):
+        radius = least * 2**doublings
         grid = VertexGrid(vertices, dr.opaque(mi.Float, radius), kept)
         if grid.count < _FEW:
             return None
         others = grid.occupancy
         if others > 4:
             break
-        radius *= 2
     # Cubes cut squares of two radii out of a surface
     per_area = max(others, 1e-6) / (4 * radius**2)
     return math.sqrt(count / (math.pi * per_area))
