@@ -102,7 +102,7 @@ class LightTracerIntegrator(WalkIntegrator):
             'max_depth': 8
     """
 
-    sees_media = False
+    has_light_paths = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

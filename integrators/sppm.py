@@ -90,7 +90,6 @@ class ProgressivePhotonMapping(WalkIntegrator):
     """
 
     has_light_paths = True
-    sees_media = False
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)

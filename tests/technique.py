@@ -62,8 +62,8 @@ class Technique:
             gradients and AOVs.
         draws_like_path: At the same seed, does it draw the same numbers as ``path``? Then images
             are compared, which has more power than comparing means.
-        makes_splats: Does one sample bring light to many pixels? Then the errors of pixels depend
-            on each other, and noise is estimated from many seeds.
+        makes_splats: Does one sample bring light to many pixels, or do pixels share photons? Then
+            the errors of pixels depend on each other, and noise is estimated from many seeds.
         checks, thorough: Its tests.
     """
 

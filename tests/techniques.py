@@ -310,7 +310,7 @@ TECHNIQUES: dict[str, Technique] = {
         ),
     ),
     "photon_map": Technique(
-        "photon_map", {"photons": 1 << 16}, is_plugin=True,
+        "photon_map", {"photons": 1 << 16}, is_plugin=True, makes_splats=True,
         checks=Checks(cases=["no_light"]),
         thorough=Checks(
             variants=["llvm_ad_mono"], depths=[-1],
