@@ -27,9 +27,9 @@ from .photon_history import PhotonHistory
 from .photon_phases import BEFORE, is_diffuse
 from .vertex_grid import VertexGrid
 
-#: The radii of a map: how many, and the ratio of one to the one before; and the largest, in units
-#: of the diagonal of the scene.
-_LEVELS, _STEP, _WIDEST = 4, 2.0, 0.05
+#: The radii of a map: how many, and the ratio of one to the one before. Where the search for a
+#: suitable one begins, at most, and the largest one, in units of the diagonal of the scene.
+_LEVELS, _STEP, _LEAST, _WIDEST = 4, 2.0, 1e-3, 0.05
 
 #: Tells which vertices are in a grid.
 Kept = Callable[[mi.UInt32, mi.Bool], mi.Bool]
@@ -104,7 +104,9 @@ class PhotonMaps:
         def indirect(index: mi.UInt32, active: mi.Bool) -> mi.Bool:
             return (vertices.depth(index, active) > 1) & ~vertices.is_caustic(index, active)
 
-        widest = _WIDEST * scene_diagonal(scene)
+        diagonal = scene_diagonal(scene)
+        # Pixels of small films are wide
+        least, widest = min(least, _LEAST * diagonal), _WIDEST * diagonal
 
         def photon_map(given: float, kept: Kept | None) -> PhotonMap | None:
             if given > 0:
