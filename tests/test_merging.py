@@ -17,6 +17,11 @@ from test_furnace import FURNACES
 from mitsuba_ext.bidirectional.merging import MergingRadius, median_footprint
 from mitsuba_ext.bidirectional.vertex_grid import VertexGrid
 from mitsuba_ext.composition import merging_parameters
+from mitsuba_ext.decisions.camera.shared_numbers import (
+    TIME_STEP,
+    WAVELENGTH_STEP,
+    SharedNumbers,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -238,6 +243,16 @@ def test_groups_shrink_the_radius_as_so_many_passes() -> None:
     apart, together = (MergingRadius(2.0, 0.75, pixels=100) for _ in range(2))
     found = [apart.next(100) for _ in range(9)]
     assert [together.next(100, 4) for _ in range(3)] == pytest.approx(found[::4])
+
+
+@pytest.mark.parametrize("step", [TIME_STEP, WAVELENGTH_STEP])
+def test_shared_numbers_are_even_and_the_same_for_all_pixels(step: int) -> None:
+    index = dr.arange(mi.UInt32, 64)
+    found = [SharedNumbers(step, seed, 1).draw(None, 5 * index, index) for seed in (3, 3, 4)]
+    a, b, other = (number.numpy() for number, weight in found)
+    assert (a == b).all() and not (a == other).any() and found[0][1] == 1
+    gaps = 64 * np.diff(np.sort(a))
+    assert gaps.min() > 0.1 and gaps.max() < 5
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
