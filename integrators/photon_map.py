@@ -26,7 +26,6 @@ from mitsuba_ext.composition.slots import read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
-from mitsuba_ext.transport.path_decisions import Roulette
 from mitsuba_ext.transport.walk import Walk
 
 #: The names of the maps, in the order in which they are made.
@@ -115,7 +114,12 @@ class PhotonMapping(WalkIntegrator):
         super().__init__(props)
         self.photons = self.parameter(props, "photons", 250_000, minimum=1, maximum=1 << 24)
         self.final_gather = self.parameter(props, "final_gather", True)
-        self.guided = self.parameter(props, "guided", False) and self.final_gather
+        self.guided = self.parameter(props, "guided", False)
+        if self.guided and not self.final_gather:
+            raise ValueError(
+                f'"{self.name}": "guided" chooses the directions of the final gather, which '
+                f'"final_gather" switches off: leave one of them out'
+            )
         self.lookup_size = self.parameter(props, "lookup_size", 30, minimum=1)
         self.radii = {
             name: self.parameter(props, f"{name}_radius", 0.0, minimum=0.0)
@@ -180,7 +184,7 @@ class PhotonMapping(WalkIntegrator):
             decisions["scattering"] = PhotonDirections(self.maps)
         return replace(
             self.walk(**decisions), mis=Phases(), rr_depth=0,
-            roulette=EndsWithTheGather(Roulette(), self.rr_depth, last),
+            roulette=EndsWithTheGather(self.rr_depth, last),
             subpaths=PhotonSubpaths(
                 *self.maps.estimates(scene, self.max_depth), self.final_gather
             ),

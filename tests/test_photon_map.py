@@ -88,6 +88,11 @@ def test_a_given_radius_is_used() -> None:
 # ---- Errors ----
 
 
+def test_a_guided_gather_needs_a_gather() -> None:
+    with pytest.raises((ValueError, RuntimeError), match='"photon_map": "guided" chooses'):
+        make(guided=True, final_gather=False)
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
 def test_spectral_variants_are_refused(variant: str) -> None:
     scene = mi.load_dict(stage(), optimize=False)

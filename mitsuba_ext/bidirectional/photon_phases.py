@@ -54,22 +54,18 @@ class Phases(Weights):
 
 
 class EndsWithTheGather(Roulette):
-    """Ends a path at the diffuse vertex at which the last segment arrives.
+    """Ends a path at the diffuse vertex at which the last segment arrives. Before that, it decides
+    as ``path`` does.
 
     Parameters:
-        roulette: Decides before that, from ``rr_depth`` on.
         rr_depth: See :class:`~mitsuba_ext.transport.walk.Walk`, whose own is 0.
         last: The part of a path in which it ends.
     """
 
-    def __init__(self, roulette: Roulette, rr_depth: int, last: int) -> None:
-        self._roulette, self._last = roulette, last
-        self._rr_depth = dr.opaque(mi.UInt32, rr_depth)
-
-    def begin(self, sampler, ray, pixel):
-        return self._roulette.begin(sampler, ray, pixel)
+    def __init__(self, rr_depth: int, last: int) -> None:
+        self._rr_depth, self._last = dr.opaque(mi.UInt32, rr_depth), last
 
     def survival(self, state, vertex, path, active):
-        survival, state = self._roulette.survival(state, vertex, path, active)
+        survival, state = super().survival(state, vertex, path, active)
         survival = dr.select(path.depth >= self._rr_depth, survival, 1)
         return dr.select(path.sums >= self._last, 0, survival), state
