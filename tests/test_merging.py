@@ -264,10 +264,25 @@ def test_spectral_caustics_have_the_mean_of_path(variant: str, name: str, glass:
     """Only vertices of the same wavelengths merge."""
     ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.4, "bsdf": {"type": glass}}
     scene = mi.load_dict(stage(ball=ball), optimize=False)
-    found = batches(scene, make(name, 5, radius=0.03), 128, range(1, 9))
+    everywhere = {"merging": "all"} if name == "vcm" else {}
+    found = batches(scene, make(name, 5, radius=0.03, **everywhere), 128, range(1, 9))
     reference = "composed_path" if glass == "dispersive_dielectric" else "path"
     expected = batches(scene, make(reference, 5), 1024, range(101, 109))
     assert_same_mean(found, expected, 0.03, tolerance=0.1)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_the_hero_counts_once_where_both_paths_are_dispersed(variant: str) -> None:
+    """A floor under a plate of dispersive glass, through which light and camera see it."""
+    T = mi.ScalarTransform4f
+    plate = {"type": "cube", "bsdf": {"type": "dispersive_dielectric"},
+             "to_world": T().translate([0, 0, 0.1]).scale([3, 3, 0.05])}  # fmt: skip
+    scene = mi.load_dict(stage(plate=plate, block=None), optimize=False)
+    means = [
+        batches(scene, make(name, 5, **more), spp, range(1, 5))[..., 8:, :, :].mean()
+        for name, spp, more in (("sppm", 64, {"radius": 0.1}), ("composed_path", 1024, {}))
+    ]
+    assert means[0] == pytest.approx(means[1], rel=0.1)
 
 
 @pytest.mark.parametrize("name", ["vcm", pytest.param("sppm", marks=pytest.mark.slow)])

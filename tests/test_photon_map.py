@@ -52,6 +52,29 @@ def test_direct_light_is_that_of_path(parameters: dict) -> None:
     assert_same_mean(found, expected, 0.03, tolerance=0.0)
 
 
+def test_guided_directions_change_no_mean() -> None:
+    """The same photons, looked up from other directions."""
+    scene = load("furnace_box", width=16, height=16)
+    plain, guided = (
+        batches(scene, make(3, photons=1 << 14, guided=guided), 128, range(1, 5)).mean()
+        for guided in (False, True)
+    )
+    assert guided == pytest.approx(plain, rel=0.003)
+
+
+def test_light_by_way_of_a_mirror_counts_once() -> None:
+    """The lamp shines up, at a mirror: no light reaches the floor directly."""
+    T = mi.ScalarTransform4f
+    lamp = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(0.5),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 5.0}}}  # fmt: skip
+    mirror = {"type": "rectangle", "bsdf": {"type": "conductor"},
+              "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(3)}  # fmt: skip
+    scene = mi.load_dict(stage(light=lamp, mirror=mirror), optimize=False)
+    found = batches(scene, make(4, photons=1 << 17), 64, range(1, 9))
+    expected = batches(scene, mi.load_dict({"type": "path", "max_depth": 4}), 256, range(101, 109))
+    assert_same_mean(found, expected, 0.02, tolerance=0.0)
+
+
 def test_more_photons_have_less_bias() -> None:
     """In the corners of a box, a part of the disk is missing."""
     scene = load("furnace_box", width=16, height=16)
