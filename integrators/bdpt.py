@@ -33,10 +33,10 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
          (preferably in regions whose vertices were visible from the camera path's vertex, and
          brought light, in the pilot samples). (Default: uniform)
      * - light_paths
-       - |string|
-       - Whether light paths are traced: :monosp:`always`, or :monosp:`auto`: pilot samples measure
-         whether light paths are worth their time; if not, all other samples are those of
-         :monosp:`path` with the same decisions. (Default: always)
+       - |float| or |string|
+       - Number of light paths for each camera path, from 0 (camera paths alone) to 64; or
+         :monosp:`always`, which is 1; or :monosp:`auto`: pilot samples measure how many are worth
+         their time. Where few are, all other samples take that many. (Default: always)
      * - sample_direct
        - |bool|
        - Connect camera paths to points that are sampled on lights (s = 1)? False shows what the

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mitsuba as mi
@@ -10,6 +11,7 @@ from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.photon_mapper import PhotonMapper
+from mitsuba_ext.composition.light_paths import MOST_PATHS, check_shared_rays
 from mitsuba_ext.composition.merging_parameters import MergingParameters, share_rays
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera_samples import CameraSamples
@@ -48,6 +50,10 @@ class ProgressivePhotonMapping(WalkIntegrator):
        - |float|
        - α, in (0, 1]: the squared radius of pass i is that of the first times i to the power of
          α − 1. With 1 it stays. (Default: 0.75)
+     * - light_paths
+       - |float|
+       - Number of light paths for each camera path. More of them make the radius of a pass smaller.
+         (Default: 1)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
@@ -58,9 +64,9 @@ class ProgressivePhotonMapping(WalkIntegrator):
     integrator :class:`vcm` has all other techniques beside this one.
 
     The image is biased with any number of samples: light is blurred over the radius, dark at edges
-    and in creases that are narrower than that. The bias falls with the squared radius. There are as
-    many photon paths as camera samples. Vertices merge only on surfaces that face about the same
-    way, so that light does not leak through thin walls.
+    and in creases that are narrower than that. The bias falls with the squared radius. Vertices
+    merge only on surfaces that face about the same way, so that light does not leak through thin
+    walls.
 
     In a render in batches (:monosp:`checkpoint`, or several workers), the radius of a batch goes on
     where that of the one before ended.
@@ -94,10 +100,15 @@ class ProgressivePhotonMapping(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.merging = MergingParameters.read(self, props)
+        self.light_paths = self.parameter(
+            props, "light_paths", 1.0, minimum=1 / MOST_PATHS, maximum=MOST_PATHS
+        )
         self.fill(props)
 
     def parameters(self) -> dict[str, Any]:
-        return {**self.merging.parameters(), **super().parameters()}
+        return {
+            **self.merging.parameters(), "light_paths": self.light_paths, **super().parameters()
+        }  # fmt: skip
 
     @property
     def needs_equal_samples(self) -> str:
@@ -105,12 +116,13 @@ class ProgressivePhotonMapping(WalkIntegrator):
 
     @property
     def sample_cost(self) -> int:
-        return 3
+        return max(3, math.ceil(self.light_paths))
 
     @property
     def most_lanes(self) -> int:
         layout = Layout(len(mi.Spectrum()), 0, True)
-        return _PASS_BYTES // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
+        bytes_per_path = STRIDE * bytes_per_vertex(layout) + _PATH_BYTES
+        return int(_PASS_BYTES / max(1.0, self.light_paths)) // bytes_per_path
 
     def schedule(self, scene, sensor, samples, seed) -> OneStage:
         query = self.query(scene)
@@ -124,8 +136,10 @@ class ProgressivePhotonMapping(WalkIntegrator):
             emission = LightEmission(scene)
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
+        check_shared_rays(self.name, scene, self.light_paths)
         light_walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
-        radius = self.merging.radius_of(scene, sensor, light_walk, False, self.samples_before)
+        before = round(self.samples_before * self.light_paths)
+        radius = self.merging.radius_of(scene, sensor, light_walk, False, before)
         camera = CameraSamples()
         share_rays(camera, scene, seed)
-        return OneStage(PhotonMapper(walk, light_walk, radius), camera)
+        return OneStage(PhotonMapper(walk, light_walk, radius, self.light_paths), camera)

@@ -48,8 +48,8 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
          α − 1. With 1 it stays. (Default: 0.75)
      * - (Parameters of bdpt)
        - |several|
-       - Those of :class:`bdpt`: connections, light_image, subpath_selection, sample_direct,
-         next_event, directions, roulette, shadow_test.
+       - Those of :class:`bdpt`: light_paths, connections, light_image, subpath_selection,
+         sample_direct, next_event, directions, roulette, shadow_test.
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
@@ -70,8 +70,7 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     the same time: vertices of other paths cannot be merged. Errors of colour and of motion blur are
     then alike in all pixels; they fall faster than noise.
 
-    Participating media are refused, and so are ``light_paths`` and ``technique_images`` of
-    :class:`bdpt` with merging.
+    Participating media are refused, and so is ``technique_images`` of :class:`bdpt` with merging.
 
     Source: I. Georgiev, J. Křivánek, T. Davidovič, P. Slusallek, *Light Transport Simulation with
     Vertex Connection and Merging*, ACM Transactions on Graphics 31(6), 2012; I. Georgiev,
@@ -98,11 +97,10 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
             props, "merging", "caustics", choices=("caustics", "all", "none")
         )
         self.merging = MergingParameters.read(self, props)
-        refused = "technique_images" if self.technique_images else "light_paths"
-        if self.where != "none" and (self.technique_images or "light_paths" in self.slots):
+        if self.where != "none" and self.technique_images:
             raise ValueError(
-                f'"{self.name}": the parameter "{refused}" cannot be combined with merging; leave '
-                f"it out, or use \"bdpt\""
+                f'"{self.name}": the parameter "technique_images" cannot be combined with merging; '
+                f'leave it out, or use "bdpt"'
             )
 
     @property

@@ -22,8 +22,8 @@ class LightImage:
     """Connects vertices of light paths to the sensor. It uses a kernel of its own, which has a lane
     for each vertex.
 
-    There must be as many light paths as camera paths. The sum of a pixel's splats, divided by the
-    number of its camera samples, is then their contribution to the pixel's radiance.
+    The sum of a pixel's splats, divided by the number of its camera samples, is their contribution
+    to the pixel's radiance.
 
     It draws one random number if the sensor has an aperture, and none otherwise.
 
@@ -32,12 +32,13 @@ class LightImage:
         sensor: The sensor to which the vertices are connected.
         numbers: The source of random numbers.
         rays: The camera rays of the pass. A light path's splats are multiplied by the importance of
-            the camera ray in its lane.
+            the camera ray in its lane (if their number differs, rays must have equal importance).
         sums: Computes MIS weights. If it is ``None``, the weights are 1.
         query: Intersects rays with the scene.
         hides_emitters: Are area lights invisible to the sensor?
         least_depth: Least number of segments between the light and a vertex that is connected.
         observer: Is told the splats.
+        light_paths: Number of light paths for each camera path.
 
     Attributes:
         shadow_count: Number of shadow rays traced.
@@ -54,7 +55,9 @@ class LightImage:
         hides_emitters: bool = False,
         least_depth: int = 1,
         observer: TechniqueObserver | None = None,
+        light_paths: float = 1.0,
     ) -> None:
+        self._share = dr.opaque(mi.Float, 1 / light_paths)
         self._least_depth = least_depth
         self._observer = observer
         self._scene, self._sensor, self._importance = scene, sensor, rays.importance
@@ -74,7 +77,7 @@ class LightImage:
         """The objects and constants that kernels depend on."""
         return (
             self._least_depth, self._scene, self._sensor, self._importance, self._sums,
-            self._query, self._hides_emitters, self._seed,
+            self._query, self._hides_emitters, self._seed, self._share,
         )  # fmt: skip
 
     def add(self, vertices: LightVertices) -> None:
@@ -117,13 +120,14 @@ class LightImage:
             heroes, vertex.hero_is_alone, si.bsdf(), si, to_camera, active
         )
         importance = connection.importance * lens_weight
-        value *= vertex.β * importance
+        value *= vertex.β * (importance * self._share)
         mis, by_camera = mi.Float(1), ()
         if self._sums is not None:
             # The density per area with which a camera ray finds the vertex, divided by the density
             # of this point of the aperture
             found = importance * geometric_cosine(si, to_camera)
-            mis = weight(self._sums.others(found, vertex.sums, reverse_pdf))
+            others = self._sums.others(found, vertex.sums, reverse_pdf)
+            mis = weight(others / self._sums.image_count)
             by_camera = self._sums.by_camera(
                 found, vertex.sums, reverse_pdf, vertex.depth == 1
             )

@@ -44,7 +44,7 @@ class LightTracer:
         )  # fmt: skip
         # Evaluated now, since later kernels of the pass read them again
         dr.schedule(sample, rays.ray.wavelengths)
-        numbers = light_numbers(sampler, dr.width(rays.ray))
+        numbers = light_numbers(sampler, dr.width(rays.ray), dr.width(rays.ray))
         scatter_count = walk.run(
             scene, numbers, rays.ray.time, rays.ray.wavelengths, active, image.add
         )

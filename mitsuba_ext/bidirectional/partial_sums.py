@@ -60,8 +60,8 @@ class PartialSums:
         next_event: The decision that samples points on lights for next event estimation at the
             vertices of camera paths.
         connections: The average fraction of the vertices of a light path to which a vertex of a
-            camera path is connected (s, t ≥ 2). All other techniques are used once for each pair of
-            paths.
+            camera path is connected (s, t ≥ 2). Camera paths are connected to the light (s = 1) and
+            hit it (s = 0) once.
         exponent: 1 for the balance heuristic, 2 for the power heuristic.
         follows_camera: Is ``by_camera`` of :class:`Sums` computed?
         selection: Chooses the vertices of light paths by regions; its ``expected`` for a pair of
@@ -71,6 +71,8 @@ class PartialSums:
             ``None`` if vertices are not merged.
         merges_all: Are vertices merged wherever their BSDF is smooth? If not, only where light
             arrives from a delta lobe.
+        light_paths: Number of light paths for each camera path: so often, on average, a light path
+            is connected to the sensor (t = 1).
     """
 
     def __init__(
@@ -82,11 +84,14 @@ class PartialSums:
         selection: SubpathSelection | None = None,
         merging: mi.Float | None = None,
         merges_all: bool = False,
+        light_paths: mi.Float | float = 1.0,
     ) -> None:
         self._next_event, self.exponent, self.selection = next_event, exponent, selection
         self.follows_camera = follows_camera
         #: ``connections``, raised to the exponent.
         self.count = self.ratio(mi.Float(connections))
+        #: ``light_paths``, raised to the exponent.
+        self.image_count = self.ratio(mi.Float(light_paths))
         #: ``merging``, raised to the exponent.
         self.merging = None if merging is None else self.ratio(merging)
         self.merges_all = merges_all

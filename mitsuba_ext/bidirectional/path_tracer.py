@@ -20,7 +20,7 @@ from ..transport.without_lengths import WithoutLengths
 from .connections import LightSubpaths
 from .emission import LightEmission
 from .light_image import LightImage
-from .light_numbers import light_numbers
+from .light_numbers import LightPathRays
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
 from .merging import HANDFUL, MergedSubpaths, MergingRadius
@@ -55,6 +55,8 @@ class BidirectionalPathTracer:
         skips_direct: Are paths of one and two segments left out?
         radius: Within what radius vertices are merged; ``None`` if they are not.
         merges_all: See :class:`PartialSums`.
+        light_paths: Number of light paths for each camera path. It must be 1 where paths of
+            different lanes cannot be connected (see ``selection`` and ``is_alone``).
     """
 
     walk: Walk
@@ -67,6 +69,7 @@ class BidirectionalPathTracer:
     skips_direct: bool = False
     radius: MergingRadius | None = None
     merges_all: bool = False
+    light_paths: float = 1.0
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
@@ -83,22 +86,26 @@ class BidirectionalPathTracer:
             walk = replace(walk, observer=Observers([walk.observer, observer]))
             follows_camera = observer.compares_with_camera
         lanes = dr.width(rays.ray)
+        light = LightPathRays.of(sampler, rays, self.light_paths)
+        per_camera_path = light.count / lanes
         radius, merging = None, None
         if self.radius is not None:
             # Of paths of different times or wavelengths, those of one sample of each pixel merge
-            paths = min(lanes, self.radius.pixels) if own_lane else lanes
-            radius = dr.opaque(mi.Float, self.radius.next(paths, lanes // paths))
+            paths = min(lanes, self.radius.pixels) if own_lane else light.count
+            radius = dr.opaque(mi.Float, self.radius.next(paths, light.count // paths))
             merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / HANDFUL)
             dr.make_opaque(merging)
         sums = PartialSums(
             walk.next_event, dr.opaque(mi.Float, count), follows_camera=follows_camera,
             selection=selection, merging=merging, merges_all=self.merges_all,
+            light_paths=dr.opaque(mi.Float, per_camera_path),
         )  # fmt: skip
         image = None
         if self.sensor is not None:
+            numbers = sampler if light.count == lanes else light.numbers
             image = LightImage(
-                scene, self.sensor, sampler, rays, sums, walk.query, walk.hide_emitters,
-                2 if self.skips_direct else 1, observer,
+                scene, self.sensor, numbers, rays, sums, walk.query, walk.hide_emitters,
+                2 if self.skips_direct else 1, observer, per_camera_path,
             )  # fmt: skip
         light_walk = LightWalk(
             self.emission, walk.max_depth, walk.rr_depth, sums, query=walk.query
@@ -112,9 +119,8 @@ class BidirectionalPathTracer:
                 image.add(vertices)
             rounds.append(PackedVertices(vertices))
 
-        numbers = light_numbers(sampler, lanes)
         scatter_count = light_walk.run(
-            scene, numbers, rays.ray.time, rays.ray.wavelengths, active, take
+            scene, light.numbers, light.time, light.wavelengths, light.emits(active), take
         )
         splats = image.splats() if image is not None else []
         weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)
@@ -122,7 +128,7 @@ class BidirectionalPathTracer:
             weights = WithoutLengths(weights, 1, 2)
         subpaths = None
         if rounds:
-            vertices = VertexCache(rounds, lanes)
+            vertices = VertexCache(rounds, light.count)
             if selection is not None:
                 choice = RegionChoice(vertices, selection)
             else:
@@ -142,15 +148,16 @@ class BidirectionalPathTracer:
         sample = self._camera_paths(
             replace(walk, mis=weights, subpaths=subpaths), scene, sampler, rays, active
         )
+        # The first lane counts all rays that are not those of the path in a lane
+        is_first = dr.arange(mi.UInt32, lanes) == 0
         shadow_count = sample.shadow_count
         if image is not None:
-            # The first lane counts all shadow rays of the light image
-            is_first = dr.arange(mi.UInt32, lanes) == 0
             shadow_count = shadow_count + dr.select(is_first, image.shadow_count, 0)
-        scatter_count += sample.scatter_count
+        scatter_count = light.by_camera_path(scatter_count, lanes)
         whole = replace(
-            sample, splats=splats, scatter_count=scatter_count, shadow_count=shadow_count
-        )
+            sample, splats=splats, scatter_count=sample.scatter_count + scatter_count,
+            shadow_count=shadow_count,
+        )  # fmt: skip
         if observer is not None:
             observer.traced(sample, whole)
         return whole

@@ -18,7 +18,7 @@ from ..transport.heroes import Heroes
 from ..transport.numbers import Numbers
 from ..transport.path_decisions import Roulette, Weights
 from ..transport.walk import Walk
-from .light_numbers import light_numbers
+from .light_numbers import LightPathRays
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
 from .merging import MergedSubpaths, MergingRadius
@@ -48,33 +48,38 @@ class PhotonMapper:
         walk: Traces the camera paths; it makes no connections.
         light_walk: Traces the light paths.
         radius: Within what radius vertices are merged.
+        light_paths: Number of light paths for each camera path; 1 in spectral variants and with
+            moving shapes.
     """
 
     walk: Walk
     light_walk: LightWalk
     radius: MergingRadius
+    light_paths: float = 1.0
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
     ) -> Sample:
         dr.schedule(rays)
         lanes = dr.width(rays.ray)
+        light = LightPathRays.of(sampler, rays, self.light_paths)
         rounds: list[LightVertices] = []
         scatter_count = self.light_walk.run(
-            scene, light_numbers(sampler, lanes), rays.ray.time, rays.ray.wavelengths, active,
+            scene, light.numbers, light.time, light.wavelengths, light.emits(active),
             lambda vertices: rounds.append(PackedVertices(vertices)),
         )  # fmt: skip
         walk = replace(self.walk, mis=FoundByCamera(), roulette=OnlySpecular(), rr_depth=0)
         if rounds:
-            vertices = VertexCache(rounds, lanes)
+            vertices = VertexCache(rounds, light.count)
             # Of paths of different times or wavelengths, those of one sample of each pixel merge
             groups = mi.is_spectral or bool(movers(scene))
-            paths = min(lanes, self.radius.pixels) if groups else lanes
-            radius = dr.opaque(mi.Float, self.radius.next(paths, lanes // paths))
+            paths = min(lanes, self.radius.pixels) if groups else light.count
+            radius = dr.opaque(mi.Float, self.radius.next(paths, light.count // paths))
             grid = VertexGrid(vertices, radius, None, vertices.group if groups else None)
             subpaths = MergedSubpaths(
                 vertices, grid, None, Heroes(scene), walk.max_depth, paths, groups
             )
             walk = replace(walk, subpaths=subpaths)
         sample = walk(scene, sampler, rays, active)
+        scatter_count = light.by_camera_path(scatter_count, lanes)
         return replace(sample, scatter_count=sample.scatter_count + scatter_count)

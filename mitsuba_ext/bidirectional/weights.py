@@ -47,8 +47,8 @@ class BidirectionalWeights(Weights):
         if self._sensor is None:
             return self.sums.begin(mi.Float(0), mi.Float(0))
         self._origin, pdf = self._sensor.origin(ray)
-        # One light path is traced for each camera path: the technique t = 1 has the count 1
-        return self.sums.begin(self.sums.ratio(dr.rcp(pdf)), dr.zeros(mi.Float, dr.width(pdf)))
+        dVCM = self.sums.image_count * self.sums.ratio(dr.rcp(pdf))
+        return self.sums.begin(dVCM, dr.zeros(mi.Float, dr.width(pdf)))
 
     def arrive(self, path: PathState, si: mi.SurfaceInteraction3f) -> Sums:
         is_first = path.depth == 0

@@ -19,7 +19,7 @@ from ..bidirectional.technique_images import TechniqueImages
 from ..rendering.camera import film_extent
 from ..transport.estimator import Estimator
 from ..transport.path_decisions import NoConnections, SubpathSelection
-from .light_paths import LightPathChoice
+from .light_paths import LightPathChoice, check_shared_rays
 from .light_side import LightSide
 from .slots import BIDIRECTIONAL_SLOTS, read_slot
 from .walk_integrator import WalkIntegrator
@@ -93,12 +93,14 @@ class BidirectionalIntegrator(WalkIntegrator):
     @property
     def most_lanes(self) -> int:
         layout = Layout(len(mi.Spectrum()), 4, True)
-        return _PASS_BYTES // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
+        paths = max(1.0, getattr(self.slots.get("light_paths"), "count", 1.0))
+        return int(_PASS_BYTES / paths) // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
 
     def estimators(self, scene: mi.Scene, sensor: mi.Sensor):
         if not scene.emitters() or self.max_depth < 2:
             return self.walk
         side = LightSide.of(self.name, scene, sensor, self.light_image)
+        check_shared_rays(self.name, scene, getattr(self.slots.get("light_paths"), "count", 1.0))
         film = sensor.film()
         if self.technique_images:
             self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
@@ -116,25 +118,26 @@ class BidirectionalIntegrator(WalkIntegrator):
     def _estimator(
         self, side: LightSide, radius: MergingRadius | None, **decisions: Any
     ) -> Estimator:
-        always = LightPathChoice(True, self.techniques)
+        always = LightPathChoice(observer=self.techniques)
         choice: LightPathChoice = decisions.pop("light_paths", always)
+        are_traced = choice.count > 0
         selection = decisions.pop("subpath_selection", SubpathSelection())
         next_event = decisions.pop("next_event", None)
         if not self.sample_direct:
             next_event = NoConnections()
-        elif choice.are_traced:
+        elif are_traced:
             next_event = side.next_event(next_event)
         else:
             next_event = next_event or side.correct
         if next_event:
             decisions["next_event"] = next_event
         walk = self.walk(**decisions)
-        if not choice.are_traced:
+        if not are_traced:
             return walk
         return BidirectionalPathTracer(
             walk, side.emission, side.sensor, self.connections, selection, choice.observer,
-            radius=radius, merges_all=self.merges_all,
-        )
+            radius=radius, merges_all=self.merges_all, light_paths=choice.count,
+        )  # fmt: skip
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         self.techniques = None

@@ -1,9 +1,12 @@
-"""The slot ``light_paths``: whether paths are traced from lights."""
+"""The slot ``light_paths``: how many paths are traced from lights."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -14,7 +17,8 @@ from ..learning.benefit import gain_of, is_worth, trimmed_batches
 from ..learning.learner import Learner
 from ..learning.pixel_estimates import relative_scale
 from ..rendering.camera import film_extent
-from .decision_parameters import DecisionParameters, Setting
+from ..scene.movers import movers
+from .decision_parameters import DecisionParameters, Setting, Slots
 
 #: The time of a ray of a bidirectional sample, in units of that of a ray of ``path``: BSDFs are
 #: evaluated at both ends of a connection, and densities in both directions.
@@ -27,12 +31,58 @@ _TIME_OF_A_RAY = 1.5
 _ENOUGH = 1 << 16
 
 
+#: The most light paths for each camera path.
+MOST_PATHS = 64.0
+
+
 @dataclass(frozen=True)
 class LightPathChoice:
-    """Whether light paths are traced, and the observer of their contributions."""
+    """
+    Attributes:
+        count: Number of light paths for each camera path; with 0, none are traced.
+        observer: Observes their contributions.
+    """
 
-    are_traced: bool
+    count: float = 1.0
     observer: TechniqueObserver | None = None
+
+
+class LightPathCount(DecisionParameters):
+    """So many light paths for each camera path. The attribute is the parameter."""
+
+    slots = ("light_paths",)
+
+    def __init__(self, count: float) -> None:
+        self.count = count
+
+    @staticmethod
+    def accepts(count: Any) -> bool:
+        """Can a scene ask for so many?"""
+        return type(count) in (int, float) and 0 <= count <= MOST_PATHS
+
+    def decision(self, setting: Setting) -> LightPathChoice:
+        return LightPathChoice(self.count)
+
+    @property
+    def sample_cost(self) -> int:
+        return max(1, math.ceil(self.count))
+
+    def describe(self, slots: Slots = MappingProxyType({})) -> str:
+        return f"{self.count:g}"
+
+
+def check_shared_rays(plugin: str, scene: mi.Scene, count: float) -> None:
+    """
+    Raises:
+        NotImplementedError: Each camera path needs a light path of its wavelengths and time, and
+            there would not be one for each.
+    """
+    if count not in (0, 1) and (mi.is_spectral or movers(scene)):
+        why = "in spectral variants" if mi.is_spectral else "with moving shapes"
+        raise NotImplementedError(
+            f'"{plugin}": the parameter "light_paths" is {count:g}; {why}, each camera path needs '
+            f"one light path: leave the parameter out"
+        )
 
 
 class LightPathsWhereTheyPay(DecisionParameters):
@@ -72,7 +122,7 @@ class LightPathTrial(Learner):
     def __init__(self, film: mi.Film) -> None:
         self._width, height = film_extent(film)
         self._moments: PathMoments | None = PathMoments(film, self._width, height)
-        self._choice = LightPathChoice(True, self._moments)
+        self._choice = LightPathChoice(1.0, self._moments)
         self.estimate: Estimate | None = None
         self.variance = self.cost = float("nan")
 
@@ -97,19 +147,19 @@ class LightPathTrial(Learner):
             self.variance, error = 0.0, 0.0
         self._moments = None
         efficiency = 1 / (max(self.variance, 1e-3) * self.cost)
-        self._choice = LightPathChoice(is_worth(efficiency, error, 1.0))
+        self._choice = LightPathChoice(float(is_worth(efficiency, error, 1.0)))
         return self._choice
 
     def state(self) -> dict[str, np.ndarray]:
-        return {"light_paths": np.array([self._choice.are_traced])}
+        return {"light_paths": np.array([self._choice.count])}
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightPathChoice:
         self._moments = None
-        self._choice = LightPathChoice(bool(state["light_paths"][0]))
+        self._choice = LightPathChoice(float(state["light_paths"][0]))
         return self._choice
 
     def __str__(self) -> str:
-        kept = "light paths pay" if self._choice.are_traced else "light paths do not pay"
+        kept = "light paths pay" if self._choice.count > 0 else "light paths do not pay"
         if np.isnan(self.variance):
             return kept
         return f"{kept} ({self.variance:.2f} of the variance, {self.cost:.1f} x the time)"

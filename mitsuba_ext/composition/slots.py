@@ -11,7 +11,7 @@ from .camera_numbers import PURPOSES, WeightedNumbers
 from .connections import Connections
 from .decision_parameters import DecisionParameters, ParameterReader
 from .directions import Guided
-from .light_paths import LightPathsWhereTheyPay
+from .light_paths import MOST_PATHS, LightPathCount, LightPathsWhereTheyPay
 from .mis import HEURISTICS, MisHeuristic
 from .next_event import (
     CAMERA_METHODS,
@@ -60,8 +60,8 @@ _PLUGINS: tuple[type[DecisionParameters], ...] = (
 
 
 def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameters | None:
-    """Reads what the scene puts into a slot: a word, or a nested plugin; for ``connections`` also
-    a number. ``None`` for what ``path`` does.
+    """Reads what the scene puts into a slot: a word, or a nested plugin; for ``connections`` and
+    ``light_paths`` also a number. ``None`` for what ``path`` does.
 
     Raises:
         TypeError, ValueError: The value is none of these, or belongs into another slot.
@@ -74,6 +74,8 @@ def read_slot(plugin: str, props: mi.Properties, slot: str) -> DecisionParameter
         return parameters
     if slot == "connections" and type(value) is int:
         return Connections(ParameterReader.of_defaults(plugin, {"count": slot}, count=value))
+    if slot == "light_paths" and LightPathCount.accepts(value):
+        return LightPathCount(float(value))
     if slot in PURPOSES and isinstance(value, str) and value in PATTERNS:
         parameters = WeightedNumbers(ParameterReader.of_defaults(plugin, pattern=value))
         parameters.check_slot(plugin, slot)
@@ -95,4 +97,6 @@ def _accepted(slot: str, value: object) -> str:
     number = "a number, " if slot == "connections" else ""
     plugins = [f'"{kind.name}"' for kind in _PLUGINS if slot in kind.slots]
     nested = f", {number}or a nested plugin: {' or '.join(plugins)}" if plugins else ""
+    if slot == "light_paths":
+        nested = f", or a number from 0 to {MOST_PATHS:g}"
     return f"{found}; it must be one of {', '.join(words)}{nested}"
