@@ -22,7 +22,7 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
      * - connections
        - |int|
        - To how many vertices of light paths, chosen at random, each vertex of a camera path is
-         connected. (Default: 1)
+         connected; 0 for none. (Default: 1)
      * - light_image
        - |bool|
        - Connect light paths to the sensor as well (t = 1)? This finds caustics that are seen

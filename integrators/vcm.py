@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext.bidirectional.light_walk import LightWalk
-from mitsuba_ext.bidirectional.merging import MergingRadius
+from mitsuba_ext.bidirectional.merging_radius import MergingRadius
 from mitsuba_ext.bidirectional.partial_sums import PartialSums
 from mitsuba_ext.composition.bidirectional_integrator import BidirectionalIntegrator
 from mitsuba_ext.composition.light_side import LightSide

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsuba_ext.bidirectional.connections import End, joining_by_camera, joining_weight
+from mitsuba_ext.bidirectional.connections import End, joining_rivals, joining_weight
 from mitsuba_ext.bidirectional.emission import EmittedRay, LightEmission
 from mitsuba_ext.bidirectional.partial_sums import PartialSums, weight
 from mitsuba_ext.bidirectional.scattering import geometric_cosine, reverse_density
@@ -134,8 +134,9 @@ def _walk(scene, numbers, ray, count, active, mode):
     return found, active
 
 
-#: How often two vertices of subpaths are connected, for weights: not once, as all else.
-CONNECTIONS = 0.4
+#: How often two vertices of subpaths are connected, and how many light paths there are for each
+#: camera path, for weights: not once, as all else.
+CONNECTIONS, LIGHT_PATHS = 0.4, 3.0
 
 
 def weights_of_techniques(
@@ -148,8 +149,11 @@ def weights_of_techniques(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As the estimator computes them: the weight of each technique, [s, path], 0 where it cannot
     find the path; which of the lanes have a path; and for all techniques but the first two the
-    ratios of the densities of these to its own, [s − 2, 2, path]."""
-    sums = PartialSums(next_event, CONNECTIONS, follows_camera=True, selection=selection)
+    ratios of the densities of these to its own, and the squared ratios of other connections and of
+    the light image, [s − 2, 4, path]."""
+    sums = PartialSums(
+        next_event, CONNECTIONS, splits=True, selection=selection, light_paths=LIGHT_PATHS
+    )
     active = paths.active
     weights = BidirectionalWeights(scene, sums, emits, sensor)
     ctx = mi.BSDFContext()
@@ -159,7 +163,9 @@ def weights_of_techniques(
     si = vertices[0].from_light
     first, at_first = sums.first(scene, emitted, si, active), mi.Bool(True)
     arrived = sums.arrive(first, si, mi.Float(1), at_first, by_light=True)
-    by_light = [replace(first, region=arrived.region, count=arrived.count)]
+    by_light = [
+        replace(first, region=arrived.region, count=arrived.count, by_kind=mi.Vector2f(0))
+    ]
     # Which techniques scatter only where their densities are not 0
     from_light, from_camera = [mi.Bool(True)], [mi.Bool(True), mi.Bool(True)]
     for a, b in zip(vertices, vertices[1:]):
@@ -258,7 +264,11 @@ def weights_of_techniques(
         joined = joining_weight(sums, *ends, dr.squared_norm(b.p - a.p), expected)
         found.append(dr.select(a.is_delta | b.is_delta, 0, joined))
         factor = 1 / (CONNECTIONS * expected)
-        ratios.append(joining_by_camera(sums, *ends, dr.squared_norm(b.p - a.p), i == 0, factor))
+        is_first = b is vertices[-1], i == 0
+        rivals = joining_rivals(
+            sums, *ends, dr.squared_norm(b.p - a.p), is_first, factor, expected
+        )
+        ratios.append([*rivals.by_camera, *rivals.by_kind])
 
     # ----- t = 1 -----
     if sensor is not None:
@@ -267,9 +277,12 @@ def weights_of_techniques(
         wo = last.from_camera.wi
         density = pdf / dr.squared_norm(last.p - origin) * geometric_cosine(last.from_light, wo)
         reverse = reverse_density(ctx, last.bsdf, last.from_light, wo, active)
-        seen = weight(sums.others(density, by_light[-1], reverse))
+        seen = weight(sums.others(density, by_light[-1], reverse) / sums.image_count)
         found.append(dr.select(last.is_delta, 0, seen))
-        ratios.append(sums.by_camera(density, by_light[-1], reverse, len(vertices) == 1))
+        ends = density, by_light[-1], reverse, len(vertices) == 1
+        ratios.append(
+            [*(sums.by_camera(*ends) / LIGHT_PATHS), *(sums.by_kind(*ends) / sums.image_count)]
+        )
     # from_camera: for s = 0, 1, …, t = 1; from_light: for s = 2, …
     can = [from_camera[s] & (from_light[s - 2] if s > 1 else True) for s in range(len(found))]
     found = [dr.select(active & c, w, 0) for c, w in zip(can, found)]
@@ -278,5 +291,7 @@ def weights_of_techniques(
     return (
         np.stack([np.broadcast_to(np.array(w, dtype=np.float64), shape) for w in found]),
         np.array(active),
-        np.array([np.array(r, dtype=np.float64) for r in ratios]),
+        np.array([
+            [np.broadcast_to(np.array(x, dtype=np.float64), shape) for x in r] for r in ratios
+        ]),  # fmt: skip
     )

@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from bidirectional_paths import CONNECTIONS, Paths, trace, weights_of_techniques
+from bidirectional_paths import CONNECTIONS, LIGHT_PATHS, Paths, trace, weights_of_techniques
 from hard_cases import _octahedron, area, diffuse, rectangle, rgb, sensor, stage
 from statistical import some
 from test_light_tracer import EMITTERS, MATERIALS, T, _balls
@@ -192,7 +192,8 @@ def assert_camera_ratios(
     found, ratios = found[:, exists], ratios[..., exists]
     assert len(ratios) == len(found) - 2
     compared = 0
-    for own, ratio in zip(found[2:], ratios):
+    for s, (own, ratio) in enumerate(zip(found[2:], ratios), 2):
+        assert_kinds(found, s, ratio[2:])
         for by_camera, q in zip(found[:2], ratio):
             # What camera paths cannot find, or so rarely that its weight is below the least float
             assert np.all((own * q**2)[(by_camera == 0) & (own > 0)] < 1e-30)
@@ -202,6 +203,16 @@ def assert_camera_ratios(
                 assert np.quantile(np.abs(q[is_clear] / expected - 1), 0.98) < 1e-2
             compared += is_clear.sum()
     assert compared >= 20
+
+
+def assert_kinds(found: np.ndarray, s: int, squares: np.ndarray) -> None:
+    """``squares``: those of the other connections, and of the light image, for the technique s."""
+    own, last = found[s], len(found) - 1
+    others = [k for k in range(2, last) if k != s], [last] if s != last else []
+    is_clear = own > 1e-3
+    for kind, q2 in zip(others, squares):
+        expected = found[kind].sum(axis=0)[is_clear] / own[is_clear]
+        np.testing.assert_allclose(q2[is_clear], expected, rtol=3e-2, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", some("rectangle", "constant", of=EMITTERS))
@@ -304,6 +315,7 @@ def test_weights_are_those_of_the_densities(name: str, by_regions: bool) -> None
         densities = _densities(name, paths, exists, scene)
         # But for hits (0), connections to lights (1) and to the sensor (the last)
         densities[2:-1] *= CONNECTIONS
+        densities[-1] *= LIGHT_PATHS
         if selection is not None:
             # Technique s connects the vertices s − 2 and s − 1
             vertices = paths.vertices

@@ -1,4 +1,4 @@
-"""``bdpt`` with ``light_paths = auto``."""
+"""``light_paths``: how many, and those of their techniques that pay."""
 
 from __future__ import annotations
 
@@ -53,7 +53,8 @@ def test_light_that_path_cannot_find_keeps_light_paths() -> None:
     scene["sky"] = {"type": "constant", "radiance": rgb(100.0)}
     integrator = _auto()
     mi.render(mi.load_dict(scene, optimize=False), integrator=integrator, spp=64)
-    assert integrator.statistics.learned.startswith("light paths pay (0.00")
+    learned = integrator.statistics.learned
+    assert learned.startswith("light paths pay: ") and "(0.00 of" in learned
 
 
 @pytest.mark.parametrize("light", some("constant", of=["constant", "rectangle"]))
@@ -77,7 +78,7 @@ def assert_variance_of_path_is_predicted(scene: dict[str, Any], **parameters: An
     scene = mi.load_dict(scene, optimize=False)
     integrator = _auto(max_depth=4, pilot_spp=64, **parameters)
     mi.render(scene, integrator=integrator, spp=256)
-    predicted = integrator.learners["light_paths"].estimate.by_camera.mean()
+    predicted = integrator.learners["light_paths"].estimate.variances[0].mean()
     seeds = batches(scene, mi.load_dict({"type": "path", "max_depth": 4}), 16, range(24))
     measured = 16 * seeds.mean(axis=-1).var(axis=0, ddof=1).mean()
     assert predicted == pytest.approx(measured, rel=0.15)
@@ -139,16 +140,16 @@ def test_weights_are_those_of_the_densities_that_light_paths_know(
             dr.eval(self.count)
             counts.append(self.count)
 
-        def joined(self, s, t, value, mis, by_camera, active) -> None:
-            self._compare(s, mis, by_camera, active)
-            super().joined(s, t, value, mis, by_camera, active)
+        def joined(self, s, t, value, mis, rivals, active) -> None:
+            self._compare(s, mis, rivals, active)
+            super().joined(s, t, value, mis, rivals, active)
 
-        def splatted(self, s, position, value, mis, by_camera, active) -> None:
-            self._compare(s, mis, by_camera, active)
-            super().splatted(s, position, value, mis, by_camera, active)
+        def splatted(self, s, position, value, mis, rivals, active) -> None:
+            self._compare(s, mis, rivals, active)
+            super().splatted(s, position, value, mis, rivals, active)
 
-        def _compare(self, s, mis, by_camera, active) -> None:
-            error = dr.abs(mis * (1 + dr.squared_norm(by_camera)) - 1)
+        def _compare(self, s, mis, rivals, active) -> None:
+            error = dr.abs(mis * (1 + dr.squared_norm(rivals.by_camera)) - 1)
             index = dr.select((s == length) & (error < 2e-3), mi.UInt32(0), 1)
             dr.scatter_add(self.count, mi.UInt32(1), index, active & (mis < 0.99))
 

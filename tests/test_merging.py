@@ -14,7 +14,8 @@ from stage import area, film, sensor, stage
 from statistical import assert_same_mean, batches, load
 from test_furnace import FURNACES
 
-from mitsuba_ext.bidirectional.merging import MergingRadius, median_footprint
+from mitsuba_ext.bidirectional.merging import median_footprint
+from mitsuba_ext.bidirectional.merging_radius import MergingRadius
 from mitsuba_ext.bidirectional.vertex_grid import VertexGrid
 from mitsuba_ext.composition import merging_parameters
 from mitsuba_ext.decisions.camera.shared_numbers import (
@@ -84,19 +85,20 @@ def test_the_grid_finds_each_point_within_the_radius_once(scale: float, radius: 
 
 
 def test_the_radius_shrinks_as_its_source_says_whatever_the_size_of_a_pass() -> None:
-    radius = MergingRadius(2.0, 0.75, pixels=100)
+    radius = MergingRadius(2.0, 0.75, pixels=100, footprint=0.1)
     found = [radius.next(100) for _ in range(16)]
     assert found[0] == 2 and found[15] == pytest.approx(2 * 16 ** (-1 / 8))
     # Four times as many light paths: a disk of a quarter of the area holds as many vertices
-    assert MergingRadius(2.0, 0.75, pixels=100).next(400) == pytest.approx(1)
-    constant = MergingRadius(2.0, 1.0, pixels=100)
+    assert MergingRadius(2.0, 0.75, pixels=100, footprint=0.1).next(400) == pytest.approx(1)
+    constant = MergingRadius(2.0, 1.0, pixels=100, footprint=0.1)
     assert [constant.next(100) for _ in range(3)] == [2, 2, 2]
 
 
 def test_a_batch_goes_on_with_the_radius_of_the_one_before() -> None:
-    whole = MergingRadius(2.0, 0.75, pixels=100)
+    whole = MergingRadius(2.0, 0.75, pixels=100, footprint=0.1)
     found = [whole.next(200) for _ in range(6)]
-    batch = MergingRadius(2.0, 0.75, pixels=100, before=8)  # 4 passes of 2 samples per pixel
+    # 4 passes of 2 samples per pixel
+    batch = MergingRadius(2.0, 0.75, pixels=100, footprint=0.1, before=8)
     assert [batch.next(200), batch.next(200)] == pytest.approx(found[4:])
 
 
@@ -240,7 +242,7 @@ def test_weights_add_up_to_one_behind_mirrors_and_glass() -> None:
 
 
 def test_groups_shrink_the_radius_as_so_many_passes() -> None:
-    apart, together = (MergingRadius(2.0, 0.75, pixels=100) for _ in range(2))
+    apart, together = (MergingRadius(2.0, 0.75, pixels=100, footprint=0.1) for _ in range(2))
     found = [apart.next(100) for _ in range(9)]
     assert [together.next(100, 4) for _ in range(3)] == pytest.approx(found[::4])
 
@@ -302,7 +304,6 @@ def test_moving_glass_has_the_mean_of_path(name: str) -> None:
 # ---- Errors ----
 
 
-@pytest.mark.parametrize("parameters", [{"light_paths": "auto"}, {"technique_images": "a.exr"}])
 def test_what_merging_does_not_know_is_refused(parameters: dict) -> None:
     (key,) = parameters
     with pytest.raises((ValueError, RuntimeError), match=f'"vcm": the parameter "{key}"'):

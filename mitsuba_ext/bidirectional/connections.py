@@ -13,7 +13,7 @@ from ..transport.observer import Observer
 from ..transport.path_decisions import SceneQuery, Subpaths
 from ..transport.vertex import Vertex
 from .light_vertices import VertexCache
-from .partial_sums import PartialSums, Sums, weight
+from .partial_sums import PartialSums, Rivals, Sums, weight
 from .scattering import adjoint_value, geometric_cosine, reverse_density
 from .technique_observer import TechniqueObserver
 from .vertex_choice import VertexChoice
@@ -55,21 +55,31 @@ def joining_weight(
     return weight(others / (sums.count * sums.ratio(expected)))
 
 
-def joining_by_camera(
+def joining_rivals(
     sums: PartialSums,
     one: End,
     other: End,
     squared_distance: mi.Float,
-    is_first: mi.Bool | bool,
+    is_first: tuple[mi.Bool | bool, mi.Bool | bool],
     factor: mi.Float | float,
-) -> mi.Vector2f | tuple[()]:
-    """:meth:`PartialSums.by_camera` for connecting a camera path that ends in ``one`` to a light
-    path that ends in ``other``, at its first vertex behind the light where ``is_first``.
-    ``factor`` is 1 / (expected number of times they are connected): the true number, not that
-    which MIS weights assume."""
-    to_other = one.pdf * geometric_cosine(other.si, other.wo) * dr.rcp(squared_distance)
-    ratios = sums.by_camera(to_other, other.sums, other.reverse_pdf, is_first)
-    return () if isinstance(ratios, tuple) else ratios * factor
+    expected: mi.Float | float = 1.0,
+) -> Rivals:
+    """Those of connecting a camera path that ends in ``one`` to a light path that ends in
+    ``other``. The other parameters are those of :func:`joining_weight`, and:
+
+    Parameters:
+        is_first: Is ``one``, and is ``other`` the first vertex of its subpath?
+        factor: 1 / (expected number of times they are connected), for ``Rivals.by_camera``: the
+            true number, not that which MIS weights assume.
+    """
+    inverse = dr.rcp(squared_distance)
+    to_one = other.pdf * geometric_cosine(one.si, one.wo) * inverse
+    to_other = one.pdf * geometric_cosine(other.si, other.wo) * inverse
+    ends = to_other, other.sums, other.reverse_pdf, is_first[1]
+    kinds = sums.by_kind(*ends)
+    kinds += sums.by_kind(to_one, one.sums, one.reverse_pdf, is_first[0])
+    kinds /= sums.count * sums.ratio(expected)
+    return Rivals(sums.by_camera(*ends) * factor, kinds)
 
 
 class LightSubpaths(Subpaths):
@@ -172,11 +182,14 @@ class LightSubpaths(Subpaths):
         visible = active & ~self._query.occluded(scene, si, ds, active)
         value = dr.select(visible, value, 0)
         if self._techniques is not None:
-            by_camera = joining_by_camera(
-                self._sums, near_end, far_end, squared_distance, other.depth == 1, factor
-            )
+            rivals = ()
+            if self._sums.splits:
+                rivals = joining_rivals(
+                    self._sums, near_end, far_end, squared_distance,
+                    (vertex.depth == 0, other.depth == 1), factor, chosen.expected,
+                )  # fmt: skip
             self._techniques.joined(
-                other.depth + 1, vertex.depth + 2, value, mis, by_camera, visible
+                other.depth + 1, vertex.depth + 2, value, mis, rivals, visible
             )
         if chosen.region is not None:
             self._observer.subpath(

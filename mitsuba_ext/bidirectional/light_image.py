@@ -12,7 +12,7 @@ from ..transport.heroes import Heroes
 from ..transport.numbers import Numbers, hashed_2d
 from ..transport.path_decisions import SceneQuery
 from .light_vertices import LightVertices
-from .partial_sums import PartialSums, weight
+from .partial_sums import PartialSums, Rivals, weight
 from .scattering import evaluate, geometric_cosine
 from .sensor import ConnectableSensor, is_occluded
 from .technique_observer import TechniqueObserver
@@ -121,16 +121,17 @@ class LightImage:
         )
         importance = connection.importance * lens_weight
         value *= vertex.β * (importance * self._share)
-        mis, by_camera = mi.Float(1), ()
+        mis, rivals = mi.Float(1), ()
         if self._sums is not None:
             # The density per area with which a camera ray finds the vertex, divided by the density
             # of this point of the aperture
             found = importance * geometric_cosine(si, to_camera)
             others = self._sums.others(found, vertex.sums, reverse_pdf)
             mis = weight(others / self._sums.image_count)
-            by_camera = self._sums.by_camera(
-                found, vertex.sums, reverse_pdf, vertex.depth == 1
-            )
+            if self._sums.splits:
+                ends = found, vertex.sums, reverse_pdf, vertex.depth == 1
+                kinds = self._sums.by_kind(*ends) / self._sums.image_count
+                rivals = Rivals(self._sums.by_camera(*ends), kinds)
             value *= mis
         # A connection that cannot contribute needs no shadow ray
         active &= dr.max(dr.abs(value)) > 0
@@ -146,7 +147,7 @@ class LightImage:
         finite = active & dr.all(dr.isfinite(value))
         if self._observer is not None:
             self._observer.splatted(
-                vertex.depth + 1, connection.position, value, mis, by_camera, finite
+                vertex.depth + 1, connection.position, value, mis, rivals, finite
             )
         return Splats(
             value, connection.position, vertices.wavelengths(vertex, active), finite, vertex.lane

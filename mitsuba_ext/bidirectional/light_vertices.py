@@ -24,11 +24,12 @@ _DEPTH_BITS = 15
 
 @dataclass
 class Layout:
-    """The words of a stored vertex: 19 to 37 in RGB variants.
+    """The words of a stored vertex: 19 to 38 in RGB variants.
 
     Attributes:
         spectrum: Words of a spectrum.
-        sums: Words of the partial sums of MIS weights: 0, 2, or 4 (``Sums.by_camera``).
+        sums: Words of the partial sums of MIS weights: 0, 2, or 5 (``Sums.by_camera``, and
+            ``Sums.by_kind`` of connections).
         is_whole: Are all fields of the interaction stored?
         has_region: Is the region stored in which the vertex lies?
     """
@@ -85,7 +86,8 @@ class VertexStore:
             mark |= dr.select(hero_is_alone, mi.UInt32(_HERO_IS_ALONE), 0)
         if self.layout.has_region:
             mark |= sums.region << _DEPTH_BITS
-        words = [*β, *[sums.last, sums.dVC, *sums.by_camera][: self.layout.sums], as_float(mark)]
+        words = [*β, *[sums.last, sums.dVC, *sums.by_camera][: self.layout.sums]]
+        words += [*([sums.by_kind.x] if self.layout.sums > 4 else []), as_float(mark)]
         words += to_words(si, self.layout.is_whole)
         words += [mi.Float(0)] * (self.layout.words - len(words))
         dr.scatter(self.words, mi.ArrayXf(words), slot, active)
@@ -172,6 +174,7 @@ class LightVertices:
             sums = Sums(w[n], w[n + 1])
         if layout.sums > 2:
             sums.by_camera = mi.Vector2f(w[n + 2], w[n + 3])
+            sums.by_kind = mi.Vector2f(w[n + 4], 0)
         mark = dr.reinterpret_array(mi.UInt32, w[layout.mark])
         depth = mark & (_HERO_IS_ALONE - 1)
         if layout.has_region:

@@ -97,7 +97,7 @@ class LightWalk:
         if sums is None:
             return Layout(spectrum, 0, is_whole)
         has_region = sums.selection is not None
-        return Layout(spectrum, 4 if sums.follows_camera else 2, is_whole, has_region)
+        return Layout(spectrum, 5 if sums.splits else 2, is_whole, has_region)
 
     def begin(
         self,
@@ -268,6 +268,7 @@ class LightWalk:
             later.region,
             later.count,
             ~is_first & (paths.sums.dVCM == 0) if self.sums.merging is not None else (),
+            later.by_kind,
         )
 
     def _scatter(self, heroes, paths, bsdf, si, bs, weight, sums, active):

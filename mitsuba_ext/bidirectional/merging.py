@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -25,6 +24,7 @@ from .light_vertices import LightVertex, LightVertices, PackedVertices, VertexCa
 from .light_walk import LightWalk
 from .partial_sums import PartialSums
 from .scattering import geometric_cosine, reverse_density
+from .technique_observer import TechniqueObserver
 from .vertex_grid import VertexGrid
 
 #: Vertices merge on surfaces that face about the same way: the least cosine between their normals;
@@ -53,37 +53,6 @@ _FEW, WIDEST = 64, 20.0
 
 #: The largest radius in units of the diagonal of the scene: pixels of very small films are wide.
 _LARGEST = 0.04
-
-
-@dataclass
-class MergingRadius:
-    """The radius of merging. It shrinks from pass to pass, so that bias vanishes, and suits the
-    number of light paths of a pass: a disk holds about as many vertices whatever that is.
-
-    Source: C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic Approach*, ACM
-    Transactions on Graphics 30(3), 2011: the squared radius of pass i is proportional to i^(α − 1)
-    (in the limit of their Eq. 15).
-
-    Parameters:
-        first: The radius of a first pass that has one light path per pixel.
-        decay: α, in (0, 1]; 1 for a constant radius.
-        pixels: Number of pixels.
-        before: Light paths per pixel of passes that other renders have made before.
-    """
-
-    first: float
-    decay: float
-    pixels: int
-    before: int = 0
-    _passes: int = 0
-
-    def next(self, paths: int, groups: int = 1) -> float:
-        """The radius of the next pass, of so many light paths; or of so many groups, of so many
-        light paths each, whose vertices are not merged with those of other groups."""
-        share = self.pixels / paths
-        number = self._passes + 1 + self.before * share
-        self._passes += groups
-        return self.first * (share * number ** (self.decay - 1)) ** 0.5
 
 
 def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
@@ -194,6 +163,7 @@ class MergedSubpaths(Subpaths):
         shares_rays: Are vertices merged only with those of paths of the same time and wavelengths?
             ``grid`` then has these groups.
         others: Other techniques at the same vertices; ``None`` if there are none.
+        observer: Is told what merging adds.
     """
 
     def __init__(
@@ -206,9 +176,10 @@ class MergedSubpaths(Subpaths):
         paths: int,
         shares_rays: bool = False,
         others: Subpaths | None = None,
+        observer: TechniqueObserver | None = None,
     ) -> None:
         self._vertices, self._grid, self._sums, self._others = vertices, grid, sums, others
-        self._heroes, self._ctx = heroes, heroes.context()
+        self._heroes, self._ctx, self._observer = heroes, heroes.context(), observer
         self._max_depth, self._shares_rays = dr.opaque(mi.UInt32, max_depth), shares_rays
         # The density of light paths per area, for one vertex in the disk
         count = dr.opaque(mi.Float, paths)
@@ -224,13 +195,14 @@ class MergedSubpaths(Subpaths):
         merged = mi.Spectrum(0)
         state, si = self._grid.begin(), vertex.si
         group = group_of(si.time, si.wavelengths) if self._shares_rays else mi.UInt32(0)
-        near = [mi.UInt32(0) for _ in range(_BATCH)]
+        near, looked = [mi.UInt32(0) for _ in range(_BATCH)], mi.UInt32(0)
         while dr.hint(merges, label="merge"):
             count, searches = mi.UInt32(0), mi.Bool(merges)
             while dr.hint(searches, label="search"):
                 state, index, found, merges = self._grid.next(state, si.p, searches, group)
                 near = _pushed(near, index, found)
                 count += dr.select(found, 1, 0)
+                looked += 1
                 searches = merges & (count < _BATCH)
             exists = count > 0
             while dr.hint(exists, label="evaluate"):
@@ -239,6 +211,8 @@ class MergedSubpaths(Subpaths):
                 count -= 1
                 exists = count > 0
         total += merged * vertex.path.β * self._per_vertex
+        if dr.hint(self._observer is not None, mode="scalar"):
+            self._observer.searched(looked)
         return total, shadow_count
 
     def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:
@@ -259,8 +233,17 @@ class MergedSubpaths(Subpaths):
         # Flux arrives per area of the surface; the value holds the shading cosine
         arrives = geometric_cosine(far, far.wi)
         value *= other.β * dr.select(arrives > 0, dr.rcp(arrives), 0)
+        mis, rivals = mi.Float(1), ()
         if self._sums is not None:
             reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
-            value *= self._sums.merging_weight(other.sums, pdf, vertex.path.sums, reverse)
+            ends = other.sums, pdf, vertex.path.sums, reverse
+            mis = self._sums.merging_weight(*ends)
+            value *= mis
+            if self._sums.splits:
+                is_first = other.depth == 1, vertex.depth == 0
+                rivals = self._sums.merging_rivals(*ends, is_first)
         active &= dr.all(dr.isfinite(value))
+        if self._observer is not None:
+            brought = value * vertex.path.β * self._per_vertex
+            self._observer.merged(brought, mis, rivals, active)
         return dr.select(active, value, 0)

@@ -33,6 +33,8 @@ class Sums:
         by_camera: Only for light paths, from the second vertex on, and if :class:`PartialSums`
             computes it: the two terms of dVC in which a camera path finds the whole path (s = 0 and
             1), not raised to the exponent.
+        by_kind: Only if :class:`PartialSums` computes it: the parts of dVC of connections (s, t ≥
+            2), and of the light image (t = 1; only for camera paths).
         region, count: Only if the light path vertices for connections are chosen by regions
             (otherwise ``()``): the region of the last vertex; and the factor of ``dVCM`` where the
             technique that connects the last two vertices is such a connection.
@@ -46,11 +48,27 @@ class Sums:
     region: Any = ()
     count: Any = ()
     is_caustic: Any = ()
+    by_kind: mi.Vector2f | tuple[()] = ()
 
     @property
     def last(self) -> mi.Float:
         """``dVCM``, times ``count`` if vertices are chosen by regions."""
         return self.dVCM if isinstance(self.count, tuple) else self.dVCM * self.count
+
+
+@dataclass
+class Rivals:
+    """How densely the other techniques find a path that one technique has found: by kind, in units
+    of the density of that technique times the number of its samples.
+
+    Attributes:
+        by_camera: The densities of camera paths alone (s = 0 and 1).
+        by_kind: The sum over connections (s, t ≥ 2), and that of the light image (t = 1), raised to
+            the exponent of the MIS heuristic.
+    """
+
+    by_camera: mi.Vector2f
+    by_kind: mi.Vector2f
 
 
 class PartialSums:
@@ -63,7 +81,7 @@ class PartialSums:
             camera path is connected (s, t ≥ 2). Camera paths are connected to the light (s = 1) and
             hit it (s = 0) once.
         exponent: 1 for the balance heuristic, 2 for the power heuristic.
-        follows_camera: Is ``by_camera`` of :class:`Sums` computed?
+        splits: Are ``by_camera`` and ``by_kind`` of :class:`Sums` computed?
         selection: Chooses the vertices of light paths by regions; its ``expected`` for a pair of
             regions multiplies ``connections``. ``None`` if the choice is uniform.
         merging: The density of merging at a vertex, relative to the product of the densities with
@@ -80,14 +98,14 @@ class PartialSums:
         next_event: EmitterSampling,
         connections: mi.Float | float = 1.0,
         exponent: int = 2,
-        follows_camera: bool = False,
+        splits: bool = False,
         selection: SubpathSelection | None = None,
         merging: mi.Float | None = None,
         merges_all: bool = False,
         light_paths: mi.Float | float = 1.0,
     ) -> None:
         self._next_event, self.exponent, self.selection = next_event, exponent, selection
-        self.follows_camera = follows_camera
+        self.splits = splits
         #: ``connections``, raised to the exponent.
         self.count = self.ratio(mi.Float(connections))
         #: ``light_paths``, raised to the exponent.
@@ -120,17 +138,18 @@ class PartialSums:
             self.ratio(connected * inverse),
             dr.select(is_delta, 0, self.ratio(leaves * inverse)),
         )
-        if self.follows_camera:
+        if self.splits:
             sums.by_camera = dr.zeros(mi.Vector2f, dr.width(inverse))
         return sums
 
     def begin(self, dVCM: mi.Float, dVC: mi.Float) -> Sums:
         """The sums where a subpath begins."""
-        if self.selection is None:
-            return Sums(dVCM, dVC)
-        lanes = dr.width(dVCM)
-        region, count = dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, 1, lanes)
-        return Sums(dVCM, dVC, region=region, count=count)
+        sums, lanes = Sums(dVCM, dVC), dr.width(dVCM)
+        if self.splits:
+            sums.by_kind = dr.zeros(mi.Vector2f, lanes)
+        if self.selection is not None:
+            sums.region, sums.count = dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, 1, lanes)
+        return sums
 
     def others(self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float) -> mi.Float:
         """For a technique that connects a subpath's last vertex to something: the sum over all
@@ -165,6 +184,23 @@ class PartialSums:
         others = light.last + self.ratio(pdf) * light.dVC
         others += camera.last + self.ratio(reverse_pdf) * camera.dVC
         return weight(others / self.merging)
+
+    def merging_rivals(
+        self,
+        light: Sums,
+        pdf: mi.Float,
+        camera: Sums,
+        reverse_pdf: mi.Float,
+        is_first: tuple[mi.Bool, mi.Bool],
+    ) -> Rivals:
+        """Those of merging. The parameters are those of :meth:`merging_weight`; ``is_first`` tells
+        whether the light path's, and the camera path's vertex is its first one."""
+        inverse, one = dr.rcp(self.merging), mi.Float(1)
+        kinds = self.by_kind(one, light, pdf, is_first[0])
+        kinds += self.by_kind(one, camera, reverse_pdf, is_first[1])
+        return Rivals(
+            self.by_camera(self.root(inverse), light, pdf, is_first[0]), kinds * inverse
+        )
 
     def merging_before(
         self, sums: Sums, squared_distance: mi.Float, cosine: mi.Float
@@ -242,6 +278,7 @@ class PartialSums:
             () if isinstance(sums.by_camera, tuple) else sums.by_camera * inverse,
             region,
             count,
+            by_kind=sums.by_kind * self.ratio(inverse) if self.splits else (),
         )
 
     def leave(
@@ -251,7 +288,7 @@ class PartialSums:
         pdf: mi.Float,
         reverse_pdf: mi.Float,
         is_delta: mi.Bool,
-        is_first: mi.Bool | bool = False,
+        is_first: mi.Bool | bool,
     ) -> Sums:
         """The sums behind a vertex, after a direction was sampled there.
 
@@ -260,7 +297,7 @@ class PartialSums:
             pdf, reverse_pdf: Density of the direction, and of the reverse direction through the
                 vertex, per solid angle.
             is_delta: Was the direction sampled from a delta lobe? Then no technique connects here.
-            is_first: Is this the first vertex after the light?
+            is_first: Is this the first vertex of the subpath?
         """
         leaves = cosine * dr.select(pdf > 0, dr.rcp(pdf), 0)
         smooth = self.others(leaves, sums, reverse_pdf)
@@ -272,15 +309,36 @@ class PartialSums:
             self._leave_by_camera(sums, cosine, leaves, reverse_pdf, is_delta, is_first),
             sums.region,
             sums.count,
+            by_kind=self._leave_by_kind(sums, cosine, leaves, reverse_pdf, is_delta, is_first),
         )
+
+    def by_kind(
+        self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float, is_first: mi.Bool | bool
+    ) -> mi.Vector2f | tuple[()]:
+        """The parts of :meth:`others` (whose parameters these are) of connections and of the light
+        image. ``()`` if ``splits`` is not set."""
+        if not self.splits:
+            return ()
+        # What connects to the first vertex: the sensor for a camera path, a light for a light path
+        is_camera = isinstance(sums.by_camera, tuple)
+        last = dr.select(is_first, mi.Vector2f(0, 1 if is_camera else 0), mi.Vector2f(1, 0))
+        return self.ratio(density) * (
+            last * sums.last + self.ratio(reverse_pdf) * sums.by_kind
+        )
+
+    def _leave_by_kind(self, sums, cosine, leaves, reverse_pdf, is_delta, is_first):
+        smooth = self.by_kind(leaves, sums, reverse_pdf, is_first)
+        if isinstance(smooth, tuple):
+            return ()
+        return dr.select(is_delta, sums.by_kind * self.ratio(cosine), smooth)
 
     def by_camera(
         self, density: mi.Float, sums: Sums, reverse_pdf: mi.Float, is_first: mi.Bool | bool
     ) -> mi.Vector2f | tuple[()]:
         """The densities with which a camera path alone finds the whole path (s = 0 and 1), each
         divided by that of connecting to the last vertex of the light path. The parameters are those
-        of :meth:`others`; the ratios are not raised to the exponent. ``()`` if ``follows_camera``
-        is not set."""
+        of :meth:`others`; the ratios are not raised to the exponent. ``()`` if ``splits`` is not
+        set."""
         if isinstance(sums.by_camera, tuple):
             return ()
         first = mi.Vector2f(reverse_pdf * self.root(sums.dVC), self.root(sums.dVCM))

@@ -1,16 +1,47 @@
-"""The variance that ``path`` would have, estimated from samples of bidirectional path tracing."""
+"""The variance that other sets of techniques would have, estimated from samples of bidirectional
+path tracing with all of them."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..learning.pixel_estimates import box_means
 from ..transport.estimator import CameraRays, Sample
 from ..transport.mis import power_heuristic
+from .candidate_moments import CandidateMoments
+from .candidates import Available, Candidate, candidates
+from .merging import HANDFUL
+from .partial_sums import Rivals
 from .technique_observer import TechniqueObserver
+
+
+@dataclass
+class Counts:
+    """What takes time in the samples of all techniques.
+
+    Attributes:
+        camera_rays, light_rays: Rays that go on with camera paths and with light paths.
+        tested: Shadow rays to lights, of camera paths.
+        splatted, connected: Shadow rays to the sensor, and between vertices of both paths.
+        looked: Vertices, and rows of cells, that were looked at for merging.
+    """
+
+    camera_rays: int = 0
+    tested: int = 0
+    light_rays: int = 0
+    splatted: int = 0
+    connected: int = 0
+    looked: int = 0
+
+    def add(self, *counts: int) -> None:
+        """Adds to all of them, in their order."""
+        for field, count in zip(fields(self), counts):
+            setattr(self, field.name, getattr(self, field.name) + count)
 
 
 class Estimate(NamedTuple):
@@ -18,17 +49,16 @@ class Estimate(NamedTuple):
 
     Attributes:
         mean: Radiance.
-        bidirectional, by_camera: Variance of one sample of each pixel, with all techniques, and
-            with those of ``path`` alone. They may be negative if there are few samples.
+        variances: Variance of one sample of each pixel, for each candidate. They may be negative if
+            there are few samples.
     """
 
     mean: np.ndarray
-    bidirectional: np.ndarray
-    by_camera: np.ndarray
+    variances: list[np.ndarray]
 
 
 class PathMoments(TechniqueObserver):
-    """Estimates the variance of ``path`` from the samples of all techniques.
+    """Estimates the variance of each candidate from the samples of all techniques.
 
     Light that camera paths find rarely is hardly ever in their samples. Their sample variance would
     therefore be too small where the true variance is largest. But the second moment of ``path`` is
@@ -39,6 +69,11 @@ class PathMoments(TechniqueObserver):
     integral. Products of the contributions at different vertices of a camera path, and squared
     means, are estimated from camera paths alone.
 
+    The variance of another candidate is that of all techniques, plus the difference between the
+    second moments (:class:`CandidateMoments`). Where there are fewer light paths, camera paths
+    bring more of the light: their squared mean, and products of their contributions, grow as the
+    square of that.
+
     Source: P. Grittmann, I. Georgiev, P. Slusallek, *Efficiency-Aware Multiple Importance Sampling
     for Bidirectional Rendering Algorithms*, ACM TOG 41(4), 2022 (second moments of one set of
     techniques from samples of another).
@@ -46,40 +81,67 @@ class PathMoments(TechniqueObserver):
     Parameters:
         film: Film of the sensor.
         width, height: Its sampled pixels.
+        spp: Samples per pixel of a pass of the render.
 
     Attributes:
+        candidates: See :func:`candidates`. The samples are those of the second one.
         samples: Number of camera samples.
-        unreachable: Number of samples of paths that ``path`` cannot find.
-        rays: Rays traced for all techniques, and for those of ``path``.
+        unreachable: For each candidate, the number of samples of paths that it cannot find.
+        counts: What takes time (:class:`Counts`).
     """
 
-    compares_with_camera = True
+    compares = True
 
-    def __init__(self, film: mi.Film, width: int, height: int) -> None:
+    def __init__(self, film: mi.Film, width: int, height: int, spp: int) -> None:
+        self._spp, self._shared = spp, {}
         self._width, self._pixels = width, width * height
         self._offset = mi.Vector2f(mi.ScalarVector2f(film.crop_offset()))
-        self.samples = self.unreachable = 0
-        self.rays = np.zeros(2)
+        self.candidates: list[Candidate] = []
+        self.samples = 0
+        self.unreachable = np.zeros(0, int)
+        self.counts = Counts()
         # For each pixel: number of samples; sums of the samples' values, of their squares, and of
-        # the second moment of ``path``; sums of splats, and of their squares
-        self._sums = np.zeros((6, self._pixels))
+        # the second moment of ``path``; sums of splats, and of their squares, and of the squares of
+        # what was merged
+        self._sums = np.zeros((7, self._pixels))
+        # The second moment and the light image of each candidate but ``path``
+        self._others = np.zeros((0, self._pixels, 2))
 
     # ---- Observer ----
 
-    def start(self, rays: CameraRays) -> None:
+    def start(self, rays: CameraRays, available: Available) -> None:
+        if not self.candidates:
+            self.candidates = candidates(available)
+            self.unreachable = np.zeros(len(self.candidates), int)
+            self._others = np.zeros((len(self.candidates) - 1, self._pixels, 2))
+            if available.radius is not None:
+                self._shared = {
+                    c.light_paths: available.radius.samples_per_vertex(c.light_paths, self._spp)
+                    for c in self.candidates[1:] if c.merges
+                }  # fmt: skip
         self._pixel, self._importance = rays.pixel, rays.importance
         lanes = dr.width(rays.pixel)
         self._lane = dr.arange(mi.UInt32, lanes)
         # For each camera path: its value with the techniques of ``path`` alone, the squares of the
         # terms of this sum, and the second moment
         self._path, self._squares, self._moment = (dr.zeros(mi.Float, lanes) for _ in range(3))
-        self._shadow_count = dr.zeros(mi.UInt32, lanes)
+        # The squares of what was merged
+        self._merged = dr.zeros(mi.Float, lanes)
+        self._shadow_count, self._looked = (dr.zeros(mi.UInt32, lanes) for _ in range(2))
         self._missed = dr.zeros(mi.UInt32, 1)
         self._splats = dr.zeros(mi.Float, 3 * self._pixels)
+        self._moments = CandidateMoments(self.candidates[1:], self._pixels, self._shared)
         dr.eval(
-            self._path, self._squares, self._moment, self._shadow_count, self._missed,
-            self._splats, self._importance,
+            self._path, self._squares, self._moment, self._merged, self._shadow_count, self._looked,
+            self._missed, self._splats, self._importance,
         )  # fmt: skip
+        self._by_kind = mi.Vector2f(0)
+
+    def weighed(self, by_kind: mi.Vector2f) -> None:
+        self._by_kind = by_kind
+
+    def searched(self, count: mi.UInt32) -> None:
+        dr.scatter_add(self._looked, count, self._lane)
 
     def emission(self, path, ds, value, mis, pdf, active) -> None:
         brought = self._brightness(value)
@@ -108,22 +170,41 @@ class PathMoments(TechniqueObserver):
         dr.scatter_add(self._squares, dr.square(part), self._lane, active)
         moment = brought * whole * _share(mi.Vector2f(1, other))
         dr.scatter_add(self._moment, moment, self._lane, active)
+        rivals = Rivals(mi.Vector2f(1, other), self._by_kind)
+        self._moments.add(brought, mis, rivals, self._pixel, active)
 
-    def joined(self, s, t, value, mis, by_camera, active) -> None:
+    def joined(self, s, t, value, mis, rivals, active) -> None:
+        own = Rivals(rivals.by_camera, rivals.by_kind + mi.Vector2f(1, 0))
+        self._add_other(value, mis, own, active)
+
+    def merged(self, value, mis, rivals, active) -> None:
+        self._add_other(value, mis, rivals, active, HANDFUL)
+        square = dr.square(self._brightness(value))
+        dr.scatter_add(self._merged, square, self._lane, active & dr.isfinite(square))
+
+    def _add_other(self, value, mis, rivals, active, count: float = 1.0) -> None:
+        """Adds what the camera path in each lane found together with a light path. ``rivals`` holds
+        the technique itself. MIS weights count ``count`` such contributions as one sample."""
         brought = self._brightness(value)
         active = active & (brought > 0)
-        moment = self._seen_by_path(dr.square(brought) / mis, by_camera, active)
+        moment = self._seen_by_path(
+            count * dr.square(brought) / mis, rivals.by_camera, active
+        )
         dr.scatter_add(self._moment, moment, self._lane, active)
+        self._moments.add(brought, mis, rivals, self._pixel, active, count)
 
-    def splatted(self, s, position, value, mis, by_camera, active) -> None:
+    def splatted(self, s, position, value, mis, rivals, active) -> None:
         brought = dr.mean(value)
         active = active & (brought > 0)
         place = mi.Point2u(position - self._offset)
-        pixel = 3 * (place.y * self._width + place.x)
-        moment = self._seen_by_path(dr.square(brought) / mis, by_camera, active)
-        dr.scatter_add(self._splats, brought, pixel, active)
-        dr.scatter_add(self._splats, dr.square(brought), pixel + 1, active)
-        dr.scatter_add(self._splats, moment, pixel + 2, active)
+        pixel = place.y * self._width + place.x
+        square = dr.square(brought) / mis
+        moment = self._seen_by_path(square, rivals.by_camera, active)
+        dr.scatter_add(self._splats, brought, 3 * pixel, active)
+        dr.scatter_add(self._splats, dr.square(brought), 3 * pixel + 1, active)
+        dr.scatter_add(self._splats, moment, 3 * pixel + 2, active)
+        own = Rivals(rivals.by_camera, rivals.by_kind + mi.Vector2f(0, 1))
+        self._moments.add(brought, mis, own, pixel, active)
 
     def _seen_by_path(self, square, by_camera, active) -> mi.Float:
         can_be = dr.max(by_camera) > 0
@@ -151,30 +232,47 @@ class PathMoments(TechniqueObserver):
         self._sums += (
             np.bincount(pixel, minlength=self._pixels), per_pixel(values), per_pixel(values**2),
             per_pixel(moment) + splats[:, 2], splats[:, 0], splats[:, 1],
+            per_pixel(self._merged.numpy()),
         )  # fmt: skip
-        self.unreachable += int(self._missed[0])
+        moments, lost = self._moments.taken()
+        self._others += moments
+        self.unreachable += (int(self._missed[0]), *lost)
         lanes = len(pixel)
         self.samples += lanes
-        tested = int(dr.sum(self._shadow_count)[0])
-        self.rays += (
-            2 * lanes + _total(whole.scatter_count) + _total(whole.shadow_count),
-            lanes + _total(camera.scatter_count) + tested,
-        )
+        tested, scattered = _total(self._shadow_count), _total(camera.scatter_count)
+        self.counts.add(
+            lanes + scattered, tested, lanes + _total(whole.scatter_count) - scattered,
+            _total(whole.shadow_count) - _total(camera.shadow_count),
+            _total(camera.shadow_count) - tested, _total(self._looked),
+        )  # fmt: skip
 
     # ---- After the passes ----
 
     def estimate(self) -> Estimate:
         """The estimate from all passes."""
-        n, x, x2, moment, splats, splats2 = self._sums
+        n, x, x2, moment, splats, splats2, merged = self._sums
         n = np.maximum(n, 1)
         # The unbiased estimate: with few samples, the square of the sample mean is too large, by
         # the variance of the mean
         of_camera = np.where(n > 1, (x2 - x**2 / n) / np.maximum(n - 1, 1), x2)
-        # Few of all light paths splat to a pixel: the sum of their squares is about their variance
-        bidirectional = of_camera + splats2 / n
+        # Few of all light paths splat to a pixel: the sum of their squares is about their variance.
+        # So it is with merging, but some samples of a pixel find the same vertex
+        shared = self._shared.get(1.0, 1.0)
+        everything = of_camera + (splats2 + (shared - 1) * merged) / n
         mean = (x + splats) / n
-        squared_mean = np.where(n > 1, mean**2 - bidirectional / n, 0)
-        return Estimate(mean, bidirectional, moment / n - squared_mean)
+        squared_mean = np.where(n > 1, mean**2 - everything / n, 0)
+        moments, images = np.moveaxis(self._others, 2, 0)
+        # What camera paths bring, with each candidate, and products of such contributions
+        brought = [self._smooth(mean - image / n) for image in images]
+        products = everything - moments[0] / n + brought[0] ** 2
+        ratios = [x / np.maximum(brought[0], 1e-30) for x in brought]
+        variances = [
+            m / n + products * ratio**2 - x**2 for m, x, ratio in zip(moments, brought, ratios)
+        ]
+        return Estimate(mean, [moment / n - squared_mean, *variances])
+
+    def _smooth(self, values: np.ndarray) -> np.ndarray:
+        return box_means(values.reshape(-1, self._width)).ravel()
 
 
 def _share(q: mi.Vector2f) -> mi.Float:

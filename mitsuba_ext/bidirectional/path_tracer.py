@@ -17,13 +17,15 @@ from ..transport.observer import Observers
 from ..transport.path_decisions import SubpathSelection
 from ..transport.walk import Walk
 from ..transport.without_lengths import WithoutLengths
+from .candidates import Available
 from .connections import LightSubpaths
 from .emission import LightEmission
 from .light_image import LightImage
 from .light_numbers import LightPathRays
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
-from .merging import HANDFUL, MergedSubpaths, MergingRadius
+from .merging import HANDFUL, MergedSubpaths
+from .merging_radius import MergingRadius
 from .partial_sums import PartialSums
 from .sensor import ConnectableSensor
 from .technique_observer import TechniqueObserver
@@ -35,6 +37,10 @@ from .weights import BidirectionalWeights
 #: weights depend on the samples. (door_ajar: 11 % less variance than with 1.)
 _VERTICES = 2.5
 
+#: The number of connections that MIS weights assume where there are none: dVCM, which holds it,
+#: must not be 0, which stands for a delta lobe.
+_NONE = 1e-9
+
 
 @dataclass
 class BidirectionalPathTracer:
@@ -45,7 +51,8 @@ class BidirectionalPathTracer:
         walk: Traces the camera paths.
         emission: Samples the rays with which light paths begin.
         sensor: The sensor to which light paths are connected; ``None`` to leave out this technique.
-        connections: Number of light path vertices to which each camera path vertex is connected.
+        connections: Number of light path vertices to which each camera path vertex is connected, or
+            0.
         selection: Chooses the regions from which these vertices are taken. Paths of different
             wavelengths or times cannot be connected. Where these differ between lanes, the choice
             is always uniform among the vertices of the light path in the same lane.
@@ -76,15 +83,18 @@ class BidirectionalPathTracer:
     ) -> Sample:
         walk = self.walk
         own_lane = self.is_alone or mi.is_spectral or bool(movers(scene))
-        selection = self.selection if self.selection.count > 0 and not own_lane else None
+        selects = self.selection.count > 0 and self.connections > 0 and not own_lane
+        selection = self.selection if selects else None
         # Connections per vertex of a light path. A selection divides by the number of vertices
         # itself, in ``expected``
-        count = self.connections if selection else self.connections / _VERTICES
-        observer, follows_camera = self.observer, False
+        count = self.connections if selection else self.connections / _VERTICES or _NONE
+        observer, splits = self.observer, False
         if observer is not None:
-            observer.start(rays)
+            observer.start(rays, Available(
+                self.sensor is not None, self.connections > 0, self.radius, not own_lane
+            ))  # fmt: skip
             walk = replace(walk, observer=Observers([walk.observer, observer]))
-            follows_camera = observer.compares_with_camera
+            splits = observer.compares
         lanes = dr.width(rays.ray)
         light = LightPathRays.of(sampler, rays, self.light_paths)
         per_camera_path = light.count / lanes
@@ -96,7 +106,7 @@ class BidirectionalPathTracer:
             merging = dr.pi * dr.square(radius) * dr.opaque(mi.Float, paths / HANDFUL)
             dr.make_opaque(merging)
         sums = PartialSums(
-            walk.next_event, dr.opaque(mi.Float, count), follows_camera=follows_camera,
+            walk.next_event, dr.opaque(mi.Float, count), splits=splits,
             selection=selection, merging=merging, merges_all=self.merges_all,
             light_paths=dr.opaque(mi.Float, per_camera_path),
         )  # fmt: skip
@@ -123,7 +133,7 @@ class BidirectionalPathTracer:
             scene, light.numbers, light.time, light.wavelengths, light.emits(active), take
         )
         splats = image.splats() if image is not None else []
-        weights = BidirectionalWeights(scene, sums, self.emission, self.sensor)
+        weights = BidirectionalWeights(scene, sums, self.emission, self.sensor, observer)
         if self.skips_direct:
             weights = WithoutLengths(weights, 1, 2)
         subpaths = None
@@ -133,16 +143,18 @@ class BidirectionalPathTracer:
                 choice = RegionChoice(vertices, selection)
             else:
                 choice = OwnVertexChoice(vertices) if own_lane else VertexChoice(vertices)
-            subpaths = LightSubpaths(
-                scene, vertices, choice, sums, walk.query, self.connections, walk.max_depth,
-                walk.observer, observer,
-            )  # fmt: skip
+            if self.connections > 0:
+                subpaths = LightSubpaths(
+                    scene, vertices, choice, sums, walk.query, self.connections, walk.max_depth,
+                    walk.observer, observer,
+                )  # fmt: skip
             if radius is not None:
                 kept = None if self.merges_all else vertices.is_caustic
                 grid = VertexGrid(vertices, radius, kept, vertices.group if own_lane else None)
                 subpaths = MergedSubpaths(
-                    vertices, grid, sums, Heroes(scene), walk.max_depth, paths, own_lane, subpaths
-                )
+                    vertices, grid, sums, Heroes(scene), walk.max_depth, paths, own_lane, subpaths,
+                    observer,
+                )  # fmt: skip
         if isinstance(sampler, BothEnds):
             sampler = sampler.camera
         sample = self._camera_paths(

@@ -16,7 +16,7 @@ class PhotonHistory:
     is behind delta lobes; that of others is 1.
     """
 
-    selection, follows_camera, merging = None, False, None
+    selection, splits, merging = None, False, None
 
     def first(self, scene, emitted, si, active) -> Sums:
         """At the first vertex after the light."""

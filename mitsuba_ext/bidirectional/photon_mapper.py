@@ -21,7 +21,8 @@ from ..transport.walk import Walk
 from .light_numbers import LightPathRays
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
-from .merging import MergedSubpaths, MergingRadius
+from .merging import MergedSubpaths
+from .merging_radius import MergingRadius
 from .vertex_grid import VertexGrid
 
 

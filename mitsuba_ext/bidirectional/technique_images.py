@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.estimator import CameraRays
+from .candidates import Available
 from .technique_observer import TechniqueObserver
 
 #: Largest memory of the images in bytes, and longest paths that they show.
@@ -57,7 +58,7 @@ class TechniqueImages(TechniqueObserver):
 
     # ---- Observer ----
 
-    def start(self, rays: CameraRays) -> None:
+    def start(self, rays: CameraRays, available: Available) -> None:
         self._pixel, self._importance = rays.pixel, rays.importance
 
     def emission(self, path, ds, value, mis, pdf, active) -> None:
@@ -70,10 +71,10 @@ class TechniqueImages(TechniqueObserver):
         mis = dr.select(whole != 0, dr.mean(value) / whole, 0)
         self._add_own(mi.UInt32(1), vertex.depth + 2, value, mis, visible)
 
-    def joined(self, s, t, value, mis, by_camera, active) -> None:
+    def joined(self, s, t, value, mis, rivals, active) -> None:
         self._add_own(s, t, value, mis, active)
 
-    def splatted(self, s, position, value, mis, by_camera, active) -> None:
+    def splatted(self, s, position, value, mis, rivals, active) -> None:
         place = mi.Point2u(position - self._offset)
         pixel = place.y * self._width + place.x
         self._add(s, mi.UInt32(1), pixel, value, mis, active)

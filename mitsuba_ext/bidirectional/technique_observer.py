@@ -9,6 +9,8 @@ import mitsuba as mi
 
 from ..transport.estimator import CameraRays, Sample
 from ..transport.observer import Observer, Observers
+from .candidates import Available
+from .partial_sums import Rivals
 
 
 class TechniqueObserver(Observer):
@@ -16,17 +18,16 @@ class TechniqueObserver(Observer):
     paths alone (s = 0 and 1) by the methods of :class:`Observer`.
 
     Attributes:
-        compares_with_camera: Should the methods be given ``by_camera``? For a path that another
-            technique found, these are the densities with which a camera path alone finds it
-            (:meth:`PartialSums.by_camera`), divided by the density of that technique times its
-            number of connections. They take two words of each stored vertex.
+        compares: Should the methods be given ``rivals``? They take three words of each stored
+            vertex. (They are ``()`` otherwise.)
     """
 
-    compares_with_camera = False
+    compares = False
 
-    def start(self, rays: CameraRays) -> None:
-        """A pass begins, with these camera rays. The values reported for camera paths are radiance:
-        the importance of the rays has yet to multiply them. The values of splats include it."""
+    def start(self, rays: CameraRays, available: Available) -> None:
+        """A pass begins, with these camera rays, and with all techniques that are available. The
+        values reported for camera paths are radiance: the importance of the rays has yet to
+        multiply them. The values of splats include it."""
 
     def joined(
         self,
@@ -34,7 +35,7 @@ class TechniqueObserver(Observer):
         t: mi.UInt32,
         value: mi.Spectrum,
         mis: mi.Float,
-        by_camera: mi.Vector2f | tuple[()],
+        rivals: Rivals | tuple[()],
         active: mi.Bool,
     ) -> None:
         """The camera path in each lane was connected to a light path (s, t ≥ 2). This adds
@@ -46,11 +47,24 @@ class TechniqueObserver(Observer):
         position: mi.Point2f,
         value: mi.Spectrum,
         mis: mi.Float,
-        by_camera: mi.Vector2f | tuple[()],
+        rivals: Rivals | tuple[()],
         active: mi.Bool,
     ) -> None:
         """Vertices of light paths were connected to the sensor (t = 1). This adds ``value``, the
         MIS weight ``mis`` included, at a position on the film (``Splats``)."""
+
+    def merged(
+        self, value: mi.Spectrum, mis: mi.Float, rivals: Rivals | tuple[()], active: mi.Bool
+    ) -> None:
+        """The camera path in each lane was merged with a light path. This adds ``value`` to its
+        radiance, the MIS weight ``mis`` included."""
+
+    def searched(self, count: mi.UInt32) -> None:
+        """At a vertex of the camera path in each lane, so many vertices were looked at."""
+
+    def weighed(self, by_kind: mi.Vector2f) -> None:
+        """A technique of camera paths alone has been weighed; its contribution is reported next
+        (``emission``, ``connection``). ``by_kind`` is that of :class:`Rivals`."""
 
     def traced(self, camera: Sample, whole: Sample) -> None:
         """A pass has been traced. ``camera`` holds the samples of camera paths, connections to
@@ -63,11 +77,11 @@ class TechniqueObservers(Observers):
     def __init__(self, observers: Sequence[TechniqueObserver]) -> None:
         super().__init__(observers)
         self._techniques = observers
-        self.compares_with_camera = any(o.compares_with_camera for o in observers)
+        self.compares = any(o.compares for o in observers)
 
-    def start(self, rays: CameraRays) -> None:
+    def start(self, rays: CameraRays, available: Available) -> None:
         for observer in self._techniques:
-            observer.start(rays)
+            observer.start(rays, available)
 
     def joined(self, *arguments: Any) -> None:
         for observer in self._techniques:
@@ -76,6 +90,18 @@ class TechniqueObservers(Observers):
     def splatted(self, *arguments: Any) -> None:
         for observer in self._techniques:
             observer.splatted(*arguments)
+
+    def merged(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.merged(*arguments)
+
+    def searched(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.searched(*arguments)
+
+    def weighed(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.weighed(*arguments)
 
     def traced(self, *arguments: Any) -> None:
         for observer in self._techniques:

@@ -12,6 +12,7 @@ from .emission import LightEmission
 from .partial_sums import PartialSums, Sums, weight
 from .scattering import geometric_cosine, reverse_density
 from .sensor import ConnectableSensor
+from .technique_observer import TechniqueObserver
 
 
 class BidirectionalWeights(Weights):
@@ -26,6 +27,7 @@ class BidirectionalWeights(Weights):
         sums: Computes the partial sums.
         emission: Gives the densities of the rays with which light paths begin.
         sensor: The sensor to which light paths are connected; ``None`` to leave out t = 1.
+        observer: Is told the rivals of techniques; ``None`` if nobody asks.
     """
 
     def __init__(
@@ -34,9 +36,11 @@ class BidirectionalWeights(Weights):
         sums: PartialSums,
         emission: LightEmission,
         sensor: ConnectableSensor | None,
+        observer: TechniqueObserver | None = None,
     ) -> None:
         self._ctx = Heroes(scene).context()
         self.sums, self._emission, self._sensor = sums, emission, sensor
+        self._observer = observer if sums.splits else None
         self._origin = mi.Point3f(0)
 
     def kernel_state(self) -> tuple:
@@ -62,6 +66,7 @@ class BidirectionalWeights(Weights):
             dr.select(si.is_valid(), later.dVC, path.sums.dVC),
             region=later.region,
             count=later.count,
+            by_kind=later.by_kind,
         )
 
     def emission(self, scene, si, ds, path, pdf) -> mi.Float:
@@ -75,7 +80,10 @@ class BidirectionalWeights(Weights):
         )
         # dVCM holds the count of connections to light paths, but there is one to a light
         others = self.sums.ratio(found) * path.sums.dVCM / self.sums.count
-        others += self.sums.ratio(position * direction) * path.sums.dVC
+        emitted = self.sums.ratio(position * direction)
+        others += emitted * path.sums.dVC
+        if self._observer is not None:
+            self._observer.weighed(emitted * path.sums.by_kind)
         # No other technique finds lights that the sensor sees directly
         return dr.select(path.depth == 0, 1, weight(others))
 
@@ -98,6 +106,10 @@ class BidirectionalWeights(Weights):
         reverse = reverse_density(self._ctx, vertex.bsdf, si, wo, active)
         others = self.sums.others(emitted * inverse, sums, reverse)
         others += dr.select(ds.delta, 0, self.sums.ratio(scattering_pdf * inverse))
+        if self._observer is not None:
+            self._observer.weighed(
+                self.sums.by_kind(emitted * inverse, sums, reverse, vertex.depth == 0)
+            )
         return weight(others)
 
     def leave(self, vertex: Vertex, bs: mi.BSDFSample3f) -> Sums:
@@ -106,7 +118,9 @@ class BidirectionalWeights(Weights):
         active = si.is_valid() & ~is_delta
         reverse = reverse_density(self._ctx, vertex.bsdf, si, bs.wo, active)
         cosine = geometric_cosine(si, bs.wo)
-        sums = self.sums.leave(vertex.path.sums, cosine, bs.pdf, reverse, is_delta)
+        sums = self.sums.leave(
+            vertex.path.sums, cosine, bs.pdf, reverse, is_delta, vertex.depth == 0
+        )
         if self.sums.merging is not None:
             ref = vertex.path.arrival.ref
             d = si.p - ref.p

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..bidirectional.light_vertices import Layout, bytes_per_vertex
 from ..bidirectional.light_walk import STRIDE
-from ..bidirectional.merging import MergingRadius
+from ..bidirectional.merging_radius import MergingRadius
 from ..bidirectional.path_tracer import BidirectionalPathTracer
 from ..bidirectional.technique_images import TechniqueImages
 from ..rendering.camera import film_extent
@@ -40,7 +40,7 @@ class BidirectionalIntegrator(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.connections = self.parameter(props, "connections", 1, minimum=1, maximum=1024)
+        self.connections = self.parameter(props, "connections", 1, minimum=0, maximum=1024)
         self.light_image = self.parameter(props, "light_image", True)
         self.sample_direct = self.parameter(props, "sample_direct", True)
         self.technique_images = self.parameter(props, "technique_images", "")
@@ -120,7 +120,8 @@ class BidirectionalIntegrator(WalkIntegrator):
     ) -> Estimator:
         always = LightPathChoice(observer=self.techniques)
         choice: LightPathChoice = decisions.pop("light_paths", always)
-        are_traced = choice.count > 0
+        techniques = choice.techniques
+        are_traced = techniques.light_paths > 0
         selection = decisions.pop("subpath_selection", SubpathSelection())
         next_event = decisions.pop("next_event", None)
         if not self.sample_direct:
@@ -135,8 +136,9 @@ class BidirectionalIntegrator(WalkIntegrator):
         if not are_traced:
             return walk
         return BidirectionalPathTracer(
-            walk, side.emission, side.sensor, self.connections, selection, choice.observer,
-            radius=radius, merges_all=self.merges_all, light_paths=choice.count,
+            walk, side.emission, side.sensor, self.connections if techniques.connects else 0,
+            selection, choice.observer, radius=radius if techniques.merges else None,
+            merges_all=self.merges_all, light_paths=techniques.light_paths,
         )  # fmt: skip
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):

@@ -4,28 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from types import MappingProxyType
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from ..bidirectional.path_moments import Estimate, PathMoments
+from ..bidirectional.candidates import Candidate
+from ..bidirectional.path_moments import Counts, Estimate, PathMoments
 from ..bidirectional.technique_observer import TechniqueObserver
-from ..learning.benefit import gain_of, is_worth, trimmed_batches
+from ..learning.benefit import expected_gain, gain_of, trimmed_batches
 from ..learning.learner import Learner
 from ..learning.pixel_estimates import relative_scale
 from ..rendering.camera import film_extent
 from ..scene.movers import movers
 from .decision_parameters import DecisionParameters, Setting, Slots
 
-#: The time of a ray of a bidirectional sample, in units of that of a ray of ``path``: BSDFs are
-#: evaluated at both ends of a connection, and densities in both directions.
-#: ``benchmarks/bidirectional.py`` measures 1.5 in door_ajar, 1.6 to 1.8 in seven other scenes, and
-#: 2.2 in caustic. It is a constant, because with measured times two renders of the same seed could
-#: choose differently.
-_TIME_OF_A_RAY = 1.5
+#: The time of what a sample does, in units of that of a ray of ``path``: camera paths carry partial
+#: sums; rays of light paths, with the shadow rays to the sensor; connections, of which some need no
+#: shadow ray; vertices and cells looked at for merging. They are constants, because with measured
+#: times two renders of the same seed could choose differently (medians of cornell_box, caustic,
+#: glass_lamp and pool; single scenes differ by a third, rays of light paths by up to 0.6).
+_SUMS, _LIGHT_RAY, _CONNECTION, _UNTESTED, _LOOK = 0.25, 1.8, 1.25, 0.2, 0.25
 
 #: Number of samples from which the choice is made, unless the pilots have fewer.
 _ENOUGH = 1 << 16
@@ -39,11 +40,11 @@ MOST_PATHS = 64.0
 class LightPathChoice:
     """
     Attributes:
-        count: Number of light paths for each camera path; with 0, none are traced.
+        techniques: What a render uses of the techniques that it has.
         observer: Observes their contributions.
     """
 
-    count: float = 1.0
+    techniques: Candidate = Candidate(1.0, merges=True)
     observer: TechniqueObserver | None = None
 
 
@@ -61,7 +62,7 @@ class LightPathCount(DecisionParameters):
         return type(count) in (int, float) and 0 <= count <= MOST_PATHS
 
     def decision(self, setting: Setting) -> LightPathChoice:
-        return LightPathChoice(self.count)
+        return LightPathChoice(Candidate(self.count, merges=True))
 
     @property
     def sample_cost(self) -> int:
@@ -86,7 +87,7 @@ def check_shared_rays(plugin: str, scene: mi.Scene, count: float) -> None:
 
 
 class LightPathsWhereTheyPay(DecisionParameters):
-    """Light paths, unless the pilot finds that camera paths alone are more efficient."""
+    """As many light paths, and those of their techniques, as a pilot finds to be worth the time."""
 
     name = "auto"
     slots = ("light_paths",)
@@ -101,30 +102,33 @@ class LightPathsWhereTheyPay(DecisionParameters):
     def learner(self, setting: Setting, others: Mapping[str, Learner]) -> Learner | None:
         if not self.can_learn(setting.scene, setting.pilot_spp):
             return None
-        return LightPathTrial(setting.sensor.film())
+        return LightPathTrial(setting.sensor.film(), setting.spp)
 
 
 class LightPathTrial(Learner):
-    """Compares the variance of all techniques, times the time that they take, with that of camera
-    paths alone. The time is estimated from the number of rays.
+    """Chooses the candidate with the least variance times time. The time is estimated from the
+    number of rays.
 
     The variance of a pixel is divided by the square of the mean radiance of the pixel and its
     neighbours.
 
     Parameters:
         film: The film of the sensor.
+        spp: Samples per pixel of the render.
 
     Attributes:
         estimate: Estimate of the image and its variance, once the choice has been made.
-        variance, cost: Variance and time of all techniques, relative to those of camera paths.
+        candidates: What was compared, once the choice has been made.
+        variances, costs: Variance and time of each candidate, relative to ``path``.
     """
 
-    def __init__(self, film: mi.Film) -> None:
+    def __init__(self, film: mi.Film, spp: int) -> None:
         self._width, height = film_extent(film)
-        self._moments: PathMoments | None = PathMoments(film, self._width, height)
-        self._choice = LightPathChoice(1.0, self._moments)
+        self._moments: PathMoments | None = PathMoments(film, self._width, height, spp)
+        self._choice = LightPathChoice(observer=self._moments)
         self.estimate: Estimate | None = None
-        self.variance = self.cost = float("nan")
+        self.candidates: list[Candidate] = []
+        self.variances, self.costs = np.zeros(0), np.zeros(0)
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightPathChoice:
         return self._choice
@@ -133,33 +137,63 @@ class LightPathTrial(Learner):
         moments = self._moments
         if moments is None or (moments.samples < _ENOUGH and not is_last):
             return None
+        self._moments, self.candidates = None, moments.candidates
         self.estimate = estimate = moments.estimate()
         image = estimate.mean.reshape(-1, self._width)
         weight = relative_scale(image).ravel() ** 2
-        whole, by_camera = (
-            variance * weight for variance in (estimate.bidirectional, estimate.by_camera)
-        )
-        # Here the batches are of pixels, not of paths
-        gain, error = gain_of(trimmed_batches(whole, by_camera - whole))
-        self.cost = _TIME_OF_A_RAY * float(moments.rays[0] / max(moments.rays[1], 1))
-        self.variance = 1 - gain
-        if moments.unreachable > 0:
-            self.variance, error = 0.0, 0.0
-        self._moments = None
-        efficiency = 1 / (max(self.variance, 1e-3) * self.cost)
-        self._choice = LightPathChoice(float(is_worth(efficiency, error, 1.0)))
+        everything = estimate.variances[1] * weight
+        # Of each candidate, the variance in units of that of all techniques, and the error of the
+        # logarithm. Here the batches are of pixels, not of paths
+        found = [
+            gain_of(trimmed_batches(everything, variance * weight - everything))
+            for variance in estimate.variances
+        ]
+        variances = np.array([1 / max(1 - gain, 1e-6) for gain, _ in found])
+        errors = np.array([error for _, error in found])
+        lost = moments.unreachable > 0
+        variances[lost], errors[lost] = np.inf, 0.0
+        costs = np.array([cost(c, moments.counts) for c in moments.candidates])
+        # Prior: the efficiency is that of all techniques
+        efficiencies = costs[1] / (variances * costs)
+        gains = [expected_gain(*estimate) for estimate in zip(efficiencies, errors)]
+        self._best = int(np.argmax(gains))
+        self._best_with_light_paths = 1 + int(np.argmax(gains[1:]))
+        self.variances, self.costs = variances / variances[0], costs / costs[0]
+        self._choice = LightPathChoice(moments.candidates[self._best])
         return self._choice
 
     def state(self) -> dict[str, np.ndarray]:
-        return {"light_paths": np.array([self._choice.count])}
+        return {"light_paths": np.array(astuple(self._choice.techniques), float)}
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightPathChoice:
         self._moments = None
-        self._choice = LightPathChoice(float(state["light_paths"][0]))
+        count, connects, merges = state["light_paths"]
+        self._choice = LightPathChoice(Candidate(float(count), bool(connects), bool(merges)))
         return self._choice
 
     def __str__(self) -> str:
-        kept = "light paths pay" if self._choice.count > 0 else "light paths do not pay"
-        if np.isnan(self.variance):
+        techniques = self._choice.techniques
+        pays = techniques.light_paths > 0
+        kept = f"light paths pay: {techniques}" if pays else "light paths do not pay"
+        if self.estimate is None:
             return kept
-        return f"{kept} ({self.variance:.2f} of the variance, {self.cost:.1f} x the time)"
+        # What was chosen in units of ``path``; if that is ``path``, the best of the others
+        index = self._best if pays else self._best_with_light_paths
+        variance, time = self.variances[index], self.costs[index]
+        return f"{kept} ({variance:.2f} of the variance, {time:.1f} x the time)"
+
+
+def cost(techniques: Candidate, counts: Counts) -> float:
+    """The time of the samples of a pilot, had they only these techniques, in units of that of a ray
+    of ``path``. ``counts`` are those of all techniques, with one light path for each camera path.
+    """
+    rays = counts.camera_rays + counts.tested
+    if techniques.light_paths == 0:
+        return rays
+    rays += _SUMS * counts.camera_rays
+    rays += _LIGHT_RAY * techniques.light_paths * (counts.light_rays + counts.splatted)
+    if techniques.connects:
+        rays += _CONNECTION * counts.connected + _UNTESTED * counts.camera_rays
+    if techniques.merges:
+        rays += _LOOK * counts.looked
+    return rays

@@ -8,7 +8,8 @@ from typing import Any
 import mitsuba as mi
 
 from ..bidirectional.light_walk import LightWalk
-from ..bidirectional.merging import WIDEST, MergingRadius, median_footprint, suitable_radius
+from ..bidirectional.merging import WIDEST, median_footprint, suitable_radius
+from ..bidirectional.merging_radius import MergingRadius
 from ..decisions.camera.shared_numbers import TIME_STEP, WAVELENGTH_STEP, SharedNumbers
 from ..rendering.camera import film_extent
 from ..rendering.camera_samples import CameraSamples
@@ -69,4 +70,4 @@ class MergingParameters:
         if radius is None and only_caustic:
             return None
         radius = radius or WIDEST * footprint
-        return MergingRadius(radius, self.decay, pixels, before)
+        return MergingRadius(radius, self.decay, pixels, footprint, before)

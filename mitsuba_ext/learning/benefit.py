@@ -71,12 +71,18 @@ def gain_of(sums: np.ndarray) -> tuple[float, float]:
     return 1 - left, float(np.sqrt((count - 1) / count * np.square(deviation).sum()))
 
 
-def is_worth(efficiency: float, error: float, least: float) -> bool:
-    """Is the expected efficiency at least ``least``, for an estimate ``efficiency`` whose logarithm
-    has the standard error ``error``?
+def expected_gain(efficiency: float, error: float) -> float:
+    """The logarithm of the expected efficiency, for an estimate ``efficiency`` whose logarithm has
+    the standard error ``error``.
 
     The less certain the estimate, the closer to one is the expected efficiency. A significance test
     instead would make the choice depend on the seed where pilots are noisy and the possible gain is
     large."""
-    known = _PRIOR**2 / (_PRIOR**2 + error**2)
-    return efficiency > 0 and known * np.log(efficiency) >= np.log(least)
+    if efficiency <= 0:
+        return -np.inf
+    return _PRIOR**2 / (_PRIOR**2 + error**2) * float(np.log(efficiency))
+
+
+def is_worth(efficiency: float, error: float, least: float) -> bool:
+    """Is the expected efficiency (:func:`expected_gain`) at least ``least``?"""
+    return expected_gain(efficiency, error) >= np.log(least)

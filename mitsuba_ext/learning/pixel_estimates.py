@@ -70,8 +70,12 @@ class PixelEstimates:
 
 def relative_scale(image: np.ndarray) -> np.ndarray:
     """1 / mean radiance of each pixel of an image and its neighbours, shape [y, x]."""
-    means = _box_sums(image) / _box_sums(np.ones_like(image))
-    return _inverse(means, image.mean())
+    return _inverse(box_means(image), image.mean())
+
+
+def box_means(image: np.ndarray) -> np.ndarray:
+    """The mean of each pixel of an image and its neighbours, shape [y, x]."""
+    return _box_sums(image) / _box_sums(np.ones_like(image))
 
 
 def _inverse(means: np.ndarray, mean: float) -> np.ndarray:

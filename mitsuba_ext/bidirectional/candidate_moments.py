@@ -1,0 +1,105 @@
+"""Second moments of sets of techniques, from the samples of all of them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .candidates import Candidate
+from .merging import HANDFUL
+from .partial_sums import Rivals
+
+
+class CandidateMoments:
+    """For each pixel and each candidate, sums over the samples of a pass: of the second moment, and
+    of the light image.
+
+    Let a candidate find a path of contribution f with the densities qᵢ. With the power heuristic,
+    its second moment is the integral of f² Σ cᵢ qᵢ³ / (Σ qᵢ²)², where cᵢ is 1 but for merging. Of
+    techniques of one kind, only the sum of the squared densities is known: the sum of their cubes
+    is as if one of them had all of it.
+
+    Parameters:
+        candidates: The candidates.
+        pixels: Number of pixels.
+        samples_per_vertex: For each number of light paths that merging candidates have, how many
+            samples of a pixel find the same vertex (:meth:`MergingRadius.samples_per_vertex`).
+    """
+
+    def __init__(
+        self, candidates: list[Candidate], pixels: int, samples_per_vertex: dict[float, float]
+    ) -> None:
+        self._count, self._pixels = len(candidates), pixels
+        # MIS weights count a handful of vertices as one sample of a camera path; but these samples
+        # share vertices
+        shared = [samples_per_vertex.get(c.light_paths, 1.0) / HANDFUL for c in candidates]
+        # Factors of the squared densities of light image, connections, merging; and c of merging
+        self._factors = _table(
+            (c.light_paths**2, float(c.connects), float(c.merges), s)
+            for c, s in zip(candidates, shared)
+        )
+        self._sums = dr.zeros(mi.Float, 2 * self._count * pixels)
+        self._lost = dr.zeros(mi.UInt32, self._count)
+        dr.eval(self._sums, self._lost)
+
+    @dr.syntax
+    def add(self, brought, mis, rivals, pixel, active, count: float = 1.0) -> None:
+        """Adds a contribution.
+
+        Parameters:
+            brought: The contribution, with its MIS weight ``mis``.
+            rivals: Densities of techniques, that which found it included.
+            pixel: Where it is.
+            count: MIS weights count so many such contributions as one sample.
+        """
+        square = count * dr.square(brought) / mis
+        index = mi.UInt32(0)
+        while index < mi.UInt32(self._count):
+            factors = dr.gather(mi.Vector4f, self._factors, index)
+            inverse, image = _split(factors, rivals, dr.rcp(mis))
+            moment = square * inverse
+            is_found = active & dr.isfinite(moment)
+            place = 2 * (index * mi.UInt32(self._pixels) + pixel)
+            dr.scatter_add(self._sums, moment, place, is_found)
+            dr.scatter_add(self._sums, brought * image, place + 1, is_found)
+            dr.scatter_add(self._lost, mi.UInt32(1), index, active & (inverse == 0))
+            index += 1
+
+    def taken(self) -> tuple[np.ndarray, np.ndarray]:
+        """The sums, [candidate, pixel, 2], and of each candidate the number of samples of paths
+        that it cannot find."""
+        return self._sums.numpy().reshape(self._count, self._pixels, 2), self._lost.numpy()
+
+
+def _split(
+    factors: mi.Vector4f, rivals: Rivals, total: mi.Float
+) -> tuple[mi.Float, mi.Float]:
+    """Σ cᵢ qᵢ³ / (Σ qᵢ²)² in units of the technique that found a path, 0 if the candidate cannot
+    find it; and the MIS weight of the light image. ``total`` is Σ qᵢ² of all techniques."""
+    connections, image = rivals.by_kind
+    hit, next_event = (dr.square(q) for q in rivals.by_camera)
+    merging = dr.maximum(total - (hit + next_event + connections + image), 0)
+    squares = [
+        hit, next_event, factors.x * image, factors.y * connections, factors.z * merging
+    ]  # fmt: skip
+    largest = squares[0]
+    for square in squares[1:]:
+        largest = dr.maximum(largest, square)
+    # In units of the largest one: powers would be too small for floats
+    inverse = dr.select(largest > 0, dr.rcp(largest), 0)
+    shares = [square * inverse for square in squares]
+    cubes = [share * dr.sqrt(share) for share in shares]
+    cubes[-1] *= factors.w
+    whole = dr.maximum(_sum(shares), 1)
+    return _sum(cubes) / dr.square(whole) * dr.sqrt(inverse), shares[2] / whole
+
+
+def _sum(values: list[mi.Float]) -> mi.Float:
+    return sum(values[1:], values[0])
+
+
+def _table(rows) -> mi.Float:
+    table = mi.Float(np.array(list(rows), np.float32).ravel())
+    dr.eval(table)
+    return table

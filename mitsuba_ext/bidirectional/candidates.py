@@ -1,0 +1,67 @@
+"""Which techniques of bidirectional path tracing a render may use, and how often."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .merging_radius import MergingRadius
+
+#: The numbers of light paths, for each camera path, that pilots choose from. Merging needs many:
+#: the fewer there are, the wider is the radius in which a disk holds enough vertices.
+_COUNTS, _MERGING_COUNTS = (1 / 16, 1 / 4, 1.0, 4.0), (1.0, 4.0)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A set of techniques.
+
+    Attributes:
+        light_paths: Number of light paths for each camera path. With 0, there are the techniques of
+            ``path`` alone.
+        connects: Are vertices of camera paths and of light paths connected (s, t ≥ 2)?
+        merges: Are they merged?
+    """
+
+    light_paths: float
+    connects: bool = True
+    merges: bool = False
+
+    def __str__(self) -> str:
+        parts = [f"{self.light_paths:g} for each camera path"]
+        parts += [] if self.connects else ["no connections"]
+        parts += ["merging"] if self.merges else []
+        return ", ".join(parts)
+
+
+@dataclass(frozen=True)
+class Available:
+    """What a render can use.
+
+    Attributes:
+        has_image: Are light paths connected to the sensor?
+        connects: Are they connected to camera paths?
+        radius: Within what radius they are merged; ``None`` if they are not.
+        are_shared: Can a camera path be connected to any light path? If not, there is one for each.
+    """
+
+    has_image: bool
+    connects: bool
+    radius: MergingRadius | None
+    are_shared: bool
+
+
+def candidates(available: Available) -> list[Candidate]:
+    """The candidates of a render; the first one is ``path``, the second one has all techniques."""
+    can_merge = available.radius is not None
+    everything = Candidate(1.0, available.connects, can_merge)
+    found = [Candidate(0.0), everything]
+    for merges in (False, True) if can_merge else (False,):
+        for count in _MERGING_COUNTS if merges else _COUNTS:
+            for connects in (True, False) if available.connects else (False,):
+                candidate = Candidate(count, connects, merges)
+                # Light paths without any technique are of no use
+                is_useful = connects or available.has_image or merges
+                is_possible = available.are_shared or count == 1
+                if is_useful and is_possible and candidate != everything:
+                    found.append(candidate)
+    return found
