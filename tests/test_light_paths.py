@@ -10,10 +10,11 @@ import mitsuba as mi
 import pytest
 from hard_cases import area, diffuse, rectangle, rgb, stage
 from statistical import REFERENCE_SEEDS, SEEDS, assert_same_quarters, batches, load, some
-from test_bdpt import bdpt
+from test_bdpt import assert_image_of_path, bdpt
 from test_light_tracer import EMITTERS, MANY_SEEDS, T, _balls, below_the_lamp
 
 from mitsuba_ext.bidirectional import path_tracer
+from mitsuba_ext.bidirectional.candidates import Candidate
 from mitsuba_ext.bidirectional.path_moments import PathMoments
 from mitsuba_ext.bidirectional.vertex_choice import Chosen, VertexChoice
 from mitsuba_ext.composition import light_paths
@@ -98,6 +99,59 @@ def test_the_variance_of_path_is_predicted_whatever_weights_connections_have(
     assert_variance_of_path_is_predicted(_below_a_ceiling(diffuse()), light_image=False)
 
 
+@pytest.mark.parametrize("parameters", [
+    {"light_paths": 0.25}, {"light_paths": 4.0}, {"connections": 0},
+    pytest.param({"light_paths": 0.25, "connections": 0}, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_the_variance_of_fewer_techniques_is_predicted(parameters: dict[str, float]) -> None:
+    """From the samples of all of them, with one light path for each camera path."""
+    scene = mi.load_dict(_below_a_ceiling(diffuse()), optimize=False)
+    integrator = _auto(max_depth=4, pilot_spp=64)
+    mi.render(scene, integrator=integrator, spp=256)
+    learner = integrator.learners["light_paths"]
+    candidate = Candidate(parameters.get("light_paths", 1.0), "connections" not in parameters)
+    predicted = learner.estimate.variances[learner.candidates.index(candidate)].mean()
+    seeds = batches(scene, bdpt(4, **parameters), 16, range(24))
+    measured = 16 * seeds.mean(axis=-1).var(axis=0, ddof=1).mean()
+    assert predicted == pytest.approx(measured, rel=0.3)
+
+
+@pytest.mark.parametrize("parameters", [
+    {"light_paths": 0.25}, {"light_paths": 4, "connections": 0},
+    pytest.param({"light_paths": 0}, marks=pytest.mark.slow),
+    pytest.param({"light_paths": 0.1, "connections": 3}, marks=pytest.mark.slow),
+    pytest.param({"light_paths": 2, "light_image": False}, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_the_number_of_light_paths_does_not_change_the_mean(parameters: dict[str, Any]) -> None:
+    camera = {**below_the_lamp(), "type": "thinlens", "aperture_radius": 0.1, "focus_distance": 3}
+    assert_image_of_path(stage(camera=camera), **parameters)
+
+
+@pytest.mark.slow
+def test_merging_is_left_out_where_connections_find_the_light() -> None:
+    """In glass_lamp all light has passed through glass, but nothing shows it through glass."""
+    integrator = mi.load_dict(
+        {"type": "vcm", "max_depth": 6, "light_paths": "auto", "pilot_spp": 16}
+    )
+    mi.render(load("glass_lamp", width=48, height=27), integrator=integrator, spp=64)
+    assert "light paths pay" in integrator.statistics.learned
+    assert "merging" not in integrator.statistics.learned
+    mi.render(load("pool", width=48, height=27), integrator=integrator, spp=64)
+    assert "merging" in integrator.statistics.learned
+
+
+@pytest.mark.parametrize("count", [-1, 65, "many", True])
+def test_a_wrong_number_of_light_paths_is_refused(count: Any) -> None:
+    with pytest.raises(RuntimeError, match='"light_paths" is .* or a number from 0 to 64'):
+        bdpt(light_paths=count)
+
+
+def test_spectral_light_paths_are_as_many_as_camera_paths() -> None:
+    mi.set_variant("llvm_ad_spectral")
+    with pytest.raises(NotImplementedError, match='"light_paths" is 0.25; in spectral variants'):
+        bdpt(light_paths=0.25).render(mi.load_dict(stage()), spp=1)
+
+
 def test_a_restored_choice_needs_no_pilot(tmp_path) -> None:
     file = str(tmp_path / "learned.npz")
     scene = mi.load_dict(stage(light=EMITTERS["constant"](), camera=below_the_lamp()))
@@ -134,8 +188,8 @@ def test_weights_are_those_of_the_densities_that_light_paths_know(
     class Recorder(PathMoments):
         """Counts paths, by whether the weight is the expected one."""
 
-        def start(self, rays) -> None:
-            super().start(rays)
+        def start(self, rays, available) -> None:
+            super().start(rays, available)
             self.count = dr.zeros(mi.UInt32, 2)
             dr.eval(self.count)
             counts.append(self.count)

@@ -153,7 +153,9 @@ def test_without_caustics_the_image_is_that_of_bdpt(parameters: dict) -> None:
 
 @pytest.mark.parametrize(("name", "parameters"), [
     ("vcm", {}), pytest.param("vcm", {"merging": "all"}, marks=pytest.mark.slow),
+    pytest.param("vcm", {"light_paths": 4.0, "connections": 0}, marks=pytest.mark.slow),
     pytest.param("sppm", {}, marks=pytest.mark.slow),
+    pytest.param("sppm", {"light_paths": 0.5}, marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_caustics_have_the_mean_of_path(name: str, parameters: dict) -> None:
     """A large lamp, a ball of glass, and a mirror: ``path`` finds the caustics too."""

@@ -158,7 +158,11 @@ class LightPathTrial(Learner):
         gains = [expected_gain(*estimate) for estimate in zip(efficiencies, errors)]
         self._best = int(np.argmax(gains))
         self._best_with_light_paths = 1 + int(np.argmax(gains[1:]))
-        self.variances, self.costs = variances / variances[0], costs / costs[0]
+        self.costs = costs / costs[0]
+        if np.isfinite(variances[0]):
+            self.variances = variances / variances[0]
+        else:
+            self.variances = np.where(np.isfinite(variances), 0.0, 1.0)
         self._choice = LightPathChoice(moments.candidates[self._best])
         return self._choice
 
