@@ -29,7 +29,7 @@ from .decision_parameters import DecisionParameters, Setting, Slots
 _SUMS, _LIGHT_RAY, _CONNECTION, _UNTESTED, _LOOK = 0.25, 1.8, 1.25, 0.2, 0.25
 
 #: Number of samples from which the choice is made, unless the pilots have fewer.
-_ENOUGH = 1 << 16
+_ENOUGH = 1 << 15
 
 
 #: The most light paths for each camera path.
