@@ -9,9 +9,10 @@ the mean of all images of ``bdpt``; times are the median of the seeds. The effic
 can see everything: those that show no smooth mirror, smooth glass, mask or null surface. So is
 ``bdpt`` once more, in the column ``as seen by light_tracer``.
 
-``kept`` is the number of seeds for which the pilot of ``auto`` kept light paths. ``predicted`` is
-what it found with the last seed: variance and time of ``bdpt`` in units of those of ``path``.
-``measured`` has both from the renders, with all values.
+``chosen`` is what the pilot of ``auto`` chose with the last seed, and for how many seeds it did.
+``predicted`` is what it expected of that: variance and time in units of those of ``path`` (of the
+best choice with light paths, if it chose none). ``measured`` has both from the renders, which
+contain the pilot.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ INTEGRATORS = {
 COLUMNS = ["scene", "`path`: seconds", "error", "`light_tracer`: time", "error", "efficiency"]
 COLUMNS += ["`bdpt`: time", "error", "efficiency", "as seen by `light_tracer`"]
 COLUMNS += ["mean of `path`"]
-COLUMNS += ["`auto`: time", "error", "efficiency", "kept", "predicted", "measured"]
+COLUMNS += ["`auto`: time", "error", "efficiency", "chosen", "predicted", "measured"]
 
 
 def seen(scene: mi.Scene) -> np.ndarray:
@@ -87,11 +88,13 @@ def cells(renders: dict[str, Renders], visible: np.ndarray) -> list[str]:
         if kind == "bdpt":
             row.append(f"{1 / (ratios(kind, visible)[1] * slower):.2g}")
             row.append(f"{path.mean.mean() / mean.mean():.3f}")
-    learned = renders["auto"].learned
-    kept = sum(text.startswith("light paths pay") for text in learned)
-    predicted = re.findall(r"[\d.]+|inf", learned[-1])
-    slower, e = ratios("bdpt", everywhere, 0.0)
-    return [*row, f"{kept} of {len(learned)}", ", ".join(predicted), f"{e:.2f}, {slower:.1f}"]
+    learned = [re.split(r" \(", text) for text in renders["auto"].learned]
+    choice, numbers = learned[-1]
+    same = sum(other == choice for other, _ in learned)
+    predicted = re.findall(r"[\d.]+|inf", numbers)
+    slower, e = ratios("auto", everywhere)
+    return [*row, f"{choice} ({same} of {len(learned)})", ", ".join(predicted),
+            f"{e:.2f}, {slower:.1f}"]  # fmt: skip
 
 
 if __name__ == "__main__":

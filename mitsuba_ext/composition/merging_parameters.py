@@ -59,6 +59,8 @@ class MergingParameters:
         """The radius for a render, before which others have made ``before`` samples per pixel;
         ``None`` if there are no caustics to merge. The other parameters are those of
         :func:`suitable_radius`."""
+        if only_caustic and not _may_have_caustics(scene):
+            return None
         footprint = median_footprint(scene, sensor)
         width, height = film_extent(sensor.film())
         pixels = width * height
@@ -71,3 +73,10 @@ class MergingParameters:
             return None
         radius = radius or WIDEST * footprint
         return MergingRadius(radius, self.decay, pixels, footprint, before)
+
+
+def _may_have_caustics(scene: mi.Scene) -> bool:
+    """May a BSDF in ``scene`` have delta lobes? Those of instances and moving shapes are not known.
+    """
+    bsdfs = [shape.bsdf() for shape in scene.shapes()]
+    return any(b is None or int(b.flags()) & int(mi.BSDFFlags.Delta) for b in bsdfs)
