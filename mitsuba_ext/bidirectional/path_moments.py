@@ -253,14 +253,15 @@ class PathMoments(TechniqueObserver):
         n, x, x2, moment, splats, splats2, merged = self._sums
         n = np.maximum(n, 1)
         # The unbiased estimate: with few samples, the square of the sample mean is too large, by
-        # the variance of the mean
-        of_camera = np.where(n > 1, (x2 - x**2 / n) / np.maximum(n - 1, 1), x2)
+        # the variance of the mean. With one, the mean is that of the pixel's neighbours
+        alone = np.maximum(x2 - self._smooth(x) ** 2, 0)
+        of_camera = np.where(n > 1, (x2 - x**2 / n) / np.maximum(n - 1, 1), alone)
         # Few of all light paths splat to a pixel: the sum of their squares is about their variance.
         # So it is with merging, but some samples of a pixel find the same vertex
         shared = self._shared.get(1.0, 1.0)
         everything = of_camera + (splats2 + (shared - 1) * merged) / n
         mean = (x + splats) / n
-        squared_mean = np.where(n > 1, mean**2 - everything / n, 0)
+        squared_mean = np.where(n > 1, mean**2 - everything / n, self._smooth(mean) ** 2)
         moments, images = np.moveaxis(self._others, 2, 0)
         # What camera paths bring, with each candidate, and products of such contributions
         brought = [self._smooth(mean - image / n) for image in images]

@@ -117,6 +117,7 @@ class LightPathTrial(Learner):
         spp: Samples per pixel of the render.
 
     Attributes:
+        rival: The efficiency of ``path`` with what else was learned for it, relative to ``path``.
         estimate: Estimate of the image and its variance, once the choice has been made.
         candidates: What was compared, once the choice has been made.
         variances, costs: Variance and time of each candidate, relative to ``path``.
@@ -126,9 +127,17 @@ class LightPathTrial(Learner):
         self._width, height = film_extent(film)
         self._moments: PathMoments | None = PathMoments(film, self._width, height, spp)
         self._choice = LightPathChoice(observer=self._moments)
+        self.rival = 1.0
         self.estimate: Estimate | None = None
         self.candidates: list[Candidate] = []
         self.variances, self.costs = np.zeros(0), np.zeros(0)
+
+    @staticmethod
+    def samples(pixel_count: int) -> int:
+        """Samples per pixel that are enough: at least two, to estimate their variance, but for
+        large films, whose pixels have enough neighbours."""
+        least = 2 if pixel_count < _ENOUGH else 1
+        return max(least, -(-_ENOUGH // pixel_count))
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightPathChoice:
         return self._choice
@@ -155,6 +164,7 @@ class LightPathTrial(Learner):
         costs = np.array([cost(c, moments.counts) for c in moments.candidates])
         # Prior: the efficiency is that of all techniques
         efficiencies = costs[1] / (variances * costs)
+        efficiencies[0] *= self.rival
         gains = [expected_gain(*estimate) for estimate in zip(efficiencies, errors)]
         self._best = int(np.argmax(gains))
         self._best_with_light_paths = 1 + int(np.argmax(gains[1:]))

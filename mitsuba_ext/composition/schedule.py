@@ -92,6 +92,8 @@ class Schedule:
 
     Attributes:
         learners: The learners, by slot.
+        beside: Learners that learn from stages of their own, which somebody else makes: this
+            schedule saves, restores and reports what they learn.
         decisions: The decisions of the next stage that differ from those of ``path``, by slot.
         camera: Chooses points of the aperture, times and wavelengths.
     """
@@ -111,6 +113,7 @@ class Schedule:
         self._stages = list(stages)
         self.decisions: dict[str, Any] = {"query": query}
         self.learners: dict[str, Learner] = {}
+        self.beside: dict[str, Learner] = {}
         self.camera = CameraSamples()
         for slot, parameters in slots.items():
             if isinstance(parameters, WeightedNumbers):
@@ -128,6 +131,7 @@ class Schedule:
         #: For each stage, the weight of its samples relative to those of the last stage
         self._weights = stage_weights(stages) if self._learns_maps else [1.0] * len(stages)
         self._restored, self._learned = restored, learned
+        self._states: States = {}
         self._scout: Scout | None = None
         self._finished_stages = -1
 
@@ -154,12 +158,15 @@ class Schedule:
             p, n = self._scout.vertices() if self._scout else (mi.Point3f(), mi.Normal3f())
             for slot, learner in self.learners.items():
                 self._replace(slot, learner.start(self._setting.scene, p, n))
+        if self._finished_stages > 0 or self._pilot_count == 0:
+            self._learn(is_last=self._finished_stages == self._pilot_count)
+        return self.stage_again()
+
+    def stage_again(self) -> Stage:
+        """The stage that :meth:`next_stage` has returned, with the decisions of now."""
         if self._finished_stages == self._pilot_count:
-            self._learn(is_last=True)
             return self._last_stage()
-        if self._finished_stages > 0:
-            self._learn(is_last=False)
-        observer = _one_observer(learners)
+        observer = _one_observer(list(self.learners.values()))
         return Stage(
             self._estimator(observer=observer, **self.decisions),
             camera=self.camera,
@@ -168,16 +175,30 @@ class Schedule:
             observer=observer,
         )
 
+    def leave_out(self, slots: Sequence[str]) -> None:
+        """Decides as ``path`` in these slots from now on, and learns nothing more for them."""
+        for slot in slots:
+            self.decisions.pop(slot, None)
+            self.learners.pop(slot, None)
+
     def _restored_stage(self, states: States) -> Stage:
-        for slot, learner in self.learners.items():
+        for slot, learner in self._everyone.items():
             if slot in states:
                 self._replace(slot, learner.restore(self._setting.scene, states[slot]))
         for learner in self.learners.values():
             learner.finish()
         return self._last_stage()
 
+    @property
+    def _everyone(self) -> dict[str, Learner]:
+        return {**self.learners, **self.beside}
+
     def _last_stage(self) -> Stage:
-        learned = "; ".join(filter(None, map(str, self.learners.values())))
+        if self._learned is not None:
+            self._states.update({slot: x.state() for slot, x in self.beside.items()})
+            known = {s: x for s, x in self._states.items() if x and s in self._everyone}
+            self._learned(known)
+        learned = "; ".join(filter(None, map(str, self._everyone.values())))
         return Stage(self._estimator(**self.decisions), learned, camera=self.camera)
 
     def _scout_stage(self) -> Stage:
@@ -193,8 +214,7 @@ class Schedule:
             self._replace(slot, learner.learn(self._setting.scene, is_last))
         if is_last:
             if self._learned is not None:
-                states = {slot: learner.state() for slot, learner in self.learners.items()}
-                self._learned({slot: state for slot, state in states.items() if state})
+                self._states = {slot: x.state() for slot, x in self.learners.items()}
             for learner in self.learners.values():
                 learner.finish()
 

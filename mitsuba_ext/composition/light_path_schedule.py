@@ -1,0 +1,91 @@
+"""The stages of a render that begins as ``path``, and tries light paths in between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mitsuba as mi
+
+from ..learning.directions.guide_learner import GuideLearner
+from ..rendering.stages import Stage
+from ..transport.estimator import Estimator
+from .light_paths import LightPathTrial
+from .schedule import Schedule
+
+#: Where light paths pay, these slots decide as ``path``: what they learn is for camera paths that
+#: find all light alone.
+_OF_CAMERA_PATHS = ("directions", "roulette")
+
+#: The trial takes this share of all samples, at most: a sample takes about 3.5 times as long.
+_MOST = 1 / 32
+
+
+def samples_of_trial(pixel_count: int, spp: int) -> int:
+    """The samples per pixel of the trial, out of ``spp``; 0 if there are too few for a trial."""
+    samples = LightPathTrial.samples(pixel_count)
+    return samples if samples <= spp * _MOST else 0
+
+
+def place_of_trial(pilots: int) -> int:
+    """After so many of the other pilots comes the trial: all of ``pilots``, but the first two are
+    enough to tell what else is worth its time."""
+    return min(2, pilots)
+
+
+class LightPathSchedule:
+    """Adds a stage to a schedule in which light paths are tried, with the lights that were learned
+    until then. If they pay, more than guided directions do, the stages after it use them.
+
+    Parameters:
+        inner: Makes the other stages.
+        scene: The scene.
+        place: After so many stages comes the trial.
+        trial: Chooses.
+        estimator: Makes the estimator of a stage, as that of ``inner``.
+    """
+
+    def __init__(
+        self,
+        inner: Schedule,
+        scene: mi.Scene,
+        place: int,
+        trial: LightPathTrial,
+        estimator: Callable[..., Estimator],
+    ) -> None:
+        self._inner, self._scene, self._place, self._trial = inner, scene, place, trial
+        self._estimator = estimator
+        inner.beside["light_paths"] = trial
+        self._next: Stage | None = None
+        self._is_over = False
+
+    def next_stage(self) -> Stage:
+        """See :class:`mitsuba_ext.rendering.stages.Schedule`."""
+        if self._next is not None:
+            return self._stage_after_trial()
+        stage = self._inner.next_stage()
+        if self._is_over or stage.is_scout:
+            return stage
+        if self._place > 0:
+            self._place -= 1
+            return stage
+        self._next, self._is_over = stage, True
+        choice = self._trial.start(self._scene, mi.Point3f(), mi.Normal3f())
+        decisions = {
+            slot: decision for slot, decision in self._inner.decisions.items()
+            if slot not in _OF_CAMERA_PATHS
+        }  # fmt: skip
+        estimator = self._estimator(light_paths=choice, **decisions)
+        return Stage(estimator, camera=self._inner.camera)
+
+    def _stage_after_trial(self) -> Stage:
+        stage, self._next = self._next, None
+        guide = self._inner.learners.get("directions")
+        if isinstance(guide, GuideLearner) and guide.guide and guide.guidance:
+            self._trial.rival = guide.guidance.efficiency
+        choice = self._trial.learn(self._scene, is_last=True)
+        if choice is None or choice.techniques.light_paths == 0:
+            # Only the summary may be new
+            return self._inner.stage_again() if stage.learned else stage
+        self._inner.leave_out(_OF_CAMERA_PATHS)
+        self._inner.decisions["light_paths"] = choice
+        return self._inner.stage_again()
