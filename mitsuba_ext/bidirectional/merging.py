@@ -47,9 +47,9 @@ _PATHS, _DOUBLINGS = 1 << 16, 8
 #: caustic; with fewer than a tenth of them, it stays about the same.)
 HANDFUL = 8.0
 
-#: With fewer vertices of these paths, nothing is merged; and the largest radius, in footprints of
-#: pixels.
-_FEW, WIDEST = 64, 20.0
+#: With fewer vertices of these paths, nothing is merged; and the largest radius of the first sample
+#: of a pixel, in footprints of pixels.
+_FEW, WIDEST = 64, 8.0
 
 #: The largest radius in units of the diagonal of the scene: pixels of very small films are wide.
 _LARGEST = 0.04
@@ -58,7 +58,9 @@ _LARGEST = 0.04
 @dataclass
 class MergingRadius:
     """The radius of merging. It shrinks from pass to pass, so that bias vanishes, and suits the
-    number of light paths of a pass: a disk holds about as many vertices whatever that is.
+    number of light paths of a pass: a disk holds about as many vertices whatever that is. In short
+    passes, such a disk would be wide, and its bias would outweigh the noise of all passes together;
+    ``widest`` limits the radius by the number of samples so far, in however many passes.
 
     Source: C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic Approach*, ACM
     Transactions on Graphics 30(3), 2011: the squared radius of pass i is proportional to i^(α − 1)
@@ -69,12 +71,15 @@ class MergingRadius:
         decay: α, in (0, 1]; 1 for a constant radius.
         pixels: Number of pixels.
         before: Light paths per pixel of passes that other renders have made before.
+        widest: The largest radius after one light path per pixel; it shrinks with their number as
+            that of passes of one.
     """
 
     first: float
     decay: float
     pixels: int
     before: int = 0
+    widest: float = math.inf
     _passes: int = 0
 
     def next(self, paths: int, groups: int = 1) -> float:
@@ -83,7 +88,8 @@ class MergingRadius:
         share = self.pixels / paths
         number = self._passes + 1 + self.before * share
         self._passes += groups
-        return self.first * (share * number ** (self.decay - 1)) ** 0.5
+        radius = self.first * (share * number ** (self.decay - 1)) ** 0.5
+        return min(radius, self.widest * (number / share) ** ((self.decay - 1) / 2))
 
 
 def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
@@ -146,7 +152,7 @@ def suitable_radius(
     radius = disk_radius(vertices, kept, HANDFUL * _PATHS / pixels, 2 * footprint)
     if radius is None:
         return None
-    return min(radius, WIDEST * footprint, _LARGEST * scene_diagonal(scene))
+    return min(radius, _LARGEST * scene_diagonal(scene))
 
 
 def disk_radius(
