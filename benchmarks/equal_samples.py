@@ -37,9 +37,11 @@ def options(command: Callable) -> Callable:
 
 
 def load(name: str, size: tuple[int, int], sampler: str = "") -> mi.Scene:
-    """A file, or one of our scenes by its name, with another sampler than its own if that is given:
-    "sobol_owen", or with parameters "sobol_owen:dimensions=2:blue_noise=true". Scenes made
-    elsewhere call the film's size resx and resy."""
+    """A file, or one of our scenes by its name, also with parameters ("pool:lamp=0.1"), with
+    another sampler than its own if that is given: "sobol_owen", or with parameters
+    "sobol_owen:dimensions=2:blue_noise=true". Scenes made elsewhere call the film's size resx and
+    resy."""
+    name, *given = name.split(":")
     file = Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml"
     text, (width, height) = file.read_text(), size
     parameters = {"width": width, "height": height, "rfilter": "box"}
@@ -47,6 +49,7 @@ def load(name: str, size: tuple[int, int], sampler: str = "") -> mi.Scene:
         parameters = {"resx": width, "resy": height}
     elif "$rfilter" not in text:
         del parameters["rfilter"]
+    parameters |= dict(parameter.split("=") for parameter in given)
     if not sampler:
         return mi.load_file(str(file), **parameters)
     mi.file_resolver().prepend(str(file.parent))

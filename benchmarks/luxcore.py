@@ -1,8 +1,10 @@
-"""Compares ``path`` and ``bdpt`` with BIDIRCPU, the bidirectional path tracer of LuxCore, by
-variance and CPU time:
+"""Compares ``path`` and ``bdpt`` (and others: ``--integrator``) with BIDIRCPU, the bidirectional
+path tracer of LuxCore, or with another engine, by variance and CPU time:
 
     python3 -m venv luxcore && luxcore/bin/pip install pyluxcore numpy
     .venv/bin/python benchmarks/luxcore.py cornell_box caustic --python luxcore/bin/python
+    .venv/bin/python benchmarks/luxcore.py caustic --python luxcore/bin/python --integrator bdpt \\
+        --integrator vcm --engine BIDIRVMCPU:bidirvm.startradius.scale=0.0003
 
 The scene is handed over as meshes, to another process: LuxCore's libraries and Mitsuba's do not go
 together in one. It must be made of ``diffuse``, smooth ``dielectric`` and smooth ``conductor`` (a
@@ -43,9 +45,10 @@ COLUMNS = ["scene", "", "seconds", "error", "efficiency", "mean"]
 @click.command()
 @options
 @click.option("--python", required=True, help="An interpreter with pyluxcore and numpy.")
-def main(
-    names: tuple[str, ...], max_depth: int, spp: int, seeds: int, size: tuple, python: str
-) -> None:
+@click.option("--integrator", "kinds", multiple=True, default=("path", "bdpt"))
+@click.option("--engine", "engines", multiple=True, default=("BIDIRCPU",),
+              help="Engines of LuxCore, with parameters: NAME:key=value:key=value.")  # fmt: skip
+def main(names, max_depth, spp, seeds, size, python, kinds, engines) -> None:
     """Compares the integrators on the scenes NAMES."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
@@ -53,10 +56,11 @@ def main(
     side = size[1]
     for name in names:
         scene = load(name, (side, side))
-        kinds = {kind: {"type": kind} for kind in ("path", "bdpt")}
-        renders = render_in_turns(scene, kinds, max_depth, spp, seeds)
-        renders["BIDIRCPU"] = _theirs(scene, python, side, max_depth, spp, seeds)
+        integrators = {kind: {"type": kind} for kind in kinds}
+        renders = render_in_turns(scene, integrators, max_depth, spp, seeds)
         mean = renders["bdpt"].mean
+        for engine in engines:
+            renders[engine] = _theirs(scene, python, engine, side, max_depth, spp, seeds)
         cost_of_path = None
         for kind, found in renders.items():
             ratio = found.mean.mean() / mean.mean()
@@ -67,12 +71,14 @@ def main(
 
 
 def _theirs(
-    scene: mi.Scene, python: str, side: int, max_depth: int, spp: int, seeds: int
+    scene: mi.Scene, python: str, engine: str, side: int, max_depth: int, spp: int, seeds: int
 ) -> Renders:
     """Renders of LuxCore."""
     shapes = [(_material(shape), *_mesh(shape)) for shape in scene.shapes()]
     task = {"camera": _camera(scene.sensors()[0]), "shapes": shapes, "side": side}
-    task |= {"max_depth": max_depth, "spp": spp, "seeds": seeds}
+    kind, *parameters = engine.split(":")
+    task |= {"max_depth": max_depth, "spp": spp, "seeds": seeds, "engine": kind}
+    task["parameters"] = {k: float(v) for k, v in (text.split("=") for text in parameters)}
     with tempfile.TemporaryDirectory() as folder:
         given, made = Path(folder) / "task", Path(folder) / "renders"
         given.write_bytes(pickle.dumps(task))

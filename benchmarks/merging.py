@@ -2,9 +2,12 @@
 
     .venv/bin/python benchmarks/merging.py pool caustic /somewhere/scene.xml --seconds 5
 
+The name of a scene may be followed by parameters: ``"pool:lamp=0.1:radiance=9920, 9120, 7520"``.
+
 Each integrator gets so many samples per pixel as fit into the time, by a short render before.
 Writes a row of Markdown for each scene and integrator: samples per pixel, seconds (the median of
-the seeds but the first), the variance between seeds (relative as in ``equal_samples.py``; all of
+the seeds but the first; with ``--cpu`` those of all threads together, which other work on the
+machine hardly changes), the variance between seeds (relative as in ``equal_samples.py``; all of
 it, and without the largest 0.1 % of the values), the efficiency that follows from each, relative to
 the first integrator, and the mean of the image, in which bias shows, with its standard error.
 """
@@ -12,6 +15,7 @@ the first integrator, and the mean of the image, in which bias shows, with its s
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import click
 import numpy as np
@@ -28,15 +32,20 @@ _TRIAL = 32
 
 
 def renders(
-    scene: mi.Scene, kind: str, max_depth: int, seconds: float, seeds: int
+    scene: mi.Scene,
+    kind: str,
+    max_depth: int,
+    seconds: float,
+    seeds: int,
+    clock: Callable[[], float],
 ) -> tuple[np.ndarray, float, int]:
     """The images, the time of one, and its samples per pixel."""
 
     def render(spp: int, seed: int) -> tuple[np.ndarray, float]:
         integrator = mi.load_dict({"type": kind, "max_depth": max_depth})
-        begin = time.perf_counter()
+        begin = clock()
         image = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))[..., :3]
-        return image.astype(float), time.perf_counter() - begin
+        return image.astype(float), clock() - begin
 
     trials = [render(_TRIAL, 1000 + k)[1] for k in range(3)]
     spp = max(8, round(_TRIAL * seconds / min(trials)))
@@ -47,19 +56,21 @@ def renders(
 @click.command()
 @click.argument("names", nargs=-1, required=True)
 @click.option("--seconds", default=5.0, show_default=True)
+@click.option("--cpu", is_flag=True, help="The seconds are CPU time.")
 @click.option("--seeds", default=4, show_default=True)
 @click.option("--max-depth", default=8, show_default=True)
 @click.option("--size", type=(int, int), default=(160, 90), show_default=True)
 @click.option("--integrator", "kinds", multiple=True, default=INTEGRATORS)
-def main(names, seconds, seeds, max_depth, size, kinds) -> None:
+def main(names, seconds, cpu, seeds, max_depth, size, kinds) -> None:
     """Compares on the scenes NAMES."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     print_header(["scene", "", "spp", "seconds", "error", "trimmed", "efficiency", "trimmed",
                   "mean"])  # fmt: skip
+    clock = time.process_time if cpu else time.perf_counter
     for name in names:
         scene = load(name, size)
-        found = {kind: renders(scene, kind, max_depth, seconds, seeds) for kind in kinds}
+        found = {kind: renders(scene, kind, max_depth, seconds, seeds, clock) for kind in kinds}
         # The scale of errors is that of the integrator with the least of them
         mean = min((images for images, _, _ in found.values()), key=_spread).mean(axis=0)
         first: dict[float, float] = {}

@@ -44,6 +44,8 @@ PICTURES = {
     "glass_lamp": 96,
     "ring": 768,
     "pool": 512,
+    "water_glass": 512,
+    "mirrored_lamp": 512,
     "keyhole": 512,
     "shaded_lamp": 192,
     "corridor": 64,
@@ -68,6 +70,7 @@ INTEGRATORS = {
         "bdpt",
     ),
     **dict.fromkeys(["pool", "keyhole"], "erpt"),
+    **dict.fromkeys(["water_glass", "mirrored_lamp"], "vcm"),
     **dict.fromkeys(
         [
             "six_balls",

@@ -38,10 +38,10 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
      * - radius
        - |float|
        - Radius in which vertices are merged in a first pass of one sample per pixel, in
-         units of the scene. 0 stands for one in which a disk holds about eight of the vertices of
-         such a pass, where there are any, but at most 20 widths of a pixel: light paths that are
-         traced before the render measure it. A pass of k samples per pixel has 1/k of the area.
-         (Default: 0)
+         units of the scene. A pass of k samples per pixel has 1/k of the area. 0 stands for one in
+         which a disk holds about eight of the vertices of a pass, where there are any (light paths
+         that are traced before the render measure it); but for at most 6 widths of a pixel at the
+         first sample, which shrink with the samples so far, in passes of any size. (Default: 0)
      * - radius_decay
        - |float|
        - α, in (0, 1]: the squared radius of pass i is that of the first times i to the power of

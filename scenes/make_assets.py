@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 from _geometry import icosphere, torus_knot, write_ply
+from _glassware import globe, tumbler
 from _lamps import lamps
 from _maps import checker, clear_sky, hall, painting, planks, sunny_sky, tiles, write_exr
 from _pool import pool, water
@@ -28,6 +29,7 @@ def main() -> None:
     flat = furniture() | house() | {"door": leaf_and_knob["door"]}
     flat |= {"gem": icosphere(1), "wall_with_holes": wall_with_holes()}
     smooth |= ring() | {"knob": leaf_and_knob["knob"], "water": water()}
+    smooth |= tumbler() | {"globe": globe()}
     flat |= cupboard() | fittings() | window_room() | prism() | school() | pool() | keyhole()
     for name in ("stand", "curtain"):
         smooth[name] = flat.pop(name)

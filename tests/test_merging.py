@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from stage import area, film, sensor, stage
+from stage import area, film, lookat, sensor, stage
 from statistical import assert_same_mean, batches, load
 from test_furnace import FURNACES
 
@@ -102,6 +102,16 @@ def test_a_batch_goes_on_with_the_radius_of_the_one_before() -> None:
     assert [batch.next(200), batch.next(200)] == pytest.approx(found[4:])
 
 
+def test_passes_of_any_size_have_the_same_largest_radius() -> None:
+    def last(samples: int, before: int = 0) -> float:
+        radius = MergingRadius(100.0, 0.75, pixels=100, footprint=0.1, before=before, widest=2.0)
+        return [radius.next(100 * samples) for _ in range((64 - before) // samples)][-1]
+
+    assert last(1) == last(16) == last(16, before=32) == pytest.approx(2 * 64 ** (-1 / 8))
+    # A disk that holds enough is narrower
+    assert MergingRadius(4.0, 0.75, pixels=100, footprint=0.1, widest=2.0).next(1600) == 1
+
+
 def test_the_batches_of_a_render_shrink_the_radius(
     batches_of_sixteen_samples, monkeypatch, tmp_path
 ) -> None:
@@ -183,6 +193,38 @@ def test_a_sensor_of_one_ray_has_the_radiance_of_path(name: str) -> None:
     images = [batches(scene, make(kind), 4096, range(1, 9)) for kind in (name, "path")]
     means = [image[..., :3].mean() for image in images]
     assert means[0] == pytest.approx(means[1], rel=0.1)
+
+
+@pytest.mark.parametrize("radius", [0.8, 0.4])
+def test_the_bias_is_that_of_a_disk(radius: float) -> None:
+    """Light of a point at height 1 falls as (1 + d²)^(-3/2) with the distance from below it."""
+    T = mi.ScalarTransform4f
+    light = {"type": "spot", "cutoff_angle": 40.0, "beam_width": 39.9, "intensity": 1.0,
+             "to_world": T().look_at([0, 0, 1], [0, 0, 0], [0, 1, 0])}  # fmt: skip
+    floor = {"type": "rectangle", "to_world": T().scale(4), "bsdf": {"type": "diffuse"}}
+    camera = {"type": "perspective", "fov": 0.5, "film": film(1, 1),
+              "to_world": T().look_at([0, -2, 0.8], [0, 0, 0], [0, 0, 1])}  # fmt: skip
+    scene = mi.load_dict({"type": "scene", "floor": floor, "light": light, "sensor": camera})
+    integrator = make("sppm", 2, radius=radius * 64, radius_decay=1.0)
+    found = batches(scene, integrator, 4096, range(1, 9)).mean() * 2 * math.pi
+    # 3/4 radius² for small ones
+    assert found == pytest.approx(2 * (1 - (1 + radius**2) ** -0.5) / radius**2, rel=0.03)
+
+
+@pytest.mark.parametrize("name", ["sppm", pytest.param("vcm", marks=pytest.mark.slow)])
+def test_images_do_not_depend_on_the_scale_of_the_scene(name: str) -> None:
+    means = []
+    for scale in (1.0, 1e-3, 1e4):
+        world = mi.ScalarTransform4f().scale(scale)
+        ball = {"type": "sphere", "center": [0, 0, 0.5 * scale], "radius": 0.4 * scale,
+                "bsdf": {"type": "dielectric"}}  # fmt: skip
+        camera = sensor(
+            to_world=lookat([0, -4 * scale, 1.2 * scale], [0, 0, 0.6 * scale], [0, 0, 1]),
+            near_clip=0.01 * scale, far_clip=100.0 * scale,
+        )  # fmt: skip
+        scene = mi.load_dict(stage(world, camera=camera, ball=ball), optimize=False)
+        means.append(batches(scene, make(name, 5), 64, [1, 2]).mean())
+    assert means[1:] == pytest.approx([means[0]] * 2, rel=0.03)
 
 
 @pytest.mark.slow

@@ -47,9 +47,9 @@ _PATHS, _DOUBLINGS = 1 << 16, 8
 #: caustic; with fewer than a tenth of them, it stays about the same.)
 HANDFUL = 8.0
 
-#: With fewer vertices of these paths, nothing is merged; and the largest radius, in footprints of
-#: pixels.
-_FEW, WIDEST = 64, 20.0
+#: With fewer vertices of these paths, nothing is merged; and the largest radius of the first sample
+#: of a pixel, in footprints of pixels.
+_FEW, WIDEST = 64, 6.0
 
 #: The largest radius in units of the diagonal of the scene: pixels of very small films are wide.
 _LARGEST = 0.04
@@ -115,7 +115,7 @@ def suitable_radius(
     radius = disk_radius(vertices, kept, HANDFUL * _PATHS / pixels, 2 * footprint)
     if radius is None:
         return None
-    return min(radius, WIDEST * footprint, _LARGEST * scene_diagonal(scene))
+    return min(radius, _LARGEST * scene_diagonal(scene))
 
 
 def disk_radius(

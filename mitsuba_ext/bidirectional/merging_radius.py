@@ -9,7 +9,9 @@ from dataclasses import dataclass
 @dataclass
 class MergingRadius:
     """The radius of merging. It shrinks from pass to pass, so that bias vanishes, and suits the
-    number of light paths of a pass: a disk holds about as many vertices whatever that is.
+    number of light paths of a pass: a disk holds about as many vertices whatever that is. In short
+    passes, such a disk would be wide, and its bias would outweigh the noise of all passes together;
+    ``widest`` limits the radius by the number of samples so far, in however many passes.
 
     Source: C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic Approach*, ACM
     Transactions on Graphics 30(3), 2011: the squared radius of pass i is proportional to i^(α − 1)
@@ -21,6 +23,8 @@ class MergingRadius:
         pixels: Number of pixels.
         footprint: The width of a pixel, where the camera sees the scene.
         before: Light paths per pixel of passes that other renders have made before.
+        widest: The largest radius after one light path per pixel; it shrinks with their number as
+            that of passes of one.
     """
 
     first: float
@@ -28,19 +32,25 @@ class MergingRadius:
     pixels: int
     footprint: float
     before: int = 0
+    widest: float = math.inf
     _passes: int = 0
 
     def next(self, paths: int, groups: int = 1) -> float:
         """The radius of the next pass, of so many light paths; or of so many groups, of so many
         light paths each, whose vertices are not merged with those of other groups."""
-        share = self.pixels / paths
-        number = self._passes + 1 + self.before * share
+        per_pixel = paths / self.pixels
+        number = self._passes + 1 + self.before / per_pixel
         self._passes += groups
-        return self.first * (share * number ** (self.decay - 1)) ** 0.5
+        return self._radius(per_pixel, number)
 
     def samples_per_vertex(self, light_paths: float, spp: float) -> float:
         """So many samples of a pixel, of the ``spp`` of a first pass, find the same vertex, where
         any of them does: their errors are the same. ``light_paths`` is the number of these for each
         camera path."""
-        disk = math.pi * self.first**2 / (light_paths * spp)
+        disk = math.pi * self._radius(light_paths * spp, 1) ** 2
         return max(1.0, spp * disk / (disk + self.footprint**2))
+
+    def _radius(self, per_pixel: float, number: float) -> float:
+        """That of the pass of this number, with so many light paths per pixel."""
+        radius = self.first * (number ** (self.decay - 1) / per_pixel) ** 0.5
+        return min(radius, self.widest * (number * per_pixel) ** ((self.decay - 1) / 2))

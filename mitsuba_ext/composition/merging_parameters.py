@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,15 +65,17 @@ class MergingParameters:
         footprint = median_footprint(scene, sensor)
         width, height = film_extent(sensor.film())
         pixels = width * height
-        radius = self.radius
+        radius, widest = self.radius, math.inf
         if radius == 0:
+            widest = WIDEST * footprint
             radius = suitable_radius(
                 scene, sensor, light_walk, footprint, pixels, only_caustic
             )
         if radius is None and only_caustic:
             return None
-        radius = radius or WIDEST * footprint
-        return MergingRadius(radius, self.decay, pixels, footprint, before)
+        return MergingRadius(
+            radius or widest, self.decay, pixels, footprint, before, widest
+        )
 
 
 def _may_have_caustics(scene: mi.Scene) -> bool:
