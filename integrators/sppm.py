@@ -7,6 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.bidirectional.light_media import outer_medium
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.photon_mapper import PhotonMapper
@@ -14,6 +15,7 @@ from mitsuba_ext.composition.merging_parameters import MergingParameters, share_
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera_samples import CameraSamples
 from mitsuba_ext.rendering.stages import OneStage
+from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.path_decisions import NoConnections
 from mitsuba_ext.transport.walk import Walk
@@ -89,15 +91,17 @@ class ProgressivePhotonMapping(WalkIntegrator):
             'max_depth': 12
     """
 
-    has_light_paths = True
+    has_light_paths = light_paths_see_media = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.merging = MergingParameters.read(self, props)
+        self.radius_in_media = self.parameter(props, "radius_in_media", 0.0, minimum=0.0)
         self.fill(props)
 
     def parameters(self) -> dict[str, Any]:
-        return {**self.merging.parameters(), **super().parameters()}
+        own = {"radius_in_media": self.radius_in_media or "automatic"}
+        return {**self.merging.parameters(), **own, **super().parameters()}
 
     @property
     def needs_equal_samples(self) -> str:
@@ -124,8 +128,14 @@ class ProgressivePhotonMapping(WalkIntegrator):
             emission = LightEmission(scene)
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
-        light_walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
-        radius = self.merging.radius_of(scene, sensor, light_walk, False, self.samples_before)
+        outside = outer_medium(query, scene, sensor) if may_have_media(scene) else None
+        light_walk = LightWalk(
+            emission, self.max_depth, self.rr_depth, query=query, outside=outside
+        )
+        before = self.samples_before
+        radius, ball = self.merging.radius_of(scene, sensor, light_walk, False, before), None
+        if outside is not None:
+            ball = self.merging.ball_of(scene, sensor, light_walk, before, self.radius_in_media)
         camera = CameraSamples()
         share_rays(camera, scene, seed)
-        return OneStage(PhotonMapper(walk, light_walk, radius), camera)
+        return OneStage(PhotonMapper(walk, light_walk, radius, ball), camera)

@@ -39,7 +39,7 @@ _BATCH = 4
 
 #: Light paths that measure how dense vertices are, and how often the radius of that is doubled at
 #: most.
-_PATHS, _DOUBLINGS = 1 << 16, 8
+PILOT_PATHS, DOUBLINGS = 1 << 16, 8
 
 #: The number of vertices that a disk is to hold. For MIS weights, so many vertices are one sample:
 #: they share a camera path, and other techniques often vary less than their densities tell. (With
@@ -49,32 +49,34 @@ HANDFUL = 8.0
 
 #: With fewer vertices of these paths, nothing is merged; and the largest radius, in footprints of
 #: pixels.
-_FEW, WIDEST = 64, 20.0
+FEW, WIDEST = 64, 20.0
 
 #: The largest radius in units of the diagonal of the scene: pixels of very small films are wide.
-_LARGEST = 0.04
+LARGEST = 0.04
 
 
 @dataclass
 class MergingRadius:
     """The radius of merging. It shrinks from pass to pass, so that bias vanishes, and suits the
-    number of light paths of a pass: a disk holds about as many vertices whatever that is.
+    number of light paths of a pass: a disk, or a ball, holds about as many vertices whatever that is.
 
     Source: C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic Approach*, ACM
-    Transactions on Graphics 30(3), 2011: the squared radius of pass i is proportional to i^(α − 1)
-    (in the limit of their Eq. 15).
+    Transactions on Graphics 30(3), 2011: the area of the disk of pass i is proportional to i^(α − 1)
+    (in the limit of their Eq. 15), and so is the volume of its ball in a medium (their section 6).
 
     Parameters:
         first: The radius of a first pass that has one light path per pixel.
         decay: α, in (0, 1]; 1 for a constant radius.
         pixels: Number of pixels.
         before: Light paths per pixel of passes that other renders have made before.
+        dimensions: 2 for disks, 3 for balls.
     """
 
     first: float
     decay: float
     pixels: int
     before: int = 0
+    dimensions: int = 2
     _passes: int = 0
 
     def next(self, paths: int, groups: int = 1) -> float:
@@ -83,7 +85,7 @@ class MergingRadius:
         share = self.pixels / paths
         number = self._passes + 1 + self.before * share
         self._passes += groups
-        return self.first * (share * number ** (self.decay - 1)) ** 0.5
+        return self.first * (share * number ** (self.decay - 1)) ** (1 / self.dimensions)
 
 
 def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
@@ -119,16 +121,33 @@ def suitable_radius(
     only_caustic: bool,
 ) -> float | None:
     """The radius in which a disk holds a handful of the vertices of one light path per pixel, where
-    there are vertices: measured by a few light paths. ``None`` if these leave too few vertices.
+    there are vertices on surfaces: measured by a few light paths. ``None`` if these leave too few
+    vertices.
 
     Parameters:
         light_walk: Traces the light paths.
         footprint: The width of a pixel where the camera sees the scene.
         only_caustic: Are vertices merged only where light arrives from a delta lobe?
     """
+    vertices = pilot_vertices(scene, sensor, light_walk)
+    if vertices is None:
+        return None
+    kept = None if light_walk.outside is None else vertices.is_on_surface
+    if only_caustic:
+        kept = vertices.is_caustic
+    radius = disk_radius(vertices, kept, HANDFUL * PILOT_PATHS / pixels, 2 * footprint)
+    if radius is None:
+        return None
+    return min(radius, WIDEST * footprint, LARGEST * scene_diagonal(scene))
+
+
+def pilot_vertices(
+    scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk
+) -> VertexCache | None:
+    """The vertices of ``PILOT_PATHS`` light paths; ``None`` if there are none."""
     rounds: list[LightVertices] = []
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(dr.opaque(mi.UInt32, 0), _PATHS)
+    sampler.seed(dr.opaque(mi.UInt32, 0), PILOT_PATHS)
     # Times and wavelengths are those of rays of the sensor
     numbers = sampler.next_2d()
     rays, _ = sensor.sample_ray_differential(
@@ -136,17 +155,12 @@ def suitable_radius(
         mi.Point2f(0.5), mi.Point2f(0.5),
     )  # fmt: skip
     light_walk.run(
-        scene, sampler, rays.time, rays.wavelengths, dr.full(mi.Bool, True, _PATHS),
+        scene, sampler, rays.time, rays.wavelengths, dr.full(mi.Bool, True, PILOT_PATHS),
         lambda vertices: rounds.append(PackedVertices(vertices)),
     )  # fmt: skip
     if not rounds:
         return None
-    vertices = VertexCache(rounds, _PATHS)
-    kept = vertices.is_caustic if only_caustic else None
-    radius = disk_radius(vertices, kept, HANDFUL * _PATHS / pixels, 2 * footprint)
-    if radius is None:
-        return None
-    return min(radius, WIDEST * footprint, _LARGEST * scene_diagonal(scene))
+    return VertexCache(rounds, PILOT_PATHS)
 
 
 def disk_radius(
@@ -162,10 +176,10 @@ def disk_radius(
         kept: See :class:`VertexGrid`.
         least: The radius, at least, of the disks that are looked at.
     """
-    for doublings in range(_DOUBLINGS):
+    for doublings in range(DOUBLINGS):
         radius = least * 2**doublings
         grid = VertexGrid(vertices, dr.opaque(mi.Float, radius), kept)
-        if grid.count < _FEW:
+        if grid.count < FEW:
             return None
         others = grid.occupancy
         if others > 4:
@@ -210,17 +224,20 @@ class MergedSubpaths(Subpaths):
         self._vertices, self._grid, self._sums, self._others = vertices, grid, sums, others
         self._heroes, self._ctx = heroes, heroes.context()
         self._max_depth, self._shares_rays = dr.opaque(mi.UInt32, max_depth), shares_rays
-        # The density of light paths per area, for one vertex in the disk
-        count = dr.opaque(mi.Float, paths)
-        self._per_vertex = dr.rcp(dr.pi * dr.square(grid.radius) * count)
+        # The density of light paths, for one vertex within the radius
+        self._per_vertex = dr.rcp(self._measure(grid.radius) * dr.opaque(mi.Float, paths))
         dr.make_opaque(self._per_vertex)
+
+    def _measure(self, radius: mi.Float) -> mi.Float:
+        """The area in which vertices are found."""
+        return dr.pi * dr.square(radius)
 
     @dr.syntax
     def gather(self, scene, sampler, vertex, active):
         total, shadow_count = mi.Spectrum(0), mi.UInt32(0)
         if dr.hint(self._others is not None, mode="scalar"):
             total, shadow_count = self._others.gather(scene, sampler, vertex, active)
-        merges = active & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
+        merges = active & self._is_merged(vertex)
         merged = mi.Spectrum(0)
         state, si = self._grid.begin(), vertex.si
         group = group_of(si.time, si.wavelengths) if self._shares_rays else mi.UInt32(0)
@@ -240,6 +257,10 @@ class MergedSubpaths(Subpaths):
                 exists = count > 0
         total += merged * vertex.path.β * self._per_vertex
         return total, shadow_count
+
+    def _is_merged(self, vertex: Vertex) -> mi.Bool:
+        """Where is light gathered?"""
+        return mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
 
     def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:
         """BSDF · flux of one light path, with the MIS weight."""

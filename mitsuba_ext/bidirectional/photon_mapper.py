@@ -21,6 +21,7 @@ from ..transport.walk import Walk
 from .light_numbers import light_numbers
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
+from .medium_photons import MergedInMedia
 from .merging import MergedSubpaths, MergingRadius
 from .vertex_grid import VertexGrid
 
@@ -47,12 +48,14 @@ class PhotonMapper:
     Parameters:
         walk: Traces the camera paths; it makes no connections.
         light_walk: Traces the light paths.
-        radius: Within what radius vertices are merged.
+        radius: Within what radius vertices on surfaces are merged.
+        ball: Within what radius vertices in media are merged; ``None`` without media.
     """
 
     walk: Walk
     light_walk: LightWalk
     radius: MergingRadius
+    ball: MergingRadius | None = None
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
@@ -66,15 +69,23 @@ class PhotonMapper:
         )  # fmt: skip
         walk = replace(self.walk, mis=FoundByCamera(), roulette=OnlySpecular(), rr_depth=0)
         if rounds:
-            vertices = VertexCache(rounds, lanes)
-            # Of paths of different times or wavelengths, those of one sample of each pixel merge
-            groups = mi.is_spectral or bool(movers(scene))
-            paths = min(lanes, self.radius.pixels) if groups else lanes
-            radius = dr.opaque(mi.Float, self.radius.next(paths, lanes // paths))
-            grid = VertexGrid(vertices, radius, None, vertices.group if groups else None)
-            subpaths = MergedSubpaths(
-                vertices, grid, None, Heroes(scene), walk.max_depth, paths, groups
-            )
-            walk = replace(walk, subpaths=subpaths)
+            walk = replace(walk, subpaths=self._merged(scene, VertexCache(rounds, lanes), lanes))
         sample = walk(scene, sampler, rays, active)
         return replace(sample, scatter_count=sample.scatter_count + scatter_count)
+
+    def _merged(self, scene: mi.Scene, vertices: VertexCache, lanes: int) -> MergedSubpaths:
+        """Adds the light of photons to camera paths."""
+        # Of paths of different times or wavelengths, those of one sample of each pixel merge
+        groups = mi.is_spectral or bool(movers(scene))
+        group = vertices.group if groups else None
+        paths = min(lanes, self.radius.pixels) if groups else lanes
+        radius = dr.opaque(mi.Float, self.radius.next(paths, lanes // paths))
+        kept = None if self.ball is None else vertices.is_on_surface
+        grid = VertexGrid(vertices, radius, kept, group)
+        heroes, max_depth = Heroes(scene), self.walk.max_depth
+        merged = MergedSubpaths(vertices, grid, None, heroes, max_depth, paths, groups)
+        if self.ball is None:
+            return merged
+        radius = dr.opaque(mi.Float, self.ball.next(paths, lanes // paths))
+        grid = VertexGrid(vertices, radius, vertices.is_in_medium, group)
+        return MergedInMedia(vertices, grid, None, heroes, max_depth, paths, groups, merged)

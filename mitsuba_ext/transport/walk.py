@@ -220,7 +220,7 @@ class Walk:
                 sums=self.mis.leave(vertex, bs),
             )
             path = media.leave(vertex, bs, onward)
-            active_next = media.is_within(path, self.max_depth, active_next)
+            active_next = media.is_within(path.depth, self.max_depth, active_next)
             remembered = self._leave(connects, place, scene, ray.d, bs.pdf, active_em)
             next_event_state = media.kept(bs, next_event_state, remembered)
             inside = media.cross(inside, si, ray.d)
