@@ -293,7 +293,7 @@ class LightWalk:
     def _is_stored(self, media: NoMedia, vertex: Vertex, active) -> mi.Bool:
         """Which vertices are stored?"""
         stored = active & self._stores(vertex.bsdf)
-        return stored | (active & media.connects(vertex)) if media.exist else stored
+        return stored | vertex.medium.scatters if media.exist else stored
 
     def _goes_on(self, media: NoMedia, vertex: Vertex, last_depth, active) -> mi.Bool:
         """Which paths may leave a vertex?"""

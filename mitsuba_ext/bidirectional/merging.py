@@ -35,7 +35,7 @@ _LEAST_COSINE, _HALF_HEIGHT = 0.7, 0.25
 #: So many vertices are found before they are evaluated. Lanes of a kernel search for different
 #: times, and all of them wait for the last one. (With 1, pool takes 1.2 times as long; 8 gain
 #: nothing.)
-_BATCH = 4
+BATCH = 4
 
 #: Light paths that measure how dense vertices are, and how often the radius of that is doubled at
 #: most.
@@ -189,7 +189,7 @@ def disk_radius(
     return math.sqrt(count / (math.pi * per_area))
 
 
-def _pushed(stack: list[mi.UInt32], value: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
+def pushed(stack: list[mi.UInt32], value: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
     """The stack with ``value`` on top (first). The last element is dropped."""
     return [dr.select(active, new, old) for new, old in zip([value, *stack[:-1]], stack)]
 
@@ -241,14 +241,14 @@ class MergedSubpaths(Subpaths):
         merged = mi.Spectrum(0)
         state, si = self._grid.begin(), vertex.si
         group = group_of(si.time, si.wavelengths) if self._shares_rays else mi.UInt32(0)
-        near = [mi.UInt32(0) for _ in range(_BATCH)]
+        near = [mi.UInt32(0) for _ in range(BATCH)]
         while dr.hint(merges, label="merge"):
             count, searches = mi.UInt32(0), mi.Bool(merges)
             while dr.hint(searches, label="search"):
                 state, index, found, merges = self._grid.next(state, si.p, searches, group)
-                near = _pushed(near, index, found)
+                near = pushed(near, index, found)
                 count += dr.select(found, 1, 0)
-                searches = merges & (count < _BATCH)
+                searches = merges & (count < BATCH)
             exists = count > 0
             while dr.hint(exists, label="evaluate"):
                 merged += self._merged(vertex, self._vertices.at(near[0], exists), exists)

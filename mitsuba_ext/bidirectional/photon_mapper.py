@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..scene.media import may_have_grids
 from ..scene.movers import movers
 from ..transport.estimator import CameraRays, Sample
 from ..transport.heroes import Heroes
@@ -21,7 +22,7 @@ from ..transport.walk import Walk
 from .light_numbers import light_numbers
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
-from .medium_photons import MergedInMedia
+from .medium_photons import MergedInMedia, PassesThrough
 from .merging import MergedSubpaths, MergingRadius
 from .vertex_grid import VertexGrid
 
@@ -69,6 +70,8 @@ class PhotonMapper:
         )  # fmt: skip
         walk = replace(self.walk, mis=FoundByCamera(), roulette=OnlySpecular(), rr_depth=0)
         if rounds:
+            if self.ball is not None:
+                walk.distance = PassesThrough()
             walk = replace(walk, subpaths=self._merged(scene, VertexCache(rounds, lanes), lanes))
         sample = walk(scene, sampler, rays, active)
         return replace(sample, scatter_count=sample.scatter_count + scatter_count)
@@ -88,4 +91,6 @@ class PhotonMapper:
             return merged
         radius = dr.opaque(mi.Float, self.ball.next(paths, lanes // paths))
         grid = VertexGrid(vertices, radius, vertices.is_in_medium, group)
-        return MergedInMedia(vertices, grid, None, heroes, max_depth, paths, groups, merged)
+        return MergedInMedia(
+            vertices, grid, heroes, max_depth, paths, groups, merged, may_have_grids(scene)
+        )  # fmt: skip

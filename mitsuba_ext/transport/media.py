@@ -167,6 +167,8 @@ class Media(NoMedia):
         return Inside(mi.MediumPtr(rays.medium), channel, mi.Float(dr.inf), distances)
 
     def launch(self, inside, sampler, rays, ray, active):
+        if not self._distances.scatter:
+            return ray, inside
         in_medium = active & (inside.medium != None)  # noqa: E711
         known = in_medium & inside.medium.is_homogeneous()
         σ = component(extinction(inside.medium, ray, known), inside.channel)
@@ -193,7 +195,8 @@ class Media(NoMedia):
         scatters = is_homogeneous & ~si.is_valid() & (inside.reach < dr.inf)
         t = dr.minimum(inside.reach, si.t)
         chosen = component(σ, inside.channel)
-        ratio = attenuation(σ - chosen, t)
+        # Relative to the probability of getting this far
+        ratio = attenuation(σ - chosen if self._distances.scatter else σ, t)
         mei = interaction_at(ray, ray(t), inside.medium)
         σ_s, _, _ = inside.medium.get_scattering_coefficients(mei, scatters)
         sampler.next_1d(scatters)  # `volpath` draws whether the collision is a real one
@@ -220,17 +223,13 @@ class Media(NoMedia):
         return dr.select(scatters, β * dr.select(σ_s > 0, dr.rcp(σ_s), 0), β)
 
     def goes_on(self, vertex, max_depth, active):
-        flags = vertex.bsdf.flags()
+        flags, in_medium = vertex.bsdf.flags(), vertex.medium
         counts = vertex.depth + 1 < max_depth
         may_pass = mi.has_flag(flags, mi.BSDFFlags.Null)
         goes_on = active & vertex.si.is_valid() & (counts | may_pass)
-        connects = self.connects(vertex) | mi.has_flag(flags, mi.BSDFFlags.Smooth)
+        connects = in_medium.scatters & in_medium.mei.medium.use_emitter_sampling()
+        connects |= mi.has_flag(flags, mi.BSDFFlags.Smooth)
         return goes_on, goes_on & counts & connects
-
-    def connects(self, vertex: Vertex) -> mi.Bool:
-        """Which vertices lie in media whose vertices are connected to lights?"""
-        in_medium = vertex.medium
-        return in_medium.scatters & in_medium.mei.medium.use_emitter_sampling()
 
     def turns(self, vertex, active):
         is_matched = vertex.bsdf.flags() & mi.UInt32(+mi.BSDFFlags.All) == +mi.BSDFFlags.Null

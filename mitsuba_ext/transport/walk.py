@@ -134,6 +134,8 @@ class Walk:
 
         while dr.hint(active, label="walk"):
             si = self.query.interaction(pi, ray)
+            if dr.hint(media.exist and self.subpaths is not None, mode="scalar"):
+                L += self.subpaths.along(sampler, ray, si, inside, path, active)
             si, path.β, in_medium = media.fly(inside, sampler, ray, si, path.β, active)
             path.sums = self.mis.arrive(path, si)
 
