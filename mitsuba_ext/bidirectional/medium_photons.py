@@ -16,7 +16,6 @@ Mapping: A Probabilistic Approach*, ACM Transactions on Graphics 30(3), 2011, se
 from __future__ import annotations
 
 import math
-import os
 
 import drjit as dr
 import mitsuba as mi
@@ -43,8 +42,9 @@ from .merging import (
 )
 from .vertex_grid import VertexGrid
 
-#: The number of points at which a ray gathers light on its way through a homogeneous medium.
-_POINTS = int(os.environ.get("POINTS", 8))
+#: The number of points at which a ray gathers light on its way through a homogeneous medium. (In
+#: volume_caustic, 64 samples: 1 has 0.82 of the efficiency, 2 0.97, 8 0.88, 16 0.67.)
+_POINTS = 4
 
 
 class PassesThrough(Distances):
