@@ -50,6 +50,7 @@ PICTURES = {
     "night_classroom": 128,
     "near_lights": 256,
     "fog": 1024,
+    "volume_caustic": 256,
 }
 
 #: Scenes rendered by light paths or chains, or in which nothing is learned of visibility; all
@@ -68,6 +69,7 @@ INTEGRATORS = {
         "bdpt",
     ),
     **dict.fromkeys(["pool", "keyhole"], "erpt"),
+    "volume_caustic": "sppm",
     **dict.fromkeys(
         [
             "six_balls",

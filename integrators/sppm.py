@@ -34,8 +34,8 @@ class ProgressivePhotonMapping(WalkIntegrator):
     ------------------------------------------------------
 
     Traces photons from the lights in each pass, and estimates the light that leaves the first rough
-    surface of each camera path from the photons around it. The radius shrinks from pass to pass, so
-    that the image converges.
+    surface of each camera path from the photons around it, and the light that participating media
+    scatter on the way there. The radius shrinks from pass to pass, so that the image converges.
 
     .. pluginparameters::
 
@@ -46,16 +46,22 @@ class ProgressivePhotonMapping(WalkIntegrator):
          such a pass, where there are any, but at most 20 widths of a pixel: light paths that are
          traced before the render measure it. A pass of k samples per pixel has 1/k of the area.
          (Default: 0)
+     * - radius_in_media
+       - |float|
+       - As ``radius``, for photons in participating media, which are looked for in a ball: a pass of
+         k samples per pixel has 1/k of the volume. 0 stands for one in which half of the balls hold
+         about eight photons or more. (Default: 0)
      * - radius_decay
        - |float|
-       - α, in (0, 1]: the squared radius of pass i is that of the first times i to the power of
-         α − 1. With 1 it stays. (Default: 0.75)
+       - α, in (0, 1]: the squared radius of pass i (in media, its cube) is that of the first times i
+         to the power of α − 1. With 1 it stays. (Default: 0.75)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
          checkpoint.
 
-    **Use it when** caustics are seen through water or glass, or in mirrors, of lamps however small.
+    **Use it when** caustics are seen through water or glass, or in mirrors, of lamps however small;
+    or in fog: a lamp that shines through glass into fog, beams of light.
     **Not when** the scene is large and well lit: each surface needs photons of its own. The
     integrator :class:`vcm` has all other techniques beside this one.
 
@@ -71,12 +77,20 @@ class ProgressivePhotonMapping(WalkIntegrator):
     the same time: photons of others cannot be merged. Errors of colour and of motion blur are then
     alike in all pixels; they fall faster than noise.
 
-    Participating media are refused. Gradients are not supported (use :monosp:`prb`), nor nesting in
-    :monosp:`moment` and :monosp:`aov`.
+    Participating media are rendered, homogeneous and grid media. Light is blurred over the ball:
+    dark at the surface of a fog, and bright behind a wall that is thinner than the radius. The
+    medium in which a light lies is that on its side of the closest boundary, in the direction of
+    each photon; outside of all boundaries, that behind the last one that a ray from the sensor
+    crosses. In camera rays through homogeneous media, ``sample_emitters`` is ignored.
+
+    Gradients are not supported (use :monosp:`prb`), nor nesting in :monosp:`moment` and
+    :monosp:`aov`.
 
     Source: T. Hachisuka, H. W. Jensen, *Stochastic Progressive Photon Mapping*, ACM Transactions on
     Graphics 28(5), 2009; C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic
-    Approach*, ACM Transactions on Graphics 30(3), 2011; D. Cline, PhD thesis, 2007, section 7.7.
+    Approach*, ACM Transactions on Graphics 30(3), 2011; D. Cline, PhD thesis, 2007, section 7.7;
+    H. W. Jensen, P. H. Christensen, *Efficient Simulation of Light Transport in Scenes with
+    Participating Media Using Photon Maps*, SIGGRAPH 1998.
 
     .. tabs::
         .. code-tab:: xml

@@ -70,7 +70,8 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     the same time: vertices of other paths cannot be merged. Errors of colour and of motion blur are
     then alike in all pixels; they fall faster than noise.
 
-    Participating media are refused, and so are ``light_paths`` and ``technique_images`` of
+    Participating media are refused: the light paths do not scatter in them (use :monosp:`sppm`,
+    :monosp:`composed_path` or :monosp:`volpath`). So are ``light_paths`` and ``technique_images`` of
     :class:`bdpt` with merging.
 
     Source: I. Georgiev, J. Křivánek, T. Davidovič, P. Slusallek, *Light Transport Simulation with
