@@ -33,9 +33,10 @@ class ProgressivePhotonMapping(WalkIntegrator):
     Stochastic progressive photon mapping (:monosp:`sppm`)
     ------------------------------------------------------
 
-    Traces photons from the lights in each pass, and estimates the light that leaves the first rough
-    surface of each camera path from the photons around it, and the light that participating media
-    scatter on the way there. The radius shrinks from pass to pass, so that the image converges.
+    Traces photons from the lights in each pass. It estimates the light that leaves the first rough
+    surface of each camera path from the photons around it, and so the light that participating
+    media scatter on the way there. The radius shrinks from pass to pass, so that the image
+    converges.
 
     .. pluginparameters::
 
@@ -48,13 +49,13 @@ class ProgressivePhotonMapping(WalkIntegrator):
          (Default: 0)
      * - radius_in_media
        - |float|
-       - As ``radius``, for photons in participating media, which are looked for in a ball: a pass of
-         k samples per pixel has 1/k of the volume. 0 stands for one in which half of the balls hold
-         about eight photons or more. (Default: 0)
+       - As ``radius``, for photons in participating media, which are looked for in a ball: a pass
+         of k samples per pixel has 1/k of the volume. 0 stands for one in which half of the balls
+         hold about eight photons or more. (Default: 0)
      * - radius_decay
        - |float|
-       - α, in (0, 1]: the squared radius of pass i (in media, its cube) is that of the first times i
-         to the power of α − 1. With 1 it stays. (Default: 0.75)
+       - α, in (0, 1]: the squared radius of pass i (in media, its cube) is that of the first times
+         i to the power of α − 1. With 1 it stays. (Default: 0.75)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,

@@ -71,8 +71,8 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     then alike in all pixels; they fall faster than noise.
 
     Participating media are refused: the light paths do not scatter in them (use :monosp:`sppm`,
-    :monosp:`composed_path` or :monosp:`volpath`). So are ``light_paths`` and ``technique_images`` of
-    :class:`bdpt` with merging.
+    :monosp:`composed_path` or :monosp:`volpath`). So are ``light_paths`` and
+    ``technique_images`` of :class:`bdpt` with merging.
 
     Source: I. Georgiev, J. Křivánek, T. Davidovič, P. Slusallek, *Light Transport Simulation with
     Vertex Connection and Merging*, ACM Transactions on Graphics 31(6), 2012; I. Georgiev,

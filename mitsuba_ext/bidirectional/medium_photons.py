@@ -1,5 +1,5 @@
-"""Photons in participating media: vertices at which light paths scatter there, merged with points of
-camera paths that lie in a ball around them.
+"""Photons in participating media: vertices at which light paths scatter there, merged with points
+of camera paths that lie in a ball around them.
 
 The light that arrives at x and is scattered towards the camera, Σ f_p β / (N · 4/3 π r³), is summed
 over the vertices in a ball of radius r, of N light paths: their density is proportional to the

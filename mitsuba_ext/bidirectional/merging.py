@@ -58,11 +58,13 @@ LARGEST = 0.04
 @dataclass
 class MergingRadius:
     """The radius of merging. It shrinks from pass to pass, so that bias vanishes, and suits the
-    number of light paths of a pass: a disk, or a ball, holds about as many vertices whatever that is.
+    number of light paths of a pass: a disk, or a ball, holds about as many vertices whatever that
+    is.
 
     Source: C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic Approach*, ACM
-    Transactions on Graphics 30(3), 2011: the area of the disk of pass i is proportional to i^(α − 1)
-    (in the limit of their Eq. 15), and so is the volume of its ball in a medium (their section 6).
+    Transactions on Graphics 30(3), 2011: the area of the disk of pass i is proportional to
+    i^(α − 1) (in the limit of their Eq. 15), and so is the volume of its ball in a medium (their
+    section 6).
 
     Parameters:
         first: The radius of a first pass that has one light path per pixel.

@@ -322,8 +322,8 @@ class Subpaths:
         path: PathState,
         active: mi.Bool,
     ) -> mi.Spectrum | float:
-        """The radiance that they add on the way of a path to the surface ``si``, throughput included,
-        where the state of the path in participating media is ``inside``."""
+        """The radiance that they add on the way of a path to the surface ``si``, throughput
+        included, where the state of the path in participating media is ``inside``."""
         return 0.0
 
 
