@@ -52,6 +52,7 @@ PICTURES = {
     "night_classroom": 128,
     "near_lights": 256,
     "fog": 1024,
+    "volume_caustic": 256,
 }
 
 #: Scenes rendered by light paths or chains, or in which nothing is learned of visibility; all
@@ -71,6 +72,7 @@ INTEGRATORS = {
     ),
     **dict.fromkeys(["pool", "keyhole"], "erpt"),
     **dict.fromkeys(["water_glass", "mirrored_lamp"], "vcm"),
+    "volume_caustic": "sppm",
     **dict.fromkeys(
         [
             "six_balls",

@@ -95,7 +95,8 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
     image. Lights of the type :monosp:`directionalarea`, which :monosp:`path` does not find, are
     rendered; spectral variants refuse them.
 
-    Participating media are refused (use :monosp:`volpath` or :monosp:`composed_path`). Gradients
+    Participating media are refused: the light paths do not scatter in them (use :monosp:`sppm`,
+    :monosp:`composed_path` or :monosp:`volpath`). Gradients
     are not supported (use
     :monosp:`prb`), nor are scalar and polarized variants, nor nesting in :monosp:`moment` and
     :monosp:`aov`.

@@ -8,6 +8,7 @@ from typing import Any
 import mitsuba as mi
 
 from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.bidirectional.light_media import outer_medium
 from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
 from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
 from mitsuba_ext.bidirectional.photon_mapper import PhotonMapper
@@ -16,6 +17,7 @@ from mitsuba_ext.composition.merging_parameters import MergingParameters, share_
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera_samples import CameraSamples
 from mitsuba_ext.rendering.stages import OneStage
+from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.path_decisions import NoConnections
 from mitsuba_ext.transport.walk import Walk
@@ -33,9 +35,10 @@ class ProgressivePhotonMapping(WalkIntegrator):
     Stochastic progressive photon mapping (:monosp:`sppm`)
     ------------------------------------------------------
 
-    Traces photons from the lights in each pass, and estimates the light that leaves the first rough
-    surface of each camera path from the photons around it. The radius shrinks from pass to pass, so
-    that the image converges.
+    Traces photons from the lights in each pass. It estimates the light that leaves the first rough
+    surface of each camera path from the photons around it, and so the light that participating
+    media scatter on the way there. The radius shrinks from pass to pass, so that the image
+    converges.
 
     .. pluginparameters::
 
@@ -46,10 +49,15 @@ class ProgressivePhotonMapping(WalkIntegrator):
          which a disk holds about eight of the vertices of a pass, where there are any (light paths
          that are traced before the render measure it); but for at most 6 widths of a pixel at the
          first sample, which shrink with the samples so far, in passes of any size. (Default: 0)
+     * - radius_in_media
+       - |float|
+       - As ``radius``, for photons in participating media, which are looked for in a ball: a pass
+         of k samples per pixel has 1/k of the volume. 0 stands for one in which half of the balls
+         hold about eight photons or more. (Default: 0)
      * - radius_decay
        - |float|
-       - α, in (0, 1]: the squared radius of pass i is that of the first times i to the power of
-         α − 1. With 1 it stays. (Default: 0.75)
+       - α, in (0, 1]: the squared radius of pass i (in media, its cube) is that of the first times
+         i to the power of α − 1. With 1 it stays. (Default: 0.75)
      * - light_paths
        - |float|
        - Number of light paths for each camera path. More of them make the radius of a pass smaller.
@@ -59,7 +67,8 @@ class ProgressivePhotonMapping(WalkIntegrator):
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
          checkpoint.
 
-    **Use it when** caustics are seen through water or glass, or in mirrors, of lamps however small.
+    **Use it when** caustics are seen through water or glass, or in mirrors, of lamps however small;
+    or in fog: a lamp that shines through glass into fog, beams of light.
     **Not when** the scene is large and well lit: each surface needs photons of its own. The
     integrator :class:`vcm` has all other techniques beside this one.
 
@@ -75,12 +84,20 @@ class ProgressivePhotonMapping(WalkIntegrator):
     the same time: photons of others cannot be merged. Errors of colour and of motion blur are then
     alike in all pixels; they fall faster than noise.
 
-    Participating media are refused. Gradients are not supported (use :monosp:`prb`), nor nesting in
-    :monosp:`moment` and :monosp:`aov`.
+    Participating media are rendered, homogeneous and grid media. Light is blurred over the ball:
+    dark at the surface of a fog, and bright behind a wall that is thinner than the radius. The
+    medium in which a light lies is that on its side of the closest boundary, in the direction of
+    each photon; outside of all boundaries, that behind the last one that a ray from the sensor
+    crosses. In camera rays through homogeneous media, ``sample_emitters`` is ignored.
+
+    Gradients are not supported (use :monosp:`prb`), nor nesting in :monosp:`moment` and
+    :monosp:`aov`.
 
     Source: T. Hachisuka, H. W. Jensen, *Stochastic Progressive Photon Mapping*, ACM Transactions on
     Graphics 28(5), 2009; C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic
-    Approach*, ACM Transactions on Graphics 30(3), 2011; D. Cline, PhD thesis, 2007, section 7.7.
+    Approach*, ACM Transactions on Graphics 30(3), 2011; D. Cline, PhD thesis, 2007, section 7.7;
+    H. W. Jensen, P. H. Christensen, *Efficient Simulation of Light Transport in Scenes with
+    Participating Media Using Photon Maps*, SIGGRAPH 1998.
 
     .. tabs::
         .. code-tab:: xml
@@ -95,20 +112,23 @@ class ProgressivePhotonMapping(WalkIntegrator):
             'max_depth': 12
     """
 
-    has_light_paths = True
+    has_light_paths = light_paths_see_media = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.merging = MergingParameters.read(self, props)
+        self.radius_in_media = self.parameter(props, "radius_in_media", 0.0, minimum=0.0)
         self.light_paths = self.parameter(
             props, "light_paths", 1.0, minimum=1 / MOST_PATHS, maximum=MOST_PATHS
         )
         self.fill(props)
 
     def parameters(self) -> dict[str, Any]:
-        return {
-            **self.merging.parameters(), "light_paths": self.light_paths, **super().parameters()
-        }  # fmt: skip
+        own = {
+            "radius_in_media": self.radius_in_media or "automatic",
+            "light_paths": self.light_paths,
+        }
+        return {**self.merging.parameters(), **own, **super().parameters()}
 
     @property
     def needs_equal_samples(self) -> str:
@@ -137,9 +157,14 @@ class ProgressivePhotonMapping(WalkIntegrator):
         except NotImplementedError as error:
             raise NotImplementedError(f'"{self.name}": {error}') from None
         check_shared_rays(self.name, scene, self.light_paths)
-        light_walk = LightWalk(emission, self.max_depth, self.rr_depth, query=query)
+        outside = outer_medium(query, scene, sensor) if may_have_media(scene) else None
+        light_walk = LightWalk(
+            emission, self.max_depth, self.rr_depth, query=query, outside=outside
+        )
         before = round(self.samples_before * self.light_paths)
-        radius = self.merging.radius_of(scene, sensor, light_walk, False, before)
+        radius, ball = self.merging.radius_of(scene, sensor, light_walk, False, before), None
+        if outside is not None:
+            ball = self.merging.ball_of(scene, sensor, light_walk, before, self.radius_in_media)
         camera = CameraSamples()
         share_rays(camera, scene, seed)
-        return OneStage(PhotonMapper(walk, light_walk, radius, self.light_paths), camera)
+        return OneStage(PhotonMapper(walk, light_walk, radius, ball, self.light_paths), camera)

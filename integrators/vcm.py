@@ -70,7 +70,9 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
     the same time: vertices of other paths cannot be merged. Errors of colour and of motion blur are
     then alike in all pixels; they fall faster than noise.
 
-    Participating media are refused, and so is ``technique_images`` of :class:`bdpt` with merging.
+    Participating media are refused: the light paths do not scatter in them (use :monosp:`sppm`,
+    :monosp:`composed_path` or :monosp:`volpath`). So is ``technique_images`` of :class:`bdpt` with
+    merging.
 
     Source: I. Georgiev, J. Křivánek, T. Davidovič, P. Slusallek, *Light Transport Simulation with
     Vertex Connection and Merging*, ACM Transactions on Graphics 31(6), 2012; I. Georgiev,

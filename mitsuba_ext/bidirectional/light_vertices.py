@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .partial_sums import Sums
-from .stored_interaction import as_float, from_words, interaction_words, to_words
+from .stored_interaction import SHAPE_WORD, as_float, from_words, interaction_words, to_words
 
 #: A bit of the word that holds depth and region. It is set where only the hero wavelength of the
 #: path is left.
@@ -122,7 +122,8 @@ class LightVertex:
 
 class LightVertices:
     """The vertices that a pass has stored, as a list without gaps, in the order of the paths and
-    along each path. All of them can be connected: their BSDFs have a smooth part.
+    along each path. All of them can be connected: their BSDFs have a smooth part, or they lie in
+    participating media.
 
     Parameters:
         store: The store that the light walk has written.
@@ -209,6 +210,16 @@ class LightVertices:
         word = slot * self._layout.words + self._layout.spectrum
         dVCM = dr.gather(mi.Float, self._words, word, active)
         return (self.depth(slot, active) > 1) & (dVCM == 0)
+
+    def is_in_medium(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        """Do the vertices at these places of the store lie in participating media?"""
+        word = slot * self._layout.words + (self._layout.mark + 1 + SHAPE_WORD)
+        shape = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, self._words, word, active))
+        return active & (shape == 0)
+
+    def is_on_surface(self, slot: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        """Do they lie on surfaces?"""
+        return active & ~self.is_in_medium(slot, active)
 
     def group(self, slot: mi.UInt32, active: mi.Bool) -> mi.UInt32:
         """:func:`group_of` time and wavelengths of the vertices at these places of the store."""

@@ -11,12 +11,16 @@ import mitsuba as mi
 
 from ..startup.garbage import garbage_left_alone
 from ..transport.bsdfs import sample_bsdf
+from ..transport.estimator import CameraRays
+from ..transport.free_flight import Distances
 from ..transport.frozen import frozen
 from ..transport.heroes import Heroes
+from ..transport.media import NoMedia, media_of
 from ..transport.numbers import Numbers, copied, go_to, reached, schedule_state
 from ..transport.path_decisions import Roulette, SceneQuery
 from ..transport.vertex import Arrival, PathState, Vertex
-from .emission import LightEmission
+from .emission import EmittedRay, LightEmission
+from .light_media import medium_at_start
 from .light_vertices import Layout, LightVertices, VertexStore, bytes_per_vertex
 from .partial_sums import PartialSums, Sums
 from .photon_history import PhotonHistory
@@ -44,6 +48,7 @@ class LightPaths:
         depth: Segments between the light and the vertex.
         hero_is_alone: Is only the first wavelength left? ``()`` where nothing disperses light.
         scatter_count: Rays traced in directions that were sampled from a BSDF.
+        inside: The state between two vertices (``transport/media.py``); ``()`` without media.
         active: Paths that have not ended.
     """
 
@@ -56,6 +61,7 @@ class LightPaths:
     depth: mi.UInt32
     hero_is_alone: Any
     scatter_count: mi.UInt32
+    inside: Any
     active: mi.Bool
 
 
@@ -66,7 +72,8 @@ class LightWalk:
     It works in rounds: :meth:`begin` emits rays; each :meth:`advance` walks a limited number of
     vertices and returns them; :meth:`run` walks until all paths have ended.
 
-    A path draws 6 random numbers for the emitted ray and 4 for each bounce.
+    A path draws 6 random numbers for the emitted ray and 4 for each bounce; in scenes with media,
+    more.
 
     Parameters:
         emission: Samples the rays with which paths begin.
@@ -79,6 +86,8 @@ class LightWalk:
         query: Intersects rays with the scene.
         stored_lobes: Flags of BSDFs: vertices are stored where the BSDF has one of these
             (``None``: a smooth one). For ``sums``, other vertices are as specular ones.
+        outside: The medium outside of all boundaries, in scenes with media (:func:`outer_medium`).
+            ``None`` if paths pass through media as through a vacuum.
     """
 
     emission: LightEmission
@@ -88,6 +97,7 @@ class LightWalk:
     roulette: Roulette = field(default_factory=Roulette)
     query: SceneQuery = field(default_factory=SceneQuery)
     stored_lobes: int | None = None
+    outside: mi.MediumPtr | None = None
 
     @property
     def layout(self) -> Layout:
@@ -124,17 +134,18 @@ class LightWalk:
             active = mi.Bool(active) & (self.max_depth > 1)
             emitted = self.emission.sample(numbers, time, wavelengths, active)
             active &= dr.max(emitted.weight) > 0
-            pi = self.query.closest(scene, emitted.ray, coherent=False, active=active)
-            active &= pi.is_valid()
+            ray, inside = self._launch(scene, numbers, emitted, active)
+            pi = self.query.closest(scene, ray, coherent=False, active=active)
+            active &= self._media(scene).meets(pi, inside)
             sums = Sums(mi.Float(0), mi.Float(0))
             if self.sums is not None:
                 si = self.query.interaction(pi, emitted.ray)
                 sums = self.sums.first(scene, emitted, si, active)
             width = dr.width(emitted.ray)
             paths = LightPaths(
-                emitted.ray, pi, emitted.weight, dr.full(mi.Spectrum, 1, width),
+                ray, pi, emitted.weight, dr.full(mi.Spectrum, 1, width),
                 dr.full(mi.Float, 1, width), sums, dr.full(mi.UInt32, 1, width),
-                Heroes(scene).begin(), dr.zeros(mi.UInt32, width), active,
+                Heroes(scene).begin(), dr.zeros(mi.UInt32, width), inside, active,
             )  # fmt: skip
             if not isinstance(paths.hero_is_alone, tuple):
                 paths.hero_is_alone = dr.zeros(mi.Bool, width)
@@ -147,7 +158,8 @@ class LightWalk:
         kernel.
 
         Returns:
-            The vertices whose BSDF has a smooth part, and the new state of the paths.
+            The vertices whose BSDF has a smooth part, or that lie in a medium, and the new state of
+            the paths.
         """
         schedule_state(numbers)
         # Fresh copies: kernels would otherwise differ in which of the inputs are the same array
@@ -199,7 +211,7 @@ class LightWalk:
 
     @dr.syntax
     def _trace(self, scene, numbers, paths, store) -> tuple[Numbers, LightPaths]:
-        heroes = Heroes(scene)
+        heroes, media = Heroes(scene), self._media(scene)
         ctx = heroes.context()
         ctx.mode = mi.TransportMode.Importance
         place = dr.arange(mi.UInt32, store.lanes) * store.stride
@@ -212,30 +224,33 @@ class LightWalk:
 
         while dr.hint(active, label="light walk"):
             si = self.query.interaction(paths.pi, paths.ray)
+            si, β, in_medium = media.fly(paths.inside, numbers, paths.ray, si, paths.β, active)
             bsdf = si.bsdf(paths.ray)
+            vertex = Vertex(si, bsdf, paths, None, in_medium)
             sums = self._arrive(paths, si)
 
             # ----- Store the vertex if it can be connected -----
-            connectable = active & self._stores(bsdf)
             store.write(
-                place, si, paths.emitted * paths.β, sums, paths.depth, paths.hero_is_alone,
-                connectable,
+                place, si, paths.emitted * media.arriving(β, vertex), sums, paths.depth,
+                paths.hero_is_alone, self._is_stored(media, vertex, active),
             )  # fmt: skip
             place += 1
 
             # ----- Sample the BSDF -----
-            active_next = active & (paths.depth < last_depth)
+            active_next = self._goes_on(media, vertex, last_depth, active)
             sample_1, sample_2 = numbers.next_1d(), numbers.next_2d()
             bs, weight = sample_bsdf(bsdf, ctx, si, sample_1, sample_2, active_next)
             weight, sums, hero_count, hero_is_alone = self._scatter(
                 heroes, paths, bsdf, si, bs, weight, sums, active_next
             )
-            β = paths.β * weight
+            bs, weight = media.scatter(vertex, sample_1, sample_2, bs, weight)
+            β = β * weight
             sampling_weight = paths.sampling_weight * hero_count
 
             # ----- Russian roulette -----
             carries = dr.max(β) != 0  # False for NaN in Dr.Jit
-            depth = paths.depth + 1
+            depth = media.depth_behind(bs, paths.depth)
+            active_next = media.is_within(depth, self.max_depth, active_next)
             rr_active = depth >= rr_depth
             survival = self._survival(paths, si, bsdf, β, sampling_weight, depth, hero_is_alone,
                                       active_next & rr_active & carries)
@@ -245,15 +260,46 @@ class LightWalk:
 
             # ----- Move on to the next vertex -----
             ray = self.query.starts.along(si, si.to_world(bs.wo))
+            inside = media.cross(paths.inside, si, ray.d)
+            ray, inside = media.launch(inside, numbers, CameraRays(ray), ray, active_next)
             pi = self.query.closest(scene, ray, coherent=False, active=active_next)
             scatter_count = paths.scatter_count + dr.select(active_next, 1, 0)
-            active_next &= pi.is_valid()
+            active_next &= media.meets(pi, inside)
             paths = LightPaths(
                 ray, pi, paths.emitted, β, sampling_weight, sums, depth, hero_is_alone,
-                scatter_count, active_next,
+                scatter_count, inside, active_next,
             )  # fmt: skip
             active = active_next & (place < end)
         return numbers, paths
+
+    def _media(self, scene: mi.Scene) -> NoMedia:
+        """The object that handles media."""
+        if self.outside is None:
+            return NoMedia()
+        return media_of(scene, False, Distances())
+
+    def _launch(self, scene, numbers, emitted: EmittedRay, active) -> tuple[mi.Ray3f, Any]:
+        """An emitted ray, up to where it scatters in a medium at most, and the state there."""
+        media = self._media(scene)
+        if not media.exist:
+            return emitted.ray, ()
+        medium = medium_at_start(self.query, scene, emitted, self.outside, active)
+        rays = CameraRays(emitted.ray, medium=medium)
+        inside = media.begin(numbers, rays)
+        # States of a loop have the width of its lanes
+        inside.channel = inside.channel + dr.zeros(mi.UInt32, dr.width(medium))
+        return media.launch(inside, numbers, rays, emitted.ray, active)
+
+    def _is_stored(self, media: NoMedia, vertex: Vertex, active) -> mi.Bool:
+        """Which vertices are stored?"""
+        stored = active & self._stores(vertex.bsdf)
+        return stored | vertex.medium.scatters if media.exist else stored
+
+    def _goes_on(self, media: NoMedia, vertex: Vertex, last_depth, active) -> mi.Bool:
+        """Which paths may leave a vertex?"""
+        if media.exist:
+            return media.goes_on(vertex, self.max_depth, active)[0]
+        return active & (vertex.depth < last_depth)
 
     def _arrive(self, paths: LightPaths, si: mi.SurfaceInteraction3f) -> Sums:
         """The partial sums at a vertex."""

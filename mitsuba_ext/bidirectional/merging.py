@@ -35,11 +35,11 @@ _LEAST_COSINE, _HALF_HEIGHT = 0.7, 0.25
 #: So many vertices are found before they are evaluated. Lanes of a kernel search for different
 #: times, and all of them wait for the last one. (With 1, pool takes 1.2 times as long; 8 gain
 #: nothing.)
-_BATCH = 4
+BATCH = 4
 
 #: Light paths that measure how dense vertices are, and how often the radius of that is doubled at
 #: most.
-_PATHS, _DOUBLINGS = 1 << 16, 8
+PILOT_PATHS, DOUBLINGS = 1 << 16, 8
 
 #: The number of vertices that a disk is to hold. For MIS weights, so many vertices are one sample:
 #: they share a camera path, and other techniques often vary less than their densities tell. (With
@@ -49,10 +49,10 @@ HANDFUL = 8.0
 
 #: With fewer vertices of these paths, nothing is merged; and the largest radius of the first sample
 #: of a pixel, in footprints of pixels.
-_FEW, WIDEST = 64, 6.0
+FEW, WIDEST = 64, 6.0
 
 #: The largest radius in units of the diagonal of the scene: pixels of very small films are wide.
-_LARGEST = 0.04
+LARGEST = 0.04
 
 
 def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
@@ -88,16 +88,33 @@ def suitable_radius(
     only_caustic: bool,
 ) -> float | None:
     """The radius in which a disk holds a handful of the vertices of one light path per pixel, where
-    there are vertices: measured by a few light paths. ``None`` if these leave too few vertices.
+    there are vertices on surfaces: measured by a few light paths. ``None`` if these leave too few
+    vertices.
 
     Parameters:
         light_walk: Traces the light paths.
         footprint: The width of a pixel where the camera sees the scene.
         only_caustic: Are vertices merged only where light arrives from a delta lobe?
     """
+    vertices = pilot_vertices(scene, sensor, light_walk)
+    if vertices is None:
+        return None
+    kept = None if light_walk.outside is None else vertices.is_on_surface
+    if only_caustic:
+        kept = vertices.is_caustic
+    radius = disk_radius(vertices, kept, HANDFUL * PILOT_PATHS / pixels, 2 * footprint)
+    if radius is None:
+        return None
+    return min(radius, LARGEST * scene_diagonal(scene))
+
+
+def pilot_vertices(
+    scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk
+) -> VertexCache | None:
+    """The vertices of ``PILOT_PATHS`` light paths; ``None`` if there are none."""
     rounds: list[LightVertices] = []
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(dr.opaque(mi.UInt32, 0), _PATHS)
+    sampler.seed(dr.opaque(mi.UInt32, 0), PILOT_PATHS)
     # Times and wavelengths are those of rays of the sensor
     numbers = sampler.next_2d()
     rays, _ = sensor.sample_ray_differential(
@@ -105,17 +122,12 @@ def suitable_radius(
         mi.Point2f(0.5), mi.Point2f(0.5),
     )  # fmt: skip
     light_walk.run(
-        scene, sampler, rays.time, rays.wavelengths, dr.full(mi.Bool, True, _PATHS),
+        scene, sampler, rays.time, rays.wavelengths, dr.full(mi.Bool, True, PILOT_PATHS),
         lambda vertices: rounds.append(PackedVertices(vertices)),
     )  # fmt: skip
     if not rounds:
         return None
-    vertices = VertexCache(rounds, _PATHS)
-    kept = vertices.is_caustic if only_caustic else None
-    radius = disk_radius(vertices, kept, HANDFUL * _PATHS / pixels, 2 * footprint)
-    if radius is None:
-        return None
-    return min(radius, _LARGEST * scene_diagonal(scene))
+    return VertexCache(rounds, PILOT_PATHS)
 
 
 def disk_radius(
@@ -131,10 +143,10 @@ def disk_radius(
         kept: See :class:`VertexGrid`.
         least: The radius, at least, of the disks that are looked at.
     """
-    for doublings in range(_DOUBLINGS):
+    for doublings in range(DOUBLINGS):
         radius = least * 2**doublings
         grid = VertexGrid(vertices, dr.opaque(mi.Float, radius), kept)
-        if grid.count < _FEW:
+        if grid.count < FEW:
             return None
         others = grid.occupancy
         if others > 4:
@@ -144,7 +156,7 @@ def disk_radius(
     return math.sqrt(count / (math.pi * per_area))
 
 
-def _pushed(stack: list[mi.UInt32], value: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
+def pushed(stack: list[mi.UInt32], value: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
     """The stack with ``value`` on top (first). The last element is dropped."""
     return [dr.select(active, new, old) for new, old in zip([value, *stack[:-1]], stack)]
 
@@ -181,29 +193,32 @@ class MergedSubpaths(Subpaths):
         self._vertices, self._grid, self._sums, self._others = vertices, grid, sums, others
         self._heroes, self._ctx, self._observer = heroes, heroes.context(), observer
         self._max_depth, self._shares_rays = dr.opaque(mi.UInt32, max_depth), shares_rays
-        # The density of light paths per area, for one vertex in the disk
-        count = dr.opaque(mi.Float, paths)
-        self._per_vertex = dr.rcp(dr.pi * dr.square(grid.radius) * count)
+        # The density of light paths, for one vertex within the radius
+        self._per_vertex = dr.rcp(self._measure(grid.radius) * dr.opaque(mi.Float, paths))
         dr.make_opaque(self._per_vertex)
+
+    def _measure(self, radius: mi.Float) -> mi.Float:
+        """The area in which vertices are found."""
+        return dr.pi * dr.square(radius)
 
     @dr.syntax
     def gather(self, scene, sampler, vertex, active):
         total, shadow_count = mi.Spectrum(0), mi.UInt32(0)
         if dr.hint(self._others is not None, mode="scalar"):
             total, shadow_count = self._others.gather(scene, sampler, vertex, active)
-        merges = active & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
+        merges = active & self._is_merged(vertex)
         merged = mi.Spectrum(0)
         state, si = self._grid.begin(), vertex.si
         group = group_of(si.time, si.wavelengths) if self._shares_rays else mi.UInt32(0)
-        near, looked = [mi.UInt32(0) for _ in range(_BATCH)], mi.UInt32(0)
+        near, looked = [mi.UInt32(0) for _ in range(BATCH)], mi.UInt32(0)
         while dr.hint(merges, label="merge"):
             count, searches = mi.UInt32(0), mi.Bool(merges)
             while dr.hint(searches, label="search"):
                 state, index, found, merges = self._grid.next(state, si.p, searches, group)
-                near = _pushed(near, index, found)
+                near = pushed(near, index, found)
                 count += dr.select(found, 1, 0)
                 looked += 1
-                searches = merges & (count < _BATCH)
+                searches = merges & (count < BATCH)
             exists = count > 0
             while dr.hint(exists, label="evaluate"):
                 merged += self._merged(vertex, self._vertices.at(near[0], exists), exists)
@@ -214,6 +229,10 @@ class MergedSubpaths(Subpaths):
         if dr.hint(self._observer is not None, mode="scalar"):
             self._observer.searched(looked)
         return total, shadow_count
+
+    def _is_merged(self, vertex: Vertex) -> mi.Bool:
+        """Where is light gathered?"""
+        return mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
 
     def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:
         """BSDF · flux of one light path, with the MIS weight."""

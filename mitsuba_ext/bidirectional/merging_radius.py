@@ -9,13 +9,15 @@ from dataclasses import dataclass
 @dataclass
 class MergingRadius:
     """The radius of merging. It shrinks from pass to pass, so that bias vanishes, and suits the
-    number of light paths of a pass: a disk holds about as many vertices whatever that is. In short
-    passes, such a disk would be wide, and its bias would outweigh the noise of all passes together;
-    ``widest`` limits the radius by the number of samples so far, in however many passes.
+    number of light paths of a pass: a disk, or a ball, holds about as many vertices whatever that
+    is. In short passes, such a disk would be wide, and its bias would outweigh the noise of all
+    passes together; ``widest`` limits the radius by the number of samples so far, in however many
+    passes.
 
     Source: C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic Approach*, ACM
-    Transactions on Graphics 30(3), 2011: the squared radius of pass i is proportional to i^(α − 1)
-    (in the limit of their Eq. 15).
+    Transactions on Graphics 30(3), 2011: the area of the disk of pass i is proportional to
+    i^(α − 1) (in the limit of their Eq. 15), and so is the volume of its ball in a medium (their
+    section 6).
 
     Parameters:
         first: The radius of a first pass that has one light path per pixel.
@@ -25,6 +27,7 @@ class MergingRadius:
         before: Light paths per pixel of passes that other renders have made before.
         widest: The largest radius after one light path per pixel; it shrinks with their number as
             that of passes of one.
+        dimensions: 2 for disks, 3 for balls.
     """
 
     first: float
@@ -33,6 +36,7 @@ class MergingRadius:
     footprint: float
     before: int = 0
     widest: float = math.inf
+    dimensions: int = 2
     _passes: int = 0
 
     def next(self, paths: int, groups: int = 1) -> float:
@@ -52,5 +56,7 @@ class MergingRadius:
 
     def _radius(self, per_pixel: float, number: float) -> float:
         """That of the pass of this number, with so many light paths per pixel."""
-        radius = self.first * (number ** (self.decay - 1) / per_pixel) ** 0.5
-        return min(radius, self.widest * (number * per_pixel) ** ((self.decay - 1) / 2))
+        shrinks = number ** (self.decay - 1) / per_pixel
+        radius = self.first * shrinks ** (1 / self.dimensions)
+        samples = number * per_pixel
+        return min(radius, self.widest * samples ** ((self.decay - 1) / self.dimensions))

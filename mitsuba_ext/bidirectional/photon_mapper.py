@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..scene.media import may_have_grids
 from ..scene.movers import movers
 from ..transport.estimator import CameraRays, Sample
 from ..transport.heroes import Heroes
@@ -21,6 +22,7 @@ from ..transport.walk import Walk
 from .light_numbers import LightPathRays
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
+from .medium_photons import MergedInMedia, PassesThrough
 from .merging import MergedSubpaths
 from .merging_radius import MergingRadius
 from .vertex_grid import VertexGrid
@@ -48,7 +50,8 @@ class PhotonMapper:
     Parameters:
         walk: Traces the camera paths; it makes no connections.
         light_walk: Traces the light paths.
-        radius: Within what radius vertices are merged.
+        radius: Within what radius vertices on surfaces are merged.
+        ball: Within what radius vertices in media are merged; ``None`` without media.
         light_paths: Number of light paths for each camera path; 1 in spectral variants and with
             moving shapes.
     """
@@ -56,6 +59,7 @@ class PhotonMapper:
     walk: Walk
     light_walk: LightWalk
     radius: MergingRadius
+    ball: MergingRadius | None = None
     light_paths: float = 1.0
 
     def __call__(
@@ -71,16 +75,29 @@ class PhotonMapper:
         )  # fmt: skip
         walk = replace(self.walk, mis=FoundByCamera(), roulette=OnlySpecular(), rr_depth=0)
         if rounds:
+            if self.ball is not None:
+                walk.distance = PassesThrough()
             vertices = VertexCache(rounds, light.count)
-            # Of paths of different times or wavelengths, those of one sample of each pixel merge
-            groups = mi.is_spectral or bool(movers(scene))
-            paths = min(lanes, self.radius.pixels) if groups else light.count
-            radius = dr.opaque(mi.Float, self.radius.next(paths, light.count // paths))
-            grid = VertexGrid(vertices, radius, None, vertices.group if groups else None)
-            subpaths = MergedSubpaths(
-                vertices, grid, None, Heroes(scene), walk.max_depth, paths, groups
-            )
-            walk = replace(walk, subpaths=subpaths)
+            walk = replace(walk, subpaths=self._merged(scene, vertices, light.count))
         sample = walk(scene, sampler, rays, active)
         scatter_count = light.by_camera_path(scatter_count, lanes)
         return replace(sample, scatter_count=sample.scatter_count + scatter_count)
+
+    def _merged(self, scene: mi.Scene, vertices: VertexCache, count: int) -> MergedSubpaths:
+        """Adds the light of photons, from ``count`` light paths, to camera paths."""
+        # Of paths of different times or wavelengths, those of one sample of each pixel merge
+        groups = mi.is_spectral or bool(movers(scene))
+        group = vertices.group if groups else None
+        paths = min(count, self.radius.pixels) if groups else count
+        radius = dr.opaque(mi.Float, self.radius.next(paths, count // paths))
+        kept = None if self.ball is None else vertices.is_on_surface
+        grid = VertexGrid(vertices, radius, kept, group)
+        heroes, max_depth = Heroes(scene), self.walk.max_depth
+        merged = MergedSubpaths(vertices, grid, None, heroes, max_depth, paths, groups)
+        if self.ball is None:
+            return merged
+        radius = dr.opaque(mi.Float, self.ball.next(paths, count // paths))
+        grid = VertexGrid(vertices, radius, vertices.is_in_medium, group)
+        return MergedInMedia(
+            vertices, grid, heroes, max_depth, paths, groups, merged, may_have_grids(scene)
+        )  # fmt: skip

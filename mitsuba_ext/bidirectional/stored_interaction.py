@@ -28,8 +28,9 @@ _PLAIN_TEXTURES = (
     "IrregularSpectrum",
 )  # fmt: skip
 
-#: Words of the fields that all BSDFs read, and of those that only some read.
-_WORDS, _MORE_WORDS = 15, 14
+#: Words of the fields that all BSDFs read, and of those that only some read; and which of them
+#: holds the shape: 0 for an interaction in a medium.
+_WORDS, _MORE_WORDS, SHAPE_WORD = 15, 14, 14
 
 
 def needs_whole_interaction(scene: mi.Scene) -> bool:
@@ -48,7 +49,8 @@ def interaction_words(is_whole: bool) -> int:
 
 
 def to_words(si: mi.SurfaceInteraction3f, is_whole: bool) -> list[mi.Float]:
-    """The words of an interaction, without its time and wavelengths."""
+    """The words of an interaction, without its time and wavelengths. In a medium, the words of the
+    normal are not finite: there is none."""
     frame = si.sh_frame
     words = [*si.p, *si.wi, *si.uv, *_flat(si.n), *_flat(frame.n), *_flat(frame.s)]
     words.append(as_float(si.shape))
@@ -65,7 +67,7 @@ def from_words(words: list[mi.Float], is_whole: bool) -> mi.SurfaceInteraction3f
     si.uv, si.n = mi.Point2f(*words[6:8]), mi.Normal3f(_unit(*words[8:10]))
     n, s = _unit(*words[10:12]), _unit(*words[12:14])
     si.sh_frame = mi.Frame3f(s, dr.cross(n, s), n)
-    si.shape = as_shape(words[14])
+    si.shape = as_shape(words[SHAPE_WORD])
     if is_whole:
         derivatives = (mi.Vector3f(*words[i : i + 3]) for i in range(_WORDS, _WORDS + 12, 3))
         si.dp_du, si.dp_dv, si.dn_du, si.dn_dv = derivatives

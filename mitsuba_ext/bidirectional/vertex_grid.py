@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .light_vertices import VertexCache
 
@@ -86,12 +87,23 @@ class VertexGrid:
     def occupancy(self) -> float:
         """The number of other vertices in a cube around a vertex, two radii wide, on average over
         the vertices; of a grid of few vertices, as buckets stand for cells."""
+        counts = mi.Float64(self._cubes())
+        total, squares = dr.sum(counts), dr.sum(dr.square(counts))
+        return float((squares / dr.maximum(total, 1))[0]) - 1
+
+    @property
+    def median_occupancy(self) -> float:
+        """As :attr:`occupancy`, the median over the vertices."""
+        counts = np.sort(self._cubes().numpy())
+        vertices = np.cumsum(counts)
+        return float(counts[np.searchsorted(vertices, 0.5 * vertices[-1])]) - 1
+
+    def _cubes(self) -> mi.UInt32:
+        """The number of vertices in each cube, two radii wide."""
         # The two buckets of such a cube follow each other, since hashes are even
         even = 2 * dr.arange(mi.UInt32, len(self._counts) // 2)
         counts = dr.gather(mi.UInt32, self._counts, even)
-        counts = mi.Float64(counts + dr.gather(mi.UInt32, self._counts, even + 1))
-        total, squares = dr.sum(counts), dr.sum(dr.square(counts))
-        return float((squares / dr.maximum(total, 1))[0]) - 1
+        return counts + dr.gather(mi.UInt32, self._counts, even + 1)
 
     def kernel_state(self) -> tuple:
         """The arrays that kernels depend on."""

@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..bidirectional.light_walk import LightWalk
+from ..bidirectional.medium_photons import suitable_ball
 from ..bidirectional.merging import WIDEST, median_footprint, suitable_radius
 from ..bidirectional.merging_radius import MergingRadius
 from ..decisions.camera.shared_numbers import TIME_STEP, WAVELENGTH_STEP, SharedNumbers
@@ -75,6 +76,19 @@ class MergingParameters:
             return None
         return MergingRadius(
             radius or widest, self.decay, pixels, footprint, before, widest
+        )
+
+    def ball_of(
+        self, scene: mi.Scene, sensor: mi.Sensor, light_walk: LightWalk, before: int, given: float
+    ) -> MergingRadius:
+        """As :meth:`radius_of`, for balls in participating media; ``given`` is their radius, 0 for
+        one that suits the scene."""
+        footprint = median_footprint(scene, sensor)
+        width, height = film_extent(sensor.film())
+        radius = given or suitable_ball(scene, sensor, light_walk, footprint, width * height)
+        radius = radius or WIDEST * footprint
+        return MergingRadius(
+            radius, self.decay, width * height, footprint, before, dimensions=3
         )
 
 

@@ -64,11 +64,12 @@ class WalkIntegrator(StagedIntegrator):
     Attributes:
         has_light_paths (bool): Does it trace light paths besides camera paths?
         sees_media (bool): Does it render participating media? If not, it refuses them.
+        light_paths_see_media (bool): Do its light paths, if it has any, scatter in them?
         slots (dict[str, DecisionParameters]): What fills the slots of the walk.
         learners (dict[str, Learner]): The learners of the last render, by slot.
     """
 
-    has_light_paths = False
+    has_light_paths = light_paths_see_media = False
     sees_media = True
 
     def __init__(self, props: mi.Properties) -> None:
@@ -268,7 +269,12 @@ class WalkIntegrator(StagedIntegrator):
         return scene_query(scene)
 
     def _check_media(self, scene: mi.Scene) -> None:
-        if self.has_light_paths or not self.sees_media:
+        if self.has_light_paths and not self.light_paths_see_media:
+            refuse_media(
+                scene, f'"{self.name}", whose light paths do not scatter in a medium,',
+                'use "sppm", "composed_path" or "volpath"',
+            )  # fmt: skip
+        if not self.sees_media:
             refuse_media(scene, f'"{self.name}"', 'use "composed_path" or "volpath"')
         for slot, parameters in self.slots.items():
             if not parameters.sees_media:

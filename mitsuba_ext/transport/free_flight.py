@@ -16,10 +16,13 @@ class Distances:
     ones otherwise.
 
     Attributes:
+        scatter: Do paths scatter in homogeneous media? If not, they pass through these, and their
+            throughput is multiplied by the transmittance.
         exact_transmittance: Do shadow rays use the closed-form transmittance of homogeneous media?
             ``volpath`` samples a distance in each, with more noise in the same time.
     """
 
+    scatter = True
     exact_transmittance = True
 
     def begin(self, rays: CameraRays) -> Any:

@@ -87,6 +87,14 @@ class NoMedia:
         the throughput up to it, and its part that concerns media."""
         return si, β, None
 
+    def meets(self, pi: mi.PreliminaryIntersection3f, inside) -> mi.Bool:
+        """Where may a ray that was launched have one more vertex?"""
+        return pi.is_valid()
+
+    def arriving(self, β: mi.Spectrum, vertex: Vertex) -> mi.Spectrum:
+        """The throughput ``β`` at a vertex, without the scattering coefficient of a medium."""
+        return β
+
     def goes_on(self, vertex: Vertex, max_depth: int, active) -> tuple[mi.Bool, mi.Bool]:
         """May a path leave ``vertex``, and may ``vertex`` be connected to lights?"""
         goes_on = (vertex.depth + 1 < max_depth) & vertex.si.is_valid()
@@ -105,12 +113,16 @@ class NoMedia:
         """Which ``active`` samples ``bs`` scatter, and do not pass index-matched surfaces?"""
         return active
 
+    def depth_behind(self, bs, depth: mi.UInt32) -> mi.UInt32:
+        """The depth of the vertex after one at ``depth``."""
+        return depth + 1
+
     def leave(self, vertex: Vertex, bs, path: PathState) -> PathState:
         """The state of a path that leaves ``vertex`` with the sample ``bs``."""
         return path
 
-    def is_within(self, path: PathState, max_depth: int, active) -> mi.Bool:
-        """Which of the ``active`` paths may have one more vertex?"""
+    def is_within(self, depth: mi.UInt32, max_depth: int, active) -> mi.Bool:
+        """Which of the ``active`` paths may have one more vertex, at ``depth``?"""
         return active
 
     def kept(self, bs, before: Any, after: Any) -> Any:
@@ -155,6 +167,8 @@ class Media(NoMedia):
         return Inside(mi.MediumPtr(rays.medium), channel, mi.Float(dr.inf), distances)
 
     def launch(self, inside, sampler, rays, ray, active):
+        if not self._distances.scatter:
+            return ray, inside
         in_medium = active & (inside.medium != None)  # noqa: E711
         known = in_medium & inside.medium.is_homogeneous()
         σ = component(extinction(inside.medium, ray, known), inside.channel)
@@ -181,7 +195,8 @@ class Media(NoMedia):
         scatters = is_homogeneous & ~si.is_valid() & (inside.reach < dr.inf)
         t = dr.minimum(inside.reach, si.t)
         chosen = component(σ, inside.channel)
-        ratio = attenuation(σ - chosen, t)
+        # Relative to the probability of getting this far
+        ratio = attenuation(σ - chosen if self._distances.scatter else σ, t)
         mei = interaction_at(ray, ray(t), inside.medium)
         σ_s, _, _ = inside.medium.get_scattering_coefficients(mei, scatters)
         sampler.next_1d(scatters)  # `volpath` draws whether the collision is a real one
@@ -194,6 +209,18 @@ class Media(NoMedia):
             scatters |= collides
         mei = interaction_at(ray, ray(t), inside.medium)
         return _at(si, mei, t, scatters), β, MediumVertex(scatters, mei)
+
+    def meets(self, pi, inside):
+        # A path may scatter although no surface ends its ray
+        return pi.is_valid() | (inside.medium != None)  # noqa: E711
+
+    def arriving(self, β, vertex):
+        in_medium = vertex.medium
+        scatters, mei = in_medium.scatters, in_medium.mei
+        σ_s, _, _ = mei.medium.get_scattering_coefficients(mei, scatters)
+        σ_s = mi.Spectrum(σ_s)
+        # Where nothing is scattered, β is zero
+        return dr.select(scatters, β * dr.select(σ_s > 0, dr.rcp(σ_s), 0), β)
 
     def goes_on(self, vertex, max_depth, active):
         flags, in_medium = vertex.bsdf.flags(), vertex.medium
@@ -212,9 +239,8 @@ class Media(NoMedia):
         """The value and the density of the direction ``d`` (in world space): in a medium those of
         the phase function, elsewhere ``value`` and ``pdf``, those of the BSDF."""
         in_medium = vertex.medium
-        phase = in_medium.mei.medium.phase_function()
         active = active & in_medium.scatters
-        phase_value, phase_pdf = phase.eval_pdf(_context(), in_medium.mei, d, active)
+        phase_value, phase_pdf = eval_phase(in_medium.mei, d, active)
         return dr.select(active, phase_value, value), dr.select(active, phase_pdf, pdf)
 
     def transmittance(
@@ -249,6 +275,9 @@ class Media(NoMedia):
     def scattered(self, bs, active):
         return active & ~_passes(bs)
 
+    def depth_behind(self, bs, depth):
+        return depth + dr.select(_passes(bs), mi.UInt32(0), 1)
+
     def leave(self, vertex, bs, path):
         passes = _passes(bs)
         before = vertex.path
@@ -262,9 +291,9 @@ class Media(NoMedia):
             path.β, path.η, path.sampling_weight, depth, arrival, path.hero_is_alone, path.sums
         )
 
-    def is_within(self, path, max_depth, active):
+    def is_within(self, depth, max_depth, active):
         # `goes_on` lets a path leave its last vertex if that may be index-matched
-        return active & (path.depth < max_depth)
+        return active & (depth < max_depth)
 
     def kept(self, bs, before, after):
         return dr.select(_passes(bs), before, after)
@@ -287,6 +316,14 @@ def media_of(scene: mi.Scene, hide_emitters: bool, distances: Distances) -> NoMe
     if not may_have_media(scene):
         return NoMedia()
     return Media(hide_emitters, distances, may_have_grids(scene))
+
+
+def eval_phase(
+    mei: mi.MediumInteraction3f, d: mi.Vector3f, active: mi.Bool
+) -> tuple[mi.Spectrum, mi.Float]:
+    """The value of the phase function for light from the direction ``d`` (in world space), and the
+    density with which scattering finds this direction."""
+    return mei.medium.phase_function().eval_pdf(_context(), mei, d, active)
 
 
 def _passes(bs: mi.BSDFSample3f) -> mi.Bool:

@@ -313,6 +313,19 @@ class Subpaths:
         the number of shadow rays."""
         raise NotImplementedError
 
+    def along(
+        self,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        si: mi.SurfaceInteraction3f,
+        inside: Any,
+        path: PathState,
+        active: mi.Bool,
+    ) -> mi.Spectrum | float:
+        """The radiance that they add on the way of a path to the surface ``si``, throughput
+        included, where the state of the path in participating media is ``inside``."""
+        return 0.0
+
 
 class ShadowTest:
     """Whether the shadow ray of a connection is traced."""

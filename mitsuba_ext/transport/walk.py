@@ -134,6 +134,8 @@ class Walk:
 
         while dr.hint(active, label="walk"):
             si = self.query.interaction(pi, ray)
+            if dr.hint(media.exist and self.subpaths is not None, mode="scalar"):
+                L += self.subpaths.along(sampler, ray, si, inside, path, active)
             si, path.β, in_medium = media.fly(inside, sampler, ray, si, path.β, active)
             path.sums = self.mis.arrive(path, si)
 
@@ -220,7 +222,7 @@ class Walk:
                 sums=self.mis.leave(vertex, bs),
             )
             path = media.leave(vertex, bs, onward)
-            active_next = media.is_within(path, self.max_depth, active_next)
+            active_next = media.is_within(path.depth, self.max_depth, active_next)
             remembered = self._leave(connects, place, scene, ray.d, bs.pdf, active_em)
             next_event_state = media.kept(bs, next_event_state, remembered)
             inside = media.cross(inside, si, ray.d)
