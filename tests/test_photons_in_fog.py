@@ -13,7 +13,7 @@ from stage import area, diffuse, lookat, sensor
 from statistical import assert_images_are_sound, assert_same_quarters, batches, some
 
 from mitsuba_ext.bidirectional.light_media import outer_medium
-from mitsuba_ext.bidirectional.merging import MergingRadius
+from mitsuba_ext.bidirectional.merging_radius import MergingRadius
 from mitsuba_ext.transport.path_decisions import SceneQuery
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -110,10 +110,10 @@ def test_the_size_of_the_scene_does_not_matter(size: float) -> None:
 
 
 def test_balls_shrink_in_volume_as_disks_do_in_area() -> None:
-    radius = MergingRadius(2.0, 0.75, pixels=100, dimensions=3)
+    radius = MergingRadius(2.0, 0.75, pixels=100, footprint=0.1, dimensions=3)
     found = [radius.next(100) for _ in range(16)]
     assert found[0] == 2 and found[15] == pytest.approx(2 * 16 ** (-1 / 12))
-    assert MergingRadius(2.0, 0.75, 100, dimensions=3).next(800) == pytest.approx(1)
+    assert MergingRadius(2.0, 0.75, 100, 0.1, dimensions=3).next(800) == pytest.approx(1)
 
 
 def test_the_medium_outside_is_that_behind_the_last_boundary() -> None:
