@@ -6,14 +6,9 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.bidirectional.light_walk import LightWalk
-from mitsuba_ext.bidirectional.merging_radius import MergingRadius
-from mitsuba_ext.bidirectional.partial_sums import PartialSums
 from mitsuba_ext.composition.bidirectional_integrator import BidirectionalIntegrator
-from mitsuba_ext.composition.light_side import LightSide
-from mitsuba_ext.composition.merging_parameters import MergingParameters, share_rays
+from mitsuba_ext.composition.merging_parameters import MergingParameters
 from mitsuba_ext.startup import registry
-from mitsuba_ext.transport.path_decisions import EmitterSampling
 
 
 @registry.plugin
@@ -98,7 +93,8 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
         self.where = self.parameter(
             props, "merging", "caustics", choices=("caustics", "all", "none")
         )
-        self.merging = MergingParameters.read(self, props)
+        merging = MergingParameters.read(self, props)
+        self.merging = None if self.where == "none" else merging
         if self.where != "none" and self.technique_images:
             raise ValueError(
                 f'"{self.name}": the parameter "technique_images" cannot be combined with merging; '
@@ -110,26 +106,5 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
         return self.where == "all"
 
     def parameters(self) -> dict[str, Any]:
-        return {"merging": self.where, **self.merging.parameters(), **super().parameters()}
-
-    def merging_radius(
-        self, scene: mi.Scene, sensor: mi.Sensor, side: LightSide
-    ) -> MergingRadius | None:
-        if self.where == "none":
-            return None
-        sums = PartialSums(EmitterSampling(), merging=mi.Float(1))
-        light_walk = LightWalk(
-            side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)
-        )
-        radius = self.merging.radius_of(
-            scene, sensor, light_walk, not self.merges_all, self.samples_before
-        )
-        self._merges = radius is not None
-        return radius
-
-    def schedule(self, scene, sensor, samples, seed):
-        self._merges = False
-        schedule = super().schedule(scene, sensor, samples, seed)
-        if self._merges:
-            share_rays(schedule.camera, scene, seed)
-        return schedule
+        radius = self.merging.parameters() if self.merging else {}
+        return {"merging": self.where, **radius, **super().parameters()}

@@ -12,15 +12,17 @@ from typing import Any
 import mitsuba as mi
 
 from ..bidirectional.light_vertices import Layout, bytes_per_vertex
-from ..bidirectional.light_walk import STRIDE
+from ..bidirectional.light_walk import STRIDE, LightWalk
 from ..bidirectional.merging_radius import MergingRadius
+from ..bidirectional.partial_sums import PartialSums
 from ..bidirectional.path_tracer import BidirectionalPathTracer
 from ..bidirectional.technique_images import TechniqueImages
 from ..rendering.camera import film_extent
 from ..transport.estimator import Estimator
-from ..transport.path_decisions import NoConnections, SubpathSelection
+from ..transport.path_decisions import EmitterSampling, NoConnections, SubpathSelection
 from .light_paths import LightPathChoice, check_shared_rays
 from .light_side import LightSide
+from .merging_parameters import MergingParameters, share_rays
 from .slots import BIDIRECTIONAL_SLOTS, read_slot
 from .walk_integrator import WalkIntegrator
 
@@ -104,8 +106,11 @@ class BidirectionalIntegrator(WalkIntegrator):
         film = sensor.film()
         if self.technique_images:
             self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
-        return functools.partial(self._estimator, side, self.merging_radius(scene, sensor, side))
+        self._radius = self.merging_radius(scene, sensor, side)
+        return functools.partial(self._estimator, side, self._radius)
 
+    #: Where vertices are merged; ``None`` if they are not.
+    merging: MergingParameters | None = None
     #: Are all vertices merged, or only those to which light comes from a delta lobe?
     merges_all = False
 
@@ -113,7 +118,22 @@ class BidirectionalIntegrator(WalkIntegrator):
         self, scene: mi.Scene, sensor: mi.Sensor, side: LightSide
     ) -> MergingRadius | None:
         """Within what radius vertices of a render are merged; ``None`` if they are not."""
-        return None
+        if self.merging is None:
+            return None
+        sums = PartialSums(EmitterSampling(), merging=mi.Float(1))
+        light_walk = LightWalk(
+            side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)
+        )
+        return self.merging.radius_of(
+            scene, sensor, light_walk, not self.merges_all, self.samples_before
+        )
+
+    def schedule(self, scene, sensor, samples, seed):
+        self._radius = None
+        schedule = super().schedule(scene, sensor, samples, seed)
+        if self._radius is not None:
+            share_rays(schedule.camera, scene, seed)
+        return schedule
 
     def _estimator(
         self, side: LightSide, radius: MergingRadius | None, **decisions: Any
