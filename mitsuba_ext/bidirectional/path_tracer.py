@@ -64,6 +64,8 @@ class BidirectionalPathTracer:
         merges_all: See :class:`PartialSums`.
         light_paths: Number of light paths for each camera path. It must be 1 where paths of
             different lanes cannot be connected (see ``selection`` and ``is_alone``).
+        most_lanes: The most lanes that it should have, for the memory of what it stores; 0 for any
+            number.
     """
 
     walk: Walk
@@ -77,6 +79,7 @@ class BidirectionalPathTracer:
     radius: MergingRadius | None = None
     merges_all: bool = False
     light_paths: float = 1.0
+    most_lanes: int = 0
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool

@@ -11,6 +11,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from ..bidirectional.candidates import Candidate
 from ..bidirectional.light_vertices import Layout, bytes_per_vertex
 from ..bidirectional.light_walk import STRIDE, LightWalk
 from ..bidirectional.merging_radius import MergingRadius
@@ -34,9 +35,116 @@ _SLOTS = ("directions", "next_event", "roulette", "shadow_test", *BIDIRECTIONAL_
 _PASS_BYTES, _PATH_BYTES = 1 << 29, 640
 
 
-class BidirectionalIntegrator(WalkIntegrator):
-    """Camera paths and light paths, whose vertices are connected. The parameters are those of
-    :class:`bdpt`."""
+class LightPathIntegrator(WalkIntegrator):
+    """Camera paths and light paths, whose vertices are connected."""
+
+    #: See :class:`bdpt`.
+    connections, light_image, sample_direct, technique_images = 1, True, True, ""
+    #: Where vertices are merged; ``None`` if they are not.
+    merging: MergingParameters | None = None
+    #: Are all vertices merged, or only those to which light comes from a delta lobe?
+    merges_all = False
+    #: What a render uses if no decision says that.
+    techniques_by_default = Candidate(1.0, merges=True)
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.techniques: TechniqueImages | None = None
+        self._radius: MergingRadius | None = None
+
+    @property
+    def needs_equal_samples(self) -> str:
+        if self.light_image:
+            return 'its light paths find light for all pixels: set "light_image" to false'
+        if self.technique_images:
+            return 'its images of techniques count all samples alike: leave "technique_images" out'
+        return super().needs_equal_samples
+
+    @property
+    def sample_cost(self) -> int:
+        return max(3, super().sample_cost)
+
+    @property
+    def most_lanes(self) -> int:
+        return _most_lanes(getattr(self.slots.get("light_paths"), "count", 1.0))
+
+    def estimators(self, scene: mi.Scene, sensor: mi.Sensor):
+        if not scene.emitters() or self.max_depth < 2:
+            return self.walk
+        side = LightSide.of(self.name, scene, sensor, self.light_image)
+        check_shared_rays(self.name, scene, getattr(self.slots.get("light_paths"), "count", 1.0))
+        film = sensor.film()
+        if self.technique_images:
+            self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
+        self._radius = self.merging_radius(scene, sensor, side)
+        return functools.partial(self._estimator, side, self._radius)
+
+    def merging_radius(
+        self, scene: mi.Scene, sensor: mi.Sensor, side: LightSide
+    ) -> MergingRadius | None:
+        """Within what radius vertices of a render are merged; ``None`` if they are not."""
+        if self.merging is None:
+            return None
+        sums = PartialSums(EmitterSampling(), merging=mi.Float(1))
+        light_walk = LightWalk(
+            side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)
+        )
+        return self.merging.radius_of(
+            scene, sensor, light_walk, not self.merges_all, self.samples_before
+        )
+
+    def schedule(self, scene, sensor, samples, seed):
+        self._radius = None
+        schedule = super().schedule(scene, sensor, samples, seed)
+        if self._radius is not None:
+            share_rays(schedule.camera, scene, seed)
+        return schedule
+
+    def _estimator(
+        self, side: LightSide, radius: MergingRadius | None, **decisions: Any
+    ) -> Estimator:
+        always = LightPathChoice(self.techniques_by_default, self.techniques)
+        choice: LightPathChoice = decisions.pop("light_paths", always)
+        techniques = choice.techniques
+        are_traced = techniques.light_paths > 0
+        selection = decisions.pop("subpath_selection", SubpathSelection())
+        next_event = decisions.pop("next_event", None)
+        if not self.sample_direct:
+            next_event = NoConnections()
+        elif are_traced:
+            next_event = side.next_event(next_event)
+        else:
+            next_event = next_event or side.correct
+        if next_event:
+            decisions["next_event"] = next_event
+        walk = self.walk(**decisions)
+        if not are_traced:
+            return walk
+        return BidirectionalPathTracer(
+            walk, side.emission, side.sensor, self.connections if techniques.connects else 0,
+            selection, choice.observer, radius=radius if techniques.merges else None,
+            merges_all=self.merges_all, light_paths=techniques.light_paths,
+            most_lanes=_most_lanes(techniques.light_paths),
+        )  # fmt: skip
+
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
+        self.techniques = None
+        if self.technique_images:
+            self.check_target("technique_images", self.technique_images)
+        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
+        if self.techniques is not None:
+            self.techniques.write(Path(self.technique_images), self.statistics.spp)
+        elif self.technique_images:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'"{self.name}": without lights, or with "max_depth" below 2, there are no light '
+                f'paths: "{self.technique_images}" is not written.',
+            )
+        return image
+
+
+class BidirectionalIntegrator(LightPathIntegrator):
+    """A :class:`LightPathIntegrator` with the parameters of :class:`bdpt`."""
 
     has_light_paths = True
 
@@ -46,7 +154,6 @@ class BidirectionalIntegrator(WalkIntegrator):
         self.light_image = self.parameter(props, "light_image", True)
         self.sample_direct = self.parameter(props, "sample_direct", True)
         self.technique_images = self.parameter(props, "technique_images", "")
-        self.techniques: TechniqueImages | None = None
         self.fill(props, **{slot: read_slot(self.name, props, slot) for slot in _SLOTS})
         without_direct = ("next_event", "shadow_test", "light_paths")
         without_images = ("light_paths",) if self.technique_images else ()
@@ -80,98 +187,9 @@ class BidirectionalIntegrator(WalkIntegrator):
             **super().parameters(),
         }
 
-    @property
-    def needs_equal_samples(self) -> str:
-        if self.light_image:
-            return 'its light paths find light for all pixels: set "light_image" to false'
-        if self.technique_images:
-            return 'its images of techniques count all samples alike: leave "technique_images" out'
-        return super().needs_equal_samples
 
-    @property
-    def sample_cost(self) -> int:
-        return max(3, super().sample_cost)
-
-    @property
-    def most_lanes(self) -> int:
-        layout = Layout(len(mi.Spectrum()), 4, True)
-        paths = max(1.0, getattr(self.slots.get("light_paths"), "count", 1.0))
-        return int(_PASS_BYTES / paths) // (STRIDE * bytes_per_vertex(layout) + _PATH_BYTES)
-
-    def estimators(self, scene: mi.Scene, sensor: mi.Sensor):
-        if not scene.emitters() or self.max_depth < 2:
-            return self.walk
-        side = LightSide.of(self.name, scene, sensor, self.light_image)
-        check_shared_rays(self.name, scene, getattr(self.slots.get("light_paths"), "count", 1.0))
-        film = sensor.film()
-        if self.technique_images:
-            self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
-        self._radius = self.merging_radius(scene, sensor, side)
-        return functools.partial(self._estimator, side, self._radius)
-
-    #: Where vertices are merged; ``None`` if they are not.
-    merging: MergingParameters | None = None
-    #: Are all vertices merged, or only those to which light comes from a delta lobe?
-    merges_all = False
-
-    def merging_radius(
-        self, scene: mi.Scene, sensor: mi.Sensor, side: LightSide
-    ) -> MergingRadius | None:
-        """Within what radius vertices of a render are merged; ``None`` if they are not."""
-        if self.merging is None:
-            return None
-        sums = PartialSums(EmitterSampling(), merging=mi.Float(1))
-        light_walk = LightWalk(
-            side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)
-        )
-        return self.merging.radius_of(
-            scene, sensor, light_walk, not self.merges_all, self.samples_before
-        )
-
-    def schedule(self, scene, sensor, samples, seed):
-        self._radius = None
-        schedule = super().schedule(scene, sensor, samples, seed)
-        if self._radius is not None:
-            share_rays(schedule.camera, scene, seed)
-        return schedule
-
-    def _estimator(
-        self, side: LightSide, radius: MergingRadius | None, **decisions: Any
-    ) -> Estimator:
-        always = LightPathChoice(observer=self.techniques)
-        choice: LightPathChoice = decisions.pop("light_paths", always)
-        techniques = choice.techniques
-        are_traced = techniques.light_paths > 0
-        selection = decisions.pop("subpath_selection", SubpathSelection())
-        next_event = decisions.pop("next_event", None)
-        if not self.sample_direct:
-            next_event = NoConnections()
-        elif are_traced:
-            next_event = side.next_event(next_event)
-        else:
-            next_event = next_event or side.correct
-        if next_event:
-            decisions["next_event"] = next_event
-        walk = self.walk(**decisions)
-        if not are_traced:
-            return walk
-        return BidirectionalPathTracer(
-            walk, side.emission, side.sensor, self.connections if techniques.connects else 0,
-            selection, choice.observer, radius=radius if techniques.merges else None,
-            merges_all=self.merges_all, light_paths=techniques.light_paths,
-        )  # fmt: skip
-
-    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
-        self.techniques = None
-        if self.technique_images:
-            self.check_target("technique_images", self.technique_images)
-        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
-        if self.techniques is not None:
-            self.techniques.write(Path(self.technique_images), self.statistics.spp)
-        elif self.technique_images:
-            mi.Log(
-                mi.LogLevel.Warn,
-                f'"{self.name}": without lights, or with "max_depth" below 2, there are no light '
-                f'paths: "{self.technique_images}" is not written.',
-            )
-        return image
+def _most_lanes(light_paths: float) -> int:
+    """The most camera paths in a pass, with so many light paths for each."""
+    layout = Layout(len(mi.Spectrum()), 5, True)
+    bytes_per_path = STRIDE * bytes_per_vertex(layout) + _PATH_BYTES
+    return int(_PASS_BYTES / max(1.0, light_paths)) // bytes_per_path

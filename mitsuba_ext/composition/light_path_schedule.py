@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import mitsuba as mi
 
 from ..learning.directions.guide_learner import GuideLearner
 from ..rendering.stages import Stage
-from ..transport.estimator import Estimator
 from .light_paths import LightPathTrial
 from .schedule import Schedule
 
@@ -41,7 +38,6 @@ class LightPathSchedule:
         scene: The scene.
         place: After so many stages comes the trial.
         trial: Chooses.
-        estimator: Makes the estimator of a stage, as that of ``inner``.
     """
 
     def __init__(
@@ -50,10 +46,8 @@ class LightPathSchedule:
         scene: mi.Scene,
         place: int,
         trial: LightPathTrial,
-        estimator: Callable[..., Estimator],
     ) -> None:
         self._inner, self._scene, self._place, self._trial = inner, scene, place, trial
-        self._estimator = estimator
         inner.beside["light_paths"] = trial
         self._next: Stage | None = None
         self._is_over = False
@@ -74,8 +68,8 @@ class LightPathSchedule:
             slot: decision for slot, decision in self._inner.decisions.items()
             if slot not in _OF_CAMERA_PATHS
         }  # fmt: skip
-        estimator = self._estimator(light_paths=choice, **decisions)
-        return Stage(estimator, camera=self._inner.camera)
+        estimator = self._inner.estimator(light_paths=choice, **decisions)
+        return Stage(estimator, camera=self._inner.camera, most_lanes=estimator.most_lanes)
 
     def _stage_after_trial(self) -> Stage:
         stage, self._next = self._next, None

@@ -96,6 +96,7 @@ class Schedule:
             schedule saves, restores and reports what they learn.
         decisions: The decisions of the next stage that differ from those of ``path``, by slot.
         camera: Chooses points of the aperture, times and wavelengths.
+        estimator: The parameter.
     """
 
     def __init__(
@@ -109,7 +110,7 @@ class Schedule:
         restored: States | None = None,
         learned: Callable[[States], None] | None = None,
     ) -> None:
-        self._setting, self._pilot_count, self._estimator = setting, len(stages) - 1, estimator
+        self._setting, self._pilot_count, self.estimator = setting, len(stages) - 1, estimator
         self._stages = list(stages)
         self.decisions: dict[str, Any] = {"query": query}
         self.learners: dict[str, Learner] = {}
@@ -168,7 +169,7 @@ class Schedule:
             return self._last_stage()
         observer = _one_observer(list(self.learners.values()))
         return Stage(
-            self._estimator(observer=observer, **self.decisions),
+            self.estimator(observer=observer, **self.decisions),
             camera=self.camera,
             weight=self._weights[self._finished_stages],
             most_lanes=_MAP_LANES if self._learns_maps else 0,
@@ -199,7 +200,9 @@ class Schedule:
             known = {s: x for s, x in self._states.items() if x and s in self._everyone}
             self._learned(known)
         learned = "; ".join(filter(None, map(str, self._everyone.values())))
-        return Stage(self._estimator(**self.decisions), learned, camera=self.camera)
+        estimator = self.estimator(**self.decisions)
+        most = getattr(estimator, "most_lanes", 0)
+        return Stage(estimator, learned, camera=self.camera, most_lanes=most)
 
     def _scout_stage(self) -> Stage:
         depth = min(SCOUT_DEPTH, self._setting.max_depth)

@@ -1,0 +1,172 @@
+"""An integrator that decides by itself what pays, light paths included."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitsuba_ext.bidirectional.candidates import Candidate
+from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.composition.bidirectional_integrator import LightPathIntegrator
+from mitsuba_ext.composition.decision_parameters import ParameterReader
+from mitsuba_ext.composition.directions import Guided
+from mitsuba_ext.composition.light_path_schedule import (
+    LightPathSchedule,
+    place_of_trial,
+    samples_of_trial,
+)
+from mitsuba_ext.composition.light_paths import LightPathsWhereTheyPay, LightPathTrial
+from mitsuba_ext.composition.merging_parameters import MergingParameters
+from mitsuba_ext.composition.next_event import LearnedLights
+from mitsuba_ext.composition.roulette import GuidedRoulette
+from mitsuba_ext.composition.swarm import MAPS, Swarm
+from mitsuba_ext.rendering.stages import Schedule
+from mitsuba_ext.scene.media import may_have_media
+from mitsuba_ext.scene.movers import movers
+from mitsuba_ext.startup import registry
+
+#: The random numbers of a camera ray that can have learned maps.
+_CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
+
+#: Light paths are not tried in films of more pixels, since a pass stores some kilobytes for each.
+_MOST_PIXELS = 1 << 21
+
+
+@registry.plugin
+class Auto(LightPathIntegrator):
+    r"""
+    .. _integrator-auto:
+
+    Self-configuring integrator (:monosp:`auto`)
+    --------------------------------------------
+
+    Begins as :monosp:`path`, and measures which techniques are worth their time in this scene:
+    guided directions, learned lights, maps of times, points on the lens, wavelengths and distances
+    (:class:`auto_path`); light paths, how many, connections to them, and merging with them
+    (:class:`vcm`).
+
+    .. pluginparameters::
+
+     * - pilot_spp
+       - |int|
+       - Pilot samples per pixel, from which the integrator learns; at most a quarter of all
+         samples. They count towards the image. With 0, nothing is learned, and the integrator is
+         :monosp:`path`. (Default: 32)
+     * - save_learned, load_learned
+       - |string|
+       - Files. The render saves all that it has learned to :monosp:`save_learned`. With
+         :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
+         scene, with the same parameters and film size, has saved. (Default: none)
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
+
+    **Use it when** you do not know which technique a scene needs. **Not when** an image has fewer
+    than 16 samples per pixel: there is too little to learn from.
+
+    The first two pilots are those of :class:`auto_path`. After these comes a short stage with one
+    light path for each camera path, all techniques, and the lights learned until then. Its samples
+    tell the variance of each choice of techniques (no light paths; 1/16, 1/4, 1 or 4 of them for
+    each camera path; with and without connections to their vertices, and merging); numbers of rays
+    tell its time. The best choice is made, if it is better than guided directions, with which light
+    paths are not combined. This stage takes at most one of 32 samples: in renders of fewer samples,
+    there is none.
+
+    Light paths are not tried in spectral variants, with moving shapes, participating media, or
+    where the lens is learned, in films of more than two million pixels, and where a light cannot
+    emit them: there, the integrator is :class:`auto_path`.
+
+    Where vertices are merged, the image is slightly blurred, less with each sample (:class:`vcm`).
+
+    :monosp:`integrator.statistics.learned` says what was chosen, and what it was expected to gain.
+    Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized variants. Nested
+    in :monosp:`moment`, it takes no pilot samples.
+
+    Sources: those of :class:`auto_path` and :class:`vcm`; P. Grittmann, I. Georgiev, P. Slusallek,
+    *Efficiency-Aware Multiple Importance Sampling for Bidirectional Rendering Algorithms*, ACM
+    Transactions on Graphics 41(4), 2022.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="auto">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'auto',
+            'max_depth': 8
+    """
+
+    techniques_by_default = Candidate(0.0)
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.merging = MergingParameters(0.0, 0.75)
+        read = ParameterReader.of_defaults(self.name)
+        self.fill(
+            props,
+            directions=Guided(read),
+            next_event=LearnedLights(read),
+            roulette=GuidedRoulette(),
+            # Maps alone would ask for more pilot samples than guided directions
+            **{slot: MAPS[slot](read, pilot_spp=Guided.pilot_spp) for slot in _CAMERA_NUMBERS},
+        )
+        self._trial_spp = 0
+        self._has_light_paths = False
+
+    @property
+    def needs_equal_samples(self) -> str:
+        return 'its light paths may find light for all pixels: use "auto_path"'
+
+    @property
+    def sample_cost(self) -> int:
+        return 1
+
+    @property
+    def most_lanes(self) -> int:
+        # Stages with light paths have limits of their own
+        return super(LightPathIntegrator, self).most_lanes
+
+    def pilots(self, scene, pixel_count, spp):
+        stages = super().pilots(scene, pixel_count, spp)
+        self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene, spp)
+        self._trial_spp = samples_of_trial(pixel_count, spp)
+        if not stages or not self._has_light_paths:
+            self._trial_spp = 0
+        if self._trial_spp > 0:
+            stages.insert(place_of_trial(len(stages)), self._trial_spp)
+        return stages
+
+    def schedule(self, scene, sensor, samples, seed) -> Schedule | LightPathSchedule:
+        trial = LightPathTrial(sensor.film(), sum(samples))
+        if self._trial_spp == 0:
+            schedule = super().schedule(scene, sensor, samples, seed)
+            if self.load_learned and self._has_light_paths:
+                schedule.beside["light_paths"] = trial
+            return schedule
+        place = place_of_trial(len(samples) - 2)
+        others = (*samples[:place], *samples[place + 1 :])
+        inner = super().schedule(scene, sensor, others, seed)
+        return LightPathSchedule(inner, scene, place, trial)
+
+    def estimators(self, scene, sensor):
+        if not self._has_light_paths or not (self._trial_spp or self.load_learned):
+            return self.walk
+        return super().estimators(scene, sensor)
+
+    def _can_try(self, scene: mi.Scene, spp: int) -> bool:
+        """Can camera paths be connected to light paths, in what this integrator does else?"""
+        if self.max_depth < 2 or mi.is_spectral or movers(scene) or may_have_media(scene):
+            return False
+        maps = [p for p in self.slots.values() if isinstance(p, Swarm)]
+        if any(p.can_learn(scene, spp) for p in maps):
+            return False
+        if not LightPathsWhereTheyPay().can_learn(scene, spp):
+            return False
+        try:
+            LightEmission(scene)
+        except NotImplementedError:
+            return False
+        return True
