@@ -18,6 +18,7 @@ from mitsuba_ext.composition.light_paths import LightPathsWhereTheyPay, LightPat
 from mitsuba_ext.composition.merging_parameters import MergingParameters
 from mitsuba_ext.composition.next_event import LearnedLights
 from mitsuba_ext.composition.roulette import GuidedRoulette
+from mitsuba_ext.composition.staged_integrator import NO_LIMIT
 from mitsuba_ext.composition.swarm import MAPS, Swarm
 from mitsuba_ext.rendering.stages import Schedule
 from mitsuba_ext.scene.media import may_have_media
@@ -127,7 +128,7 @@ class Auto(LightPathIntegrator):
     @property
     def most_lanes(self) -> int:
         # Stages with light paths have limits of their own
-        return super(LightPathIntegrator, self).most_lanes
+        return NO_LIMIT
 
     def pilots(self, scene, pixel_count, spp):
         stages = super().pilots(scene, pixel_count, spp)

@@ -184,7 +184,7 @@ def test_list_says_whose_plugin_a_name_is_or_what_it_may_have_meant(run):
         ("sphere", '"sphere" is a plugin of Mitsuba\'s own'),
         ("neeep", 'no plugin "neeep": did you mean "neepp"?'),
         ("Volpath", 'did you mean "volpath"?'),
-        ("something", "(there are: adaptive, auto_path, bdpt, composed_path,"),
+        ("something", "(there are: adaptive, auto, auto_path, bdpt, composed_path,"),
     ):
         code, out, err = run("list", name)
         assert (code, out) == (2, "") and message in err, err

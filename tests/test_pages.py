@@ -51,6 +51,7 @@ VALUES = {
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
     **dict.fromkeys(["sample_count", "seed", "dimensions", "film_width"], 6),
     "radius": 0.5, "radius_in_media": 0.5, "radius_decay": 0.5, "merging": "all",
+    "light_paths": 0.5,
     **dict.fromkeys(["photons", "lookup_size"], 16), "global_radius": 0.5, "caustic_radius": 0.5,
     **dict.fromkeys(["final_gather", "guided", "photon_aovs"], True),
     "checkpoint": "kept", "checkpoint_every": "9s",

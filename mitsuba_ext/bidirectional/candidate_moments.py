@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from .candidates import Candidate
 from .merging import HANDFUL
 from .partial_sums import Rivals
@@ -35,10 +36,9 @@ class CandidateMoments:
         # share vertices
         shared = [samples_per_vertex.get(c.light_paths, 1.0) / HANDFUL for c in candidates]
         # Factors of the squared densities of light image, connections, merging; and c of merging
-        self._factors = _table(
-            (c.light_paths**2, float(c.connects), float(c.merges), s)
-            for c, s in zip(candidates, shared)
-        )
+        self._factors = from_numpy(mi.Float, [
+            (c.light_paths**2, c.connects, c.merges, s) for c, s in zip(candidates, shared)
+        ])  # fmt: skip
         self._sums = dr.zeros(mi.Float, 2 * self._count * pixels)
         self._lost = dr.zeros(mi.UInt32, self._count)
         dr.eval(self._sums, self._lost)
@@ -97,9 +97,3 @@ def _split(
 
 def _sum(values: list[mi.Float]) -> mi.Float:
     return sum(values[1:], values[0])
-
-
-def _table(rows) -> mi.Float:
-    table = mi.Float(np.array(list(rows), np.float32).ravel())
-    dr.eval(table)
-    return table

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..learning.pixel_estimates import box_means
+from ..images.box_filter import box_means
 from ..transport.estimator import CameraRays, Sample
 from ..transport.mis import power_heuristic
 from .candidate_moments import CandidateMoments

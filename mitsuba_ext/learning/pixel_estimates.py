@@ -7,9 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import from_numpy
-
-#: Pixels on each side, along each axis, over which the radiance of a pixel is averaged.
-_RADIUS = 4
+from ..images.box_filter import box_means, box_sums
 
 #: Added to the squared radiance of a pixel, in units of the squared mean of the image.
 _FLOOR = 1e-2
@@ -59,7 +57,7 @@ class PixelEstimates:
 
     def _means(self) -> np.ndarray:
         total, count = (
-            _box_sums(x.reshape(-1, self._width)).ravel() for x in (self._sum, self._count)
+            box_sums(x.reshape(-1, self._width)).ravel() for x in (self._sum, self._count)
         )
         return total / np.maximum(count, 1)
 
@@ -73,11 +71,6 @@ def relative_scale(image: np.ndarray) -> np.ndarray:
     return _inverse(box_means(image), image.mean())
 
 
-def box_means(image: np.ndarray) -> np.ndarray:
-    """The mean of each pixel of an image and its neighbours, shape [y, x]."""
-    return _box_sums(image) / _box_sums(np.ones_like(image))
-
-
 def _inverse(means: np.ndarray, mean: float) -> np.ndarray:
     # The bound of 1e-30 matters only in images that are black all over: every contribution is 0
     return 1 / np.sqrt(np.maximum(means**2 + _FLOOR * mean**2, 1e-30))
@@ -85,14 +78,3 @@ def _inverse(means: np.ndarray, mean: float) -> np.ndarray:
 
 def _padded(x: np.ndarray, size: int) -> np.ndarray:
     return np.pad(x, (0, size - len(x)))
-
-
-def _box_sums(image: np.ndarray) -> np.ndarray:
-    """Sums over the neighbours of each pixel, itself included."""
-    for axis in range(2):
-        size = image.shape[axis]
-        sums = np.insert(np.cumsum(image, axis), 0, 0, axis)
-        index = np.arange(size)
-        end = np.minimum(index + _RADIUS + 1, size)
-        image = sums.take(end, axis) - sums.take(np.maximum(index - _RADIUS, 0), axis)
-    return image

@@ -1,0 +1,106 @@
+"""``auto`` begins as ``path``, and tries light paths between the pilots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from fogs import fog
+from hard_cases import stage
+from statistical import (
+    MANY_SEEDS,
+    REFERENCE_SEEDS,
+    SEEDS,
+    assert_same_image,
+    assert_same_quarters,
+    batches,
+    load,
+)
+from test_light_tracer import EMITTERS, below_the_lamp
+
+from mitsuba_ext.composition import light_paths
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+@pytest.fixture(autouse=True)
+def small_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(light_paths, "_ENOUGH", 1 << 12)
+
+
+def auto(**parameters: Any) -> mi.Integrator:
+    return mi.load_dict({"type": "auto", "max_depth": 6, **parameters})
+
+
+def learned(scene: mi.Scene | dict, spp: int, integrator: mi.Integrator | None = None) -> str:
+    scene = mi.load_dict(scene) if isinstance(scene, dict) else scene
+    integrator = integrator or auto()
+    integrator.render(scene, spp=spp, seed=1)
+    return integrator.statistics.learned
+
+
+def test_light_paths_take_the_place_of_guides_where_they_pay() -> None:
+    text = learned(load("caustic", width=96, height=54), 64)
+    assert "light paths pay: " in text and "guide: " not in text
+
+
+def test_light_paths_are_left_out_under_an_open_sky() -> None:
+    scene = stage(light=EMITTERS["constant"](), camera=below_the_lamp())
+    assert "light paths do not pay" in learned(scene, 1200)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", ["rectangle", "constant"])
+def test_the_choice_does_not_change_the_mean(light: str) -> None:
+    scene = mi.load_dict(stage(light=EMITTERS[light](), camera=below_the_lamp()), optimize=False)
+    integrator = auto(max_depth=4)
+    images = batches(scene, integrator, 1200, SEEDS[:MANY_SEEDS])
+    assert "light paths" in integrator.statistics.learned
+    path = mi.load_dict({"type": "path", "max_depth": 4})
+    expected = batches(scene, path, 1200, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert_same_quarters(images, expected, 0.005)
+
+
+def test_in_short_renders_it_is_auto_path() -> None:
+    scene = load("cornell_box", width=32, height=18)
+    images = [
+        batches(scene, mi.load_dict({"type": name, "max_depth": 4}), 32, [3])[0]
+        for name in ("auto", "auto_path")
+    ]
+    assert_same_image(*images)
+
+
+@pytest.mark.parametrize("why", ["fog", "spectral"])
+def test_where_light_paths_cannot_be_tried_it_is_auto_path(why: str) -> None:
+    if why == "spectral":
+        mi.set_variant("llvm_ad_spectral")
+    scene = mi.load_dict(fog("area") if why == "fog" else stage())
+    images = []
+    for name in ("auto", "auto_path"):
+        integrator = mi.load_dict({"type": name, "max_depth": 4})
+        images.append(np.array(integrator.render(scene, spp=64, seed=2)))
+        assert "light paths" not in integrator.statistics.learned
+    assert_same_image(*images)
+
+
+def test_a_restored_choice_needs_no_pilot(tmp_path) -> None:
+    file = str(tmp_path / "learned.npz")
+    scene = load("caustic", width=96, height=54)
+    text = learned(scene, 64, auto(save_learned=file))
+    again = learned(scene, 4, auto(load_learned=file))
+    assert "light paths pay: " in again
+    choice = text.rpartition("light paths")[2].partition(" (")[0]
+    assert again.endswith(f"light paths{choice}")
+
+
+def test_equal_seeds_give_equal_images() -> None:
+    scene = load("caustic", width=96, height=54)
+    images = [np.array(auto().render(scene, spp=64, seed=4)) for _ in range(2)]
+    np.testing.assert_allclose(*images, rtol=1e-3, atol=1e-4)
+
+
+def test_integrators_that_distribute_samples_refuse_it() -> None:
+    with pytest.raises(RuntimeError, match='use "auto_path"'):
+        mi.load_dict({"type": "adaptive", "nested": {"type": "auto"}})
