@@ -39,7 +39,8 @@ def _render(scene: pyluxcore.Scene, task: dict, seed: int) -> tuple[np.ndarray, 
     side, depth = task["side"], task["max_depth"]
     config = pyluxcore.RenderConfig(
         _properties({
-            "renderengine.type": task["engine"], "sampler.type": "RANDOM", "renderengine.seed": seed,
+            "renderengine.type": task["engine"], "renderengine.seed": seed,
+            "sampler.type": "RANDOM",
             "native.threads.count": 2, "path.maxdepth": depth, "light.maxdepth": depth,
             "film.width": side, "film.height": side, "film.filter.type": "NONE",
             "film.outputs.0.type": "RGB", "film.outputs.0.filename": "unused.exr",
