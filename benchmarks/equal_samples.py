@@ -65,7 +65,10 @@ def load(name: str, size: tuple[int, int], sampler: str = "") -> mi.Scene:
 
 def title(name: str) -> str:
     """What a table calls a scene."""
-    return Path(name).parent.name if Path(name).name == "scene.xml" else Path(name).stem
+    file, *given = name.split(":")
+    path = Path(file)
+    found = path.parent.name if path.name == "scene.xml" else path.stem
+    return " ".join([found, *given])
 
 
 @dataclass

@@ -159,19 +159,17 @@ def scales(name, spp, max_depth) -> None:
 
 def enlarge(scene: mi.Scene, scale: float) -> None:
     """Scales the shapes and the camera of a scene."""
-    parameters, camera = mi.traverse(scene), mi.traverse(scene.sensors()[0])
-    for shape in scene.shapes():
-        own = mi.traverse(shape)
-        if shape.is_mesh():
-            own["vertex_positions"] = own["vertex_positions"] * scale
-        else:
-            own["to_world"] = mi.Transform4f().scale(scale) @ own["to_world"]
-        own.update()
-    for key in ("near_clip", "far_clip"):
-        camera[key] = camera[key] * scale
-    at = camera["to_world"].translation()
-    camera["to_world"] = mi.Transform4f().translate((scale - 1) * at) @ camera["to_world"]
-    camera.update()
+    parameters = mi.traverse(scene)
+    camera = next(k for k in parameters.keys() if k.endswith(".near_clip")).split(".")[0]
+    for key in list(parameters.keys()):
+        owner, _, name = key.rpartition(".")
+        if name == "vertex_positions" or (owner == camera and name in ("near_clip", "far_clip")):
+            parameters[key] = parameters[key] * scale
+        elif name == "to_world" and owner == camera:
+            offset = (scale - 1) * parameters[key].translation()
+            parameters[key] = mi.Transform4f().translate(offset) @ parameters[key]
+        elif name == "to_world":
+            parameters[key] = mi.Transform4f().scale(scale) @ parameters[key]
     parameters.update()
 
 

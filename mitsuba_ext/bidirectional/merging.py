@@ -49,7 +49,7 @@ HANDFUL = 8.0
 
 #: With fewer vertices of these paths, nothing is merged; and the largest radius of the first sample
 #: of a pixel, in footprints of pixels.
-FEW, WIDEST = 64, 6.0
+FEW, WIDEST = 64, 8.0
 
 #: The largest radius in units of the diagonal of the scene: pixels of very small films are wide.
 LARGEST = 0.04

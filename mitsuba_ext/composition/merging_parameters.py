@@ -69,9 +69,7 @@ class MergingParameters:
         radius, widest = self.radius, math.inf
         if radius == 0:
             widest = WIDEST * footprint
-            radius = suitable_radius(
-                scene, sensor, light_walk, footprint, pixels, only_caustic
-            )
+            radius = suitable_radius(scene, sensor, light_walk, footprint, pixels, only_caustic)
         if radius is None and only_caustic:
             return None
         return MergingRadius(
