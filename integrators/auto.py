@@ -71,7 +71,8 @@ class Auto(LightPathIntegrator):
     each camera path; with and without connections to their vertices, and merging); numbers of rays
     tell its time. The best choice is made, if it is better than guided directions, with which light
     paths are not combined. This stage takes at most one of 32 samples: in renders of fewer samples,
-    there is none.
+    there is none. Where light paths have less than 0.4 of the variance, the samples before are left
+    out of the image.
 
     Light paths are not tried in spectral variants, with moving shapes, participating media, or
     where the lens is learned, in films of more than two million pixels, and where a light cannot

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mitsuba as mi
 
 from ..learning.directions.guide_learner import GuideLearner
@@ -27,6 +29,11 @@ def place_of_trial(pilots: int) -> int:
     """After so many of the other pilots comes the trial: all of ``pilots``, but the first two are
     enough to tell what else is worth its time."""
     return min(2, pilots)
+
+
+#: Pilots without light paths are left out of the image if these have less than this part of their
+#: variance: at equal weights, a quarter of all samples then adds more noise than it removes.
+_FAR_LESS = 0.4
 
 
 class LightPathSchedule:
@@ -82,4 +89,5 @@ class LightPathSchedule:
             return self._inner.stage_again() if stage.learned else stage
         self._inner.leave_out(_OF_CAMERA_PATHS)
         self._inner.decisions["light_paths"] = choice
-        return self._inner.stage_again()
+        stage = self._inner.stage_again()
+        return replace(stage, forgets=self._trial.chosen_variance < _FAR_LESS)

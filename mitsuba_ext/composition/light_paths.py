@@ -132,6 +132,11 @@ class LightPathTrial(Learner):
         self.candidates: list[Candidate] = []
         self.variances, self.costs = np.zeros(0), np.zeros(0)
 
+    @property
+    def chosen_variance(self) -> float:
+        """The variance of what was chosen, relative to ``path``."""
+        return float(self.variances[self._best])
+
     @staticmethod
     def samples(pixel_count: int) -> int:
         """Samples per pixel that are enough: at least two, to estimate their variance, but for

@@ -180,6 +180,8 @@ class Job:
         self.block, self.splats = self.film.create_block(), None
         # One kernel for all passes: coalescing is decided once
         self.block.set_coalesce(self.block.coalesce() and self.plan.longest_pass >= 4)
+        # Samples per pixel that are not part of the image
+        self.forgotten = 0
 
     def _lanes(self, spp: int, pixels: range | np.ndarray | None = None) -> int:
         return (self.plan.pixel_count if pixels is None else len(pixels)) * spp
@@ -227,12 +229,18 @@ class Job:
         """Runs the passes of a stage: all of them, or as many as the timeout allows."""
         before = self.statistics.spp
         budget = self.budget.stage(samples, before, is_last)
+        forgets = stage.forgets
         length, done = self.plan.pass_length(samples, stage.most_lanes), 0
         while done < (wanted := self.plan.whole(before, budget.samples, samples)):
             if self._stopped(interrupt):
                 return
             spp = length if self.plan.structured else min(length, budget.longest, wanted - done)
             begin = time.perf_counter()
+            if forgets:
+                # Not before there are others
+                forgets, self.forgotten = False, before
+                self.block.clear()
+                self.splats = None
             compiled = self._run_pass(stage, spp)
             done += spp
             if not compiled:
@@ -393,7 +401,7 @@ class Job:
         self.film.put_block(self.block)
         if self.splats is not None and self.statistics.spp > 0:
             tensor, offset = self.splats.tensor(), self.splats.offset()
-            put_splats(self.film, tensor, offset, self.statistics.spp)
+            put_splats(self.film, tensor, offset, self.statistics.spp - self.forgotten)
 
     def finish(self) -> None:
         statistics = self.statistics

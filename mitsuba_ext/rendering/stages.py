@@ -24,6 +24,8 @@ class Stage:
         most_lanes: Largest number of samples of a pass, since observers record each sample in
             memory; 0 for no limit. A pass still has at least one sample of each pixel. Passes of
             structured samplers ignore it.
+        forgets: Are the samples of earlier stages left out of the image? For stages whose samples
+            have far less variance.
         observer: Is told when a pass begins. The estimator reports all other events to it.
     """
 
@@ -33,6 +35,7 @@ class Stage:
     camera: CameraSamples = field(default_factory=CameraSamples)
     weight: float = 1.0
     most_lanes: int = 0
+    forgets: bool = False
     observer: Observer | None = None
 
 
