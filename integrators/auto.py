@@ -70,7 +70,7 @@ class Auto(LightPathIntegrator):
     tell the variance of each choice of techniques (no light paths; 1/16, 1/4, 1 or 4 of them for
     each camera path; with and without connections to their vertices, and merging); numbers of rays
     tell its time. The best choice is made, if it is better than guided directions, with which light
-    paths are not combined. This stage takes at most one of 32 samples: in renders of fewer samples,
+    paths are not combined. This stage takes at most one of 16 samples: in renders of fewer samples,
     there is none. Where light paths have less than 0.4 of the variance, the samples before are left
     out of the image.
 

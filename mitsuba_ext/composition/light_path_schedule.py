@@ -16,7 +16,7 @@ from .schedule import Schedule
 _OF_CAMERA_PATHS = ("directions", "roulette")
 
 #: The trial takes this share of all samples, at most: a sample takes about 3.5 times as long.
-_MOST = 1 / 32
+_MOST = 1 / 16
 
 
 def samples_of_trial(pixel_count: int, spp: int) -> int:
