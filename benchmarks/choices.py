@@ -2,9 +2,10 @@
 
     python benchmarks/choices.py scenes/window.xml scenes/open.xml --seconds 5 --seeds 3
 
-Error: the variance of a pixel between the seeds / (mean² + 0.01 · (mean of the image)²), without
-the largest 0.1 % of the pixels. Time: the median over the seeds but the first, which compiles;
-learning and what other seeds compile included.
+All integrators take the same number of samples. Error: the variance of a pixel between the seeds /
+(mean² + 0.01 · (mean of the image)²), without the largest 0.1 % of the pixels (and, in brackets,
+with them). Time: the median over the seeds but the first, which compiles; learning and what other
+seeds compile included.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mi
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
 
+#: The first one is that to which the others are compared.
 INTEGRATORS = ("path", "neepp", "pss_guided", "auto_path")
 
 
@@ -34,6 +36,7 @@ def _kept(learned: str) -> str:
     words = {"guide:": "guide", "light map:": "light map"}
     kept = [word for text in learned.split("; ") for start, word in words.items()
             if text.startswith(start)]  # fmt: skip
+    kept += [text for text in learned.split("; ") if text.startswith("light paths pay")]
     return " and ".join(kept) or "nothing"
 
 
@@ -42,7 +45,14 @@ def _kept(learned: str) -> str:
 @click.option("--seconds", default=5.0, show_default=True, help="Of a render with path.")
 @click.option("--seeds", default=4, show_default=True)
 @click.option("--size", default=(320, 180), type=(int, int), show_default=True)
-def main(files: tuple[Path, ...], seconds: float, seeds: int, size: tuple[int, int]) -> None:
+@click.option("--integrator", "names", multiple=True, default=INTEGRATORS, help="The first: path.")
+def main(
+    files: tuple[Path, ...],
+    seconds: float,
+    seeds: int,
+    size: tuple[int, int],
+    names: tuple[str, ...],
+) -> None:
     """Compares on the scenes FILES."""
     mi.set_variant("llvm_ad_rgb")
     for file in files:
@@ -50,7 +60,7 @@ def main(files: tuple[Path, ...], seconds: float, seeds: int, size: tuple[int, i
         sensor = mi.traverse(scene.sensors()[0])
         sensor["film.size"] = sensor["film.crop_size"] = list(size)
         sensor.update()
-        made = {name: mi.load_dict({"type": name, "max_depth": 6}) for name in INTEGRATORS}
+        made = {name: mi.load_dict({"type": name, "max_depth": 6}) for name in names}
         for _ in range(2):
             speed = 16 / _render(scene, made["path"], 16, 1)[1]
         spp = max(8, round(seconds * speed))
@@ -68,11 +78,13 @@ def main(files: tuple[Path, ...], seconds: float, seeds: int, size: tuple[int, i
         cost = {}
         for name in made:
             error = np.sort((np.var(images[name], axis=0, ddof=1) / scale).mean(axis=2), axis=None)
-            error = error[: int(0.999 * len(error))].mean()
-            cost[name] = error * statistics.median(times[name][1:])
-        ratios = ", ".join(f"{name} {cost['path'] / cost[name]:.2f}" for name in made)
+            trimmed = error[: int(0.999 * len(error))].mean()
+            taken = statistics.median(times[name][1:])
+            cost[name] = trimmed * taken, error.mean() * taken
+        gains = {name: np.divide(cost["path"], cost[name]) for name in made}
+        ratios = ", ".join(f"{name} {few:.2f} ({all_:.2f})" for name, (few, all_) in gains.items())
         print(f"{file.parent.name}/{file.stem}, {spp} spp: {ratios}", flush=True)
-        for name in INTEGRATORS[1:]:
+        for name in names[1:]:
             print(f"    {name} kept, by seed: {' | '.join(outcomes[name])}", flush=True)
 
 

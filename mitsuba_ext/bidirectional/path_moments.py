@@ -113,7 +113,8 @@ class PathMoments(TechniqueObserver):
         if not self.candidates:
             self.candidates = candidates(available)
             self.unreachable = np.zeros(len(self.candidates), int)
-            self._others = np.zeros((len(self.candidates) - 1, self._pixels, 2))
+            others = len(self.candidates) - 1, self._pixels, 2
+            self._others = np.zeros(others, np.float32)
             if available.radius is not None:
                 self._shared = {
                     c.light_paths: available.radius.samples_per_vertex(c.light_paths, self._spp)

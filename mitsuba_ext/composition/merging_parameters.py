@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..bidirectional.light_walk import LightWalk
-from ..bidirectional.medium_photons import suitable_ball
+from ..bidirectional.medium_photons import WIDEST_BALL, suitable_ball
 from ..bidirectional.merging import WIDEST, median_footprint, suitable_radius
 from ..bidirectional.merging_radius import MergingRadius
 from ..decisions.camera.shared_numbers import TIME_STEP, WAVELENGTH_STEP, SharedNumbers
@@ -84,7 +84,7 @@ class MergingParameters:
         footprint = median_footprint(scene, sensor)
         width, height = film_extent(sensor.film())
         radius = given or suitable_ball(scene, sensor, light_walk, footprint, width * height)
-        radius = radius or WIDEST * footprint
+        radius = radius or WIDEST_BALL * footprint
         return MergingRadius(
             radius, self.decay, width * height, footprint, before, dimensions=3
         )
