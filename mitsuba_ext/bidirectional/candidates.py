@@ -42,12 +42,21 @@ class Available:
         connects: Are they connected to camera paths?
         radius: Within what radius they are merged; ``None`` if they are not.
         are_shared: Can a camera path be connected to any light path? If not, there is one for each.
+        most_lanes: The most camera paths in a pass, with one light path for each; 0 for any number.
     """
 
     has_image: bool
     connects: bool
     radius: MergingRadius | None
     are_shared: bool
+    most_lanes: int = 0
+
+    def samples_per_vertex(self, light_paths: float, spp: int, pixels: int) -> float:
+        """:meth:`MergingRadius.samples_per_vertex` in a render of ``spp`` samples per pixel."""
+        if self.most_lanes > 0:
+            in_pass = int(self.most_lanes / max(1.0, light_paths)) // pixels
+            spp = min(spp, max(1, in_pass))
+        return self.radius.samples_per_vertex(light_paths, spp) if self.radius else 1.0
 
 
 def candidates(available: Available) -> list[Candidate]:

@@ -81,7 +81,7 @@ class PathMoments(TechniqueObserver):
     Parameters:
         film: Film of the sensor.
         width, height: Its sampled pixels.
-        spp: Samples per pixel of a pass of the render.
+        spp: Samples per pixel of the render.
 
     Attributes:
         candidates: See :func:`candidates`. The samples are those of the second one.
@@ -115,11 +115,12 @@ class PathMoments(TechniqueObserver):
             self.unreachable = np.zeros(len(self.candidates), int)
             others = len(self.candidates) - 1, self._pixels, 2
             self._others = np.zeros(others, np.float32)
-            if available.radius is not None:
-                self._shared = {
-                    c.light_paths: available.radius.samples_per_vertex(c.light_paths, self._spp)
-                    for c in self.candidates[1:] if c.merges
-                }  # fmt: skip
+            self._shared = {
+                c.light_paths: available.samples_per_vertex(
+                    c.light_paths, self._spp, self._pixels
+                )
+                for c in self.candidates[1:] if c.merges
+            }  # fmt: skip
         self._pixel, self._importance = rays.pixel, rays.importance
         lanes = dr.width(rays.pixel)
         self._lane = dr.arange(mi.UInt32, lanes)

@@ -94,7 +94,8 @@ class BidirectionalPathTracer:
         observer, splits = self.observer, False
         if observer is not None:
             observer.start(rays, Available(
-                self.sensor is not None, self.connections > 0, self.radius, not own_lane
+                self.sensor is not None, self.connections > 0, self.radius, not own_lane,
+                self.most_lanes,
             ))  # fmt: skip
             walk = replace(walk, observer=Observers([walk.observer, observer]))
             splits = observer.compares

@@ -36,6 +36,9 @@ def place_of_trial(pilots: int) -> int:
 _FAR_LESS = 0.4
 
 
+#: The least gain for which light paths are worth the time to compile their kernels.
+_MARGIN = 1.1
+
 #: The efficiency of guides that are learned from all pilots, relative to that which short ones
 #: predict (door_ajar: 1.8 and 1.4).
 _GROWS = 1.25
@@ -86,8 +89,9 @@ class LightPathSchedule:
     def _stage_after_trial(self) -> Stage:
         stage, self._next = self._next, None
         guide = self._inner.learners.get("directions")
+        self._trial.rival = _MARGIN
         if isinstance(guide, GuideLearner) and guide.guide and guide.guidance:
-            self._trial.rival = guide.guidance.efficiency * _GROWS
+            self._trial.rival *= guide.guidance.efficiency * _GROWS
         choice = self._trial.learn(self._scene, is_last=True)
         if choice is None or choice.techniques.light_paths == 0:
             # Only the summary may be new
