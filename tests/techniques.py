@@ -120,8 +120,8 @@ TECHNIQUES: dict[str, Technique] = {
         thorough=Checks(["door_ajar", "window"], ["llvm_ad_spectral"], cases=_LEARNERS),
     ),
     "auto": Technique(
-        "auto", is_plugin=True, makes_splats=True,
-        checks=Checks(cases=("no_light", "film_of_one_pixel", "three_samples")),
+        "auto", is_plugin=True,
+        checks=Checks(cases=("no_light", "three_samples")),
         thorough=Checks(["rooms"], ["llvm_ad_spectral"], FURNACES[2:3], [-1], _LEARNERS),
     ),
     "guided_as_it_pays": Technique(

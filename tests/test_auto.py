@@ -72,7 +72,7 @@ def test_in_short_renders_it_is_auto_path() -> None:
     assert_same_image(*images)
 
 
-@pytest.mark.parametrize("why", ["fog", "spectral"])
+@pytest.mark.parametrize("why", ["fog", pytest.param("spectral", marks=pytest.mark.slow)])
 def test_where_light_paths_cannot_be_tried_it_is_auto_path(why: str) -> None:
     if why == "spectral":
         mi.set_variant("llvm_ad_spectral")
@@ -95,6 +95,7 @@ def test_a_restored_choice_needs_no_pilot(tmp_path) -> None:
     assert again.endswith(f"light paths{choice}")
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_images() -> None:
     scene = load("caustic", width=96, height=54)
     images = [np.array(auto().render(scene, spp=64, seed=4)) for _ in range(2)]

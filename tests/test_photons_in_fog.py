@@ -57,7 +57,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", some("sky", "chromatic", "grid", of=SCENES))
+@pytest.mark.parametrize("name", some("chromatic", of=SCENES))
 def test_fog_has_the_mean_of_volpath(name: str) -> None:
     scene = mi.load_dict(SCENES[name](), optimize=False)
     found = batches(scene, make(**_RADII), 1024, range(1, 7))
@@ -102,6 +102,7 @@ def _lamp_in_fog(size: float) -> mi.Scene:
     }, optimize=False)  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-3, 1e4])
 def test_the_size_of_the_scene_does_not_matter(size: float) -> None:
     images = [batches(_lamp_in_fog(s), make(max_depth=5), 16, range(1, 5)) for s in (1.0, size)]

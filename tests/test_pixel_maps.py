@@ -130,6 +130,7 @@ def test_what_is_not_used_is_missing_and_pixels_are_checked() -> None:
         pixel_maps(others, _sensor(), 20, 0)
 
 
+@pytest.mark.slow
 def test_a_pixel_knows_when_a_ball_crosses_it() -> None:
     scene = load("six_balls", width=96, height=54)
     integrator = mi.load_dict({"type": "swarm_path", "max_depth": 2})

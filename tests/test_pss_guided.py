@@ -215,7 +215,9 @@ def test_nothing_is_guided_where_nothing_is_gained(
 # ---- State ----
 
 
-@pytest.mark.parametrize("parameters", [{}, TILES], ids=["surfaces", "tiles"])
+@pytest.mark.parametrize(
+    "parameters", [{}, pytest.param(TILES, marks=pytest.mark.slow)], ids=["surfaces", "tiles"]
+)
 def test_renders_between_change_nothing(parameters: dict[str, Any]) -> None:
     """Another scene, another film, another number of samples, another seed."""
     scene, integrator = hidden_lamp(), insisting(**parameters)

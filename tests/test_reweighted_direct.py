@@ -44,6 +44,7 @@ def test_mean_is_that_of_path(reference, pattern, weights, count):
     assert_same_pixels_on_average(two_halves(_box(), integrator, 512, SEEDS), reference, 0.01)
 
 
+@pytest.mark.slow
 def test_glossy_things_and_mirrors_reflect_lights_once() -> None:
     """MIS weights of the BSDF sample and of the many light samples add up to one."""
     scene = load("mirrors_and_glass", width=32, height=18, rfilter="box")

@@ -193,6 +193,7 @@ def _lamp_to_the_ceiling() -> mi.Scene:
     return _room(lamp=rectangle(place, bsdf=diffuse(0.0), emitter=area(10.0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_depth", some(8, of=[8, -1]))
 @pytest.mark.parametrize(
     "make", some(_lamp_to_the_ceiling, of=[_lamp_in_glass, _lamp_to_the_ceiling])

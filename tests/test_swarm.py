@@ -48,6 +48,7 @@ def _furnace() -> mi.Scene:
     return mi.load_dict({"type": "scene", "sensor": camera, **walls, "thing": moving})
 
 
+@pytest.mark.slow
 def test_furnace_has_the_exact_radiance() -> None:
     integrator = swarm(always_use=True, max_depth=-1)
     assert_exact(batches(_furnace(), integrator, 128, [1, 2]), 1.0, precision=0.006)
@@ -81,6 +82,7 @@ def test_mean_is_that_of_uniform_numbers(variant: str) -> None:
     assert_same_pixels_on_average(images, expected, 0.03, tolerance=tolerance)
 
 
+@pytest.mark.slow
 def test_maps_lower_the_noise_where_they_promise_to() -> None:
     scene = load("six_balls", width=96, height=54)
     plain = mi.load_dict({"type": "composed_path", "max_depth": 2})

@@ -16,6 +16,7 @@ AIR, GLASS, WATER = range(3)
 SIDES = {"tumbler": (AIR, GLASS), "tumbler_wet": (WATER, GLASS), "tumbler_water": (AIR, WATER)}
 
 
+@pytest.mark.slow
 def test_a_straight_ray_leaves_what_it_has_entered(scenes) -> None:
     shapes = {
         name: {"type": "ply", "filename": str(scenes / f"assets/{name}.ply")} for name in SIDES
