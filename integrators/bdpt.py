@@ -35,8 +35,8 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
      * - light_paths
        - |float| or |string|
        - Number of light paths for each camera path, from 0 (camera paths alone) to 64; or
-         :monosp:`always`, which is 1; or :monosp:`auto`: pilot samples measure how many are worth
-         their time. Where few are, all other samples take that many. (Default: always)
+         :monosp:`always`, which is 1; or :monosp:`auto`: pilot samples measure whether 0, 1/16, 1/4, 1
+         or 4 are most efficient, with connections to their vertices or without. (Default: always)
      * - sample_direct
        - |bool|
        - Connect camera paths to points that are sampled on lights (s = 1)? False shows what the
@@ -77,8 +77,9 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
 
     In a pass, the vertices of all light paths are shared by all camera paths. In spectral variants
     and with moving shapes, a camera path shares wavelengths and time with one light path, and is
-    connected to that one only. With the sampler :monosp:`ldsampler`, whose numbers depend on each
-    other, light paths draw independent random numbers instead.
+    connected to that one only: there, ``light_paths`` is 0 or 1. With another number of light paths
+    than one, and with the sampler :monosp:`ldsampler`, whose numbers depend on each other, light
+    paths draw independent random numbers.
 
     **Learned selection.** Surfaces are divided into regions, which are smaller where there are more
     vertices. Pilot samples (:monosp:`pilot_spp`, 16 by default, at most a quarter of all samples;

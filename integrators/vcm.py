@@ -50,6 +50,9 @@ class VertexConnectionAndMerging(BidirectionalIntegrator):
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
          checkpoint.
 
+    With :monosp:`light_paths=auto`, the pilot of :class:`bdpt` also decides whether vertices are
+    merged.
+
     **Use it when** caustics are seen through water or glass, or in mirrors: no connection finds
     these. **Not when** :class:`bdpt` or :monosp:`path` finds all light: merging takes time, and
     adds a little bias.
