@@ -35,8 +35,9 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
      * - light_paths
        - |float| or |string|
        - Number of light paths for each camera path, from 0 (camera paths alone) to 64; or
-         :monosp:`always`, which is 1; or :monosp:`auto`: pilot samples measure whether 0, 1/16, 1/4,
-         1 or 4 are most efficient, with connections to their vertices or without. (Default: always)
+         :monosp:`always`, which is 1; or :monosp:`auto`: pilot samples measure whether 0, 1/16,
+         1/4, 1 or 4 are most efficient, with connections to their vertices or without. (Default:
+         always)
      * - sample_direct
        - |bool|
        - Connect camera paths to points that are sampled on lights (s = 1)? False shows what the
