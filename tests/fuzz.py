@@ -51,10 +51,11 @@ _SUSPICIOUS, _COMPARISONS = 3.5, 100
 PRECISION = 0.05
 
 #: Techniques that are tested: all but those with the most variance, whose means stay too uncertain,
-#: and one that cannot see mirrors and glass.
+#: one that cannot see mirrors and glass, and those that are biased.
 TRIED = [
     name for name in TECHNIQUES
-    if "paper" not in name and "floor" not in name and name != "light_tracer"
+    if "paper" not in name and "floor" not in name
+    and name not in ("light_tracer", "photon_map", "vcm", "sppm")
 ]  # fmt: skip
 
 #: Results of a comparison: right; ``path`` cannot be the reference, or the technique refuses what
