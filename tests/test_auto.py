@@ -20,7 +20,7 @@ from statistical import (
 )
 from test_light_tracer import EMITTERS, below_the_lamp
 
-from mitsuba_ext.composition import light_paths
+from mitsuba_ext.composition import light_path_schedule, light_paths
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -105,3 +105,16 @@ def test_equal_seeds_give_equal_images() -> None:
 def test_integrators_that_distribute_samples_refuse_it() -> None:
     with pytest.raises(RuntimeError, match='use "auto_path"'):
         mi.load_dict({"type": "adaptive", "nested": {"type": "auto"}})
+
+
+def test_samples_before_light_paths_are_left_out_where_these_have_far_less_variance(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = load("caustic", width=96, height=54)
+    weights, images = [], []
+    for least in (0.4, 0.0):
+        monkeypatch.setattr(light_path_schedule, "_FAR_LESS", least)
+        images.append(np.array(auto().render(scene, spp=64, seed=4)))
+        weights.append(np.array(scene.sensors()[0].film().develop(raw=True))[..., -1].mean())
+    assert weights[0] < 0.95 * weights[1]
+    assert images[0].mean() == pytest.approx(images[1].mean(), rel=0.05)
