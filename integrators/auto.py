@@ -7,8 +7,7 @@ import mitsuba as mi
 from mitsuba_ext.bidirectional.candidates import Candidate
 from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.composition.bidirectional_integrator import LightPathIntegrator
-from mitsuba_ext.composition.decision_parameters import ParameterReader
-from mitsuba_ext.composition.directions import Guided
+from mitsuba_ext.composition.learned_slots import learned_slots
 from mitsuba_ext.composition.light_path_schedule import (
     LightPathSchedule,
     place_of_trial,
@@ -16,17 +15,12 @@ from mitsuba_ext.composition.light_path_schedule import (
 )
 from mitsuba_ext.composition.light_paths import LightPathsWhereTheyPay, LightPathTrial
 from mitsuba_ext.composition.merging_parameters import MergingParameters
-from mitsuba_ext.composition.next_event import LearnedLights
-from mitsuba_ext.composition.roulette import GuidedRoulette
 from mitsuba_ext.composition.staged_integrator import NO_LIMIT
-from mitsuba_ext.composition.swarm import MAPS, Swarm
+from mitsuba_ext.composition.swarm import Swarm
 from mitsuba_ext.rendering.stages import Schedule
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
-
-#: The random numbers of a camera ray that can have learned maps.
-_CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
 
 #: Light paths are not tried in films of more pixels, since a pass stores some kilobytes for each.
 _MOST_PIXELS = 1 << 21
@@ -106,15 +100,7 @@ class Auto(LightPathIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.merging = MergingParameters(0.0, 0.75)
-        read = ParameterReader.of_defaults(self.name)
-        self.fill(
-            props,
-            directions=Guided(read),
-            next_event=LearnedLights(read),
-            roulette=GuidedRoulette(),
-            # Maps alone would ask for more pilot samples than guided directions
-            **{slot: MAPS[slot](read, pilot_spp=Guided.pilot_spp) for slot in _CAMERA_NUMBERS},
-        )
+        self.fill(props, **learned_slots(self.name))
         self._trial_spp = 0
         self._has_light_paths = False
 

@@ -4,16 +4,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from mitsuba_ext.composition.decision_parameters import ParameterReader
-from mitsuba_ext.composition.directions import Guided
-from mitsuba_ext.composition.next_event import LearnedLights
-from mitsuba_ext.composition.roulette import GuidedRoulette
-from mitsuba_ext.composition.swarm import MAPS
+from mitsuba_ext.composition.learned_slots import learned_slots
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.startup import registry
-
-#: The random numbers of a camera ray that can have learned maps.
-_CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
 
 
 @registry.plugin
@@ -83,12 +76,4 @@ class AutoPath(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        read = ParameterReader.of_defaults(self.name)
-        self.fill(
-            props,
-            directions=Guided(read),
-            next_event=LearnedLights(read),
-            roulette=GuidedRoulette(),
-            # Maps alone would ask for more pilot samples than guided directions
-            **{slot: MAPS[slot](read, pilot_spp=Guided.pilot_spp) for slot in _CAMERA_NUMBERS},
-        )
+        self.fill(props, **learned_slots(self.name))

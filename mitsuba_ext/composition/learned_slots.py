@@ -1,0 +1,24 @@
+"""What ``auto_path`` and ``auto`` learn for camera paths."""
+
+from __future__ import annotations
+
+from .decision_parameters import DecisionParameters, ParameterReader
+from .directions import Guided
+from .next_event import LearnedLights
+from .roulette import GuidedRoulette
+from .swarm import MAPS
+
+#: The random numbers of a camera ray that can have learned maps.
+_CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
+
+
+def learned_slots(plugin: str) -> dict[str, DecisionParameters]:
+    """All that is tried, by slot, with its defaults."""
+    read = ParameterReader.of_defaults(plugin)
+    return {
+        "directions": Guided(read),
+        "next_event": LearnedLights(read),
+        "roulette": GuidedRoulette(),
+        # Maps alone would ask for more pilot samples than guided directions
+        **{slot: MAPS[slot](read, pilot_spp=Guided.pilot_spp) for slot in _CAMERA_NUMBERS},
+    }
