@@ -124,7 +124,10 @@ SPHERE = """<shape type="sphere">
     <bsdf type="diffuse"/>
   </shape>"""
 
-PATH = '<integrator type="path"><integer name="max_depth" value="3"/></integrator>'
+PLAIN_PATH = '<integrator type="path"><integer name="max_depth" value="3"/></integrator>'
+
+#: With a parameter of its own, it is not replaced by ``auto`` in ``mitsuba-ext render``.
+PATH = PLAIN_PATH.replace("</", '<float name="timeout" value="-1"/></', 1)
 
 
 @pytest.fixture

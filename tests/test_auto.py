@@ -42,8 +42,15 @@ def learned(scene: mi.Scene | dict, spp: int, integrator: mi.Integrator | None =
 
 
 def test_light_paths_take_the_place_of_guides_where_they_pay() -> None:
-    text = learned(load("caustic", width=96, height=54), 64)
+    integrator = auto()
+    text = learned(load("caustic", width=96, height=54), 64, integrator)
     assert "light paths pay: " in text and "guide: " not in text
+    effects = integrator.statistics.effects
+    assert "directions" not in effects and "next_event" not in effects
+    light_paths = effects["light_paths"]
+    assert light_paths["is_kept"] and light_paths["light_paths"] > 0
+    assert f"({light_paths['variance']:.2f} of the variance" in text
+    assert f"{light_paths['time']:.1f} x the time" in text
 
 
 def test_light_paths_are_left_out_under_an_open_sky() -> None:

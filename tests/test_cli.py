@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 import pytest
-from conftest import PATH, in_subprocess
+from conftest import in_subprocess
 
 from mitsuba_ext.compare import read_exr
 from mitsuba_ext.inputs import pages
@@ -106,7 +106,6 @@ def test_bad_input_is_one_line_and_exit_code_2(run, make_scene, tmp_path, argume
         ('<float name="fov"', '<float name="fovv"', "unreferenced"),
         ('<rfilter type="box"/>', '<string name="filtre" value="box"/>', "unreferenced"),
         ('name="width" value="8"', 'name="width" value="$none"', "$none"),
-        (PATH, "", "no integrator"),
     ],
 )
 def test_broken_scene_is_one_line_that_names_the_file(

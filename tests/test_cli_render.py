@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import PATH
+from conftest import PATH, PLAIN_PATH
 
 from mitsuba_ext.cli import image_render
 from mitsuba_ext.cli.stopping import Stop, stopping
@@ -39,6 +39,45 @@ def test_render_writes_an_exr_with_metadata(run, make_scene, tmp_path):
     assert (metadata["seed"], metadata["spp"], metadata["scene"]) == (5, 9, str(scene))
     assert metadata["seconds"] > 0
     assert json.loads(metadata["versions"])["mitsuba"].startswith("3.")
+
+
+NOTE = '"auto" renders this scene'
+
+
+@pytest.mark.parametrize(
+    "integrator, options, rendered, note",
+    [
+        (PLAIN_PATH, [], "auto", f'{NOTE}, in place of its "path" (which --integrator scene'),
+        (PLAIN_PATH, ["--preview", "{tmp}/b.png"], "auto", f"{NOTE}, in place of"),
+        ("", [], "auto", f"{NOTE}, which names no integrator"),
+        (PLAIN_PATH, ["--integrator", "scene"], "path", ""),
+        (PLAIN_PATH, ["--integrator", "path"], "path", ""),
+        (PLAIN_PATH, ["--variant", "scalar_rgb"], "path", ""),
+        (PATH, [], "path", ""),
+        (PLAIN_PATH.replace("path", "volpath"), [], "volpath", ""),
+        (PLAIN_PATH.replace("path", "auto"), [], "auto", ""),
+        (f'<integrator type="moment">{PLAIN_PATH}</integrator>', [], "path", ""),
+    ],
+)
+def test_auto_renders_scenes_that_ask_for_path_or_nothing(
+    run, make_scene, tmp_path, integrator, options, rendered, note
+):
+    output = tmp_path / "image.exr"
+    options = [option.format(tmp=tmp_path) for option in options]
+    code, _, err = run("render", make_scene(integrator=integrator), "-o", output, *options)
+    assert code == 0 and err.startswith(note) and err.count("\n") == bool(note)
+    metadata = read_exr(output)[1]
+    assert metadata["integrator"] == rendered
+    if integrator:
+        assert json.loads(metadata["parameters"])["max_depth"] == 3
+
+
+def test_a_scene_without_integrator_needs_one_where_auto_is_not_supported(
+    run, make_scene, tmp_path
+):
+    scene = make_scene(integrator="")
+    code, _, err = run("render", scene, "-o", tmp_path / "a.exr", "--variant", "scalar_rgb")
+    assert code == 2 and "no integrator: name one" in err and str(scene) in err
 
 
 @pytest.mark.parametrize("extension", ["png", "jpg", "hdr", "pfm"])

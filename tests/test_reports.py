@@ -100,10 +100,13 @@ def test_the_end_says_what_the_render_cost(run, make_scene, tmp_path, integrator
 
 
 def test_costs_add_up():
-    one = RenderTotals({"camera": 2}, 3, 1.0, 0.5, 0.25, 7, "a")
-    two = RenderTotals({"camera": 1, "shadow": 4}, 1, 1.0, 0.0, 0.0, 5, "")
+    one = RenderTotals({"camera": 2}, 3, 1.0, 0.5, 0.25, 7, "a", {"directions": {"is_kept": True}})
+    # A batch that uses what the first one learned knows no figures
+    two = RenderTotals(
+        {"camera": 1, "shadow": 4}, 1, 1.0, 0.0, 0.0, 5, "", {"directions": {}})  # fmt: skip
     both = one.plus(two)
-    assert both == RenderTotals({"camera": 3, "shadow": 4}, 4, 2.0, 0.5, 0.25, 7, "a")
+    assert both == RenderTotals(
+        {"camera": 3, "shadow": 4}, 4, 2.0, 0.5, 0.25, 7, "a", one.effects)  # fmt: skip
     assert RenderTotals(**json.loads(json.dumps(both.known()))) == both
     assert RenderTotals().known() == {}
     many = statistics.lines(RenderTotals(), "path", range(9), {

@@ -148,7 +148,9 @@ def render_image(
             is_new = kernels_compiled() > compiled
             for file in filter(None, (output, order.preview)):
                 image_files.check_film(file, job.film, job.integrator.aov_names())
-            for remark in job.remarks(is_sensor_chosen=sensor_index is not None):
+            if job.chosen.note:
+                report.note(job.chosen.note)
+            for remark in job.chosen.remarks(is_sensor_chosen=sensor_index is not None):
                 report.warn(remark)
             if order.denoise and (remark := denoising.remark(job.film)):
                 report.warn(remark)

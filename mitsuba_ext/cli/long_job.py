@@ -55,6 +55,7 @@ class LongJob:
     """A render in batches, and its progress.
 
     Attributes:
+        chosen: What is rendered.
         integrator, name, parameters: The integrator, its name and its parameters.
         scene, sensor: What it renders.
         film: The film that holds the image.
@@ -79,19 +80,16 @@ class LongJob:
         threads = threads_of_each(options.workers) if options.workers else 0
         self._request = replace(request, threads=request.threads or threads)
         self._renderer = BatchRenderer(self._request, scenes=scenes)
-        named = self._renderer.chosen.named
+        self.chosen = self._renderer.chosen
+        named = self.chosen.named
         self.integrator, self.name, self.parameters = (
             named.integrator, named.name, named.parameters
         )  # fmt: skip
-        self.scene, self.sensor = self._renderer.chosen.scene, self._renderer.sensor
+        self.scene, self.sensor = self.chosen.scene, self._renderer.sensor
         self.film = self.sensor.film()
         self.is_interrupted, self.seconds = False, 0.0
         self.failure: InputError | None = None
         self._state, self._render = RenderState(), None
-
-    def remarks(self, is_sensor_chosen: bool) -> list[str]:
-        """Warnings about parts of the scene that the image will not show."""
-        return self._renderer.chosen.remarks(is_sensor_chosen)
 
     def run(
         self, spp: int | None, seconds: float | None, write: Callable[[bool], None], report: Report

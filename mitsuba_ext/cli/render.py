@@ -35,7 +35,8 @@ from .frames import FrameRange, Sensors, pictures
 @click.option(
     "--integrator", "specification", metavar="INTEGRATOR", shell_complete=candidates.integrators,
     help="Integrator to use instead of the scene's: NAME[:key=value,…], or an XML or JSON file. It "
-    "inherits max_depth and rr_depth of the scene's integrator unless it sets them.",
+    "inherits max_depth and rr_depth of the scene's integrator unless it sets them. 'scene' is the "
+    "scene's own.  [default: the scene's, but auto if that is path or if there is none]",
 )
 @click.option(
     "--spp", type=click.IntRange(1, MOST_SPP), metavar="N",

@@ -24,6 +24,7 @@ class RenderJob:
     """The render of a scene by an integrator, and its progress.
 
     Attributes:
+        chosen: What is rendered.
         integrator, name, parameters: The integrator, its name and its parameters.
         scene, sensor: What it renders.
         film: The film that holds the image.
@@ -39,14 +40,10 @@ class RenderJob:
         )  # fmt: skip
         self.scene, self.sensor, self.film = chosen.scene, chosen.sensor, chosen.sensor.film()
         self.is_interrupted, self.seconds, self.failure = False, 0.0, None
-        self._chosen, self._seed = chosen, seed
+        self.chosen, self._seed = chosen, seed
         self._wanted: int | None = None  # samples per pixel to render, if known
         self._is_measuring = False
         self._passes: SeedPasses | None = None
-
-    def remarks(self, is_sensor_chosen: bool) -> list[str]:
-        """Warnings about parts of the scene that the image will not show."""
-        return self._chosen.remarks(is_sensor_chosen)
 
     def run(
         self, spp: int | None, seconds: float | None, _write: Callable[[bool], None], report: Report
@@ -78,7 +75,7 @@ class RenderJob:
                     begin = time.perf_counter()
                 self._render(spp, seconds, bars, report)
         except (ValueError, TypeError, RuntimeError) as error:
-            message = f'{self._chosen.loaded.source}: "{self.name}": {one_line(error)}'
+            message = f'{self.chosen.loaded.source}: "{self.name}": {one_line(error)}'
             raise InputError(message) from error
         finally:
             self.seconds = time.perf_counter() - begin
@@ -87,7 +84,7 @@ class RenderJob:
         self._is_measuring = True
         bar = bars.add_task("measuring the speed", total=None, left="")
         spp = timing.samples_for(
-            seconds, self.integrator, self.scene, self._seed, self._chosen.sensor_index
+            seconds, self.integrator, self.scene, self._seed, self.chosen.sensor_index
         )
         bars.remove_task(bar)
         self._is_measuring = False
@@ -124,7 +121,7 @@ class RenderJob:
         if hasattr(self.integrator, "progress"):
             self.integrator.progress = progress
         timing.timed_render(
-            self.integrator, self.scene, self._seed, spp or 0, self._chosen.sensor_index
+            self.integrator, self.scene, self._seed, spp or 0, self.chosen.sensor_index
         )
 
     def variance(self) -> dict[str, np.ndarray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, astuple, dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -15,6 +15,7 @@ from ..bidirectional.candidates import Candidate
 from ..bidirectional.path_moments import Counts, Estimate, PathMoments
 from ..bidirectional.technique_observer import TechniqueObserver
 from ..learning.benefit import expected_gain, gain_of, trimmed_batches
+from ..learning.effect import Effect
 from ..learning.learner import Learner
 from ..learning.pixel_estimates import relative_scale
 from ..rendering.camera import film_extent
@@ -190,15 +191,29 @@ class LightPathTrial(Learner):
         self._choice = LightPathChoice(Candidate(float(count), bool(connects), bool(merges)))
         return self._choice
 
+    @property
+    def effect(self) -> Effect:
+        techniques = self._choice.techniques
+        is_kept = techniques.light_paths > 0
+        if self.estimate is None:
+            return Effect(is_kept, about=asdict(techniques))
+        index = self._shown
+        about = {"rival": round(self.rival, 4), **asdict(self.candidates[index])}
+        return Effect(is_kept, float(self.variances[index]), float(self.costs[index]), about)
+
+    @property
+    def _shown(self) -> int:
+        """What was chosen; if that is ``path``, the best of the others."""
+        return self._best or self._best_with_light_paths
+
     def __str__(self) -> str:
         techniques = self._choice.techniques
         pays = techniques.light_paths > 0
         kept = f"light paths pay: {techniques}" if pays else "light paths do not pay"
         if self.estimate is None:
             return kept
-        # What was chosen in units of ``path``; if that is ``path``, the best of the others
-        index = self._best if pays else self._best_with_light_paths
-        variance, time = self.variances[index], self.costs[index]
+        # In units of ``path``
+        variance, time = self.variances[self._shown], self.costs[self._shown]
         return f"{kept} ({variance:.2f} of the variance, {time:.1f} x the time)"
 
 

@@ -202,7 +202,9 @@ class Schedule:
         learned = "; ".join(filter(None, map(str, self._everyone.values())))
         estimator = self.estimator(**self.decisions)
         most = getattr(estimator, "most_lanes", 0)
-        return Stage(estimator, learned, camera=self.camera, most_lanes=most)
+        effects = {slot: learner.effect for slot, learner in self._everyone.items()}
+        effects = {slot: effect.as_dict() for slot, effect in effects.items() if effect}
+        return Stage(estimator, learned, effects, camera=self.camera, most_lanes=most)
 
     def _scout_stage(self) -> Stage:
         depth = min(SCOUT_DEPTH, self._setting.max_depth)

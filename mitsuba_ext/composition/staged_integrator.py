@@ -200,8 +200,8 @@ class StagedIntegrator(mi.SamplingIntegrator):
         self.statistics = rendering.RenderStatistics(
             len(state.done), state.spp, time.perf_counter() - begin, totals.compile_seconds,
             totals.learning_seconds, dict(totals.rays), totals.connections,
-            self.statistics.zero_radiance, totals.learned, totals.memory_bytes,
-            is_interrupted or self.is_cancelled,
+            self.statistics.zero_radiance, totals.learned, dict(totals.effects),
+            totals.memory_bytes, is_interrupted or self.is_cancelled,
         )  # fmt: skip
         image = camera.develop(sensor.film(), develop, evaluate)
         if is_interrupted:

@@ -10,11 +10,16 @@ from pathlib import Path
 import mitsuba as mi
 
 from ..errors import InputError
+from ..startup.runtime import SUPPORTED_VARIANTS
 from .content_hash import hash_code
+from .names import OF_SCENE
 from .scene_remarks import scene_remarks
 from .scene_values import SceneValues
 from .scenes import LoadedScene, load_scene
 from .specifications import NamedIntegrator, make_named
+
+#: What renders a scene that asks for ``path``, or for no integrator, where none is named.
+DEFAULT = "auto"
 
 
 @dataclass
@@ -25,31 +30,40 @@ class Chosen:
         loaded: The scene.
         named: The integrator.
         sensor_index: The index of the sensor.
+        is_default: Is the integrator :data:`DEFAULT`, because none was named?
     """
 
     loaded: LoadedScene
     named: NamedIntegrator
     sensor_index: int
+    is_default: bool = False
 
     @classmethod
     def of(cls, loaded: LoadedScene, specification: str | None, sensor_index: int) -> Chosen:
         """
         Args:
             loaded: The scene, with its integrator if ``specification`` is ``None``.
-            specification: The integrator; ``None`` for the scene's.
+            specification: The integrator; :data:`OF_SCENE` for the scene's. ``None`` for the
+                scene's, but :data:`DEFAULT` in place of ``path`` or none, in variants that it
+                supports.
 
         Raises:
             InputError: The integrator or the sensor cannot be used.
         """
-        named = _of_scene(loaded) if specification is None else make_named(
-            specification, loaded.settings
-        )
+        is_default = specification is None and loaded.only_says_path
+        is_default &= mi.variant() in SUPPORTED_VARIANTS
+        if is_default:
+            specification = DEFAULT
+        if specification in (None, OF_SCENE):
+            named = _of_scene(loaded)
+        else:
+            named = make_named(specification, loaded.settings)
         count = len(loaded.scene.sensors())
         if sensor_index >= count:
             raise InputError(
                 f"{loaded.source}: there is no sensor {sensor_index}: the scene has {count}"
             )
-        return cls(loaded, named, sensor_index)
+        return cls(loaded, named, sensor_index, is_default)
 
     @property
     def scene(self) -> mi.Scene:
@@ -58,6 +72,18 @@ class Chosen:
     @property
     def sensor(self) -> mi.Sensor:
         return self.scene.sensors()[self.sensor_index]
+
+    @property
+    def note(self) -> str:
+        """A sentence about the integrator, if it was neither named nor the scene's."""
+        if not self.is_default:
+            return ""
+        if not self.loaded.integrator_name:
+            return f'"{DEFAULT}" renders this scene, which names no integrator'
+        return (
+            f'"{DEFAULT}" renders this scene, in place of its "{self.loaded.integrator_name}" '
+            f"(which --integrator {OF_SCENE} would use)"
+        )
 
     def remarks(self, is_sensor_chosen: bool) -> list[str]:
         """Warnings about parts of the scene that the image will not show."""
@@ -87,7 +113,7 @@ class LastScene:
             path: The file.
             size: Size of the image; ``None`` for the film's.
             definitions: Values of the file's ``$name`` parameters.
-            specification: The integrator; ``None`` for the scene's.
+            specification: See :meth:`Chosen.of`.
             values: Values of parameters of the loaded scene, from :func:`.scene_values.as_text`;
                 ``None`` if no image of the call has any.
             moved: See :func:`.scenes.load_scene`.
@@ -95,7 +121,7 @@ class LastScene:
         Raises:
             InputError: The scene, the integrator or the sensor cannot be used.
         """
-        is_own, has_values = specification is None, values is not None
+        is_own, has_values = specification in (None, OF_SCENE), values is not None
         key = (mi.variant(), path, size, tuple(definitions.items()), is_own, has_values)
         if key != self._key:
             # Free the last scene first, as Dr.Jit compiles the methods of all living objects

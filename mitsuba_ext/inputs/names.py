@@ -27,6 +27,10 @@ MITSUBA_INTEGRATORS = (
 )  # fmt: skip
 
 
+#: Stands for the scene's own integrator, where one is named.
+OF_SCENE = "scene"
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """``': did you mean "neepp"?'``, or nothing if no known name resembles ``name``."""
     close = difflib.get_close_matches(name.lower(), known, n=1)
@@ -79,12 +83,14 @@ def check_integrator(specification: str) -> None:
     imported. (Afterwards, plugins of the user may be registered, and this does nothing.)
 
     Args:
-        specification: A file, or text that begins with the integrator's name.
+        specification: A file, text that begins with the integrator's name, or :data:`OF_SCENE`.
 
     Raises:
         InputError: There is no such plugin, or the text has another form.
     """
     is_file = Path(specification).suffix.lower() in (".xml", ".json")
+    if specification == OF_SCENE:
+        return
     if not is_file and "mitsuba" not in sys.modules:  # otherwise it is checked later
         _check_plugin(parse_plugin(specification))
 

@@ -80,6 +80,8 @@ class LoadedScene:
         settings: ``max_depth`` and ``rr_depth`` of the scene's own integrator, if it has them, and
             ``hide_emitters`` if it is set.
         integrator_name: Plugin name of the scene's own integrator; empty if there is none.
+        only_says_path: Does the scene say nothing else about its integrator than ``path`` and these
+            ``settings``? True also if there is none.
         size: Width and height of the image in pixels (of the crop window, if there is one).
     """
 
@@ -91,6 +93,7 @@ class LoadedScene:
     content_hash: str
     settings: dict[str, int | bool]
     integrator_name: str
+    only_says_path: bool
     size: tuple[int, int]
 
     @property
@@ -167,7 +170,7 @@ def load_scene(
             integrator = _integrator_node(state)
             # Before transform_all(): afterwards, a node may be freed memory
             integrator_name = integrator.props.plugin_name() if integrator else ""
-            settings = _settings(integrator)
+            settings, only_says_path = _settings(integrator), _only_says_path(state)
             if not keep_integrator:
                 _drop_integrators(state)
             if size is not None:
@@ -196,6 +199,7 @@ def load_scene(
         content_hash=content_hash,
         settings=settings,
         integrator_name=integrator_name,
+        only_says_path=only_says_path,
         size=(int(film.crop_size()[0]), int(film.crop_size()[1])),
     )
 
@@ -235,17 +239,27 @@ def _search_path(path: Path | None) -> Iterator[None]:
         del resolver[0]
 
 
-def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None:
-    """The integrator of the scene that traces the paths: inside a wrapper such as ``aov``, the
-    first one that sets ``max_depth``."""
+def _integrator_nodes(state: mi.parser.ParserState) -> list[mi.parser.SceneNode]:
     import mitsuba as mi
 
-    nodes = [
+    return [
         node
         for node in state.nodes
         if node.type == mi.ObjectType.Integrator
         or (node.type == mi.ObjectType.Unknown and _is_integrator(node, ""))
     ]
+
+
+def _only_says_path(state: mi.parser.ParserState) -> bool:
+    nodes = _integrator_nodes(state)
+    is_path = all(node.props.plugin_name() == "path" for node in nodes)
+    return len(nodes) < 2 and is_path and all(set(n.props.keys()) <= set(SETTINGS) for n in nodes)
+
+
+def _integrator_node(state: mi.parser.ParserState) -> mi.parser.SceneNode | None:
+    """The integrator of the scene that traces the paths: inside a wrapper such as ``aov``, the
+    first one that sets ``max_depth``."""
+    nodes = _integrator_nodes(state)
     with_depth = [node for node in nodes if SETTINGS[0] in node.props]
     return (with_depth or nodes or [None])[0]
 

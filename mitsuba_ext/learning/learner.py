@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.observer import Observer
+from .effect import Effect
 
 
 class Learner(Observer):
@@ -38,6 +39,12 @@ class Learner(Observer):
 
     def finish(self) -> None:
         """Called after all learners have learned: frees what the last stage does not need."""
+
+    @property
+    def effect(self) -> Effect | None:
+        """What is known about the decision of the last stage; ``None`` if nothing was tried, or if
+        the effect is part of that of another learner."""
+        return None
 
     def __str__(self) -> str:
         """A summary of what was learned; empty if the summary of another learner covers it."""

@@ -24,7 +24,7 @@ class RenderRequest:
     Attributes:
         scene: The file.
         size, definitions: Size of the image, and values of the file's ``$name`` parameters.
-        specification: The integrator; ``None`` for the scene's.
+        specification: See :meth:`mitsuba_ext.inputs.chosen.Chosen.of`.
         sensor: The index of the sensor.
         seed: The seed of the random numbers.
         variant, plugins: Mitsuba's variant, and modules that register other plugins.

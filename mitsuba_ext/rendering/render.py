@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -73,6 +73,10 @@ class RenderStatistics:
             each, ours only for those that would contribute and that the shadow test lets through.
         zero_radiance: Fraction of the camera samples whose radiance is zero.
         learned: Summary of what the integrator learned; empty if it does not learn.
+        effects: For each learned decision (``directions``, ``next_event``, ``light_paths``, …):
+            ``is_kept``, the ``variance`` and ``time`` that pilots predict in units of those
+            without it, and what else was chosen
+            (:class:`~mitsuba_ext.learning.effect.Effect`).
         memory: Peak of the memory that Dr.Jit held during the render, in bytes.
         interrupted: Did Ctrl-C, :meth:`cancel` or an error end the render before all samples were
             taken? Ctrl-C in the last pass does not.
@@ -89,6 +93,7 @@ class RenderStatistics:
     connections: int = 0
     zero_radiance: float = 0.0
     learned: str = ""
+    effects: dict[str, dict[str, Any]] = field(default_factory=dict)
     memory: int = 0
     interrupted: bool = False
 
@@ -216,6 +221,7 @@ class Job:
             stage = self._next_stage(schedule)
             is_last = index == len(plan.stages) - 1
             self.statistics.learned = stage.learned
+            self.statistics.effects = dict(stage.effects)
             if is_last:
                 samples = plan.spp - self.statistics.spp  # pilots may have been cut short
                 self.statistics.learning_seconds = time.perf_counter() - self.start

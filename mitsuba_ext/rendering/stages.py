@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from ..transport.estimator import Estimator
 from ..transport.observer import Observer
@@ -17,6 +18,8 @@ class Stage:
     Attributes:
         estimator: Takes the samples of the stage.
         learned: A summary of what the integrator has learned from earlier stages.
+        effects: The effects of learned decisions, by slot
+            (:meth:`mitsuba_ext.learning.effect.Effect.as_dict`).
         is_scout: Does it take one sample per pixel that is not added to the film?
         camera: Chooses points of the aperture, times and wavelengths.
         weight: The weight of its samples, in units of the weight of a sample of the last stage. It
@@ -31,6 +34,7 @@ class Stage:
 
     estimator: Estimator
     learned: str = ""
+    effects: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     is_scout: bool = False
     camera: CameraSamples = field(default_factory=CameraSamples)
     weight: float = 1.0

@@ -26,6 +26,7 @@ class RenderTotals:
         learning_seconds, compile_seconds: Parts of ``render_seconds``.
         memory_bytes: Peak of the memory that Dr.Jit held in a render, the scene included.
         learned: Summary of what the integrator has learned.
+        effects: See :class:`~mitsuba_ext.rendering.render.RenderStatistics`.
     """
 
     rays: Mapping[str, int] = field(default_factory=dict)
@@ -35,6 +36,7 @@ class RenderTotals:
     compile_seconds: float = 0.0
     memory_bytes: int = 0
     learned: str = ""
+    effects: Mapping[str, dict[str, Any]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -56,7 +58,7 @@ class RenderTotals:
             return cls(rays, render_seconds=seconds, memory_bytes=memory_peak())
         return cls(
             dict(own.rays), own.connections, seconds, own.learning_seconds, own.compile_seconds,
-            own.memory, own.learned,
+            own.memory, own.learned, own.effects,
         )  # fmt: skip
 
     def plus(self, later: RenderTotals) -> RenderTotals:
@@ -70,6 +72,7 @@ class RenderTotals:
             self.compile_seconds + later.compile_seconds,
             max(self.memory_bytes, later.memory_bytes),
             later.learned or self.learned,
+            self.effects or later.effects,
         )
 
     def known(self) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from ...maps.sample_trees import SampleTrees
 from ...transport.observer import Observer
 from ...transport.path_decisions import DirectionSamples, Roulette
 from ..benefit import BATCHES, FIRST_GUIDED, GUIDED, gain_of, is_worth
+from ..effect import Effect
 from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
 from .path_records import BYTES_PER_RECORD, PathRecords
@@ -278,6 +279,15 @@ class GuideLearner(Learner):
         before = records.variances + (uniform - actual).sum(axis=0)
         more = uniform[: self.guidance.bounces].sum(axis=0) - other
         return gain_of(np.stack([before - more, more]))[1]
+
+    @property
+    def effect(self) -> Effect | None:
+        if self.guidance is None:
+            return None if self.guide is None else Effect(True)
+        variance = max(1 - self.guidance.gain, 1e-3)
+        time = 1 / (self.guidance.efficiency * variance)
+        about = {"share": self.guidance.share, "bounces": self.guidance.bounces}
+        return Effect(self.guide is not None, variance, time, about)
 
     def __str__(self) -> str:
         return self._summary

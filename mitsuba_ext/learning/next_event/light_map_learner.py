@@ -20,6 +20,7 @@ from ...regions.surface_sides import region
 from ...transport.observer import Observer
 from ...transport.path_decisions import EmitterSampling
 from ..benefit import is_worth
+from ..effect import Effect
 from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
 from .connection_records import ConnectionRecords
@@ -93,7 +94,8 @@ class LightMapLearner(Learner):
         self.map: LightMap | None = None
         self._records: ConnectionRecords | None = None
         self._summary, self._effect = "", "not measured"
-        self._efficiency = 1.0
+        self._efficiency, self._measured = 1.0, (None, None)
+        self._is_kept: bool | None = None
         self._is_tested = False
         # Makes a finer map than that of the first pilot
         self._finer_map: Callable[[], LightMap] | None = None
@@ -205,6 +207,7 @@ class LightMapLearner(Learner):
         probabilities = self._probabilities(self.map.weights(self.target))
         if self._records is not None and not self._pays(probabilities, is_last):
             self.map = self._records = self._finer_map = None
+            self._is_kept = False
             return EmitterSampling()
         # The records are kept in trials: most pilot samples come later
         if self._finer_map is not None and self._records is not None and not is_last:
@@ -212,7 +215,7 @@ class LightMapLearner(Learner):
                 self.map, self._finer_map = self._finer_map(), None
                 return self._begin_map()
         if is_last:
-            self._summary = f"{self.map}, {self._effect}"
+            self._is_kept, self._summary = True, f"{self.map}, {self._effect}"
             if self.save is not None:
                 light_map_file.save(self.save, scene, self.map)
         return self._selection(probabilities)
@@ -224,7 +227,7 @@ class LightMapLearner(Learner):
         self.map = light_map_file.of_arrays(state, scene)
         self._set_as_path(scene)
         self.map.evaluate()
-        self._summary = str(self.map)
+        self._is_kept, self._summary = True, str(self.map)
         return self._selection(self._probabilities(self.map.weights(self.target)))
 
     def finish(self) -> None:
@@ -249,6 +252,7 @@ class LightMapLearner(Learner):
             gain = records.predicted_gain(self.map.square_ratios(as_path, probabilities))
             is_trial, cost = not is_last, records.least_cost
         efficiency = self._efficiency = 1 / (max(1 - gain, 1e-3) * cost)
+        self._measured = 1 - gain, cost
         self._effect = f"about {max(0.0, gain):.0%} less variance in {cost:.2f} x the time"
         # A trial need not be certain
         least, error = (_TRIAL_EFFICIENCY, 0.0) if is_trial else (_LEAST_EFFICIENCY, error)
@@ -272,6 +276,10 @@ class LightMapLearner(Learner):
 
     def _selection(self, probabilities: mi.Float) -> LightTable:
         return LightTable(self.map.rows, self.map.cells, probabilities)
+
+    @property
+    def effect(self) -> Effect | None:
+        return None if self._is_kept is None else Effect(self._is_kept, *self._measured)
 
     def __str__(self) -> str:
         return self._summary

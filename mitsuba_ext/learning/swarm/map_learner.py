@@ -13,6 +13,7 @@ from ...maps.swarm.cells import CellDensities, Cells
 from ...maps.swarm.film_tiles import FilmTiles
 from ...transport.colour import to_rgb
 from ...transport.estimator import CameraRays
+from ..effect import Effect
 from ..learner import Learner
 from ..pixel_estimates import brightness
 from .estimate import Form, Grid, Shares, estimate
@@ -244,6 +245,12 @@ class MapLearner(Learner):
         if self._counts is not None and self._radiance is not None:
             self._counts.add(self._pixel, self._radiance, self.choices(self._radiance))
         self._radiance = None
+
+    @property
+    def effect(self) -> Effect:
+        # Drawing from a map takes next to no time
+        is_kept = self.decision.maps is not None
+        return Effect(is_kept, 1 - self.gain, 1.0 if is_kept else None)
 
     def __str__(self) -> str:
         if self.decision.maps is None:

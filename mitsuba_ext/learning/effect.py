@@ -1,0 +1,29 @@
+"""What a pilot has found out about a decision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Effect:
+    """The effect of a learned decision, relative to that of ``path``, as far as pilots can tell.
+
+    Attributes:
+        is_kept: Does the last stage use it?
+        variance, time: Those of the last stage with it, divided by those without it; ``None`` where
+            they were not measured. Of a decision that is not kept: why it is not.
+        about: What else was chosen.
+    """
+
+    is_kept: bool
+    variance: float | None = None
+    time: float | None = None
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """All that is known, as numbers, Booleans and texts."""
+        figures = {"variance": self.variance, "time": self.time}
+        known = {key: round(x, 4) for key, x in figures.items() if x is not None}
+        return {"is_kept": self.is_kept, **known, **self.about}
