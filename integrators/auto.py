@@ -8,11 +8,7 @@ from mitsuba_ext.bidirectional.candidates import Candidate
 from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.composition.bidirectional_integrator import LightPathIntegrator
 from mitsuba_ext.composition.learned_slots import learned_slots
-from mitsuba_ext.composition.light_path_schedule import (
-    LightPathSchedule,
-    place_of_trial,
-    samples_of_trial,
-)
+from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
 from mitsuba_ext.composition.light_paths import LightPathsWhereTheyPay, LightPathTrial
 from mitsuba_ext.composition.merging_parameters import MergingParameters
 from mitsuba_ext.composition.staged_integrator import NO_LIMIT
@@ -101,8 +97,7 @@ class Auto(LightPathIntegrator):
         super().__init__(props)
         self.merging = MergingParameters(0.0, 0.75)
         self.fill(props, **learned_slots(self.name))
-        self._trial_spp = 0
-        self._has_light_paths = False
+        self._has_light_paths = self._has_trial = False
 
     @property
     def needs_equal_samples(self) -> str:
@@ -120,27 +115,22 @@ class Auto(LightPathIntegrator):
     def pilots(self, scene, pixel_count, spp):
         stages = super().pilots(scene, pixel_count, spp)
         self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene, spp)
-        self._trial_spp = samples_of_trial(pixel_count, spp)
-        if not stages or not self._has_light_paths:
-            self._trial_spp = 0
-        if self._trial_spp > 0:
-            stages.insert(place_of_trial(len(stages)), self._trial_spp)
+        is_possible = bool(stages) and LightPathTrial.is_possible(pixel_count, spp)
+        self._has_trial = is_possible and self._has_light_paths
         return stages
 
     def schedule(self, scene, sensor, samples, seed) -> Schedule | LightPathSchedule:
-        trial = LightPathTrial(sensor.film(), sum(samples))
-        if self._trial_spp == 0:
-            schedule = super().schedule(scene, sensor, samples, seed)
-            if self.load_learned and self._has_light_paths:
-                schedule.beside["light_paths"] = trial
+        schedule = super().schedule(scene, sensor, samples, seed)
+        if not self._has_light_paths or not (self._has_trial or self.load_learned):
             return schedule
-        place = place_of_trial(len(samples) - 2)
-        others = (*samples[:place], *samples[place + 1 :])
-        inner = super().schedule(scene, sensor, others, seed)
-        return LightPathSchedule(inner, scene, place, trial)
+        trial = LightPathTrial(sensor.film(), sum(samples), is_sparse=True)
+        if self._has_trial:
+            return LightPathSchedule(schedule, scene, len(samples) - 1, trial)
+        schedule.beside["light_paths"] = trial
+        return schedule
 
     def estimators(self, scene, sensor):
-        if not self._has_light_paths or not (self._trial_spp or self.load_learned):
+        if not self._has_light_paths or not (self._has_trial or self.load_learned):
             return self.walk
         return super().estimators(scene, sensor)
 

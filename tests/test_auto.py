@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 @pytest.fixture(autouse=True)
 def small_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(light_paths, "_ENOUGH", 1 << 12)
+    monkeypatch.setattr(light_paths, "_SPARSE", 1 << 12)
 
 
 def auto(**parameters: Any) -> mi.Integrator:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass
@@ -38,6 +38,17 @@ class MergingRadius:
     widest: float = math.inf
     dimensions: int = 2
     _passes: int = 0
+
+    def of_coarse_film(self, pixel_width: float) -> MergingRadius:
+        """That of a render of a film with fewer pixels, each as wide as ``pixel_width`` of them:
+        its disks are wider, and hold as many vertices."""
+        return replace(
+            self,
+            first=self.first * pixel_width ** (2 / self.dimensions),
+            widest=self.widest * pixel_width ** (2 / self.dimensions),
+            footprint=self.footprint * pixel_width,
+            pixels=max(1, round(self.pixels / pixel_width**2)),
+        )
 
     def next(self, paths: int, groups: int = 1) -> float:
         """The radius of the next pass, of so many light paths; or of so many groups, of so many

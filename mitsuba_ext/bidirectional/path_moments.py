@@ -10,7 +10,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import from_numpy
 from ..images.box_filter import box_means
+from ..images.coarse_film import CoarseFilm
 from ..transport.estimator import CameraRays, Sample
 from ..transport.mis import power_heuristic
 from .candidate_moments import CandidateMoments
@@ -78,9 +80,13 @@ class PathMoments(TechniqueObserver):
     for Bidirectional Rendering Algorithms*, ACM TOG 41(4), 2022 (second moments of one set of
     techniques from samples of another).
 
+    The samples may be those of a coarse film, whose pixels are rectangles of pixels: all arrays
+    are then about these.
+
     Parameters:
-        film: Film of the sensor.
-        width, height: Its sampled pixels.
+        coarse: The film.
+        corner: The first of its sampled pixels, on the sensor's film.
+        film_width: Sampled pixels of a row of this.
         spp: Samples per pixel of the render.
 
     Attributes:
@@ -92,10 +98,15 @@ class PathMoments(TechniqueObserver):
 
     compares = True
 
-    def __init__(self, film: mi.Film, width: int, height: int, spp: int) -> None:
-        self._spp, self._shared = spp, {}
-        self._width, self._pixels = width, width * height
-        self._offset = mi.Vector2f(mi.ScalarVector2f(film.crop_offset()))
+    def __init__(
+        self, coarse: CoarseFilm, corner: tuple[int, int], film_width: int, spp: int
+    ) -> None:
+        self._spp, self._shared, self._film_pixels = spp, {}, coarse.pixel_count
+        self._width, self._pixels = coarse.width, coarse.width * coarse.height
+        self._corner, self._film_width = mi.Vector2f(corner), film_width
+        self._of_pixel: mi.UInt32 | None = None
+        if coarse.of_pixel is not None:
+            self._of_pixel = from_numpy(mi.UInt32, coarse.of_pixel)
         self.candidates: list[Candidate] = []
         self.samples = 0
         self.unreachable = np.zeros(0, int)
@@ -117,11 +128,11 @@ class PathMoments(TechniqueObserver):
             self._others = np.zeros(others, np.float32)
             self._shared = {
                 c.light_paths: available.samples_per_vertex(
-                    c.light_paths, self._spp, self._pixels
+                    c.light_paths, self._spp, self._film_pixels
                 )
                 for c in self.candidates[1:] if c.merges
             }  # fmt: skip
-        self._pixel, self._importance = rays.pixel, rays.importance
+        self._pixel, self._importance = self._place(rays.pixel), rays.importance
         lanes = dr.width(rays.pixel)
         self._lane = dr.arange(mi.UInt32, lanes)
         # For each camera path: its value with the techniques of ``path`` alone, the squares of the
@@ -198,8 +209,8 @@ class PathMoments(TechniqueObserver):
     def splatted(self, s, position, value, mis, rivals, active) -> None:
         brought = dr.mean(value)
         active = active & (brought > 0)
-        place = mi.Point2u(position - self._offset)
-        pixel = place.y * self._width + place.x
+        place = mi.Point2u(position - self._corner)
+        pixel = self._place(place.y * self._film_width + place.x, active)
         square = dr.square(brought) / mis
         moment = self._seen_by_path(square, rivals.by_camera, active)
         dr.scatter_add(self._splats, brought, 3 * pixel, active)
@@ -207,6 +218,12 @@ class PathMoments(TechniqueObserver):
         dr.scatter_add(self._splats, moment, 3 * pixel + 2, active)
         own = Rivals(rivals.by_camera, rivals.by_kind + mi.Vector2f(0, 1))
         self._moments.add(brought, mis, own, pixel, active)
+
+    def _place(self, pixel: mi.UInt32, active: mi.Bool | bool = True) -> mi.UInt32:
+        """The place of a pixel in the arrays."""
+        if self._of_pixel is None:
+            return pixel
+        return dr.gather(mi.UInt32, self._of_pixel, pixel, active)
 
     def _seen_by_path(self, square, by_camera, active) -> mi.Float:
         can_be = dr.max(by_camera) > 0

@@ -120,6 +120,8 @@ class LightPathIntegrator(WalkIntegrator):
         walk = self.walk(**decisions)
         if not are_traced:
             return walk
+        if radius is not None and choice.pixel_width > 1:
+            radius = radius.of_coarse_film(choice.pixel_width)
         return BidirectionalPathTracer(
             walk, side.emission, side.sensor, self.connections if techniques.connects else 0,
             selection, choice.observer, radius=radius if techniques.merges else None,

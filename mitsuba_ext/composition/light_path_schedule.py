@@ -15,21 +15,9 @@ from .schedule import Schedule
 #: find all light alone.
 _OF_CAMERA_PATHS = ("directions", "roulette")
 
-#: The trial takes this share of all samples, at most: a sample takes about 3.5 times as long.
-_MOST = 1 / 16
-
-
-def samples_of_trial(pixel_count: int, spp: int) -> int:
-    """The samples per pixel of the trial, out of ``spp``; 0 if there are too few for a trial."""
-    samples = LightPathTrial.samples(pixel_count)
-    return samples if samples <= spp * _MOST else 0
-
-
-def place_of_trial(pilots: int) -> int:
-    """After so many of the other pilots comes the trial: all of ``pilots``, but the first two are
-    enough to tell what else is worth its time."""
-    return min(2, pilots)
-
+#: After so many pilots, or all if there are fewer, comes the trial: they are enough to tell what
+#: else is worth its time.
+_PILOTS = 2
 
 #: Pilots without light paths are left out of the image if these have less than this part of their
 #: variance: at equal weights, a quarter of all samples then adds more noise than it removes.
@@ -51,7 +39,7 @@ class LightPathSchedule:
     Parameters:
         inner: Makes the other stages.
         scene: The scene.
-        place: After so many stages comes the trial.
+        pilots: Number of the other pilots.
         trial: Chooses.
     """
 
@@ -59,10 +47,11 @@ class LightPathSchedule:
         self,
         inner: Schedule,
         scene: mi.Scene,
-        place: int,
+        pilots: int,
         trial: LightPathTrial,
     ) -> None:
-        self._inner, self._scene, self._place, self._trial = inner, scene, place, trial
+        self._inner, self._scene, self._trial = inner, scene, trial
+        self._place = min(_PILOTS, pilots)
         inner.beside["light_paths"] = trial
         self._next: Stage | None = None
         self._is_over = False
@@ -84,7 +73,9 @@ class LightPathSchedule:
             if slot not in _OF_CAMERA_PATHS
         }  # fmt: skip
         estimator = self._inner.estimator(light_paths=choice, **decisions)
-        return Stage(estimator, camera=self._inner.camera, most_lanes=estimator.most_lanes)
+        return Stage(
+            estimator, camera=self._inner.camera, is_scout=True, pixels=self._trial.samples
+        )
 
     def _stage_after_trial(self) -> Stage:
         stage, self._next = self._next, None

@@ -14,11 +14,12 @@ import numpy as np
 from ..bidirectional.candidates import Candidate
 from ..bidirectional.path_moments import Counts, Estimate, PathMoments
 from ..bidirectional.technique_observer import TechniqueObserver
+from ..images.coarse_film import CoarseFilm
 from ..learning.benefit import expected_gain, gain_of, trimmed_batches
 from ..learning.effect import Effect
 from ..learning.learner import Learner
 from ..learning.pixel_estimates import relative_scale
-from ..rendering.camera import film_extent
+from ..rendering.camera import film_extent, first_pixel
 from ..scene.movers import movers
 from .decision_parameters import DecisionParameters, Setting, Slots
 
@@ -33,6 +34,10 @@ _SUMS, _LIGHT_RAY, _CONNECTION, _UNTESTED, _LOOK = 0.25, 1.8, 1.25, 0.2, 0.25
 _ENOUGH = 1 << 15
 
 
+#: Number of samples of a sparse trial, which has at least two of each pixel of its film. It may
+#: have at most this share of all samples: one takes about seven times as long as one of ``path``.
+_SPARSE, _MOST = 1 << 14, 1 / 64
+
 #: The most light paths for each camera path.
 MOST_PATHS = 64.0
 
@@ -43,10 +48,13 @@ class LightPathChoice:
     Attributes:
         techniques: What a render uses of the techniques that it has.
         observer: Observes their contributions.
+        pixel_width: The paths are those of a film with fewer pixels, each as wide as so many of the
+            film's.
     """
 
     techniques: Candidate = Candidate(1.0, merges=True)
     observer: TechniqueObserver | None = None
+    pixel_width: float = 1.0
 
 
 class LightPathCount(DecisionParameters):
@@ -116,18 +124,26 @@ class LightPathTrial(Learner):
     Parameters:
         film: The film of the sensor.
         spp: Samples per pixel of the render.
+        is_sparse: Is one stage of :attr:`samples` enough, whose image is not kept? If not, there
+            are pilots of all pixels.
 
     Attributes:
+        samples: A pixel for each sample, of these only.
         rival: The efficiency of ``path`` with what else was learned for it, relative to ``path``.
         estimate: Estimate of the image and its variance, once the choice has been made.
         candidates: What was compared, once the choice has been made.
         variances, costs: Variance and time of each candidate, relative to ``path``.
     """
 
-    def __init__(self, film: mi.Film, spp: int) -> None:
-        self._width, height = film_extent(film)
-        self._moments: PathMoments | None = PathMoments(film, self._width, height, spp)
-        self._choice = LightPathChoice(observer=self._moments)
+    def __init__(self, film: mi.Film, spp: int, is_sparse: bool = False) -> None:
+        extent = film_extent(film)
+        coarse = CoarseFilm.of(*extent, _SPARSE) if is_sparse else CoarseFilm.whole(*extent)
+        corner, self._width = first_pixel(film), coarse.width
+        self._moments: PathMoments | None = PathMoments(coarse, corner, extent[0], spp)
+        self._choice = LightPathChoice(
+            observer=self._moments, pixel_width=coarse.pixel_width
+        )
+        self.samples = coarse.samples
         self.rival = 1.0
         self.estimate: Estimate | None = None
         self.candidates: list[Candidate] = []
@@ -139,11 +155,9 @@ class LightPathTrial(Learner):
         return float(self.variances[self._best])
 
     @staticmethod
-    def samples(pixel_count: int) -> int:
-        """Samples per pixel that are enough: at least two, to estimate their variance, but for
-        large films, whose pixels have enough neighbours."""
-        least = 2 if pixel_count < _ENOUGH else 1
-        return max(least, -(-_ENOUGH // pixel_count))
+    def is_possible(pixel_count: int, spp: int) -> bool:
+        """Is a sparse trial worth its time, for a render of so many samples?"""
+        return _SPARSE <= spp * pixel_count * _MOST
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightPathChoice:
         return self._choice

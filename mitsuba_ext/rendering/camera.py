@@ -37,6 +37,13 @@ def film_extent(film: mi.Film) -> tuple[int, int]:
     return int(width) + border, int(height) + border
 
 
+def first_pixel(film: mi.Film) -> tuple[int, int]:
+    """The first of the sampled pixels (:func:`film_extent`)."""
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    x, y = film.crop_offset()
+    return int(x) - border, int(y) - border
+
+
 def tell_film(sampler: mi.Sampler, film: mi.Film, first: int = 0) -> None:
     """Tells a sampler which pixels its lanes stand for, if it has the method ``set_film`` (as
     ``sobol_owen``): those of the film row by row, from index ``first`` on."""
@@ -136,14 +143,32 @@ class PassLanes:
         return lanes_at(film, pixel, index)
 
 
+@dataclass
+class PixelLanes:
+    """As :class:`PassLanes`, for samples that belong to no pass.
+
+    Attributes:
+        pixel: The pixel of each sample.
+    """
+
+    pixel: mi.UInt32
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return dr.width(self.pixel)
+
+    def lanes(self, film: mi.Film) -> Lanes:
+        """The lanes."""
+        return lanes_at(film, self.pixel, dr.opaque(mi.UInt32, 0))
+
+
 def lanes_at(film: mi.Film, pixel: mi.UInt32, index: mi.UInt32) -> Lanes:
     """Lanes for these samples of these pixels."""
     width, _height = film_extent(film)
     y = pixel // width
     corner = mi.Vector2i(mi.Int32(pixel - y * width), mi.Int32(y))
-    if film.sample_border():
-        corner -= film.rfilter().border_size()
-    corner += mi.Vector2i(film.crop_offset())
+    corner += mi.Vector2i(first_pixel(film))
     return Lanes(pixel, corner, index)
 
 

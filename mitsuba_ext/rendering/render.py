@@ -293,18 +293,21 @@ class Job:
 
     def _run_scout(self, stage: Stage) -> None:
         begin = time.perf_counter()
-        for pixels in self.parts:
+        for pixels in self.parts if stage.pixels is None else [stage.pixels]:
             self._scout(stage, pixels)
         self.statistics.compile_seconds += time.perf_counter() - begin
         dr.sync_thread()
 
-    def _scout(self, stage: Stage, pixels: range | None) -> None:
+    def _scout(self, stage: Stage, pixels: range | np.ndarray | None) -> None:
         sampler = mi.load_dict({"type": "independent"})
         # The same numbers for all seeds: the decisions of a scout change sizes of tables, and with
         # them the kernels
-        number = 0 if pixels is None else pixels.start
+        number = 0 if stage.pixels is not None or pixels is None else pixels.start
         sampler.seed(dr.opaque(mi.UInt32, number), self._lanes(1, pixels))
-        lanes = camera.PassLanes.of(self.film, 1, 0, pixels)
+        if stage.pixels is None:
+            lanes = camera.PassLanes.of(self.film, 1, 0, pixels)
+        else:
+            lanes = camera.PixelLanes(from_numpy(mi.UInt32, pixels))
         self._begin(stage, lanes)
         take = look if self._is_frozen(stage) else look.__wrapped__
         radiance = take(

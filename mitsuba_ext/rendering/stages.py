@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
 from ..transport.estimator import Estimator
 from ..transport.observer import Observer
 from .camera_samples import CameraSamples
@@ -21,6 +23,7 @@ class Stage:
         effects: The effects of learned decisions, by slot
             (:meth:`mitsuba_ext.learning.effect.Effect.as_dict`).
         is_scout: Does it take one sample per pixel that is not added to the film?
+        pixels: Of a scout: the pixel of each sample; ``None`` for one sample of each pixel.
         camera: Chooses points of the aperture, times and wavelengths.
         weight: The weight of its samples, in units of the weight of a sample of the last stage. It
             must not depend on any sample.
@@ -36,6 +39,7 @@ class Stage:
     learned: str = ""
     effects: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     is_scout: bool = False
+    pixels: np.ndarray | None = None
     camera: CameraSamples = field(default_factory=CameraSamples)
     weight: float = 1.0
     most_lanes: int = 0

@@ -1,0 +1,59 @@
+"""A film with fewer pixels, for samples that only need to be representative."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class CoarseFilm:
+    """Divides the pixels of a film into about equal rectangles.
+
+    Attributes:
+        width, height: Number of rectangles along each axis.
+        pixel_count: Number of pixels of the film.
+        of_pixel: The rectangle of each pixel, row by row; ``None`` if each pixel has its own.
+        samples: A pixel for each sample, as many of each rectangle.
+    """
+
+    width: int
+    height: int
+    pixel_count: int
+    of_pixel: np.ndarray | None
+    samples: np.ndarray
+
+    @classmethod
+    def whole(cls, width: int, height: int) -> CoarseFilm:
+        """Each pixel is a rectangle, and has one sample."""
+        pixels = np.arange(width * height, dtype=np.uint32)
+        return cls(width, height, width * height, None, pixels)
+
+    @classmethod
+    def of(cls, width: int, height: int, count: int) -> CoarseFilm:
+        """With about ``count`` samples, at least two of each rectangle, so that their variance can
+        be estimated."""
+        pixels, scale = width * height, np.sqrt(count / (2 * width * height))
+        if scale >= 1:
+            film = cls.whole(width, height)
+            return cls(width, height, pixels, None, np.tile(film.samples, -(-count // pixels)))
+        columns, rows = (max(1, round(scale * size)) for size in (width, height))
+        column, row = _places(width, columns), _places(height, rows)
+        of_pixel = (row[:, None] * columns + column).ravel().astype(np.uint32)
+        x, y = _centres(width, columns), _centres(height, rows)
+        samples = (y[:, None] * width + x).ravel().astype(np.uint32)
+        return cls(columns, rows, pixels, of_pixel, np.tile(samples, 2))
+
+    @property
+    def pixel_width(self) -> float:
+        """The mean width of a rectangle, in pixels."""
+        return float(np.sqrt(self.pixel_count / (self.width * self.height)))
+
+
+def _places(size: int, parts: int) -> np.ndarray:
+    return (2 * np.arange(size) + 1) * parts // (2 * size)
+
+
+def _centres(size: int, parts: int) -> np.ndarray:
+    return (2 * np.arange(parts) + 1) * size // (2 * parts)
