@@ -12,7 +12,6 @@ from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
 from mitsuba_ext.composition.light_paths import LightPathsWhereTheyPay, LightPathTrial
 from mitsuba_ext.composition.merging_parameters import MergingParameters
 from mitsuba_ext.composition.staged_integrator import NO_LIMIT
-from mitsuba_ext.composition.swarm import Swarm
 from mitsuba_ext.rendering.stages import Schedule
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import movers
@@ -59,14 +58,14 @@ class Auto(LightPathIntegrator):
     light path for each camera path, all techniques, and the lights learned until then. Its samples
     tell the variance of each choice of techniques (no light paths; 1/16, 1/4, 1 or 4 of them for
     each camera path; with and without connections to their vertices, and merging); numbers of rays
-    tell its time. The best choice is made, if it is better than guided directions, with which light
-    paths are not combined. This stage takes at most one of 16 samples: in renders of fewer samples,
-    there is none. Where light paths have less than 0.4 of the variance, the samples before are left
-    out of the image.
+    tell its time. The best choice is made, if it is better than guided directions and maps, with
+    which light paths are not combined. This stage has 16384 samples, spread over the film, which
+    are not part of the image; in renders of less than a million samples, there is none. Where light
+    paths have less than 0.4 of the variance, the samples before are left out of the image.
 
-    Light paths are not tried in spectral variants, with moving shapes, participating media, or
-    where the lens is learned, in films of more than two million pixels, and where a light cannot
-    emit them: there, the integrator is :class:`auto_path`.
+    Light paths are not tried in participating media, in films of more than two million pixels, and
+    where a light cannot emit them: there, the integrator is :class:`auto_path`. In spectral
+    variants and with moving shapes, nothing is merged.
 
     Where vertices are merged, the image is slightly blurred, less with each sample (:class:`vcm`).
 
@@ -114,7 +113,7 @@ class Auto(LightPathIntegrator):
 
     def pilots(self, scene, pixel_count, spp):
         stages = super().pilots(scene, pixel_count, spp)
-        self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene, spp)
+        self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene)
         is_possible = bool(stages) and LightPathTrial.is_possible(pixel_count, spp)
         self._has_trial = is_possible and self._has_light_paths
         return stages
@@ -134,14 +133,18 @@ class Auto(LightPathIntegrator):
             return self.walk
         return super().estimators(scene, sensor)
 
-    def _can_try(self, scene: mi.Scene, spp: int) -> bool:
+    def merging_radius(self, scene, sensor, side):
+        # Only paths of equal wavelengths and times merge: all pixels would have to share these,
+        # even if nothing is merged in the end
+        if mi.is_spectral or movers(scene):
+            return None
+        return super().merging_radius(scene, sensor, side)
+
+    def _can_try(self, scene: mi.Scene) -> bool:
         """Can camera paths be connected to light paths, in what this integrator does else?"""
-        if self.max_depth < 2 or mi.is_spectral or movers(scene) or may_have_media(scene):
+        if self.max_depth < 2 or may_have_media(scene):
             return False
-        maps = [p for p in self.slots.values() if isinstance(p, Swarm)]
-        if any(p.can_learn(scene, spp) for p in maps):
-            return False
-        if not LightPathsWhereTheyPay().can_learn(scene, spp):
+        if not LightPathsWhereTheyPay().can_learn(scene, 1):
             return False
         try:
             LightEmission(scene)

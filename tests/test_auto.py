@@ -70,6 +70,29 @@ def test_the_choice_does_not_change_the_mean(light: str) -> None:
     assert_same_quarters(images, expected, 0.005)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["moving glass and a lens", "spectral"])
+def test_light_paths_take_the_place_of_maps_and_keep_the_mean(case: str) -> None:
+    ball = {"type": "sphere", "center": [-0.3, 0, 0.5], "radius": 0.4,
+            "bsdf": {"type": "dielectric"}}  # fmt: skip
+    camera = below_the_lamp()
+    if case == "spectral":
+        mi.set_variant("llvm_ad_spectral")
+    else:
+        ball = {"type": "moving", "translate": [0.6, 0, 0], "in": ball}
+        camera = below_the_lamp("thinlens", aperture_radius=0.1, focus_distance=4.0,
+                                shutter_open=0.0, shutter_close=1.0)  # fmt: skip
+    scene = mi.load_dict(stage(camera=camera, ball=ball), optimize=False)
+    integrator = auto(max_depth=5)
+    images = batches(scene, integrator, 1024, SEEDS[:MANY_SEEDS])
+    text = integrator.statistics.learned
+    assert "light paths pay: 1 for each camera path" in text and "merging" not in text
+    assert not any(word in text for word in ("times:", "lens:", "wavelengths:"))
+    path = mi.load_dict({"type": "composed_path", "max_depth": 5})
+    expected = batches(scene, path, 4096, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert_same_quarters(images, expected, 0.03)
+
+
 def test_in_short_renders_it_is_auto_path() -> None:
     scene = load("cornell_box", width=32, height=18)
     images = [
@@ -79,11 +102,8 @@ def test_in_short_renders_it_is_auto_path() -> None:
     assert_same_image(*images)
 
 
-@pytest.mark.parametrize("why", ["fog", pytest.param("spectral", marks=pytest.mark.slow)])
-def test_where_light_paths_cannot_be_tried_it_is_auto_path(why: str) -> None:
-    if why == "spectral":
-        mi.set_variant("llvm_ad_spectral")
-    scene = mi.load_dict(fog("area") if why == "fog" else stage())
+def test_where_light_paths_cannot_be_tried_it_is_auto_path() -> None:
+    scene = mi.load_dict(fog("area"))
     images = []
     for name in ("auto", "auto_path"):
         integrator = mi.load_dict({"type": name, "max_depth": 4})

@@ -9,7 +9,7 @@ from .roulette import GuidedRoulette
 from .swarm import MAPS
 
 #: The random numbers of a camera ray that can have learned maps.
-_CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
+CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
 
 
 def learned_slots(plugin: str) -> dict[str, DecisionParameters]:
@@ -20,5 +20,5 @@ def learned_slots(plugin: str) -> dict[str, DecisionParameters]:
         "next_event": LearnedLights(read),
         "roulette": GuidedRoulette(),
         # Maps alone would ask for more pilot samples than guided directions
-        **{slot: MAPS[slot](read, pilot_spp=Guided.pilot_spp) for slot in _CAMERA_NUMBERS},
+        **{slot: MAPS[slot](read, pilot_spp=Guided.pilot_spp) for slot in CAMERA_NUMBERS},
     }

@@ -7,13 +7,15 @@ from dataclasses import replace
 import mitsuba as mi
 
 from ..learning.directions.guide_learner import GuideLearner
+from ..rendering.camera_samples import CameraSamples
 from ..rendering.stages import Stage
+from .learned_slots import CAMERA_NUMBERS
 from .light_paths import LightPathTrial
 from .schedule import Schedule
 
 #: Where light paths pay, these slots decide as ``path``: what they learn is for camera paths that
 #: find all light alone.
-_OF_CAMERA_PATHS = ("directions", "roulette")
+_OF_CAMERA_PATHS = ("directions", "roulette", *CAMERA_NUMBERS)
 
 #: After so many pilots, or all if there are fewer, comes the trial: they are enough to tell what
 #: else is worth its time.
@@ -74,7 +76,7 @@ class LightPathSchedule:
         }  # fmt: skip
         estimator = self._inner.estimator(light_paths=choice, **decisions)
         return Stage(
-            estimator, camera=self._inner.camera, is_scout=True, pixels=self._trial.samples
+            estimator, camera=CameraSamples(), is_scout=True, pixels=self._trial.samples
         )
 
     def _stage_after_trial(self) -> Stage:
@@ -83,6 +85,10 @@ class LightPathSchedule:
         self._trial.rival = _MARGIN
         if isinstance(guide, GuideLearner) and guide.guide and guide.guidance:
             self._trial.rival *= guide.guidance.efficiency * _GROWS
+        for slot in CAMERA_NUMBERS:
+            learner = self._inner.learners.get(slot)
+            if learner is not None and (effect := learner.effect).is_kept:
+                self._trial.rival /= effect.variance
         choice = self._trial.learn(self._scene, is_last=True)
         if choice is None or choice.techniques.light_paths == 0:
             # Only the summary may be new

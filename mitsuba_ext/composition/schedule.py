@@ -181,6 +181,8 @@ class Schedule:
         for slot in slots:
             self.decisions.pop(slot, None)
             self.learners.pop(slot, None)
+            if hasattr(self.camera, slot):
+                setattr(self.camera, slot, None)
 
     def _restored_stage(self, states: States) -> Stage:
         for slot, learner in self._everyone.items():
