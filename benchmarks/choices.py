@@ -1,91 +1,209 @@
-"""Is what learns at least as efficient as ``path``, in renders of a given time?
+"""Is what learns at least as efficient as ``path``, and as the best of the others, in renders of a
+given time?
 
-    python benchmarks/choices.py scenes/window.xml scenes/open.xml --seconds 5 --seeds 3
+    python benchmarks/choices.py scenes/window.xml scenes/open.xml --seconds 5 --out out/choices
 
-All integrators take the same number of samples. Error: the variance of a pixel between the seeds /
-(mean² + 0.01 · (mean of the image)²), without the largest 0.1 % of the pixels (and, in brackets,
-with them). Time: the median over the seeds but the first, which compiles; learning and what other
-seeds compile included.
+All integrators take the same number of samples: as many as ``path`` takes in the given time. Error
+of a pixel: the variance between the seeds, plus the squared difference of their mean to that of the
+integrators that have light paths (without the integrator itself, and corrected for noise), over
+(mean² + 0.01 · (mean of the image)²). The difference shows what light an integrator misses. Errors
+are means over all pixels but the 0.1 % with the largest ones, and in brackets over all. Time: the
+median over the seeds but the first, which compiles; learning, and what other seeds compile,
+included.
+
+``--cpu`` measures the time of all cores instead of the wall clock, for machines that do other work.
+It favours what runs on all cores. ``--table`` prints the table of all results in the folder.
 """
 
 from __future__ import annotations
 
+import json
 import statistics
 import time
 from pathlib import Path
+from typing import Any
 
 import click
 
 import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mitsuba)
 
+import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
 
 #: The first one is that to which the others are compared.
-INTEGRATORS = ("path", "neepp", "pss_guided", "auto_path")
+INTEGRATORS = ("path", "auto_path", "bdpt", "vcm", "auto")
+
+#: Integrators whose mean is trusted: they find the light that camera paths miss.
+TRUSTED = ("bdpt", "vcm", "auto")
 
 
 def _render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int):
-    begin = time.perf_counter()
+    begin = time.perf_counter(), time.process_time()
     image = mi.render(scene, integrator=integrator, spp=spp, seed=seed).numpy()
-    return image[..., :3].astype(float), time.perf_counter() - begin
+    taken = time.perf_counter() - begin[0], time.process_time() - begin[1]
+    return image[..., :3].astype(float), taken
 
 
-def _kept(learned: str) -> str:
-    """What was kept, in a word for each decision."""
-    words = {"guide:": "guide", "light map:": "light map"}
-    kept = [word for text in learned.split("; ") for start, word in words.items()
-            if text.startswith(start)]  # fmt: skip
-    kept += [text for text in learned.split("; ") if text.startswith("light paths pay")]
-    return " and ".join(kept) or "nothing"
+def _choice(effects: dict[str, dict[str, Any]]) -> str:
+    """What was kept, in a few words."""
+    words = []
+    for slot, effect in effects.items():
+        if not effect["is_kept"]:
+            continue
+        if slot == "light_paths":
+            connects = "" if effect["connects"] else ", no connections"
+            merges = ", merging" if effect["merges"] else ""
+            words.append(f"{effect['light_paths']:g} light paths{connects}{merges}")
+        else:
+            words.append({"next_event": "lights", "directions": "guide"}.get(slot, slot))
+    return " + ".join(words) or "path"
+
+
+def _predicted(effects: dict[str, dict[str, Any]]) -> float:
+    """The efficiency that the pilots predict for the last stage, in units of that of ``path``."""
+    kept = [e for e in effects.values() if e["is_kept"] and "variance" in e]
+    return float(np.prod([1 / max(e["variance"] * e.get("time", 1.0), 1e-9) for e in kept]))
+
+
+def errors(images: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
+    """The squared relative error of each pixel, for each integrator, in ascending order."""
+    mean = {name: np.mean(some, axis=0) for name, some in images.items()}
+    noise = {name: np.var(some, axis=0, ddof=1) for name, some in images.items()}
+    trusted = [name for name in TRUSTED if name in images] or list(images)
+    scale = np.mean([mean[name] for name in trusted], axis=0) ** 2
+    scale += 0.01 * scale.mean()
+    found = {}
+    for name, some in images.items():
+        others = [other for other in trusted if other != name]
+        error = noise[name]
+        if others:
+            truth = np.mean([mean[other] for other in others], axis=0)
+            noise_of_truth = np.sum([noise[other] for other in others], axis=0) / len(others) ** 2
+            missed = (mean[name] - truth) ** 2 - (noise[name] + noise_of_truth) / len(some)
+            error = error + missed
+        found[name] = np.sort((error / scale).mean(axis=2), axis=None)
+    return found
+
+
+def compare(
+    file: Path, seconds: float, seeds: int, size: tuple[int, int], names: tuple[str, ...], cpu: bool
+) -> dict[str, Any]:
+    """The result for one scene: times, errors, choices."""
+    scene = mi.load_file(str(file))
+    sensor = mi.traverse(scene.sensors()[0])
+    sensor["film.size"] = sensor["film.crop_size"] = list(size)
+    sensor.update()
+    made = {name: mi.load_dict({"type": name, "max_depth": 6}) for name in names}
+    for _ in range(3):
+        wall, busy = _render(scene, made["path"], 16, 1)[1]
+    spp = max(8, round(16 * seconds / (busy / dr.thread_count() if cpu else wall)))
+    images, times = {name: [] for name in made}, {name: [] for name in made}
+    effects: dict[str, list[dict[str, Any]]] = {name: [] for name in made}
+    refused = {}
+    for seed in range(seeds):
+        for name, integrator in made.items():
+            try:
+                image, taken = _render(scene, integrator, spp, 1000 * seed + 3)
+            except (RuntimeError, NotImplementedError) as error:
+                refused[name] = str(error)
+                continue
+            images[name].append(image)
+            times[name].append(taken)
+            effects[name].append(integrator.statistics.effects if name != "path" else {})
+    images = {name: some for name, some in images.items() if len(some) == seeds}
+    found = errors(images)
+    result = {}
+    for name, error in found.items():
+        result[name] = {
+            "time": statistics.median(wall for wall, _ in times[name][1:]),
+            "cpu": statistics.median(busy for _, busy in times[name][1:]),
+            "error": error[: int(0.999 * len(error))].mean(), "error_of_all": error.mean(),
+            "effects": effects[name],
+        }  # fmt: skip
+    return {"spp": spp, "seconds": seconds, "cpu": cpu, "integrators": result, "refused": refused}
+
+
+def gain(result: dict[str, Any], name: str, key: str = "error") -> float:
+    """The efficiency of an integrator in units of that of the first one."""
+    first, other = (result["integrators"][which] for which in ("path", name))
+    clock = "cpu" if result["cpu"] else "time"
+    return first[key] * first[clock] / max(other[key] * other[clock], 1e-300)
+
+
+def line(scene: str, result: dict[str, Any]) -> str:
+    """A line of the table."""
+    gains = {name: gain(result, name) for name in result["integrators"]}
+    cells = [
+        f"{name} {gains[name]:.3g} ({gain(result, name, 'error_of_all'):.3g})" for name in gains
+    ]
+    return f"{scene}, {result['spp']} spp: {', '.join(cells)}"
+
+
+def table(folder: Path) -> None:
+    """Prints a table of all results in a folder, and what they have in common."""
+    results = {file.stem: json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))}
+    names = list(dict.fromkeys(n for r in results.values() for n in r["integrators"]))[1:]
+    print(f"| scene | spp | {' | '.join(f'`{name}`' for name in names)} | chosen | predicted |")
+    print("|---" * (4 + len(names)) + "|")
+    for scene, result in results.items():
+        known = result["integrators"]
+        cells = [
+            f"{gain(result, name):.3g}" if name in known else "" for name in names
+        ]
+        effects = known["auto"]["effects"] if "auto" in known else []
+        chosen = " / ".join(dict.fromkeys(map(_choice, effects)))
+        predicted = statistics.median(map(_predicted, effects)) if effects else 1.0
+        print(f"| {scene} | {result['spp']} | {' | '.join(cells)} | {chosen} | {predicted:.3g} |")
+    complete = [r for r in results.values() if set(names) <= set(r["integrators"])]
+    for name in names:
+        gains = [gain(r, name) for r in results.values() if name in r["integrators"]]
+        both = [gain(r, name) for r in complete]
+        best = [
+            gain(r, name) / max(gain(r, other) for other in r["integrators"])
+            for r in results.values() if name in r["integrators"]
+        ]
+        print(
+            f"{name}: {len(gains)} scenes, least {min(gains):.2f}, of the best one "
+            f"{min(best):.2f}; geometric mean of {len(both)} scenes "
+            f"{np.exp(np.mean(np.log(both))) if both else 0:.2f}"
+        )
 
 
 @click.command()
-@click.argument("files", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.argument("files", nargs=-1, type=click.Path(exists=True, path_type=Path))
 @click.option("--seconds", default=5.0, show_default=True, help="Of a render with path.")
 @click.option("--seeds", default=4, show_default=True)
 @click.option("--size", default=(320, 180), type=(int, int), show_default=True)
 @click.option("--integrator", "names", multiple=True, default=INTEGRATORS, help="The first: path.")
+@click.option("--cpu", is_flag=True, help="Measure the time of all cores.")
+@click.option("--out", default="out/choices", type=click.Path(path_type=Path), show_default=True)
+@click.option("--table", "only_table", is_flag=True, help="Print the table of the results in OUT.")
 def main(
     files: tuple[Path, ...],
     seconds: float,
     seeds: int,
     size: tuple[int, int],
     names: tuple[str, ...],
+    cpu: bool,
+    out: Path,
+    only_table: bool,
 ) -> None:
     """Compares on the scenes FILES."""
+    if only_table:
+        table(out)
+        return
     mi.set_variant("llvm_ad_rgb")
+    out.mkdir(parents=True, exist_ok=True)
     for file in files:
-        scene = mi.load_file(str(file))
-        sensor = mi.traverse(scene.sensors()[0])
-        sensor["film.size"] = sensor["film.crop_size"] = list(size)
-        sensor.update()
-        made = {name: mi.load_dict({"type": name, "max_depth": 6}) for name in names}
-        for _ in range(2):
-            speed = 16 / _render(scene, made["path"], 16, 1)[1]
-        spp = max(8, round(seconds * speed))
-        images, times = {name: [] for name in made}, {name: [] for name in made}
-        outcomes = {name: [] for name in made}
-        for seed in range(seeds):
-            for name, integrator in made.items():
-                image, taken = _render(scene, integrator, spp, 1000 * seed + 3)
-                images[name].append(image)
-                times[name].append(taken)
-                if name != "path":
-                    outcomes[name].append(_kept(integrator.statistics.learned))
-        mean = np.mean([np.mean(some, axis=0) for some in images.values()], axis=0)
-        scale = mean**2 + 0.01 * mean.mean() ** 2
-        cost = {}
-        for name in made:
-            error = np.sort((np.var(images[name], axis=0, ddof=1) / scale).mean(axis=2), axis=None)
-            trimmed = error[: int(0.999 * len(error))].mean()
-            taken = statistics.median(times[name][1:])
-            cost[name] = trimmed * taken, error.mean() * taken
-        gains = {name: np.divide(cost["path"], cost[name]) for name in made}
-        ratios = ", ".join(f"{name} {few:.2f} ({all_:.2f})" for name, (few, all_) in gains.items())
-        print(f"{file.parent.name}/{file.stem}, {spp} spp: {ratios}", flush=True)
-        for name in names[1:]:
-            print(f"    {name} kept, by seed: {' | '.join(outcomes[name])}", flush=True)
+        scene = file.parent.name if file.stem == "scene" else file.stem
+        result = compare(file, seconds, seeds, size, names, cpu)
+        (out / f"{scene}.json").write_text(json.dumps(result))
+        print(line(scene, result), flush=True)
+        for name in result["integrators"]:
+            kept = [_choice(effects) for effects in result["integrators"][name]["effects"]]
+            if set(kept) != {"path"}:
+                print(f"    {name} kept, by seed: {' | '.join(kept)}", flush=True)
 
 
 if __name__ == "__main__":
