@@ -102,9 +102,10 @@ def compare(
     effects: dict[str, list[dict[str, Any]]] = {name: [] for name in made}
     refused = {}
     for seed in range(seeds):
-        for name, integrator in made.items():
+        for index, (name, integrator) in enumerate(made.items()):
             try:
-                image, taken = _render(scene, integrator, spp, 1000 * seed + 3)
+                # Of equal seeds, images would be correlated
+                image, taken = _render(scene, integrator, spp, 1000 * seed + 3 + 101 * index)
             except (RuntimeError, NotImplementedError) as error:
                 refused[name] = str(error)
                 continue
