@@ -94,7 +94,7 @@ class AdaptiveSampling(WrappingIntegrator):
     (:monosp:`light_tracer`, Markov chains, and :monosp:`bdpt` unless its :monosp:`light_image` is
     off). So are weighted point sets for camera rays (:monosp:`weighted_numbers`). Nested in
     :monosp:`moment` or :monosp:`aov`, it returns the samples of its nested integrator, without
-    adaptive sampling. Gradients are not supported (use :monosp:`prb`).
+    adaptive sampling. Gradients are not supported (use :class:`composed_prb`).
 
     Source: D. Cline, PhD thesis, 2007, section 5.5; the parameters have the names of Mitsuba's pull
     request 1731. D. Kirk, J. Arvo, *Unbiased Sampling Techniques for Image Synthesis*, SIGGRAPH

@@ -70,8 +70,8 @@ class Auto(LightPathIntegrator):
     Where vertices are merged, the image is slightly blurred, less with each sample (:class:`vcm`).
 
     :monosp:`integrator.statistics.learned` says what was chosen, and what it was expected to gain.
-    Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized variants. Nested
-    in :monosp:`moment`, it takes no pilot samples.
+    Gradients are not supported (use :class:`composed_prb`), nor are scalar and polarized variants.
+    Nested in :monosp:`moment`, it takes no pilot samples.
 
     Sources: those of :class:`auto_path` and :class:`vcm`; P. Grittmann, I. Georgiev, P. Slusallek,
     *Efficiency-Aware Multiple Importance Sampling for Bidirectional Rendering Algorithms*, ACM

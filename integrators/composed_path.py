@@ -110,8 +110,8 @@ class ComposedPath(WalkIntegrator):
          checkpoint.
 
     **Use it when** you want :monosp:`path` with passes of bounded memory, a time budget, statistics
-    or progress, or to combine techniques. **Not when** you need gradients (use :monosp:`prb`), or a
-    scalar or polarized variant.
+    or progress, or to combine techniques. **Not when** you need gradients (use
+    :class:`composed_prb`), or a scalar or polarized variant.
 
     In scenes with participating media, it is :monosp:`volpath`: homogeneous and grid media, all
     phase functions, index-matched surfaces, cameras and lights in fog. There are three differences:

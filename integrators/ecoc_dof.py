@@ -104,7 +104,7 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
     ray are refused (:monosp:`light_tracer`, Markov chains, and :monosp:`bdpt` unless its
     :monosp:`light_image` is off). Of our integrators, only :monosp:`variance` can nest it. Nested
     in :monosp:`moment` or :monosp:`aov`, it returns the samples of its nested integrator, not
-    filtered. Gradients are not supported (use :monosp:`prb`).
+    filtered. Gradients are not supported (use :class:`composed_prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 5, Eqs. 5.1 to 5.5 (:monosp:`effective`). The
     filter :monosp:`lens`, more than three layers and hidden surfaces in them are ours. The source

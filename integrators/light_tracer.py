@@ -82,8 +82,9 @@ class LightTracerIntegrator(WalkIntegrator):
     numbers instead.
 
     Alpha and output variables are those of the camera rays. Participating media are refused (use
-    :monosp:`volpath` or :monosp:`composed_path`). Gradients are not supported (use :monosp:`prb`),
-    nor are scalar and polarized variants, nor nesting in :monosp:`moment` and :monosp:`aov`.
+    :monosp:`volpath` or :monosp:`composed_path`). Gradients are not supported (use
+    :class:`composed_prb`), nor are scalar and polarized variants, nor nesting in :monosp:`moment`
+    and :monosp:`aov`.
 
     Source: J. Arvo, *Backward Ray Tracing*, SIGGRAPH course, 1986; E. Veach, *Robust Monte Carlo
     Methods for Light Transport Simulation*, PhD thesis, 1997, section 10.2 (t = 1); adjoint BSDFs:

@@ -101,8 +101,8 @@ class NEEPlusPlus(WalkIntegrator):
 
     Participating media are rendered as by :monosp:`volpath`; lights are learned for points in them
     as for surfaces (but :monosp:`light_sampling=linear` refuses them). Gradients are not supported
-    (use :monosp:`prb`), nor are scalar and polarized variants. Nested in :monosp:`moment`, it takes
-    no pilot samples.
+    (use :class:`composed_prb`), nor are scalar and polarized variants. Nested in :monosp:`moment`,
+    it takes no pilot samples.
 
     Source: J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
     Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, sections 3 to 4.2.

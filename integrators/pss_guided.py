@@ -76,8 +76,8 @@ class PSSGuided(WalkIntegrator):
     :monosp:`integrator.guide` is the learned guide (see examples/learned_samples.py).
 
     Participating media are rendered as by :monosp:`volpath`; in them, directions are guided by
-    tiles only. Gradients are not supported (use :monosp:`prb`), nor are scalar and polarized
-    variants. Nested in :monosp:`moment`, it takes no pilot samples.
+    tiles only. Gradients are not supported (use :class:`composed_prb`), nor are scalar and
+    polarized variants. Nested in :monosp:`moment`, it takes no pilot samples.
 
     Source: J. J. Guo, PhD thesis, TU Delft, chapter 2 (Eqs. 2.5 to 2.13, Algorithm 1): trees of
     film tiles. Regions of surfaces, the estimates, and the measurement of the gain are ours.

@@ -33,7 +33,7 @@ class ReweightedLens(ReweightedCamera):
     The page of :monosp:`weighted_numbers` says more about sets and weights. The other dimensions of
     a sample come from the sensor's sampler. A nested integrator of this package learns as usual;
     its own timeout is ignored. Where it is nested in :monosp:`moment`, nothing is reweighted.
-    Gradients are not supported (use :monosp:`prb`).
+    Gradients are not supported (use :class:`composed_prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.3. Periodic cells, and the fact
     that they are unbiased, are our addition.

@@ -42,7 +42,7 @@ class ReweightedTime(ReweightedCamera):
     a sample come from the sensor's sampler, or from a nested :monosp:`reweighted_lens` or
     :monosp:`reweighted_wavelength`. A nested integrator of this package learns as usual; its own
     timeout is ignored. Where it is nested in :monosp:`moment`, nothing is reweighted. Gradients are
-    not supported (use :monosp:`prb`).
+    not supported (use :class:`composed_prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.1. Periodic cells, and the fact
     that they are unbiased, are our addition.

@@ -44,7 +44,7 @@ class ReweightedWavelength(ReweightedCamera):
     a sample come from the sensor's sampler, or from a nested :monosp:`reweighted_lens` or
     :monosp:`reweighted_time`. A nested integrator of this package learns as usual; its own timeout
     is ignored. Where it is nested in :monosp:`moment`, nothing is reweighted. Gradients are not
-    supported (use :monosp:`prb`).
+    supported (use :class:`composed_prb`).
 
     Source: J. J. Guo, PhD thesis, TU Delft, sections 4.4 and 4.5.2.2. Periodic cells, the fact that
     they are unbiased, and cells modulo 1/4 are our addition.

@@ -90,7 +90,7 @@ class ProgressivePhotonMapping(WalkIntegrator):
     each photon; outside of all boundaries, that behind the last one that a ray from the sensor
     crosses. In camera rays through homogeneous media, ``sample_emitters`` is ignored.
 
-    Gradients are not supported (use :monosp:`prb`), nor nesting in :monosp:`moment` and
+    Gradients are not supported (use :class:`composed_prb`), nor nesting in :monosp:`moment` and
     :monosp:`aov`.
 
     Source: T. Hachisuka, H. W. Jensen, *Stochastic Progressive Photon Mapping*, ACM Transactions on

@@ -62,6 +62,16 @@ def test_the_page_on_techniques_shows_lines_of_the_example():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("variant")
+def test_the_colour_of_the_walls_is_approached(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(EXAMPLES / "recover_albedo.py"))["main"](steps=6)
+    found = re.findall(r"rb: \[\[(\S+),", capsys.readouterr().out)
+    assert len(found) == 2 and all(0.36 < float(red) < 0.5 for red in found)
+    assert (tmp_path / "recover_albedo.png").is_file()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["frames", "denoise"])
 def test_other_examples_write_their_images(file: str, tmp_path, monkeypatch):
     if file == "denoise":

@@ -34,7 +34,7 @@ WALKS = [
 VALUES = {
     "roulette": "throughput", "save_learned": "learned.npz", "load_learned": "learned.npz",
     **dict.fromkeys(["max_depth", "rr_depth", "grid", "pilot_spp", "refine", "tile", "bounces"], 3),
-    **dict.fromkeys(["connections", "count", "light_samples", "camera_samples"], 3),
+    **dict.fromkeys(["connections", "count", "light_samples", "camera_samples", "learn_every"], 3),
     "candidates": 4, "splits": 7, "share": 0.5,
     **dict.fromkeys(["hide_emitters", "rejection", "always_guide", "nee_first_bounce"], True),
     **dict.fromkeys(["timeout", "max_memory", "slope"], 8.0), "floor": 0.5,
@@ -62,8 +62,8 @@ VALUES = {
 
 #: What makes a parameter known that is not always.
 CONDITIONS = {
-    **{("composed_path", key): {"next_event": "contribution"}
-       for key in ("pilot_spp", "save_learned", "load_learned")},
+    **{(name, key): {"next_event": "contribution"} for name in ("composed_path", "composed_prb")
+       for key in ("pilot_spp", "save_learned", "load_learned", "learn_every")},
     **{("two_stage", key): {"visibility": "primary"}
        for key in ("reallocated", "pilot_spp", "save_learned", "load_learned")},
     ("two_stage_lights", "reallocated"): {"visibility": "world"},
@@ -144,7 +144,7 @@ def test_pages_have_what_their_readers_look_for(name):
         assert "composed_path" in page.summary and "--integrator" in page.text
 
 
-@pytest.mark.parametrize("name", [*WALKS, *DECISIONS, *SEQUENCES])
+@pytest.mark.parametrize("name", [*WALKS, "composed_prb", *DECISIONS, *SEQUENCES])
 def test_every_parameter_of_a_page_is_known(name):
     for key in described(name):
         condition = CONDITIONS.get((name, key), CHECKPOINT.get(key, {}))
@@ -152,13 +152,13 @@ def test_every_parameter_of_a_page_is_known(name):
         assert not unknown
 
 
-@pytest.mark.parametrize("name", [*WALKS, *DECISIONS, *SEQUENCES])
+@pytest.mark.parametrize("name", [*WALKS, "composed_prb", *DECISIONS, *SEQUENCES])
 def test_what_str_shows_is_on_the_page_with_the_same_default(name):
     text = str(make(name)[0])
     assert text.startswith(f"{name}[\n")
     on_page = described(name)
     for key, value in re.findall(r"^  (\w+) = (.*?),?$", text, re.MULTILINE):
-        if key in SLOTS and name != "composed_path":  # of a preset: with several parameters
+        if key in SLOTS and not name.startswith("composed_"):  # several parameters
             continue
         default = on_page[key].partition(";")[0].partition(" ")[0]
         if re.fullmatch(r"\d+/\d+", default):

@@ -28,7 +28,7 @@ def load_all():
             integrator = mi.load_dict({"type": name, "nested": {"type": "path", "max_depth": 3}})
         else:
             integrator = mi.load_dict({"type": name, "max_depth": 3})
-            assert isinstance(integrator, mi.SamplingIntegrator), name
+            assert isinstance(integrator, (mi.SamplingIntegrator, mi.CppADIntegrator)), name
             assert integrator.max_depth == 3
         text = str(integrator)
         assert text.startswith(name) and "max_depth = 3" in text, text

@@ -231,5 +231,5 @@ class StagedIntegrator(mi.SamplingIntegrator):
         """The error for a render with gradients."""
         return NotImplementedError(
             f'"{self.name}" does not compute gradients: use an integrator made for that, such as '
-            f'"prb".'
+            f'"composed_prb" or "prb".'
         )

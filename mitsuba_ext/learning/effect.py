@@ -25,5 +25,5 @@ class Effect:
     def as_dict(self) -> dict[str, Any]:
         """All that is known, as numbers, Booleans and texts."""
         figures = {"variance": self.variance, "time": self.time}
-        known = {key: round(x, 4) for key, x in figures.items() if x is not None}
+        known = {key: round(float(x), 4) for key, x in figures.items() if x is not None}
         return {"is_kept": self.is_kept, **known, **self.about}

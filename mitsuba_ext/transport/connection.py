@@ -21,6 +21,7 @@ from .path_decisions import (
     ShadowTest,
     Weights,
 )
+from .replay import Replay
 from .vertex import Vertex
 
 #: The golden ratio: its multiples, modulo one, are evenly spread.
@@ -61,8 +62,9 @@ class Connector:
         weights: Weights,
         observer: Observer,
         media: NoMedia,
+        replay: Replay | None = None,
     ) -> None:
-        self._media = media
+        self._media, self._replay = media, replay
         self._scene, self._query, self._heroes, self._weights = scene, query, heroes, weights
         self._next_event, self._connections = next_event, connections
         self._shadow_test, self._scattering, self._observer = shadow_test, scattering, observer
@@ -131,9 +133,10 @@ class Connector:
         considered = active & (ds.pdf != 0)
         # A connection that cannot contribute needs no shadow ray
         tested = considered & (dr.max(dr.abs(value)) > 0)
-        value, tested, state = self._roulette(
-            state, connection, survival_sample, si, value, tested
-        )
+        if self._replay is not None:
+            tested = considered  # its derivative need not be zero
+        weight, tested, state = self._roulette(state, connection, survival_sample, si, tested)
+        value *= weight
         if self._media.exist:
             T = self._media.transmittance(
                 self._query, self._scene, vertex, ds, inside, sampler, tested
@@ -142,6 +145,8 @@ class Connector:
             visible = tested & (dr.max(T) > 0)
         else:
             visible = tested & ~self._query.occluded(self._scene, si, ds, tested)
+        if self._replay is not None:
+            self._replay.connected(vertex, ds, β * (mis * weight), visible)
         self._observer.connection(
             connection.choice, vertex, ds, contribution, value, pdf, visible, tested
         )
@@ -151,16 +156,17 @@ class Connector:
         """The number that decides whether a connection is tested; ``()`` if all are."""
         return () if isinstance(self._shadow_test, AlwaysTest) else sampler.next_1d()
 
-    def _roulette(self, state, connection, survival_sample, si, value, active):
-        """Lets the shadow test's decision drop connections; the survivors weigh 1/p."""
+    def _roulette(self, state, connection, survival_sample, si, active):
+        """Lets the shadow test's decision drop connections; the survivors weigh 1/p. Returns the
+        weight, which connections survive, and the decision's state."""
         p, state = self._shadow_test.probability(
             state, connection.choice, si, connection.ds, active
         )
         if p is None:
-            return value, active, state
+            return mi.Float(1), active, state
         survives = survival_sample < p
         # p > 0 wherever a lane survives: the random number is not negative
-        return value * dr.select(survives, dr.rcp(p), 0), active & survives, state
+        return dr.select(survives, dr.rcp(p), 0), active & survives, state
 
     def gather_one(
         self,

@@ -35,6 +35,7 @@ from .path_decisions import (
     Subpaths,
     Weights,
 )
+from .replay import Replay
 from .vertex import Arrival, PathState, Vertex
 
 
@@ -57,6 +58,8 @@ class Walk:
         mis: The MIS weights of connections and of scattering.
         subpaths: Other subpaths whose vertices are connected to those of the path.
         observer: Receives the events of the walk.
+        replay: Propagates derivatives along the paths; ``None`` if they are traced for the first
+            time.
     """
 
     max_depth: int
@@ -73,6 +76,7 @@ class Walk:
     mis: Weights = field(default_factory=Weights)
     subpaths: Subpaths | None = None
     observer: Observer = field(default_factory=Observer)
+    replay: Replay | None = None
 
     #: See :class:`~mitsuba_ext.transport.estimator.Estimator`.
     can_be_frozen = True
@@ -97,7 +101,7 @@ class Walk:
         ctx = heroes.context()
         connector = Connector(
             scene, self.next_event, self.connections, self.shadow_test, self.scattering,
-            self.query, heroes, self.mis, self.observer, media,
+            self.query, heroes, self.mis, self.observer, media, self.replay,
         )  # fmt: skip
         makes_one, makes_many = connects and connector.single, connects and connector.many
         # In media, transmittance takes random numbers, which `volpath` draws before the BSDF's
@@ -151,6 +155,8 @@ class Walk:
                 self.observer.emission(
                     path, hit, path.β * emitted, mis, light_pdf, active
                 )
+                if dr.hint(self.replay is not None, mode="scalar"):
+                    self.replay.emitted(si, path, mis, hit.emitter, active & (path.arrival.pdf > 0))
 
             # ----- Should we continue tracing to reach one more vertex? -----
             vertex = Vertex(si, si.bsdf(ray), path, pixel, in_medium)
@@ -206,6 +212,8 @@ class Walk:
                 shadow_count += dr.select(tested, 1, 0)
             bs, bsdf_weight = media.scatter(vertex, sample_1, sample_2, bs, bsdf_weight)
             self.observer.direction(vertex, sample_2, directions_weight, L, turns)
+            if dr.hint(self.replay is not None, mode="scalar"):
+                self.replay.scattered(vertex, bs.wo, L, turns)
 
             # ----- Move on to the next vertex -----
             bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)

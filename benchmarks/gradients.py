@@ -1,0 +1,96 @@
+"""How noisy are gradients, and how long do they take? ``composed_prb`` against Mitsuba's ``prb``.
+
+    python benchmarks/gradients.py scenes/rooms.xml --spp 64
+
+The loss is the mean of the image, weighted by random numbers / (1 + radiance). Its gradients are
+those with respect to all colours, roughnesses and emissions of the scene that are no textures.
+Variance: the geometric mean, over these parameters, of the variance between seeds. Time: the median
+over the renders but the first two, of the image and its gradients; learning included. z: the
+difference of the means to those of ``prb``, in units of its standard error.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from pathlib import Path
+
+import click
+
+import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mitsuba)
+
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
+import numpy as np  # isort: skip
+
+_ENDS = ("reflectance.value", "radiance.value", "alpha.value")
+
+#: The first one is that to which the others are compared; it gets four times as many seeds.
+INTEGRATORS = {
+    "prb": {"type": "prb"},
+    "composed_prb": {"type": "composed_prb"},
+    "lights": {"type": "composed_prb", "next_event": "contribution"},
+    "guide and lights": {
+        "type": "composed_prb", "next_event": "contribution", "directions": "guided"
+    },
+}  # fmt: skip
+
+
+def gradients(scene, parameters, keys, integrator, weights, spp: int, seed: int):
+    """The sum over the channels of each parameter's gradient, and the seconds that it took."""
+    for key in keys:
+        dr.enable_grad(parameters[key])
+        dr.set_grad(parameters[key], 0)
+    begin = time.perf_counter()
+    image = mi.render(
+        scene, parameters, integrator=integrator, seed=seed, seed_grad=seed + 10000, spp=spp
+    )
+    dr.backward(dr.mean(image * weights, axis=None))
+    found = [np.array(dr.grad(parameters[key])).sum() for key in keys]
+    return found, time.perf_counter() - begin
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.option("--spp", default=64, show_default=True)
+@click.option("--seeds", default=8, show_default=True)
+@click.option("--size", default=(128, 72), type=(int, int), show_default=True)
+def main(files: tuple[Path, ...], spp: int, seeds: int, size: tuple[int, int]) -> None:
+    """Compares on the scenes FILES."""
+    mi.set_variant("llvm_ad_rgb")
+    for file in files:
+        scene = mi.load_file(str(file))
+        sensor = mi.traverse(scene.sensors()[0])
+        sensor["film.size"] = sensor["film.crop_size"] = list(size)
+        sensor.update()
+        parameters = mi.traverse(scene)
+        keys = [key for key in parameters.keys() if key.endswith(_ENDS)]
+        random = np.random.default_rng(1).uniform(0.5, 1.5, (*size[::-1], 3))
+        mean = mi.render(scene, integrator=mi.load_dict({"type": "bdpt", "max_depth": 6}), spp=64)
+        weights = mi.TensorXf((random / (1 + np.array(mean))).astype(np.float32))
+        print(f"{file}, {spp} spp, {len(keys)} parameters", flush=True)
+        known = None
+        for name, plugin in INTEGRATORS.items():
+            integrator = mi.load_dict({**plugin, "max_depth": 6})
+            count = seeds if known else 4 * seeds
+            found, times = zip(*(
+                gradients(scene, parameters, keys, integrator, weights, spp, 100 * count + seed)
+                for seed in range(count)
+            ))  # fmt: skip
+            mean, variance = np.mean(found, axis=0), np.var(found, axis=0, ddof=1)
+            taken = statistics.median(times[2:])
+            known = known or (mean, variance, taken)
+            is_noisy = (known[1] > 1e-20) & np.isfinite(known[0])
+            error = np.sqrt(variance / count + known[1] / (4 * seeds))[is_noisy]
+            z = np.abs(mean - known[0])[is_noisy] / np.maximum(error, 1e-30)
+            ratio = np.exp(np.mean(np.log(variance[is_noisy] / known[1][is_noisy])))
+            print(
+                f"    {name}: variance {ratio:.2f}, time {taken / known[2]:.2f}, efficiency "
+                f"{known[2] / (taken * ratio):.2f}; |z| median {np.median(z):.1f}, "
+                f"largest {z.max():.1f}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

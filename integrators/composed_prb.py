@@ -1,0 +1,138 @@
+"""Gradients of the path tracer whose decisions are chosen in the scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+from mitsuba.ad.integrators import common
+
+from mitsuba_ext.composition.remembering_path import RememberingPath
+from mitsuba_ext.rendering.camera import film_extent
+from mitsuba_ext.scene.geometry_gradients import refuse_geometry
+from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.estimator import CameraRays
+from mitsuba_ext.transport.replay import Replay
+
+
+@registry.plugin
+class ComposedPRB(common.RBIntegrator):
+    r"""
+    .. _integrator-composed_prb:
+
+    Gradients of the composed path tracer (:monosp:`composed_prb`)
+    --------------------------------------------------------------
+
+    Path replay backpropagation, as Mitsuba's :monosp:`prb`, along the paths of
+    :class:`composed_path`: lights and directions can be learned, so that gradients are less noisy
+    in scenes with many or hidden lights. For :monosp:`mi.render(scene, params, integrator=…)`.
+
+    .. pluginparameters::
+
+     * - directions, next_event, roulette, connections, mis, shadow_test
+       - |string| or |decision|
+       - Those of :class:`composed_path`, but for :monosp:`resampled`, :monosp:`two_stage` and
+         :monosp:`triple_product` lights and :monosp:`swarm` directions. (Default: uniform, uniform,
+         automatic, one, power, always)
+     * - pilot_spp, save_learned, load_learned
+       - |int|, |string|
+       - Those of :class:`composed_path`.
+     * - learn_every
+       - |int|
+       - After so many renders of a scene, the next one learns again, since materials and lights may
+         have changed; 0 to learn once. The parameter is accepted only if a decision learns.
+         (Default: 16)
+     * - max_depth
+       - |int|
+       - Longest path in the image, -1 for no limit. (Default: -1)
+     * - rr_depth
+       - |int|
+       - Path depth at which Russian roulette on the throughput begins. (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: false)
+     * - timeout
+       - |float|
+       - Seconds after which a render of the image (not of gradients) ends. (Default: -1, none)
+
+    **Use it when** you optimize materials, textures, lights or environment maps. **Not when** you
+    optimize the place or shape of things, or the camera (use :monosp:`prb` or
+    :monosp:`prb_projective`), or a scene with participating media (use :monosp:`prbvolpath`): these
+    are refused, and so are moving shapes and dispersion. As in :monosp:`prb`, mirrors and smooth
+    glass have no gradients.
+
+    The image is that of :class:`composed_path`. Derivatives come from a second trace of the same
+    walk, with the same random numbers: at each vertex, the walk tells what the path has gathered,
+    and the rest of its radiance is known. All densities, MIS weights and learned maps are constant.
+    With all defaults, gradients are those of :monosp:`prb`, from the same random numbers.
+
+    The first render of a scene takes pilot samples and learns; later ones use what it has learned,
+    as do the passes for gradients. :monosp:`forget()` makes the next one learn.
+
+    Source: D. Vicini, S. Speierer, W. Jakob, *Path Replay Backpropagation: Differentiating Light
+    Paths using Constant Memory and Linear Time*, ACM Transactions on Graphics 40(4), 2021.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="composed_prb">
+                <string name="directions" value="guided"/>
+                <string name="next_event" value="contribution"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'composed_prb',
+            'directions': 'guided',
+            'next_event': 'contribution'
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.path = RememberingPath(props)
+        super().__init__(props)
+        self.name, self.max_depth = self.path.name, self.path.max_depth
+        self.rr_depth = self.path.rr_depth
+        self._pixel_count = 1
+
+    @property
+    def statistics(self):
+        """See :class:`StagedIntegrator`."""
+        return self.path.statistics
+
+    def to_string(self) -> str:
+        return str(self.path)
+
+    def forget(self) -> None:
+        """Learns again in the next render."""
+        self.path.forget()
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        with dr.suspend_grad():
+            return self.path.render(scene, sensor, seed, spp, develop, evaluate)
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        refuse_geometry(self.name, params)
+        return super().render_forward(scene, params, sensor, seed, spp)
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        refuse_geometry(self.name, params)
+        super().render_backward(scene, params, grad_in, sensor, seed, spp)
+
+    def prepare(self, sensor, seed=0, spp=0, aovs=()):
+        width, height = film_extent(sensor.film())
+        self._pixel_count = width * height
+        return super().prepare(sensor, seed, spp, list(aovs))
+
+    def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_others):
+        lanes = dr.width(ray)
+        pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
+        rays, walk = CameraRays(ray, pixel), self.path.remembered(scene)
+        replay = None
+        if mode != dr.ADMode.Primal:
+            replay = Replay(scene, state_in, δL if mode == dr.ADMode.Backward else None)
+            walk = replace(walk, replay=replay)
+        sample = walk(scene, sampler, rays, mi.Bool(active))
+        if mode == dr.ADMode.Forward:
+            return replay.derivative, sample.valid, [], None
+        return sample.L, sample.valid, [], sample.L
