@@ -18,7 +18,7 @@ BIN    := $(VENV)/bin
 
 DEMO_OUT := out/demo
 DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml scenes/rooms.xml scenes/glass_lamp.xml \
-        path auto_path bdpt --size 160x90 --spp 64 --seeds 3 \
+        path auto bdpt --size 160x90 --spp 80 --seeds 3 \
         --reference-integrator bdpt --reference-spp 512 --out $(DEMO_OUT)
 
 # One process per core (1 GiB of memory each), each with one thread of Dr.Jit. A process that is done

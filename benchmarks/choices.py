@@ -12,7 +12,8 @@ median over the seeds but the first, which compiles; learning, and what other se
 included.
 
 ``--cpu`` measures the time of all cores instead of the wall clock, for machines that do other work.
-It favours what runs on all cores. ``--table`` prints the table of all results in the folder.
+It favours what runs on all cores. ``--table`` prints the table of all results in the folder. All
+must have been measured with the same clock.
 """
 
 from __future__ import annotations
@@ -141,34 +142,34 @@ def line(scene: str, result: dict[str, Any]) -> str:
     return f"{scene}, {result['spp']} spp: {', '.join(cells)}"
 
 
-def table(folder: Path) -> None:
-    """Prints a table of all results in a folder, and what they have in common."""
-    results = {file.stem: json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))}
-    names = list(dict.fromkeys(n for r in results.values() for n in r["integrators"]))[1:]
-    print(f"| scene | spp | {' | '.join(f'`{name}`' for name in names)} | chosen | predicted |")
-    print("|---" * (4 + len(names)) + "|")
+def table(folder: Path, name: str = "auto") -> None:
+    """Prints a table of all results in a folder for one integrator: the best of the others, its own
+    efficiency, what it chose, and what it predicted; and a summary."""
+    results = {file.stem: json.loads(file.read_text()) for file in folder.glob("*.json")}
+    results = dict(sorted(results.items(), key=lambda item: -gain(item[1], name)))
+    print("| scene | samples | best other | its efficiency | `auto` | predicted | chosen |")
+    print("|---" * 7 + "|")
+    of_path, of_best, honest = [], [], []
     for scene, result in results.items():
-        known = result["integrators"]
-        cells = [
-            f"{gain(result, name):.3g}" if name in known else "" for name in names
-        ]
-        effects = known["auto"]["effects"] if "auto" in known else []
+        others = {n: gain(result, n) for n in result["integrators"] if n not in (name, "path")}
+        best = max(others, key=lambda n: others[n])
+        own, of_all = gain(result, name), gain(result, name, "error_of_all")
+        effects = result["integrators"][name]["effects"]
+        predicted = statistics.median(map(_predicted, effects))
         chosen = " / ".join(dict.fromkeys(map(_choice, effects)))
-        predicted = statistics.median(map(_predicted, effects)) if effects else 1.0
-        print(f"| {scene} | {result['spp']} | {' | '.join(cells)} | {chosen} | {predicted:.3g} |")
-    complete = [r for r in results.values() if set(names) <= set(r["integrators"])]
-    for name in names:
-        gains = [gain(r, name) for r in results.values() if name in r["integrators"]]
-        both = [gain(r, name) for r in complete]
-        best = [
-            gain(r, name) / max(gain(r, other) for other in r["integrators"])
-            for r in results.values() if name in r["integrators"]
-        ]
         print(
-            f"{name}: {len(gains)} scenes, least {min(gains):.2f}, of the best one "
-            f"{min(best):.2f}; geometric mean of {len(both)} scenes "
-            f"{np.exp(np.mean(np.log(both))) if both else 0:.2f}"
+            f"| {scene} | {result['spp']} | `{best}` | {others[best]:.3g} | {own:.3g} ({of_all:.3g}) "
+            f"| {predicted:.3g} | {chosen} |"
         )
+        of_path.append(own)
+        of_best.append(own / max(1, others[best]))
+        honest.append(own / predicted)
+    print(
+        f"{len(results)} scenes; of path: least {min(of_path):.2f}, geometric mean "
+        f"{np.exp(np.mean(np.log(of_path))):.2f}; of the best: least {min(of_best):.2f}, median "
+        f"{statistics.median(of_best):.2f}; measured / predicted within 0.7 to 1.4 in "
+        f"{sum(0.7 <= ratio <= 1.4 for ratio in honest)}"
+    )
 
 
 @click.command()

@@ -12,7 +12,7 @@ import mitsuba as mi  # isort: skip
 SCENE = Path(__file__).resolve().parents[1] / "scenes" / "door_ajar.xml"
 
 mi.set_variant("llvm_ad_rgb")
-scene = mi.load_file(str(SCENE), integrator="neepp", spp=64)
+scene = mi.load_file(str(SCENE), integrator="auto", spp=64)
 image = mi.render(scene, seed=1)
 mi.Bitmap(image).write("door_ajar.exr")
 
