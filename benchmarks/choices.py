@@ -157,10 +157,11 @@ def table(folder: Path, name: str = "auto") -> None:
         effects = result["integrators"][name]["effects"]
         predicted = statistics.median(map(_predicted, effects))
         chosen = " / ".join(dict.fromkeys(map(_choice, effects)))
-        print(
-            f"| {scene} | {result['spp']} | `{best}` | {others[best]:.3g} | {own:.3g} ({of_all:.3g}) "
-            f"| {predicted:.3g} | {chosen} |"
-        )
+        cells = [
+            scene, result["spp"], f"`{best}`", f"{others[best]:.3g}", f"{own:.3g} ({of_all:.3g})",
+            f"{predicted:.3g}", chosen,
+        ]  # fmt: skip
+        print(f"| {' | '.join(map(str, cells))} |")
         of_path.append(own)
         of_best.append(own / max(1, others[best]))
         honest.append(own / predicted)
