@@ -31,9 +31,10 @@ class Replay:
 
     def __init__(self, scene: mi.Scene, L: mi.Spectrum, δL: mi.Spectrum | None) -> None:
         self._scene, self._L, self._δL = scene, L, δL
-        self._lane = dr.arange(mi.UInt32, dr.width(L))
-        self._sums = dr.zeros(mi.Float, len(mi.Spectrum()) * dr.width(L))
-        dr.eval(self._sums, self._lane)
+        if δL is None:
+            self._lane = dr.arange(mi.UInt32, dr.width(L))
+            self._sums = dr.zeros(mi.Float, len(mi.Spectrum()) * dr.width(L))
+            dr.eval(self._sums, self._lane)
 
     @property
     def derivative(self) -> mi.Spectrum:
