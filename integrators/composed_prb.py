@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
 
 import drjit as dr
@@ -14,6 +15,9 @@ from mitsuba_ext.scene.geometry_gradients import refuse_geometry
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.replay import Replay
+
+# Mitsuba executes this module again for each variant, but perhaps not yet for this one
+common = importlib.reload(common)
 
 
 @registry.plugin
@@ -30,14 +34,31 @@ class ComposedPRB(common.RBIntegrator):
 
     .. pluginparameters::
 
-     * - directions, next_event, roulette, connections, mis, shadow_test
+     * - directions
        - |string| or |decision|
-       - Those of :class:`composed_path`, but for :monosp:`resampled`, :monosp:`two_stage` and
-         :monosp:`triple_product` lights and :monosp:`swarm` directions. (Default: uniform, uniform,
-         automatic, one, power, always)
-     * - pilot_spp, save_learned, load_learned
-       - |int|, |string|
-       - Those of :class:`composed_path`.
+       - As in :class:`composed_path`, but for :monosp:`swarm`. (Default: uniform)
+     * - next_event
+       - |string| or |decision|
+       - As in :class:`composed_path`, but for :monosp:`resampled`, :monosp:`two_stage` and
+         :monosp:`triple_product`. (Default: uniform)
+     * - roulette
+       - |string|
+       - As in :class:`composed_path`. (Default: automatic)
+     * - connections
+       - |string|, |int| or |decision|
+       - As in :class:`composed_path`. (Default: one)
+     * - mis
+       - |string| or |decision|
+       - As in :class:`composed_path`. (Default: power)
+     * - shadow_test
+       - |string| or |decision|
+       - As in :class:`composed_path`. (Default: always)
+     * - pilot_spp
+       - |int|
+       - As in :class:`composed_path`. (Default: 32 with guided directions, otherwise 16)
+     * - save_learned, load_learned
+       - |string|
+       - As in :class:`composed_path`. (Default: none)
      * - learn_every
        - |int|
        - After so many renders of a scene, the next one learns again, since materials and lights may
