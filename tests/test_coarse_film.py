@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mitsuba_ext.bidirectional.merging_radius import MergingRadius
 from mitsuba_ext.images.coarse_film import CoarseFilm
 
 
@@ -27,3 +28,13 @@ def test_small_films_are_whole_and_have_more_samples() -> None:
     film = CoarseFilm.of(64, 32, 32768)
     assert film.of_pixel is None and film.pixel_width == 1
     np.testing.assert_array_equal(np.bincount(film.samples), np.full(64 * 32, 16))
+
+
+def test_disks_are_as_much_wider_as_pixels() -> None:
+    """They hold as many vertices, of one light path for each of the fewer pixels."""
+    radius = MergingRadius(first=0.1, decay=0.75, pixels=6400, footprint=0.01, widest=0.2)
+    coarse = radius.of_coarse_film(4.0)
+    assert coarse.pixels == 400
+    assert coarse.samples_per_vertex(1, 8) == pytest.approx(radius.samples_per_vertex(1, 8))
+    for _ in range(3):
+        assert coarse.next(400) == pytest.approx(4 * radius.next(6400))

@@ -88,7 +88,7 @@ class LightPathSchedule:
         for slot in CAMERA_NUMBERS:
             learner = self._inner.learners.get(slot)
             if learner is not None and (effect := learner.effect).is_kept:
-                self._trial.rival /= effect.variance
+                self._trial.rival /= max(effect.variance, 1e-3)
         choice = self._trial.learn(self._scene, is_last=True)
         if choice is None or choice.techniques.light_paths == 0:
             # Only the summary may be new
