@@ -86,7 +86,8 @@ class ComposedPRB(common.RBIntegrator):
     The image is that of :class:`composed_path`. Derivatives come from a second trace of the same
     walk, with the same random numbers: at each vertex, the walk tells what the path has gathered,
     and the rest of its radiance is known. All densities, MIS weights and learned maps are constant.
-    With all defaults, gradients are those of :monosp:`prb`, from the same random numbers.
+    With all defaults, gradients are those of :monosp:`prb`, from the same random numbers up to
+    :monosp:`rr_depth`.
 
     The first render of a scene takes pilot samples and learns; later ones use what it has learned,
     as do the passes for gradients. :monosp:`forget()` makes the next one learn.

@@ -91,13 +91,15 @@ def keys_of(parameters: mi.SceneParameters) -> list[str]:
     return found
 
 
-def test_with_all_defaults_gradients_are_those_of_prb() -> None:
+@pytest.mark.parametrize("more", [{}, {"hide_emitters": True}], ids=str)
+def test_with_all_defaults_gradients_are_those_of_prb(more: dict[str, Any]) -> None:
     """They use the same random numbers."""
     scene = room()
     parameters = small(scene)
     keys = keys_of(parameters)
     ours, theirs = (
-        backward(scene, parameters, keys, make(name), 3, 64) for name in ("composed_prb", "prb")
+        backward(scene, parameters, keys, make(name, **more), 3, 64)
+        for name in ("composed_prb", "prb")
     )
     for key, found, expected in zip(keys, ours, theirs):
         scale = np.abs(expected).max()

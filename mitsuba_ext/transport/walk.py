@@ -156,7 +156,10 @@ class Walk:
                     path, hit, path.β * emitted, mis, light_pdf, active
                 )
                 if dr.hint(self.replay is not None, mode="scalar"):
-                    self.replay.emitted(si, path, mis, hit.emitter, active & (path.arrival.pdf > 0))
+                    seen = active & (path.arrival.pdf > 0)
+                    if dr.hint(self.hide_emitters, mode="scalar"):
+                        seen &= si.is_valid() | (path.depth > 0)
+                    self.replay.emitted(si, path, mis, hit.emitter, seen)
 
             # ----- Should we continue tracing to reach one more vertex? -----
             vertex = Vertex(si, si.bsdf(ray), path, pixel, in_medium)
