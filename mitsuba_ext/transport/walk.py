@@ -158,7 +158,7 @@ class Walk:
                 if dr.hint(self.replay is not None, mode="scalar"):
                     seen = active & (path.arrival.pdf > 0)
                     if dr.hint(self.hide_emitters, mode="scalar"):
-                        seen &= si.is_valid() | (path.depth > 0)
+                        seen &= si.is_valid() | valid
                     self.replay.emitted(si, path, mis, hit.emitter, seen)
 
             # ----- Should we continue tracing to reach one more vertex? -----
