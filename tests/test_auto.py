@@ -53,6 +53,27 @@ def test_light_paths_take_the_place_of_guides_where_they_pay() -> None:
     assert f"{light_paths['time']:.1f} x the time" in text
 
 
+def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, estimates = load("cornell_box", width=64, height=36), []
+    trials: list[light_paths.LightPathTrial] = []
+    made = light_paths.LightPathTrial.__init__
+
+    def remembered(trial: light_paths.LightPathTrial, *arguments: Any, **options: Any) -> None:
+        made(trial, *arguments, **options)
+        trials.append(trial)
+
+    monkeypatch.setattr(light_paths.LightPathTrial, "__init__", remembered)
+    monkeypatch.setattr(light_paths, "_MOST", 1.0)
+    for samples in (1 << 10, 1 << 14):
+        monkeypatch.setattr(light_paths, "_SPARSE", samples)
+        auto().render(scene, spp=32, seed=1)
+        estimates.append((trials[-1].estimate.mean.mean(), trials[-1].variances[:8]))
+    (coarse, few), (whole, many) = estimates
+    assert len(trials[0].samples) < 64 * 36 < len(trials[1].samples)
+    assert coarse == pytest.approx(whole, rel=0.1)
+    np.testing.assert_allclose(few, many, rtol=0.35)
+
+
 def test_light_paths_are_left_out_under_an_open_sky() -> None:
     scene = stage(light=EMITTERS["constant"](), camera=below_the_lamp())
     assert "light paths do not pay" in learned(scene, 1200)
