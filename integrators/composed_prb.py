@@ -10,8 +10,9 @@ import mitsuba as mi
 from mitsuba.ad.integrators import common
 
 from mitsuba_ext.composition.remembering_path import RememberingPath
-from mitsuba_ext.rendering.camera import film_extent
-from mitsuba_ext.scene.geometry_gradients import refuse_geometry
+from mitsuba_ext.composition.sensitive_path import SensitivePath
+from mitsuba_ext.rendering.camera import film_extent, find_sensor
+from mitsuba_ext.scene.gradients import refuse_geometry
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.replay import Replay
@@ -90,7 +91,8 @@ class ComposedPRB(common.RBIntegrator):
     :monosp:`rr_depth`.
 
     The first render of a scene takes pilot samples and learns; later ones use what it has learned,
-    as do the passes for gradients. :monosp:`forget()` makes the next one learn.
+    as do the passes for gradients. :monosp:`forget()` makes the next one learn. If some of several
+    lights are optimized, the passes for gradients learn which light is best for their derivatives.
 
     Source: D. Vicini, S. Speierer, W. Jakob, *Path Replay Backpropagation: Differentiating Light
     Paths using Constant Memory and Linear Time*, ACM Transactions on Graphics 40(4), 2021.
@@ -111,7 +113,8 @@ class ComposedPRB(common.RBIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        self.path = RememberingPath(props)
+        self.path, self._sensitive = RememberingPath(props), SensitivePath(props)
+        self._for_gradients = self.path
         super().__init__(props)
         self.name, self.max_depth = self.path.name, self.path.max_depth
         self.rr_depth = self.path.rr_depth
@@ -122,24 +125,36 @@ class ComposedPRB(common.RBIntegrator):
         """See :class:`StagedIntegrator`."""
         return self.path.statistics
 
+    @property
+    def gradient_statistics(self):
+        """Those of the samples from which the passes for gradients have learned."""
+        return self._sensitive.statistics
+
     def to_string(self) -> str:
         return str(self.path)
 
     def forget(self) -> None:
         """Learns again in the next render."""
         self.path.forget()
+        self._sensitive.forget()
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         with dr.suspend_grad():
             return self.path.render(scene, sensor, seed, spp, develop, evaluate)
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
-        refuse_geometry(self.name, params)
+        self._learn_for(scene, params, sensor, seed, spp)
         return super().render_forward(scene, params, sensor, seed, spp)
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
-        refuse_geometry(self.name, params)
+        self._learn_for(scene, params, sensor, seed, spp)
         super().render_backward(scene, params, grad_in, sensor, seed, spp)
+
+    def _learn_for(self, scene, params, sensor, seed, spp) -> None:
+        refuse_geometry(self.name, params)
+        sensor = find_sensor(scene, sensor)
+        learned = self._sensitive.prepare(scene, params, sensor, seed, spp)
+        self._for_gradients = self._sensitive if learned else self.path
 
     def prepare(self, sensor, seed=0, spp=0, aovs=()):
         width, height = film_extent(sensor.film())
@@ -149,7 +164,7 @@ class ComposedPRB(common.RBIntegrator):
     def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_others):
         lanes = dr.width(ray)
         pixel = dr.arange(mi.UInt32, lanes) // (lanes // self._pixel_count)
-        rays, walk = CameraRays(ray, pixel), self.path.remembered(scene)
+        rays, walk = CameraRays(ray, pixel), self._for_gradients.remembered(scene)
         replay = None
         if mode != dr.ADMode.Primal:
             replay = Replay(scene, state_in, δL if mode == dr.ADMode.Backward else None)

@@ -116,11 +116,17 @@ LEARNED = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("decisions", LEARNED, ids=lambda d: next(iter(d)))
-def test_decisions_do_not_change_the_expected_gradient(decisions: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "decisions, optimized",
+    [*((decisions, KINDS) for decisions in LEARNED), (LEARNED[0], KINDS[3:4])],
+    ids=lambda each: next(iter(each)),
+)
+def test_decisions_do_not_change_the_expected_gradient(
+    decisions: dict[str, Any], optimized: tuple[str, ...]
+) -> None:
     scene = room()
     parameters = small(scene)
-    keys = keys_of(parameters)
+    keys = [key for key in keys_of(parameters) if key.endswith(optimized)]
     integrator = make(**decisions)
     ours = [backward(scene, parameters, keys, integrator, seed, 256) for seed in range(12)]
     prb = make("prb")
@@ -191,10 +197,13 @@ def test_what_is_black_has_a_gradient() -> None:
 
 def test_the_image_is_that_of_composed_path_and_later_renders_learn_nothing() -> None:
     scene = load("rooms", width=48, height=27)
+    ours, path = (
+        np.array(make(name, next_event="power").render(scene, spp=8, seed=4))
+        for name in ("composed_prb", "composed_path")
+    )
+    np.testing.assert_allclose(ours, path, rtol=1e-3)
     integrator = make(next_event="contribution", learn_every=3)
-    path = make("composed_path", next_event="contribution")
-    first = np.array(integrator.render(scene, spp=32, seed=4))
-    np.testing.assert_allclose(first, np.array(path.render(scene, spp=32, seed=4)), rtol=1e-3)
+    integrator.render(scene, spp=32, seed=4)
     learned, passes = integrator.statistics.learned, integrator.statistics.passes
     assert learned.startswith("light map: ") and passes > 1
     for _ in range(2):
@@ -205,6 +214,46 @@ def test_the_image_is_that_of_composed_path_and_later_renders_learn_nothing() ->
     integrator.forget()
     integrator.render(scene, spp=32, seed=5)
     assert integrator.statistics.passes > 1
+
+
+def test_where_one_of_several_lights_is_optimized_it_is_chosen_more_often() -> None:
+    """The passes for gradients learn for themselves, once."""
+    T = mi.ScalarTransform4f
+    lamps = {
+        f"lamp{x}": rectangle(
+            T().translate([x - 1.5, 0, 2]).rotate([1, 0, 0], 180).scale(0.2),
+            emitter=area(0.2 if x == 2 else 8.0),
+        )
+        for x in range(4)
+    }
+    scene = mi.load_dict(stage(floor=rectangle(T().scale(2)), **lamps), optimize=False)
+    parameters = small(scene)
+    (key,) = (key for key in parameters.keys() if key.endswith("lamp2.emitter.radiance.value"))
+    integrator = make(next_event="contribution", learn_every=8)
+    learned = []
+
+    def gradient(seed: int) -> float:
+        dr.enable_grad(parameters[key])
+        dr.set_grad(parameters[key], 0)
+        image = mi.render(
+            scene, parameters, integrator=integrator, seed=seed, seed_grad=seed + 500, spp=64
+        )
+        dr.backward(dr.mean(image, axis=None))
+        learned.append(integrator.gradient_statistics.passes)
+        integrator.gradient_statistics.passes = 0
+        return float(dr.sum(dr.grad(parameters[key]))[0])
+
+    ours = [gradient(seed) for seed in range(16)]
+    assert all(passes > 1 for passes in learned[::8]) and sum(p > 0 for p in learned) == 2
+    integrator = make(next_event="contribution", learn_every=8)
+    for other in parameters.keys():
+        if other.endswith("radiance.value"):
+            dr.enable_grad(parameters[other])
+    # Where all of them are, what is best for the image is used
+    theirs = [gradient(seed) for seed in range(16)]
+    assert not any(learned[16:])
+    assert np.var(ours, ddof=1) < 0.5 * np.var(theirs, ddof=1)
+    assert abs(np.mean(ours) - np.mean(theirs)) < np.std(theirs)
 
 
 def test_what_has_no_gradients_is_refused() -> None:

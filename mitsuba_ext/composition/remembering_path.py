@@ -78,10 +78,18 @@ class RememberingPath(WalkIntegrator):
         # Decisions that do not learn are made again: what they depend on may have changed
         return self.can_learn and self._scene is scene and self._decisions is not None
 
+    @property
+    def is_due(self) -> bool:
+        """Is what it has learned too old?"""
+        return 0 < self.learn_every <= self._renders
+
     def pilots(self, scene, pixel_count, spp):
-        if self.learn_every and self._renders >= self.learn_every:
+        if self.is_due:
             self.forget()
-        return [] if self._knows(scene) else super().pilots(scene, pixel_count, spp)
+        if self._knows(scene):
+            return []
+        # Many renders use what this one learns: pilots have up to three quarters of its samples
+        return super().pilots(scene, pixel_count, 3 * spp)
 
     def schedule(self, scene, sensor, samples, seed):
         self._renders += 1

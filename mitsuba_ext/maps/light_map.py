@@ -180,13 +180,20 @@ class LightMap(Observer):
 
     def _square(self, visibility: mi.Float) -> mi.Float:
         """The mean squared contribution of a shadow ray, in units of ``unoccluded`` squared."""
-        squares = mi.Float(self.squares) / _UNIT
+        count, successes = self.cells.count, mi.UInt64(self.successes)
+        cell = dr.arange(mi.UInt32, len(self.squares)) % count
         # The mean square of the shadow rays that arrived, and of one more on a dark surface
         total = int(dr.sum(self.squares)[0]) / _UNIT + _DARK**2
-        arrived = dr.opaque(mi.Float, total / (int(dr.sum(mi.UInt64(self.successes))[0]) + 1))
-        return (squares + _PRIOR_SQUARES * visibility * arrived) / (
-            mi.Float(self.tests) + _PRIOR_SQUARES
-        )
+        arrived = dr.opaque(mi.Float, total / (int(dr.sum(successes)[0]) + 1))
+        # The same for each cell; sums of integers do not depend on their order
+        of_cell, number = dr.zeros(mi.UInt64, count), dr.zeros(mi.UInt64, count)
+        dr.scatter_add(of_cell, self.squares, cell)
+        dr.scatter_add(number, successes, cell)
+        arrived = mi.Float(of_cell) / _UNIT + _PRIOR_SQUARES * arrived
+        arrived /= mi.Float(number) + _PRIOR_SQUARES
+        expected = visibility * dr.gather(mi.Float, arrived, cell)
+        squares = mi.Float(self.squares) / _UNIT
+        return (squares + _PRIOR_SQUARES * expected) / (mi.Float(self.tests) + _PRIOR_SQUARES)
 
     def square_ratios(self, default: mi.Float, other: mi.Float) -> mi.Float:
         """For each row, the mean square of a connection if its cell is chosen with the

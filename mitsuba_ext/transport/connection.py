@@ -133,6 +133,8 @@ class Connector:
         considered = active & (ds.pdf != 0)
         # A connection that cannot contribute needs no shadow ray
         tested = considered & (dr.max(dr.abs(value)) > 0)
+        worth = self._weights.worth(vertex, ds)
+        value, contribution = value * worth, contribution * worth
         if self._replay is not None:
             tested = considered  # its derivative need not be zero
         weight, tested, state = self._roulette(state, connection, survival_sample, si, tested)

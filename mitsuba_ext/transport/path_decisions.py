@@ -247,6 +247,11 @@ class Weights:
         number of connections, ``scattering_pdf`` the density with which scattering finds it."""
         return dr.select(ds.delta, 1, self._heuristic(pdf, scattering_pdf))
 
+    def worth(self, vertex: Vertex, ds: mi.DirectionSample3f) -> mi.Float | float:
+        """How much the light of a connection counts, where not all light counts the same.
+        :meth:`emission` contains this factor."""
+        return 1.0
+
     def leave(self, vertex: Vertex, bs: mi.BSDFSample3f) -> Any:
         """The sums after ``vertex``, in the direction that was sampled there."""
         return vertex.path.sums

@@ -247,9 +247,12 @@ class LightMapLearner(Learner):
             # The samples were drawn from the table, and it was not learned from them
             (gain, error), cost = records.measured, records.cost
         else:
-            # Too optimistic: the table was learned from the same samples
+            # Too optimistic, as the table was learned from the same samples; too pessimistic where
+            # few of them reach each entry: these drew from the unoccluded contributions, and what
+            # is learned is rarely worse
             as_path = dr.tile(self._as_path, self.map.rows.count)
-            gain = records.predicted_gain(self.map.square_ratios(as_path, probabilities))
+            predicted = records.predicted_gain(self.map.square_ratios(as_path, probabilities))
+            gain = max(predicted, records.measured[0])
             is_trial, cost = not is_last, records.least_cost
         efficiency = self._efficiency = 1 / (max(1 - gain, 1e-3) * cost)
         self._measured = 1 - gain, cost

@@ -1,0 +1,71 @@
+"""A path tracer that learns for the gradients of some of a scene's lights.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..scene.gradients import Optimized
+from ..transport.estimator import Estimator
+from ..transport.path_decisions import Weights
+from ..transport.sensitivity import Sensitivity
+from .remembering_path import RememberingPath
+
+
+class SensitivePath(RememberingPath):
+    """Learns from paths that are weighted by how many optimized things they meet
+    (:class:`Sensitivity`): which light, and which direction, is best for the gradients.
+
+    It learns only where some of the lights are optimized, but not all. Otherwise that is about what
+    is best for the image (docs/results/gradients.md).
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.save_learned = ""
+        self._requested: tuple[mi.Scene, frozenset[str]] | None = None
+        self._optimized: Optimized | None = None
+
+    def prepare(
+        self, scene: mi.Scene, params: Any, sensor: mi.Sensor, seed: Any, spp: int
+    ) -> bool:
+        """Learns, if it is time. Returns whether it knows more than what is best for the image.
+
+        Parameters:
+            scene, params, sensor, seed, spp: Those of a pass for gradients.
+        """
+        if not self.can_learn or self.load_learned:
+            return False
+        items = params.items() if hasattr(params, "items") else ()
+        requested = scene, frozenset(str(key) for key, x in items if dr.grad_enabled(x))
+        is_known = self._requested == requested and not self.is_due
+        self._renders += 1
+        if not is_known:
+            self.forget()
+            self._requested, self._optimized = requested, Optimized(scene)
+            if self._optimized.lights_differ:
+                self._learn(scene, sensor, seed, spp)
+            self._renders = 1
+        return self._knows(scene)
+
+    def _learn(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> None:
+        spp = spp or sensor.sampler().sample_count()
+        # Pilots are three quarters of the samples
+        samples = min(4 * self._pilot_spp // 3 + 1, spp * (self.learn_every or 16) // 4)
+        # Other random numbers than those of the pass that uses what is learned
+        seed = mi.UInt32(seed) + 0x9E3779B9
+        with dr.suspend_grad():
+            self.render_once(scene, sensor, seed, max(4, samples), False, True)
+
+    def estimators(self, scene: mi.Scene, sensor: mi.Sensor) -> Callable[..., Estimator]:
+        def sensitive(**decisions: Any) -> Estimator:
+            weights = decisions.pop("mis", None) or Weights()
+            return self.walk(mis=Sensitivity(weights, self._optimized), **decisions)
+
+        return sensitive

@@ -1,0 +1,87 @@
+"""Which gradients are requested: what in a scene is optimized."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Parameters of shapes and sensors that move what rays hit.
+_GEOMETRY = ("vertex_positions", "vertex_normals", "to_world", "x_fov", "principal_point_offset_x",
+             "principal_point_offset_y")  # fmt: skip
+
+
+def refuse_geometry(plugin: str, params: Any) -> None:
+    """
+    Parameters:
+        plugin: Name of the integrator.
+        params: The parameters that ``mi.render`` was given, such as those of ``mi.traverse``.
+
+    Raises:
+        NotImplementedError: Gradients with respect to the place of something are requested.
+    """
+    if not (isinstance(params, Mapping) or hasattr(params, "items")):
+        return
+    for key, value in params.items():
+        if str(key).rpartition(".")[2] in _GEOMETRY and dr.grad_enabled(value):
+            raise NotImplementedError(
+                f'"{plugin}": there are no gradients with respect to "{key}", which moves things; '
+                f'use "prb" or "prb_projective"'
+            )
+
+
+class Optimized:
+    """Which BSDFs and lights of a scene have parameters with gradients.
+
+    Attributes:
+        lights_differ (bool): Are some of the lights optimized, but not all?
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        bsdfs, emitters = {}, {}
+        for shape in scene.shapes():
+            index = _index(mi.BSDFPtr(shape.bsdf()))
+            is_known = bsdfs.get(index, False)
+            bsdfs[index] = is_known or _is_optimized(shape.bsdf()) or _has_optimized_colours(shape)
+        for emitter in scene.emitters():
+            emitters[_index(mi.EmitterPtr(emitter))] = _is_optimized(emitter)
+        self.lights_differ = len({*emitters.values()}) == 2
+        self._bsdfs, self._emitters = _table(bsdfs), _table(emitters)
+
+    def bsdf(self, bsdf: mi.BSDFPtr) -> mi.Float:
+        """1 where it is optimized, otherwise 0."""
+        return _gathered(self._bsdfs, bsdf)
+
+    def emitter(self, emitter: mi.EmitterPtr) -> mi.Float:
+        """1 where it is optimized, otherwise 0."""
+        return _gathered(self._emitters, emitter)
+
+
+def _is_optimized(thing: Any) -> bool:
+    return any(dr.grad_enabled(value) for _key, value in mi.traverse(thing))
+
+
+def _has_optimized_colours(shape: mi.Shape) -> bool:
+    """Has a mesh attributes with gradients, which its BSDF may use?"""
+    # Those of its BSDF and its light have the names of these before a dot
+    return any("." not in key and dr.grad_enabled(value) for key, value in mi.traverse(shape))
+
+
+def _index(pointer: mi.BSDFPtr | mi.EmitterPtr) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, pointer)[0])
+
+
+def _table(flags: Mapping[int, bool]) -> mi.Float:
+    # An object that is not known, such as one of a shape group, counts as optimized
+    table = np.ones(max(flags, default=0) + 1, np.float32)
+    table[[*flags]] = [*flags.values()]
+    return mi.Float(table)
+
+
+def _gathered(table: mi.Float, pointer: mi.BSDFPtr | mi.EmitterPtr) -> mi.Float:
+    index = dr.reinterpret_array(mi.UInt32, pointer)
+    is_known = index < len(table)
+    return dr.select(is_known, dr.gather(mi.Float, table, index, is_known), 1)
