@@ -3,7 +3,8 @@
     python benchmarks/gradients.py scenes/rooms.xml --spp 64
 
 The loss is the mean of the image, weighted by random numbers / (1 + radiance). Its gradients are
-those with respect to all colours, roughnesses and emissions of the scene that are no textures.
+those with respect to all colours, roughnesses and emissions of the scene that are no textures;
+with ``--lamps``, with respect to the emission of one of the lamps alone.
 Variance: the geometric mean, over these parameters, of the variance between seeds. Time: the median
 over the renders but the first two, of the image and its gradients; learning included. z: the
 difference of the means to those of ``prb``, in units of its standard error.
@@ -25,7 +26,7 @@ import numpy as np  # isort: skip
 
 _ENDS = ("reflectance.value", "radiance.value", "alpha.value")
 
-#: The first one is that to which the others are compared; it gets four times as many seeds.
+#: The first one is that to which the others are compared.
 INTEGRATORS = {
     "prb": {"type": "prb"},
     "composed_prb": {"type": "composed_prb"},
@@ -50,39 +51,55 @@ def gradients(scene, parameters, keys, integrator, weights, spp: int, seed: int)
     return found, time.perf_counter() - begin
 
 
+def load(file: Path, size: tuple[int, int]) -> tuple[mi.Scene, mi.SceneParameters, mi.TensorXf]:
+    """The scene, its parameters, and the weights of the loss."""
+    scene = mi.load_file(str(file))
+    sensor = mi.traverse(scene.sensors()[0])
+    sensor["film.size"] = sensor["film.crop_size"] = list(size)
+    sensor.update()
+    random = np.random.default_rng(1).uniform(0.5, 1.5, (*size[::-1], 3))
+    mean = mi.render(scene, integrator=mi.load_dict({"type": "bdpt", "max_depth": 6}), spp=64)
+    weights = mi.TensorXf((random / (1 + np.array(mean))).astype(np.float32))
+    return scene, mi.traverse(scene), weights
+
+
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--spp", default=64, show_default=True)
-@click.option("--seeds", default=8, show_default=True)
+@click.option("--seeds", default=16, show_default=True)
 @click.option("--size", default=(128, 72), type=(int, int), show_default=True)
-def main(files: tuple[Path, ...], spp: int, seeds: int, size: tuple[int, int]) -> None:
+@click.option("--lamps", default=0, help="Of so many lamps, each on its own, in scenes with more.")
+def main(files: tuple[Path, ...], spp: int, seeds: int, size: tuple[int, int], lamps: int) -> None:
     """Compares on the scenes FILES."""
     mi.set_variant("llvm_ad_rgb")
     for file in files:
-        scene = mi.load_file(str(file))
-        sensor = mi.traverse(scene.sensors()[0])
-        sensor["film.size"] = sensor["film.crop_size"] = list(size)
-        sensor.update()
-        parameters = mi.traverse(scene)
+        scene, parameters, weights = load(file, size)
         keys = [key for key in parameters.keys() if key.endswith(_ENDS)]
-        random = np.random.default_rng(1).uniform(0.5, 1.5, (*size[::-1], 3))
-        mean = mi.render(scene, integrator=mi.load_dict({"type": "bdpt", "max_depth": 6}), spp=64)
-        weights = mi.TensorXf((random / (1 + np.array(mean))).astype(np.float32))
-        print(f"{file}, {spp} spp, {len(keys)} parameters", flush=True)
+        sets = [keys]
+        if lamps:
+            all_lamps = [[key] for key in keys if key.endswith("radiance.value")]
+            sets = all_lamps[:: -(-len(all_lamps) // lamps)]
+        print(f"{file}, {spp} spp, {sum(map(len, sets))} parameters", flush=True)
         known = None
-        for name, plugin in INTEGRATORS.items():
-            integrator = mi.load_dict({**plugin, "max_depth": 6})
-            count = seeds if known else 4 * seeds
-            found, times = zip(*(
-                gradients(scene, parameters, keys, integrator, weights, spp, 100 * count + seed)
-                for seed in range(count)
-            ))  # fmt: skip
-            mean, variance = np.mean(found, axis=0), np.var(found, axis=0, ddof=1)
+        for first, (name, plugin) in enumerate(INTEGRATORS.items()):
+            found, times = [[] for _ in sets], []
+            for index, wanted in enumerate(sets):
+                integrator = mi.load_dict({**plugin, "max_depth": 6})
+                dr.disable_grad([parameters[key] for key in keys])
+                for seed in range(1000 * first, 1000 * first + seeds):
+                    values, seconds = gradients(
+                        scene, parameters, wanted, integrator, weights, spp, seed
+                    )
+                    found[index].append(values)
+                    times.append(seconds)
+            samples = np.concatenate(found, axis=1)
+            mean, variance = np.mean(samples, axis=0), np.var(samples, axis=0, ddof=1)
             taken = statistics.median(times[2:])
             known = known or (mean, variance, taken)
-            is_noisy = (known[1] > 1e-20) & np.isfinite(known[0])
-            error = np.sqrt(variance / count + known[1] / (4 * seeds))[is_noisy]
-            z = np.abs(mean - known[0])[is_noisy] / np.maximum(error, 1e-30)
+            # Lights and materials that no path finds have neither gradients nor noise
+            is_noisy = (known[1] > 1e-20) & (variance > 1e-20)
+            error = np.sqrt((variance + known[1]) / seeds)[is_noisy]
+            z = np.abs(mean - known[0])[is_noisy] / error
             ratio = np.exp(np.mean(np.log(variance[is_noisy] / known[1][is_noisy])))
             print(
                 f"    {name}: variance {ratio:.2f}, time {taken / known[2]:.2f}, efficiency "
