@@ -1,6 +1,7 @@
-"""Renders the pictures of the README: ``path`` beside an integrator of ours, at equal time.
+"""Renders pairs of pictures at equal time: ``path`` beside an integrator of ours.
 
-    .venv/bin/python benchmarks/equal_time_pictures.py rooms door_ajar glass_lamp pool
+    python benchmarks/equal_time_pictures.py            # those of the plugins' pages
+    python benchmarks/equal_time_pictures.py --readme   # those of the README
 
 Kernels are compiled before. ``path`` is rendered by ``composed_path`` with its defaults, which
 makes the same image and ends at a timeout. Both halves have one exposure: that of our image.
@@ -9,6 +10,7 @@ makes the same image and ends at a timeout. Both halves have one exposure: that 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import click
 import numpy as np
@@ -17,27 +19,88 @@ from PIL import Image, ImageDraw
 
 import mitsuba as mi  # isort: skip
 
-FIGURES = Path(__file__).parents[1] / "docs" / "figures"
+DOCS = Path(__file__).parents[1] / "docs"
 
-#: The integrator of ours for each scene, and the longest paths.
-OURS = {
-    "rooms": ({"type": "auto_path"}, 8),
-    "door_ajar": ({"type": "auto_path"}, 8),
-    "glass_lamp": ({"type": "bdpt"}, 12),
-    "pool": ({"type": "vcm"}, 8),
-    "caustic": ({"type": "bdpt"}, 8),
+
+class Pair(NamedTuple):
+    """A scene, an integrator of ours, the longest paths, and what stands beside it."""
+
+    scene: str
+    ours: dict[str, Any]
+    max_depth: int = 8
+    path: dict[str, Any] = {"type": "composed_path"}  # noqa: RUF012
+
+
+#: The pictures of the README, by scene.
+README = {
+    "rooms": Pair("rooms", {"type": "auto_path"}),
+    "door_ajar": Pair("door_ajar", {"type": "auto_path"}),
+    "glass_lamp": Pair("glass_lamp", {"type": "bdpt"}, 12),
+    "pool": Pair("pool", {"type": "vcm"}),
+    "caustic": Pair("caustic", {"type": "bdpt"}),
+}
+
+_PATH = {"type": "composed_path"}
+
+#: The pictures of the plugins' pages. Integrators around others have them around ``path``.
+PLUGINS = {
+    "auto": Pair("water_glass", {"type": "auto"}),
+    "auto_path": Pair("door_ajar", {"type": "auto_path"}),
+    "neepp": Pair("rooms", {"type": "neepp"}),
+    "pss_guided": Pair("corridor", {"type": "pss_guided"}),
+    "swarm_path": Pair("colour_wheel", {"type": "swarm_path"}),
+    "bdpt": Pair("glass_lamp", {"type": "bdpt"}, 12),
+    "vcm": Pair("pool", {"type": "vcm"}),
+    "sppm": Pair("volume_caustic", {"type": "sppm"}),
+    "photon_map": Pair("caustic", {"type": "photon_map"}),
+    "light_tracer": Pair("ring", {"type": "light_tracer"}),
+    "erpt": Pair("keyhole", {"type": "erpt"}),
+    "pssmlt": Pair("pool", {"type": "pssmlt"}),
+    "mlt": Pair("mirrored_lamp", {"type": "mlt"}),
+    "composed_path": Pair("many_lamps", {**_PATH, "next_event": "power"}),
+    "reweighted_time": Pair("fast_balls", {"type": "reweighted_time", "nested": _PATH}),
+    "reweighted_lens": Pair("defocus", {"type": "reweighted_lens", "nested": _PATH}),
+    "ecoc_dof": Pair("defocus", {"type": "ecoc_dof", "nested": _PATH}),
+    "adaptive": Pair("spotlights", {"type": "adaptive", "nested": _PATH}),
 }
 
 #: Where the brightest values of our image come to lie, before the sRGB curve.
 _WHITE = 0.9
 
 
-def _rendered(scene: mi.Scene, integrator: dict, seconds: float, max_depth: int):
-    """The image, and the samples per pixel that fit into the time."""
-    timed = mi.load_dict({**integrator, "max_depth": max_depth, "timeout": seconds})
+def rendered(scene: mi.Scene, integrator: dict, seconds: float, max_depth: int):
+    """The image, and the statistics: how many samples per pixel fit into the time."""
+    inner = integrator.get("nested", integrator)
+    timed = {**inner, "max_depth": max_depth}
+    if "nested" in integrator:
+        timed = {**integrator, "nested": timed}
+    timed = mi.load_dict({**timed, "timeout": seconds})
     for seed in range(3):  # the first two compile the kernels of timed passes
         image = np.array(mi.render(scene, integrator=timed, spp=1 << 16, seed=seed))[..., :3]
     return image, timed.statistics
+
+
+def side_by_side(pair: Pair, seconds: float, size: tuple[int, int]) -> tuple[Image.Image, str]:
+    """Both pictures in one, and a sentence about their samples."""
+    scene = load(pair.scene, size)
+    halves = {"path": pair.path, pair.ours["type"]: pair.ours}
+    if len(halves) == 1:
+        halves = {"path": pair.path, "next_event=power": pair.ours}
+    made = {k: rendered(scene, v, seconds, pair.max_depth) for k, v in halves.items()}
+    scale = _WHITE / np.quantile([*made.values()][1][0], 0.98)
+    picture = Image.new("RGB", (2 * size[0] + 4, size[1]), "white")
+    samples = []
+    for index, (label, (image, statistics)) in enumerate(made.items()):
+        half = _to_8_bit(image, scale)
+        ImageDraw.Draw(half).text((6, size[1] - 16), label, fill="white", stroke_width=1,
+                                  stroke_fill="black")  # fmt: skip
+        picture.paste(half, (index * (size[0] + 4), 0))
+        samples.append(f"{label} {statistics.spp}")
+    text = (
+        f"{pair.scene}.xml, {size[0]}x{size[1]}, {seconds:g} s each on two cores, learning "
+        f"included. Samples per pixel: {', '.join(samples)}."
+    )
+    return picture, text
 
 
 def _to_8_bit(image: np.ndarray, scale: float) -> Image.Image:
@@ -47,26 +110,23 @@ def _to_8_bit(image: np.ndarray, scale: float) -> Image.Image:
 
 
 @click.command()
-@click.argument("names", nargs=-1, type=click.Choice(list(OURS)))
+@click.argument("names", nargs=-1)
+@click.option("--readme", is_flag=True, help="The pictures of the README.")
 @click.option("--seconds", default=5.0, show_default=True, help="For each render.")
 @click.option("--size", type=(int, int), default=(320, 180), show_default=True)
-def main(names: tuple[str, ...], seconds: float, size: tuple[int, int]) -> None:
-    """Renders the scenes NAMES (all, if none is given)."""
+def main(names: tuple[str, ...], readme: bool, seconds: float, size: tuple[int, int]) -> None:
+    """Renders the pictures NAMES (all, if none is given)."""
     mi.set_variant("llvm_ad_rgb")
-    for name in names or OURS:
-        ours, max_depth = OURS[name]
-        scene = load(name, size)
-        halves = {"path": {"type": "composed_path"}, ours["type"]: ours}
-        made = {k: _rendered(scene, v, seconds, max_depth) for k, v in halves.items()}
-        scale = _WHITE / np.quantile(made[ours["type"]][0], 0.98)
-        picture = Image.new("RGB", (2 * size[0] + 4, size[1]), "white")
-        for index, (label, (image, statistics)) in enumerate(made.items()):
-            half = _to_8_bit(image, scale)
-            ImageDraw.Draw(half).text((6, size[1] - 16), label, fill="white", stroke_width=1,
-                                      stroke_fill="black")  # fmt: skip
-            picture.paste(half, (index * (size[0] + 4), 0))
-            print(f"{name}, {label}: {statistics.spp} spp in {statistics.seconds:.1f} s")
-        picture.save(FIGURES / f"equal_time_{name}.jpg", quality=90)
+    pairs = README if readme else PLUGINS
+    (DOCS / "pictures").mkdir(exist_ok=True)
+    for name in names or pairs:
+        picture, text = side_by_side(pairs[name], seconds, size)
+        print(f"{name}: {text}", flush=True)
+        if readme:
+            picture.save(DOCS / "figures" / f"equal_time_{name}.jpg", quality=90)
+        else:
+            picture.save(DOCS / "pictures" / f"{name}.jpg", quality=85)
+            (DOCS / "pictures" / f"{name}.txt").write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -6,8 +6,8 @@ The loss is the mean of the image, weighted by random numbers / (1 + radiance). 
 those with respect to all colours, roughnesses and emissions of the scene that are no textures;
 with ``--lamps``, with respect to the emission of one of the lamps alone.
 Variance: the geometric mean, over these parameters, of the variance between seeds. Time: the median
-over the renders but the first two, of the image and its gradients; learning included. z: the
-difference of the means to those of ``prb``, in units of its standard error.
+over the renders but the first two, of the image and its gradients, of all cores; learning included.
+z: the difference of the means to those of ``prb``, in units of its standard error.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ INTEGRATORS = {
 
 
 def gradients(scene, parameters, keys, integrator, weights, spp: int, seed: int):
-    """The sum over the channels of each parameter's gradient, and the seconds that it took."""
+    """The sum over the channels of each parameter's gradient, and the CPU time."""
     for key in keys:
         dr.enable_grad(parameters[key])
         dr.set_grad(parameters[key], 0)
-    begin = time.perf_counter()
+    begin = time.process_time()
     image = mi.render(
         scene, parameters, integrator=integrator, seed=seed, seed_grad=seed + 10000, spp=spp
     )
     dr.backward(dr.mean(image * weights, axis=None))
     found = [np.array(dr.grad(parameters[key])).sum() for key in keys]
-    return found, time.perf_counter() - begin
+    return found, time.process_time() - begin
 
 
 def load(file: Path, size: tuple[int, int]) -> tuple[mi.Scene, mi.SceneParameters, mi.TensorXf]:
