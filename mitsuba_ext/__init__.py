@@ -13,7 +13,7 @@ from pathlib import Path
 
 from .startup import mitsuba_import
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = ["__version__"]
 

@@ -156,6 +156,7 @@ def test_what_only_prints_starts_without_mitsuba(make_scene, tmp_path):
     render = ["render", str(make_scene()), "-o", str(tmp_path / "image.exr"), "--integrator"]
     command_lines = [
         ["--help"], ["--version"], ["render", "--help"], ["list"], ["list", "neepp"],
+        ["export-blender"],
         ["list", "path"], ["list", "neeep"], [*render, "neeep"], ["render", "none.xml", "-o", "a"],
         ["compare", render[1], "path", "neeep", "--spp=1"],
         [*render, "composed_path:directions=[guided_direction]"], [*render, "learned_lights"],

@@ -27,7 +27,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "command.md"
 
 def documented() -> dict[str, set[int]]:
     """The codes of each subcommand, as the page says."""
-    rows = re.findall(r"^\| `([a-z]+)` \|(.*)\|$", PAGE.read_text(), re.MULTILINE)
+    rows = re.findall(r"^\| `([a-z-]+)` \|(.*)\|$", PAGE.read_text(), re.MULTILINE)
     columns = (0, 1, 2, 130, 143, 129)
     return {
         name: {code for code, cell in zip(columns, cells.split("|")) if cell.strip() != "–"}
@@ -113,6 +113,7 @@ def test_the_others(exits, image, tmp_path, monkeypatch):
     exits("diff", (0, (image, image)), (2, (image, tmp_path / "no.exr")))
     exits("list", (0, ()), (0, ("neepp",)), (2, ("nothing",)))
     exits("completion", (0, ("bash",)), (2, ("tcsh",)))
+    exits("export-blender", (0, ()), (2, ("-o", tmp_path / "no" / "integrators.json")))
     for code in (0, 1):
         monkeypatch.setattr(doctor, "main", lambda code=code: code)
         exits("doctor", (code, ()))

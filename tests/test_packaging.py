@@ -10,7 +10,9 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import venv
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -34,6 +36,33 @@ def test_every_folder_with_modules_is_a_package() -> None:
 def test_range_of_mitsuba_is_the_same_in_both_places() -> None:
     first, end = (".".join(map(str, version)) for version in runtime.MITSUBA_VERSIONS)
     assert f'"mitsuba>={first},<{end}"' in PYPROJECT
+
+
+def test_version_is_that_of_the_changes_and_of_the_citation() -> None:
+    """The version stands in ``mitsuba_ext.__version__``; these two files repeat it."""
+    entries = re.findall(
+        r"^## \[(.+?)\] – (.+)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    version = re.findall(r"^version: (.+)$", citation, re.MULTILINE)
+    date = re.findall(r'^date-released: "(.+)"$', citation, re.MULTILINE)
+    assert entries[0] == (mitsuba_ext.__version__, *date)
+    assert version == [mitsuba_ext.__version__]
+    assert re.search(r'^version = \{ attr = "mitsuba_ext.__version__" \}$', PYPROJECT, re.MULTILINE)
+
+
+def test_workflow_of_github_runs_the_steps_of_the_ci() -> None:
+    yaml = pytest.importorskip("yaml")
+    text = (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
+    workflow = yaml.safe_load(text)
+    # YAML 1.1 reads the key "on" as true
+    assert {"push", "pull_request"} <= set(workflow[True])
+    (job,) = workflow["jobs"].values()
+    assert job["strategy"]["matrix"]["python"] == ["3.9", "3.12"]
+    assert all("uses" in step or "run" in step for step in job["steps"])
+    commands = "\n".join(step.get("run", "") for step in job["steps"])
+    for command in (".ci/run", "-m build"):
+        assert command in commands, f"ci.yml does not run {command}"
 
 
 def test_page_on_versions_names_every_file_that_uses_meshes_as_in_mitsuba_3_9() -> None:
@@ -146,16 +175,65 @@ def _run(folder: Path, *arguments: object, **environment: str) -> subprocess.Com
     )  # fmt: skip
 
 
+#: What is not part of the sources: git's own, environments, and what is built.
+_BUILT = (
+    ".git", ".venv", "out", "build", "dist", "_build", "*.egg-info", "__pycache__", ".*_cache",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """A copy of the whole tree, and the archive of its sources and the wheel made from that."""
+    folder = tmp_path_factory.mktemp("built")
+    tree = folder / "tree"
+    shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(*_BUILT))
+    subprocess.run([sys.executable, "-m", "build", "--outdir", folder, tree], check=True)
+    (archive,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    return tree, archive, wheel
+
+
 @pytest.mark.slow
-def test_archive_and_wheel_work_in_another_environment(source_tree: Path, tmp_path: Path) -> None:
-    """Built from the sources and installed elsewhere: the plugins are registered and render, and a
-    comparison writes its report, also where the source tree is the current folder."""
-    for name in ("pyproject.toml", "setup.py", "LICENSE", "README.md"):
-        shutil.copy(ROOT / name, source_tree)
-    archive = shutil.make_archive(str(tmp_path / "sources"), "zip", tmp_path, source_tree.name)
-    # An archive of the sources, and a wheel made from that
-    subprocess.run([sys.executable, "-m", "build", "--outdir", tmp_path, source_tree], check=True)
-    (wheel,) = tmp_path.glob("*.whl")
+def test_archive_has_what_the_tests_and_the_docs_need(built: tuple[Path, Path, Path]) -> None:
+    tree, archive, _ = built
+    with tarfile.open(archive) as file:
+        names = {name.partition("/")[2] for name in file.getnames()}
+    assert archive.name == f"mitsuba_ext-{mitsuba_ext.__version__}.tar.gz"
+    wanted = {"CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "Makefile", "README.md"}
+    wanted |= {".ci/run", ".github/workflows/ci.yml", "pyproject.toml", "setup.py"}
+    for folder in ("benchmarks", "docs", "examples", "scenes", "tests", "mitsuba_ext", *KINDS):
+        files = (file for file in (tree / folder).rglob("*") if file.is_file())
+        wanted |= {str(file.relative_to(tree)) for file in files}
+    wanted -= {f"scenes/{file.name}" for file in (tree / "scenes").glob("*_in_fog.xml")}
+    assert not wanted - names, "MANIFEST.in leaves files out"
+    assert not [name for name in names if name.endswith(".pyc")]
+
+
+@pytest.mark.slow
+def test_wheel_has_plugins_and_templates_and_nothing_else(built: tuple[Path, Path, Path]) -> None:
+    tree, _, wheel = built
+    with zipfile.ZipFile(wheel) as file:
+        names = set(file.namelist())
+    assert wheel.name == f"mitsuba_ext-{mitsuba_ext.__version__}-py3-none-any.whl"
+    wanted = {"mitsuba_ext/py.typed"}
+    for folder in ("mitsuba_ext", *KINDS):
+        # The folders of plugins are inside of the installed package
+        prefix = "" if folder == "mitsuba_ext" else "mitsuba_ext/"
+        for file in (tree / folder).rglob("*"):
+            if file.suffix in (".py", ".html", ".css", ".js"):
+                wanted.add(prefix + str(file.relative_to(tree)))
+    assert "mitsuba_ext/compare/report/report.css" in wanted
+    info = f"mitsuba_ext-{mitsuba_ext.__version__}.dist-info/"
+    assert {name for name in names if not name.startswith(info)} == wanted
+    assert info + "licenses/LICENSE" in names
+
+
+@pytest.mark.slow
+def test_archive_and_wheel_work_in_another_environment(
+    built: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    """Installed elsewhere, the plugins are registered and render, and a comparison writes its
+    report, also where the source tree is the current folder."""
+    tree, archive, wheel = built
     venv.create(tmp_path / "venv", with_pip=True)
     binaries = tmp_path / "venv" / "bin"
     code = """
@@ -177,8 +255,10 @@ sys.exit(doctor.main())
         options = [] if source == wheel else ["--no-deps"]
         subprocess.run([*install, *options, source], check=True)
         subprocess.run([binaries / "python", "-c", code], cwd=tmp_path, check=True)
-        out = tmp_path / Path(source).suffix
-        subprocess.run(
-            [binaries / "mitsuba-ext", *arguments, f"--out={out}"], cwd=source_tree, check=True
-        )
+        image = tmp_path / f"first{source.suffix}.exr"
+        render = [binaries / "mitsuba-ext", "render", scene, "-o", image, "--spp=4"]
+        subprocess.run(render, cwd=tmp_path, check=True)
+        assert image.exists()
+        out = tmp_path / source.suffix
+        subprocess.run([binaries / "mitsuba-ext", *arguments, f"--out={out}"], cwd=tree, check=True)
         assert (out / "report.html").stat().st_size > 10_000

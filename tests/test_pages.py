@@ -117,12 +117,18 @@ def test_row_of_common_parameters_stands_for_the_table_of_the_base_class(tmp_pat
     assert [(row.name, row.description) for row in parameters] == [
         ("a", "Own a."), ("b", "Base b."), ("e", "Root e."), ("c", "Own c."),
     ]
+    # Classes between that have no table are passed over, in the same file too
+    plugin.write_text(
+        f'from .deeper.base import Base\n\nclass Between(Base):\n    pass\n\n'
+        f'class P(Between):\n    """P.\n{table}{common}    """\n'
+    )
+    assert [row.name for row in pages.read_page(plugin).parameters] == ["b", "e", "c"]
     plugin.write_text(f'class P(Base):\n    """P.\n{table}{common}    """\n')
     with pytest.raises(ValueError, match="P has no base class with"):
         pages.read_page(plugin)
 
 
-@pytest.mark.parametrize("name", WALKS)
+@pytest.mark.parametrize("name", [*WALKS, "auto", "bdpt", "light_tracer", "vcm"])
 def test_integrators_describe_the_common_parameters_by_reference(name):
     own = {row.name: row for row in pages.read_page(FILES[name]).parameters}
     shared = {row.name: row for row in pages.read_page(FILES["composed_path"]).parameters}

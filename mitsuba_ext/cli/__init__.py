@@ -20,6 +20,7 @@ from .compare import compare
 from .completion import completion, register
 from .denoise import denoise
 from .diff import diff
+from .export_blender import export_blender
 from .merge import merge
 from .plugins import list_plugins
 from .render import render
@@ -45,7 +46,9 @@ def doctor() -> int:
     return doctor_module.main()
 
 
-for command in (render, merge, denoise, compare, diff, list_plugins, doctor, completion):
+for command in (
+    render, merge, denoise, compare, diff, list_plugins, doctor, export_blender, completion,
+):  # fmt: skip
     cli.add_command(command)
 
 

@@ -12,7 +12,7 @@
         folder="out/doors",
     )
     results = comparison.run()          # also out/doors/results.json and report.html
-    compare.show(results)               # tables
+    compare.show(results)               # tables; a notebook shows ``results`` itself as one
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from .budgets import Budget, equal_samples, equal_time, sweep, until
 from .comparison import Comparison, SceneSetup
 from .experiment import Contender, Experiment
 from .intervals import Estimate
+from .notebook import Results
 from .references import Reference, load_reference, render_reference
 from .report import write_report
 from .runs import Run
@@ -45,6 +46,7 @@ __all__ = [
     "LoadedScene",
     "NamedIntegrator",
     "Reference",
+    "Results",
     "Run",
     "SceneSetup",
     "Step",

@@ -26,6 +26,7 @@ from ..startup.machine import machine, versions
 from . import references, results, timing
 from .budgets import Budget
 from .experiment import Experiment, make_all
+from .notebook import Results
 from .references import Reference
 from .report import write_report
 
@@ -131,7 +132,7 @@ class Comparison:
         self._running: tuple[str, Experiment] | None = None
         self.is_finished = False
 
-    def run(self, progress: bool | Callable[[Step], None] = True) -> dict[str, object]:
+    def run(self, progress: bool | Callable[[Step], None] = True) -> Results:
         """Measures everything, writes ``results.json`` and ``report.html``, returns the results.
 
         After Ctrl-C, it writes both files from the finished runs, then raises the exception again.
@@ -169,7 +170,7 @@ class Comparison:
             if self._records:
                 self.write()
 
-    def results(self) -> dict[str, object]:
+    def results(self) -> Results:
         """The content of ``results.json``; see :mod:`.results`."""
         content = {
             "schema": results.SCHEMA,
@@ -182,7 +183,11 @@ class Comparison:
             "versions": versions(),
             "machine": machine(),
         }
-        return results.clean(content)
+        return Results(results.clean(content), self.folder)
+
+    def _repr_html_(self) -> str | None:
+        """For notebooks: what has been measured; ``None`` before that."""
+        return self.results()._repr_html_() if self._records else None
 
     def write(self) -> None:
         """Writes ``results.json`` and ``report.html``."""

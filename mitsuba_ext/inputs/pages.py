@@ -84,7 +84,10 @@ def _class_page(file: Path, tree: ast.Module, cls: ast.ClassDef) -> Page:
     rows: list[Parameter] = []
     for parameter in page.parameters:
         if parameter.name == _COMMON:
-            common = _class_page(*_base_class(file, tree, cls)).parameters
+            base = _base_class(file, tree, cls)
+            while _LIST not in _docstring(base[2]):  # a class between that adds no parameters
+                base = _base_class(*base)
+            common = _class_page(*base).parameters
             rows += [row for row in common if row.name not in own]
         else:
             rows.append(parameter)
@@ -94,13 +97,16 @@ def _class_page(file: Path, tree: ast.Module, cls: ast.ClassDef) -> Page:
 def _base_class(
     file: Path, tree: ast.Module, cls: ast.ClassDef
 ) -> tuple[Path, ast.Module, ast.ClassDef]:
-    """The file, its syntax tree and the definition of the base class that ``file`` imports from
-    this package.
+    """The file, its syntax tree and the definition of the base class, which ``file`` defines or
+    imports from this package.
 
     Raises:
         ValueError: There is no such base class.
     """
     bases = {base.id for base in cls.bases if isinstance(base, ast.Name)}
+    for definition in tree.body:
+        if isinstance(definition, ast.ClassDef) and definition.name in bases:
+            return file, tree, definition
     for node in tree.body:
         names = {alias.name for alias in node.names} if isinstance(node, ast.ImportFrom) else set()
         if bases & names:

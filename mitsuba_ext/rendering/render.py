@@ -27,6 +27,7 @@ from . import camera
 from .dither import dithered_parts
 from .filter_weights import put_splats
 from .interrupts import deferred_interrupt
+from .notebook import statistics_table
 from .pass_samples import GradientsError, count_rays, look, put_samples
 from .plan import Planned, plan_render
 from .stages import DivisibleSchedule, Schedule, Stage
@@ -96,6 +97,9 @@ class RenderStatistics:
     effects: dict[str, dict[str, Any]] = field(default_factory=dict)
     memory: int = 0
     interrupted: bool = False
+
+    def _repr_html_(self) -> str:
+        return statistics_table(self)
 
 
 def render(

@@ -51,7 +51,7 @@ def render_page(results: Record, folder: Path) -> str:
         for index, scene in enumerate(results["scenes"], 1)
     ]
     script = (_FOLDER / "report.js").read_text(encoding="utf-8")
-    template = _environment().get_template("report.html")
+    template = environment().get_template("report.html")
     return template.render(
         title=_title(results, list(labels)),
         facts=_facts(results),
@@ -72,21 +72,22 @@ def render_page(results: Record, folder: Path) -> str:
 
 
 @cache  # compiles the templates once
-def _environment() -> jinja2.Environment:
+def environment() -> jinja2.Environment:
+    """The templates of this folder, and the filters that they use."""
     import jinja2
 
-    environment = jinja2.Environment(
+    made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_FOLDER, encoding="utf-8"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["number"] = formats.number
-    environment.filters["breakable"] = _breakable
-    environment.filters["short"] = formats.short
-    environment.filters["seconds"] = partial(formats.quantity, unit=formats.seconds)
-    return environment
+    made.filters["number"] = formats.number
+    made.filters["breakable"] = _breakable
+    made.filters["short"] = formats.short
+    made.filters["seconds"] = partial(formats.quantity, unit=formats.seconds)
+    return made
 
 
 def _breakable(label: str) -> Markup:
@@ -115,10 +116,10 @@ def _scene(
             one["label"]: tables.ratio_cell(one, level, "efficiency")
             for one in scene["integrators"]
         },
-        "level": _level(budget, level),
+        "level": level_name(budget, level),
         "table": tables.make_table(scene, level, target),
         "other_tables": [
-            (_level(budget, other), tables.make_table(scene, other))
+            (level_name(budget, other), tables.make_table(scene, other))
             for other in reversed(records.levels(scene))
             if other != level
         ],
@@ -192,7 +193,8 @@ def _scene_facts(scene: Record) -> list[tuple[str, str]]:
     return facts
 
 
-def _level(budget: Record, level: float | None) -> str:
+def level_name(budget: Record, level: float | None) -> str:
+    """A level with its unit; empty if nothing was measured."""
     if level is None:
         return ""
     return _LEVELS.get(budget["kind"], "level {}").format(formats.number(level))

@@ -54,14 +54,24 @@ class Table:
     unrecorded: list[str]
 
 
-def make_table(scene: Record, level: float | None, target: float | None = None) -> Table:
-    """The table of one level. ``target`` is the relMSE of ``until``; ``None`` for other budgets."""
+def make_table(
+    scene: Record,
+    level: float | None,
+    target: float | None = None,
+    wanted: Callable[[Column], bool] = lambda _column: True,
+) -> Table:
+    """The table of one level.
+
+    Args:
+        target: The relMSE of ``until``; ``None`` for other budgets.
+        wanted: Which columns to make.
+    """
     integrators = scene["integrators"]
     rows = [(integrator, at_level(integrator, level)) for integrator in integrators]
     columns = [*_ratios(integrators), *_target(target), *_RUN, *_ERRORS, *_WORK]
     used = [
         column
-        for column in columns
+        for column in filter(wanted, columns)
         if any(record and column.estimate(one, record) for one, record in rows)
     ]
     groups: list[tuple[str, int]] = []
