@@ -7,6 +7,8 @@
 #   make test-slow  runs the long statistical tests, and other slow tests
 #   make bench   runs the benchmarks on our scenes, and on ../shared/scenes if it exists; writes a
 #                report, and the table and the plot of docs/results/benchmark.md
+#   make docs    builds the documentation site, which needs no network, in out/docs; the results of
+#                tutorials are kept in out/docs_work until the code of the tutorials changes
 #   make lint    checks the code's style
 #   make clean   removes everything that was built, `.venv` included, but not `out/`
 #
@@ -25,7 +27,7 @@ DEMO := $(BIN)/mitsuba-ext compare scenes/door_ajar.xml scenes/rooms.xml scenes/
 # takes over tests that others have not begun.
 PYTEST := $(BIN)/python -m pytest -q -n logical --maxprocesses 8 --dist worksteal
 
-.PHONY: demo test test-slow bench lint setup clean
+.PHONY: demo test test-slow bench docs lint setup clean
 
 demo: setup
 	$(DEMO)
@@ -39,6 +41,12 @@ test-slow: setup
 
 bench: setup
 	$(BIN)/python benchmarks/benchmark.py
+
+docs: setup $(VENV)/.installed_docs
+	rm -rf out/docs
+	$(BIN)/python -m sphinx -q -E -W --keep-going -d out/docs_work/pages -c docs/site . out/docs
+	$(BIN)/python docs/site/check.py out/docs
+	@echo "Open out/docs/index.html in a browser."
 
 lint: setup
 	$(BIN)/python -m ruff check .
@@ -54,6 +62,10 @@ $(VENV)/.installed: pyproject.toml setup.py
 	    { echo "$(PYTHON) cannot make virtual environments: run \`sudo apt install python3-venv\`." >&2; exit 1; }
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+$(VENV)/.installed_docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	@touch $@
 
 clean:

@@ -47,25 +47,25 @@ class PhotonMapping(WalkIntegrator):
     .. pluginparameters::
 
      * - photons
-       - |integer|
+       - |int|
        - Number of light paths. (Default: 250000)
      * - final_gather
-       - |boolean|
+       - |bool|
        - Is indirect light found by one more segment from the first diffuse surface? If not, the
          global map is shown there directly: less noise, and blotches. (Default: true)
      * - guided
-       - |boolean|
+       - |bool|
        - Do half of the segments of the final gather follow the directions from which photons have
          come? This takes longer, and seldom pays. (Default: false)
      * - lookup_size
-       - |integer|
+       - |int|
        - Number of photons that an estimate is to use; it chooses radii that are 0. (Default: 30)
      * - global_radius, caustic_radius
        - |float|
        - Radius in which photons of the two maps are looked for, in units of the scene. (Default: 0:
          one of four that suits the photons around the place)
      * - photon_aovs
-       - |boolean|
+       - |bool|
        - Writes what the two maps alone tell of the surface that a pixel shows, to the channels
          :monosp:`global.R`, :monosp:`caustic.R`, … (Default: false)
      * - next_event, shadow_test

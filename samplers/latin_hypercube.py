@@ -23,8 +23,8 @@ class LatinHypercubeSampler(SequenceSampler):
     .. pluginparameters::
 
      * - (Common parameters)
-       - |-|
-       - Those of all samplers of this package.
+       - |int|
+       - Those of :class:`SequenceSampler`: sample_count, seed.
 
     **Use it when** you compare sequences. **Not when** you want the least error:
     :monosp:`sobol_owen` stratifies pairs of numbers as well.

@@ -23,8 +23,8 @@ class LatticeSampler(SequenceSampler):
     .. pluginparameters::
 
      * - (Common parameters)
-       - |-|
-       - Those of all samplers of this package.
+       - |int|
+       - Those of :class:`SequenceSampler`: sample_count, seed.
      * - dimensions
        - |int|
        - Dimensions that are stratified together: 2, 4, 6 or 8. A path that draws more of them gets

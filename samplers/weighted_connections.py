@@ -40,9 +40,9 @@ class WeightedConnectionsPlugin(DecisionPlugin):
      * - weights
        - |string|
        - Weights of the points: :monosp:`none` (all equal), :monosp:`torus` (areas of periodic
-         Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points mapped by 1 - |2u - 1|,
-         which removes discontinuities at the border), or :monosp:`voronoi` (cells that end at the
-         border, as in the thesis: slightly biased). (Default: none)
+         Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points mapped by
+         ``1 - |2u - 1|``, which removes discontinuities at the border), or :monosp:`voronoi`
+         (cells that end at the border, as in the thesis: slightly biased). (Default: none)
 
     **Use it when** the noise comes from soft shadows and large lights, and edges, defocus or
     materials do not need many camera samples. **Not when** most light is indirect, or the noise

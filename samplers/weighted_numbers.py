@@ -32,10 +32,11 @@ class WeightedNumbersPlugin(DecisionPlugin):
      * - weights
        - |string|
        - Weights of the points: :monosp:`none` (all equal), :monosp:`torus` (areas or lengths of
-         periodic Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points mapped by 1 -
-         |2u - 1|, which removes discontinuities at the border; not for wavelengths, which have no
-         discontinuity there, because both ends of the spectrum are dark), or :monosp:`voronoi`
-         (cells that end at the border, as in the thesis: slightly biased). (Default: none)
+         periodic Voronoi cells: unbiased), :monosp:`unbiased` (the same, with points mapped by
+         ``1 - |2u - 1|``, which removes discontinuities at the border; not for wavelengths, which
+         have no discontinuity there, because both ends of the spectrum are dark), or
+         :monosp:`voronoi` (cells that end at the border, as in the thesis: slightly biased).
+         (Default: none)
 
     **Use it when** the sensor's sampler is :monosp:`independent`, and the noise comes from defocus
     (aperture) or motion (time), or is coloured (wavelength). **Not when** the noise comes from
