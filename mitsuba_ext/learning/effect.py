@@ -26,4 +26,5 @@ class Effect:
         """All that is known, as numbers, Booleans and texts."""
         figures = {"variance": self.variance, "time": self.time}
         known = {key: round(float(x), 4) for key, x in figures.items() if x is not None}
-        return {"is_kept": self.is_kept, **known, **self.about}
+        about = {key: x.item() if hasattr(x, "item") else x for key, x in self.about.items()}
+        return {"is_kept": self.is_kept, **known, **about}
