@@ -54,7 +54,7 @@ PLUGINS = {
     "sppm": Pair("volume_caustic", {"type": "sppm"}),
     "photon_map": Pair("caustic", {"type": "photon_map"}),
     "light_tracer": Pair("ring", {"type": "light_tracer"}),
-    "erpt": Pair("keyhole", {"type": "erpt"}),
+    "erpt": Pair("pool", {"type": "erpt"}),
     "pssmlt": Pair("pool", {"type": "pssmlt"}),
     "mlt": Pair("mirrored_lamp", {"type": "mlt"}),
     "composed_path": Pair("many_lamps", {**_PATH, "next_event": "power"}),

@@ -7,7 +7,8 @@ those with respect to all colours, roughnesses and emissions of the scene that a
 with ``--lamps``, with respect to the emission of one of the lamps alone.
 Variance: the geometric mean, over these parameters, of the variance between seeds. Time: the median
 over the renders but the first two, of the image and its gradients, of all cores; learning included.
-z: the difference of the means to those of ``prb``, in units of its standard error.
+z: the difference of the means to those of ``prb``, in units of its standard error. In brackets: the
+same from the squared distance between the quartiles, on which rare large values have no effect.
 """
 
 from __future__ import annotations
@@ -95,15 +96,21 @@ def main(files: tuple[Path, ...], spp: int, seeds: int, size: tuple[int, int], l
             samples = np.concatenate(found, axis=1)
             mean, variance = np.mean(samples, axis=0), np.var(samples, axis=0, ddof=1)
             taken = statistics.median(times[2:])
-            known = known or (mean, variance, taken)
+            spread = np.square(np.subtract(*np.quantile(samples, (0.75, 0.25), axis=0)))
+            known = known or (mean, variance, taken, spread)
             # Lights and materials that no path finds have neither gradients nor noise
-            is_noisy = (known[1] > 1e-20) & (variance > 1e-20)
+            is_noisy = np.minimum(known[1], variance) > 1e-20
+            is_noisy &= np.minimum(known[3], spread) > 0
             error = np.sqrt((variance + known[1]) / seeds)[is_noisy]
             z = np.abs(mean - known[0])[is_noisy] / error
-            ratio = np.exp(np.mean(np.log(variance[is_noisy] / known[1][is_noisy])))
+            ratio, middle = (
+                np.exp(np.mean(np.log(x[is_noisy] / y[is_noisy])))
+                for x, y in ((variance, known[1]), (spread, known[3]))
+            )
+            speed = known[2] / taken
             print(
-                f"    {name}: variance {ratio:.2f}, time {taken / known[2]:.2f}, efficiency "
-                f"{known[2] / (taken * ratio):.2f}; |z| median {np.median(z):.1f}, "
+                f"    {name}: variance {ratio:.2f} ({middle:.2f}), time {1 / speed:.2f}, efficiency "
+                f"{speed / ratio:.2f} ({speed / middle:.2f}); |z| median {np.median(z):.1f}, "
                 f"largest {z.max():.1f}",
                 flush=True,
             )
