@@ -109,9 +109,9 @@ def main(files: tuple[Path, ...], spp: int, seeds: int, size: tuple[int, int], l
             )
             speed = known[2] / taken
             print(
-                f"    {name}: variance {ratio:.2f} ({middle:.2f}), time {1 / speed:.2f}, efficiency "
-                f"{speed / ratio:.2f} ({speed / middle:.2f}); |z| median {np.median(z):.1f}, "
-                f"largest {z.max():.1f}",
+                f"    {name}: variance {ratio:.2f} ({middle:.2f}), time {1 / speed:.2f}, "
+                f"efficiency {speed / ratio:.2f} ({speed / middle:.2f}); "
+                f"|z| median {np.median(z):.1f}, largest {z.max():.1f}",
                 flush=True,
             )
 

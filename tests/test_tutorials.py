@@ -13,7 +13,9 @@ FOLDER = Path(__file__).parents[1] / "docs" / "tutorials"
 TUTORIALS = sorted(FOLDER.glob("*.md"))
 
 #: The code of a cell, after its options (lines that begin with a colon).
-_CELL = re.compile(r"^```\{code-cell\} ipython3\n(?::[^\n]*\n)*\n?(.*?)^```$", re.DOTALL | re.MULTILINE)
+_CELL = re.compile(
+    r"^```\{code-cell\} ipython3\n(?::[^\n]*\n)*\n?(.*?)^```$", re.DOTALL | re.MULTILINE
+)
 
 
 def _cells(tutorial: Path) -> list[str]:

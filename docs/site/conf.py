@@ -42,6 +42,9 @@ myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 4
 
 # Tutorials are executed. Their results are kept until their code changes
+# The gallery is not in the repository (benchmarks/gallery.py)
+suppress_warnings = ["toc.empty_glob"]
+
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(ROOT / "out" / "docs_work" / "notebooks")
 nb_execution_raise_on_error = True
