@@ -82,7 +82,8 @@ class ComposedPRB(common.RBIntegrator):
     optimize the place or shape of things, or the camera (use :monosp:`prb` or
     :monosp:`prb_projective`), or a scene with participating media (use :monosp:`prbvolpath`): these
     are refused, and so are moving shapes and dispersion. As in :monosp:`prb`, mirrors and smooth
-    glass have no gradients.
+    glass have no gradients, and those of exactly black colours lack the light that scattered rays
+    would have found.
 
     The image is that of :class:`composed_path`. Derivatives come from a second trace of the same
     walk, with the same random numbers: at each vertex, the walk tells what the path has gathered,
