@@ -23,6 +23,9 @@ from previews import INTEGRATORS, PICTURES, SPECTRAL, WIDTHS
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "gallery"
 
+#: The best of our integrators but ``auto``.
+BEST = {**INTEGRATORS, **dict.fromkeys(["pool", "caustic", "ring"], "vcm")}
+
 #: Scenes without motion whose references light paths render with less noise than ``path``.
 _LIGHT_PATHS = ("bdpt", "vcm", "erpt", "sppm")
 
@@ -32,7 +35,7 @@ _REFERENCES = {"fog": "volpath", "volume_caustic": "sppm"}
 
 def compared(name: str) -> list[str]:
     """The integrators of a scene: Mitsuba's or its equivalent, the best other one, and ``auto``."""
-    best = INTEGRATORS.get(name, "auto_path")
+    best = BEST.get(name, "auto_path")
     text = (ROOT / "scenes" / f"{name}.xml").read_text(encoding="utf-8")
     first = "volpath" if "<medium" in text else "path"
     if "moving" in text or "dispersive" in text:  # Mitsuba's own do not see these
@@ -42,7 +45,7 @@ def compared(name: str) -> list[str]:
 
 def reference(name: str) -> str:
     """The integrator that renders the reference."""
-    best = INTEGRATORS.get(name, "auto_path")
+    best = BEST.get(name, "auto_path")
     return _REFERENCES.get(name, "bdpt" if best in _LIGHT_PATHS else best)
 
 
