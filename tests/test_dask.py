@@ -45,6 +45,7 @@ def _cluster(folder: Path, count: int) -> Iterator[tuple[str, list[subprocess.Po
     """A scheduler and workers of one thread; its address, and the processes of the workers."""
     import json
 
+    pytest.importorskip("distributed")
     file, processes = folder / "scheduler.json", []
 
     def start(kind: str, *options: str) -> subprocess.Popen:
