@@ -56,7 +56,8 @@ class ComposedPRB(common.RBIntegrator):
        - As in :class:`composed_path`. (Default: always)
      * - pilot_spp
        - |int|
-       - As in :class:`composed_path`. (Default: 32 with guided directions, otherwise 16)
+       - As in :class:`composed_path`, but up to three quarters of the samples of the first render.
+         (Default: 32 with guided directions, otherwise 16)
      * - save_learned, load_learned
        - |string|
        - As in :class:`composed_path`. (Default: none)

@@ -123,6 +123,17 @@ def test_surroundings_decide_where_nothing_was_tested():
     assert (visibility[:-1, 0] < 0.1).all() and (visibility[:-1, 1] > 0.9).all()
 
 
+def test_where_nothing_was_tested_a_light_is_as_good_as_elsewhere():
+    """One lamp arrives and brings nothing, such as one that is not optimized."""
+    light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1)))
+    unoccluded = row_of(light_map, light_map.unoccluded)
+    observe(light_map, 0, 500, 0, 0.0)
+    observe(light_map, 1, 500, 0, unoccluded[1])
+    ratio = light_map.weights("contribution") / light_map.unoccluded
+    ratio = ratio.numpy().reshape(-1, 2)[:-1]
+    assert (ratio[:, 0] < 0.2 * ratio[:, 1]).all()
+
+
 def test_a_map_without_a_test_expects_the_unoccluded():
     light_map = map_of(floor(a=lamp(0, 0, 1), b=lamp(0.5, 0, 1, radiance=3.0)))
     unoccluded = light_map.unoccluded.numpy().reshape(-1, 2)

@@ -247,9 +247,9 @@ class LightMapLearner(Learner):
             # The samples were drawn from the table, and it was not learned from them
             (gain, error), cost = records.measured, records.cost
         else:
-            # Too optimistic, as the table was learned from the same samples; too pessimistic where
-            # few of them reach each entry: these drew from the unoccluded contributions, and what
-            # is learned is rarely worse
+            # The prediction is too optimistic, as the table was learned from the same samples, but
+            # too pessimistic where each entry has few of them. The pilot itself chose by unoccluded
+            # contributions, and a learned table is rarely worse than that
             as_path = dr.tile(self._as_path, self.map.rows.count)
             predicted = records.predicted_gain(self.map.square_ratios(as_path, probabilities))
             gain = max(predicted, records.measured[0])
