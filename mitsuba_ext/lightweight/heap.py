@@ -1,0 +1,96 @@
+"""The shape of the tree: essentially complete, with four children for each node, and indexed like
+a heap, so that neither nodes nor leaves need pointers ([1], section 3.3.1).
+
+Node ``q`` has the children ``4q + 1`` to ``4q + 4``. Leaves follow the last inner node. They hold
+four triangles each, in the order of their indices; the last ones hold fewer or none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Children of a node, and triangles of a leaf ([1], section 3.4.3).
+ARITY, LEAF_SIZE = 4, 4
+
+
+@dataclass(frozen=True)
+class Run:
+    """Neighbouring nodes of one level whose children hold equally many triangles.
+
+    Attributes:
+        start: The first triangle of the first node, from left to right.
+        nodes: How many nodes.
+        children: How many triangles each child of a node holds.
+    """
+
+    start: int
+    nodes: int
+    children: tuple[int, int, int, int]
+
+
+class Heap:
+    """The tree over a number of triangles.
+
+    Parameters:
+        triangles: How many triangles, at least one.
+
+    Attributes:
+        inner: The number of inner nodes, which is the index of the first leaf.
+        counts: How many triangles are below each node. Shape (nodes,).
+        levels: The inner nodes of each level, from the root down.
+    """
+
+    def __init__(self, triangles: int) -> None:
+        leaves = -(-triangles // LEAF_SIZE)
+        self.inner = max(1, -(-(leaves - 1) // (ARITY - 1)))
+        slots = (ARITY - 1) * self.inner + 1
+        self.counts = np.empty(self.inner + slots, dtype=np.int64)
+        self.counts[self.inner :] = np.clip(
+            triangles - LEAF_SIZE * np.arange(slots), 0, LEAF_SIZE
+        )
+        self.levels: list[range] = []
+        first = 0
+        while first < self.inner:
+            self.levels.append(range(first, min(self.inner, ARITY * first + 1)))
+            first = ARITY * first + 1
+        for level in reversed(self.levels):
+            self.counts[level.start : level.stop] = self.of_children(level).sum(axis=1)
+
+    def of_children(self, level: range) -> np.ndarray:
+        """How many triangles the children of a level's nodes hold. Shape (nodes, 4)."""
+        return self.counts[ARITY * level.start + 1 : ARITY * level.stop + 1].reshape(-1, ARITY)
+
+    def runs(self, level: range) -> list[Run]:
+        """The nodes of a level in runs, at most three: where the tree ends on the bottom row, where
+        that row stops, and where it ends one row above."""
+        children = self.of_children(level)
+        changes = np.flatnonzero(np.any(children[1:] != children[:-1], axis=1)) + 1
+        edges = [0, *changes.tolist(), len(children)]
+        starts = np.concatenate([[0], np.cumsum(children.sum(axis=1))])
+        return [
+            Run(int(starts[a]), b - a, tuple(map(int, children[a])))
+            for a, b in zip(edges[:-1], edges[1:])
+        ]
+
+    def leaves_from_left(self) -> np.ndarray:
+        """The leaves from left to right: those of the bottom row come first."""
+        bottom = self._bottom
+        return np.concatenate([
+            np.arange(bottom, len(self.counts)), np.arange(self.inner, bottom)
+        ])  # fmt: skip
+
+    def by_leaf(self, triangles: np.ndarray) -> np.ndarray:
+        """Sorts triangles by the indices of their leaves.
+
+        Parameters:
+            triangles: Something for each triangle, from left to right.
+        """
+        on_bottom = int(self.counts[self._bottom :].sum())
+        return np.concatenate([triangles[on_bottom:], triangles[:on_bottom]])
+
+    @property
+    def _bottom(self) -> int:
+        """The first leaf of the bottom row."""
+        return max(ARITY * self.levels[-1].start + 1, self.inner)

@@ -1,0 +1,146 @@
+"""The tree of a mesh: how it is built, and how rays meet its nodes and leaves."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..arrays import from_numpy
+from . import triangles
+from .building import distribute
+from .heap import ARITY, LEAF_SIZE, Heap
+from .nodes import MIN_EXPONENT, RANGE, WORDS, Grid, boxes_of_nodes, encode
+from .traversal import NONE, Hit, traverse
+
+#: Rounding errors of the distance to a side of a box, relative to the distances of which it is the
+#: difference.
+_ERROR = 2.0**-21
+
+#: Components of directions that are smaller are replaced by this: their inverse is finite.
+_TINY = 1e-18
+
+#: How many triangles are read at a time.
+_CHUNK = 1 << 18
+
+
+class Corners(Protocol):
+    """The triangles of a mesh, in the order of the tree."""
+
+    def corners(self, triangle: mi.UInt32, active: mi.Bool) -> list[mi.Point3f]:
+        """The three corners of a triangle."""
+
+
+class MeshTree:
+    """A tree over triangles.
+
+    Parameters:
+        vertices: Positions. Shape (vertices, 3), float32.
+        faces: The vertices of each triangle. Shape (triangles, 3), uint32.
+
+    Attributes:
+        order: The triangles in the order of the leaves, in which ``Corners`` have them. Shape
+            (triangles,), uint32.
+        grid (Grid): The space in which boxes are stored.
+        nbytes (int): The memory of the nodes.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        heap = Heap(len(faces))
+        boxes = _boxes(vertices, faces)
+        order = distribute(boxes, heap)
+        self.grid = Grid.over(boxes[:3].min(axis=1), boxes[3:].max(axis=1))
+        words = encode(boxes_of_nodes(boxes, heap), heap, self.grid)
+        self.order = heap.by_leaf(order)
+        self.nbytes = words.nbytes
+        self.nodes = from_numpy(mi.UInt32, words)
+        self.low, self.scale = mi.Point3f(self.grid.low), mi.Vector3f(self.grid.scale)
+        self.inner, self.size = mi.UInt32(heap.inner), mi.UInt32(len(faces))
+        # Opaque: the trees of other meshes share the kernel
+        dr.make_opaque(self.low, self.scale, self.inner, self.size)
+
+    def closest(self, ray: mi.Ray3f, corners: Corners, active: mi.Bool) -> Hit:
+        """The closest hit of each ray before ``ray.maxt``."""
+        return traverse(_RaysInTree(self, ray, corners), ray, active, any_hit=False)
+
+    def occluded(self, ray: mi.Ray3f, corners: Corners, active: mi.Bool) -> mi.Bool:
+        """Is there any hit before ``ray.maxt``?"""
+        return traverse(_RaysInTree(self, ray, corners), ray, active, any_hit=True)[1] != NONE
+
+
+class _RaysInTree:
+    """Rays that traverse a tree."""
+
+    root = 0
+
+    def __init__(self, tree: MeshTree, ray: mi.Ray3f, corners: Corners) -> None:
+        self._tree, self._ray, self._corners = tree, ray, corners
+        # In the space of the grid, with the same distances
+        self._o = (ray.o - tree.low) * tree.scale
+        d = dr.select(dr.abs(ray.d) < _TINY, dr.mulsign(mi.Vector3f(_TINY), ray.d), ray.d)
+        self._inverse = dr.rcp(d * tree.scale)
+        self._error = _ERROR * (dr.abs(self._o) + RANGE) * dr.abs(self._inverse)
+
+    def is_leaf(self, node):
+        return node >= self._tree.inner
+
+    def child(self, node, number):
+        return ARITY * node + 1 + number
+
+    def distances(self, node, maxt):
+        words = [
+            word
+            for half in range(2)
+            for word in dr.gather(mi.Array4u, self._tree.nodes, WORDS // 4 * node + half)
+        ]
+        x_y, z_and_exponents = words[6:]
+        corner = [x_y & 0xFFFF, x_y >> 16, z_and_exponents & 0xFFFF]
+        near, far, start, end, unit = [], [], [], [], []
+        for k in range(3):
+            exponent = (z_and_exponents >> (16 + 4 * k)) & 15
+            power = dr.reinterpret_array(mi.Float, (exponent + (127 + MIN_EXPONENT)) << 23)
+            unit.append(power * self._inverse[k])
+            distance = (mi.Float(mi.Int32(corner[k])) - self._o[k]) * self._inverse[k]
+            start.append(distance - self._error[k])
+            end.append(distance + self._error[k])
+            is_reversed = self._inverse[k] < 0
+            near.append(dr.select(is_reversed, words[3 + k], words[k]))
+            far.append(dr.select(is_reversed, words[k], words[3 + k]))
+        results = []
+        for c in range(ARITY):
+            enter, leave = mi.Float(0), maxt
+            for k in range(3):
+                enter = dr.maximum(enter, dr.fma(_byte(near[k], c), unit[k], start[k]))
+                leave = dr.minimum(leave, dr.fma(_byte(far[k], c), unit[k], end[k]))
+            results.append((enter, enter <= leave))
+        return results
+
+    def intersect(self, leaf, hit):
+        t, triangle, uv = hit
+        first = (leaf - self._tree.inner) * LEAF_SIZE
+        for k in range(LEAF_SIZE):
+            index = first + k
+            exists = index < self._tree.size
+            corners = self._corners.corners(index, exists)
+            is_hit, new_t, new_uv = triangles.intersect(self._ray, t, corners)
+            is_hit &= exists
+            t, triangle = dr.select(is_hit, new_t, t), dr.select(is_hit, index, triangle)
+            uv = dr.select(is_hit, new_uv, uv)
+        return t, triangle, uv
+
+
+def _byte(word: mi.UInt32, number: int) -> mi.Float:
+    return mi.Float(mi.Int32(word >> (8 * number) & 0xFF))
+
+
+def _boxes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The boxes of triangles: lower and upper corners. Shape (6, triangles), float32."""
+    boxes = np.empty((6, len(faces)), dtype=np.float32)
+    for first in range(0, len(faces), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        corners = vertices[faces[part]]
+        boxes[:3, part] = corners.min(axis=1).T
+        boxes[3:, part] = corners.max(axis=1).T
+    return boxes
