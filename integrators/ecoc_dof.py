@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsuba_ext.composition.wrapping_integrator import WrappingIntegrator
-from mitsuba_ext.decisions.query.moving_scene import scene_query
+from mitsuba_ext.decisions.query.scene import scene_query
 from mitsuba_ext.defocus.filters import FILTERS
 from mitsuba_ext.defocus.thin_lens import ThinLens
 from mitsuba_ext.images.denoising import denoiser

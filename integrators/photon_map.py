@@ -199,7 +199,9 @@ class PhotonMapping(WalkIntegrator):
     def sample_aovs(self, scene, sampler, ray) -> list[mi.Float]:
         values = super().sample_aovs(scene, sampler, ray)
         if self.photon_aovs:
-            si = scene.ray_intersect(ray)
+            query, ray_alone = self.query(scene), mi.Ray3f(ray)
+            pi = query.closest(scene, ray_alone, coherent=True, active=mi.Bool(True))
+            si = query.interaction(pi, ray_alone)
             vertex = first_vertex(scene, si, ray)
             active = si.is_valid() & is_diffuse(vertex.bsdf)
             for estimate in self.maps.estimates(scene, self.max_depth):

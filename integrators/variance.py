@@ -109,7 +109,7 @@ class Variance(mi.AdjointIntegrator):
     """
 
     #: True, because each render checks whether the nested integrator supports motion.
-    sees_motion = True
+    sees_all = True
 
     #: Each pixel of its film has the weight one, and not the number of samples.
     film_counts_samples = False

@@ -9,6 +9,7 @@ from mitsuba_ext.luminaires.moving_emitter import MovingEmitter
 from mitsuba_ext.motion.motion_parameters import read_motion
 from mitsuba_ext.motion.rigid_motion import Motion
 from mitsuba_ext.scene.bounds import shape_bounds
+from mitsuba_ext.scene.placeholder import span
 from mitsuba_ext.startup import registry
 
 
@@ -134,7 +135,7 @@ class Moving(mi.Mesh):
         if self.light is not None:
             own["emitter"] = self._emitter(self.name, self.light, self.motion)
         super().__init__(self.name, vertex_count=3, face_count=2, props=own)
-        self._span(*self.motion.bounds(self._corners()))
+        span(self, *self.motion.bounds(self._corners()))
 
     @property
     def at_rest(self) -> mi.Scene:
@@ -171,6 +172,8 @@ class Moving(mi.Mesh):
                 )
             if isinstance(getattr(child, "motion", None), Motion):
                 raise self._error('a "moving" shape cannot be nested in another one')
+            if hasattr(child, "lightweight"):
+                raise self._error(f'a "{child.name}" cannot move; nest the mesh itself')
             self._refuse_what_cannot_move(child)
             children.append(child)
         if not any(map(_has_extent, children)):
@@ -206,17 +209,6 @@ class Moving(mi.Mesh):
     def _corners(self) -> np.ndarray:
         boxes = [shape_bounds(child) for child in self.children if _has_extent(child)]
         return np.array([list(box.corner(i)) for box in boxes for i in range(8)], dtype=np.float64)
-
-    def _span(self, low: np.ndarray, high: np.ndarray) -> None:
-        """Gives the scene the bounds of the motion: two triangles without area, which no ray can
-        hit."""
-        parameters = mi.traverse(self)
-        # Rounded outwards
-        low = np.nextafter(low.astype(np.float32), np.float32(-np.inf))
-        high = np.nextafter(high.astype(np.float32), np.float32(np.inf))
-        parameters["vertex_positions"] = mi.Float(np.concatenate([low, high, high]))
-        parameters["faces"] = mi.UInt32([0, 0, 1, 1, 1, 2])
-        parameters.update()
 
     # ---- Helpers ----
 

@@ -21,7 +21,7 @@ from statistical import (
 )
 from techniques import REFERENCE, TECHNIQUES
 
-from mitsuba_ext.decisions.query.moving_scene import scene_query
+from mitsuba_ext.decisions.query.scene import scene_query
 from mitsuba_ext.scene.movers import is_moving_camera
 from mitsuba_ext.transport.path_decisions import SceneQuery
 

@@ -23,7 +23,7 @@ from statistical import (
 from techniques import REFERENCE, TECHNIQUES
 
 from mitsuba_ext.composition.decision_parameters import Setting
-from mitsuba_ext.decisions.query.moving_scene import scene_query
+from mitsuba_ext.decisions.query.scene import scene_query
 
 Scene = dict[str, Any]
 

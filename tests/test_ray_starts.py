@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from stage import lookat, sensor, stage
 
-from mitsuba_ext.decisions.query.moving_scene import scene_query
+from mitsuba_ext.decisions.query.scene import scene_query
 from mitsuba_ext.transport.ray_starts import RayStarts, ray_starts
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..octahedral import from_octahedral, octahedral
 from ..scene.movers import movers
 
 #: BSDFs that read no more of the interaction than ``wi`` and ``uv``. BSDFs and textures nested in
@@ -52,7 +53,7 @@ def to_words(si: mi.SurfaceInteraction3f, is_whole: bool) -> list[mi.Float]:
     """The words of an interaction, without its time and wavelengths. In a medium, the words of the
     normal are not finite: there is none."""
     frame = si.sh_frame
-    words = [*si.p, *si.wi, *si.uv, *_flat(si.n), *_flat(frame.n), *_flat(frame.s)]
+    words = [*si.p, *si.wi, *si.uv, *octahedral(si.n), *octahedral(frame.n), *octahedral(frame.s)]
     words.append(as_float(si.shape))
     if is_whole:
         words += [*si.dp_du, *si.dp_dv, *si.dn_du, *si.dn_dv]
@@ -64,8 +65,8 @@ def from_words(words: list[mi.Float], is_whole: bool) -> mi.SurfaceInteraction3f
     """The inverse of :func:`to_words`."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(words[0]))
     si.p, si.wi = mi.Point3f(*words[0:3]), mi.Vector3f(*words[3:6])
-    si.uv, si.n = mi.Point2f(*words[6:8]), mi.Normal3f(_unit(*words[8:10]))
-    n, s = _unit(*words[10:12]), _unit(*words[12:14])
+    si.uv, si.n = mi.Point2f(*words[6:8]), mi.Normal3f(from_octahedral(*words[8:10]))
+    n, s = from_octahedral(*words[10:12]), from_octahedral(*words[12:14])
     si.sh_frame = mi.Frame3f(s, dr.cross(n, s), n)
     si.shape = as_shape(words[SHAPE_WORD])
     if is_whole:
@@ -86,25 +87,6 @@ def as_float(value: Any) -> mi.Float:
 def as_shape(word: mi.Float) -> mi.ShapePtr:
     """The inverse of :func:`as_float` for shapes."""
     return dr.reinterpret_array(mi.ShapePtr, dr.reinterpret_array(mi.UInt32, word))
-
-
-def _flat(v: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-    """A unit vector in octahedral coordinates, two numbers in [-1, 1]."""
-    scale = dr.rcp(dr.abs(v.x) + dr.abs(v.y) + dr.abs(v.z))
-    x, y = v.x * scale, v.y * scale
-    is_below = v.z < 0
-    return (
-        dr.select(is_below, dr.mulsign(1 - dr.abs(y), x), x),
-        dr.select(is_below, dr.mulsign(1 - dr.abs(x), y), y),
-    )
-
-
-def _unit(x: mi.Float, y: mi.Float) -> mi.Vector3f:
-    """The inverse of :func:`_flat`."""
-    z = 1 - dr.abs(x) - dr.abs(y)
-    # Distance below the equator: this half of the octahedron was folded outwards
-    below = dr.maximum(-z, 0)
-    return dr.normalize(mi.Vector3f(x - dr.mulsign(below, x), y - dr.mulsign(below, y), z))
 
 
 def _is_plain(bsdf: mi.BSDF) -> bool:

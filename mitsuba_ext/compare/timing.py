@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..rendering.batches import sample_count
 from ..rendering.camera import forget_state
-from ..scene.movers import check_motion_is_seen
+from ..scene.unseen import check_all_is_seen
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -57,7 +57,7 @@ def timed_render(
     import drjit as dr
     import mitsuba as mi
 
-    check_motion_is_seen(integrator, scene)
+    check_all_is_seen(integrator, scene)
 
     # Free garbage now: the collector must not free it while Dr.Jit traces calls (see garbage.py)
     gc.collect()

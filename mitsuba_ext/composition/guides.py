@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from ..decisions.query.moving_scene import scene_query
+from ..decisions.query.scene import scene_query
 from ..rendering import guides
 
 

@@ -53,13 +53,13 @@ class StagedIntegrator(mi.SamplingIntegrator):
          with :monosp:`checkpoint`. (Default: 60s)
 
     Attributes:
-        sees_motion: True, as it renders ``moving`` shapes.
+        sees_all: True, as it renders ``moving`` and lightweight shapes.
         progress: Called after each pass with the fraction done; it may raise or call ``cancel``.
         statistics: The statistics of the last render
             (:class:`~mitsuba_ext.rendering.render.RenderStatistics`).
     """
 
-    sees_motion = True
+    sees_all = True
 
     def __init__(self, props: mi.Properties) -> None:
         self.name = props.plugin_name()

@@ -11,7 +11,7 @@ from ..bidirectional.both_ends import from_both_ends
 from ..bidirectional.emission import LightEmission
 from ..bidirectional.light_vertices import LightVertices, PackedVertices, VertexCache
 from ..bidirectional.light_walk import LightWalk
-from ..decisions.query.moving_scene import scene_query
+from ..decisions.query.scene import scene_query
 from ..learning.learner import Learner
 from ..learning.pixel_estimates import brightness
 from ..learning.subpaths.region_learner import LightVertexSample, RegionLearner

@@ -12,15 +12,15 @@ from typing import Any
 
 import mitsuba as mi
 
-from ..decisions.query.moving_aovs import moving_aovs
-from ..decisions.query.moving_scene import scene_query
+from ..decisions.query.aovs import output_variables
+from ..decisions.query.scene import scene_query
 from ..errors import InputError
 from ..files import check_target
 from ..learning.learner import Learner
 from ..rendering.aovs import check_aovs
 from ..rendering.camera import film_extent
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
-from ..scene.movers import movers
+from ..scene.unseen import has_unseen_shapes
 from ..transport.estimator import CameraRays, Estimator
 from ..transport.path_decisions import EmitterSampling, SceneQuery
 from ..transport.walk import Walk
@@ -241,8 +241,8 @@ class WalkIntegrator(StagedIntegrator):
         """The values of the channels that :meth:`aov_names` names."""
         if self._aovs is None:
             return []
-        if movers(scene):  # Mitsuba's "aov" ignores motion
-            return moving_aovs(self._aovs, self.aovs, scene_query(scene), scene, sampler, ray)
+        if has_unseen_shapes(scene):
+            return output_variables(self._aovs, self.aovs, scene, sampler, ray)
         return self._aovs.sample(scene, sampler, ray, None, mi.Bool(True))[2]
 
     def common_parameters(self) -> dict[str, Any]:

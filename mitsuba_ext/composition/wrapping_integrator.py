@@ -8,8 +8,8 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ..rendering.stages import OneStage, Schedule
-from ..scene.movers import check_motion_is_seen
 from ..scene.nesting import refuse_checkpoint
+from ..scene.unseen import check_all_is_seen
 from ..startup.garbage import garbage_left_alone
 from ..transport.estimator import CameraRays, Sample
 from .staged_integrator import StagedIntegrator
@@ -84,7 +84,7 @@ class WrappingIntegrator(StagedIntegrator):
             # The size of point sets depends on the timeout, and must be the same for all of them
             self.nested.timeout = self.timeout
             return self.nested.schedule(scene, sensor, samples, seed)
-        check_motion_is_seen(self.nested, scene)
+        check_all_is_seen(self.nested, scene)
         return OneStage(_NestedEstimator(self.nested, sensor.get_medium()))
 
     def sample(self, scene, sampler, ray, medium=None, active=True):

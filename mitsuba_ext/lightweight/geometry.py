@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from .traversal import Hit
-
 
 class Lightweight:
-    """The geometry of a shape.
+    """The geometry of a lightweight shape, which does not refer to that shape: they would keep each
+    other alive.
 
     Attributes:
-        shape (mi.Shape): The shape that surface interactions have.
-        has_interactions (bool): Does :meth:`interaction` compute them? If not, ``shape`` does.
+        surface (mi.Shape | None): The shape of surface interactions, which computes them. ``None``
+            if they are computed by :meth:`interaction`; they then have the lightweight shape.
     """
 
-    shape: mi.Shape
-    has_interactions: bool
+    surface: mi.Shape | None = None
 
-    def closest(self, ray: mi.Ray3f, active: mi.Bool) -> Hit:
-        """The closest hit of each ray before ``ray.maxt``."""
+    def closest(self, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32, mi.Point2f]:
+        """The closest hit of each ray before ``ray.maxt``: distance, triangle (``NONE`` if there is
+        no hit), and barycentric coordinates of the second and third corner."""
         raise NotImplementedError
 
     def occluded(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
@@ -29,5 +28,5 @@ class Lightweight:
     def interaction(
         self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f
     ) -> mi.SurfaceInteraction3f:
-        """The surface interaction of an intersection with ``shape``."""
+        """The surface interaction of an intersection with the lightweight shape."""
         raise NotImplementedError

@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import from_numpy
-from . import triangles
 from .building import distribute
 from .heap import ARITY, LEAF_SIZE, Heap
 from .nodes import MIN_EXPONENT, RANGE, WORDS, Grid, boxes_of_nodes, encode
 from .traversal import NONE, Hit, traverse
+from .triangles import Projection
 
 #: Rounding errors of the distance to a side of a box, relative to the distances of which it is the
 #: difference.
@@ -31,6 +31,23 @@ class Corners(Protocol):
 
     def corners(self, triangle: mi.UInt32, active: mi.Bool) -> list[mi.Point3f]:
         """The three corners of a triangle."""
+
+
+def positions_and_faces(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices of a mesh, and those of each triangle. Shapes (vertices, 3), (triangles, 3).
+
+    Raises:
+        ValueError: A vertex is not finite.
+    """
+    parameters = mi.traverse(mesh)
+    positions = np.array(parameters["vertex_positions"]).reshape(-1, 3)
+    is_finite = np.isfinite(positions).all(axis=1)
+    if not is_finite.all():
+        raise ValueError(
+            f'"lightweight_mesh": the nested mesh cannot be used: its vertex '
+            f"{np.argmin(is_finite)} is not finite"
+        )
+    return positions, np.array(parameters["faces"]).reshape(-1, 3)
 
 
 class MeshTree:
@@ -76,7 +93,7 @@ class _RaysInTree:
     root = 0
 
     def __init__(self, tree: MeshTree, ray: mi.Ray3f, corners: Corners) -> None:
-        self._tree, self._ray, self._corners = tree, ray, corners
+        self._tree, self._corners, self._projection = tree, corners, Projection(ray)
         # In the space of the grid, with the same distances
         self._o = (ray.o - tree.low) * tree.scale
         d = dr.select(dr.abs(ray.d) < _TINY, dr.mulsign(mi.Vector3f(_TINY), ray.d), ray.d)
@@ -124,7 +141,7 @@ class _RaysInTree:
             index = first + k
             exists = index < self._tree.size
             corners = self._corners.corners(index, exists)
-            is_hit, new_t, new_uv = triangles.intersect(self._ray, t, corners)
+            is_hit, new_t, new_uv = self._projection.intersect(t, corners)
             is_hit &= exists
             t, triangle = dr.select(is_hit, new_t, t), dr.select(is_hit, index, triangle)
             uv = dr.select(is_hit, new_uv, uv)

@@ -81,6 +81,8 @@ def traverse(tree: Tree, ray: mi.Ray3f, active: mi.Bool, any_hit: bool) -> Hit:
         node = dr.select(pops, dr.select(is_near, stored, NONE), node)
         return active, node, size, stack, hit
 
+    # Which triangle is hit does not depend smoothly on anything
+    ray = dr.detach(ray)
     width = dr.width(ray)
     hit = (mi.Float(ray.maxt), dr.full(mi.UInt32, NONE, width), dr.zeros(mi.Point2f, width))
     node, size = dr.full(mi.UInt32, tree.root, width), dr.zeros(mi.UInt32, width)

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..scene.movers import check_motion_is_seen
+from ..scene.unseen import check_all_is_seen
 from ..startup.garbage import garbage_left_alone
 from .camera import film_told, find_sensor
 
@@ -147,7 +147,7 @@ def each_batch(
     Raises:
         NotImplementedError: The scene has moving shapes, and the integrator does not support them.
     """
-    check_motion_is_seen(integrator, scene)
+    check_all_is_seen(integrator, scene)
     sensor = find_sensor(scene, sensor)
     batch_spp = sample_count(sensor, batch_spp)
     # Removes the AOVs of an earlier render

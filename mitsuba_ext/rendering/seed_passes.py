@@ -13,8 +13,8 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
-from ..scene.movers import check_motion_is_seen
 from ..scene.nesting import with_nested
+from ..scene.unseen import check_all_is_seen
 from ..startup.garbage import garbage_left_alone
 from .batches import sample_count
 from .camera import film_extent, film_told
@@ -92,7 +92,7 @@ class SeedPasses:
     def __init__(
         self, integrator: mi.Integrator, scene: mi.Scene, sensor: mi.Sensor, seed: int
     ) -> None:
-        check_motion_is_seen(integrator, scene)
+        check_all_is_seen(integrator, scene)
         check_extent(sensor.film())
         self._integrator, self._scene, self._sensor, self._seed = integrator, scene, sensor, seed
         self._film = sensor.film()

@@ -1,5 +1,4 @@
-"""Finds the moving parts of a scene, and raises errors for integrators that do not render motion.
-"""
+"""Finds the moving parts of a scene, and raises errors for what does not support motion."""
 
 from __future__ import annotations
 
@@ -7,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..motion.rigid_motion import Motion
-from .nesting import class_name
 
 
 def movers(scene: mi.Scene) -> list[mi.Shape]:
@@ -74,16 +72,3 @@ def refuse_moving_lights(scene: mi.Scene) -> None:
             'paths cannot start from lights that move: use an integrator without light paths, such '
             'as "composed_path"'
         )
-
-
-def check_motion_is_seen(integrator: mi.Integrator, scene: mi.Scene) -> None:
-    """Refuses to render a scene with moving shapes with an integrator that does not support them.
-
-    Integrators that support motion have the attribute ``sees_motion``. Mitsuba's own integrators
-    and those of other packages would render the scene without the shapes that move.
-
-    Raises:
-        NotImplementedError: Something moves in ``scene``, and the integrator does not support it.
-    """
-    if not getattr(integrator, "sees_motion", False):
-        refuse_movers(scene, f'"{class_name(integrator)}"', 'use "composed_path"')

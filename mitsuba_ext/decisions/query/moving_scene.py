@@ -12,23 +12,12 @@ import numpy as np
 
 from ...arrays import from_numpy
 from ...motion.rigid_motion import Pose, PoseTable
-from ...scene.movers import movers
 from ...transport.path_decisions import SceneQuery
-from ...transport.ray_starts import RayStarts, ray_starts
+from ...transport.ray_starts import RayStarts
+from .box import Box
 
 #: The owner of shapes that do not move.
 _NOBODY = 0xFFFFFFFF
-
-
-def scene_query(scene: mi.Scene) -> SceneQuery:
-    """The query that finds all shapes of ``scene``; the default one where nothing moves.
-
-    Raises:
-        ValueError: A shape belongs to two movers, or to one and to the static scene.
-    """
-    moving = movers(scene)
-    starts = ray_starts(scene)
-    return MovingSceneQuery(scene, moving, starts) if moving else SceneQuery(starts)
 
 
 class MovingSceneQuery(SceneQuery):
@@ -49,7 +38,7 @@ class MovingSceneQuery(SceneQuery):
         super().__init__(starts)
         self.scenes = [mover.at_rest for mover in moving]
         self._poses = PoseTable([mover.motion for mover in moving])
-        self._boxes = [_Box(mover.bbox()) for mover in moving]
+        self._boxes = [Box(mover.bbox()) for mover in moving]
         self._owners = self._find_owners(scene, moving)
         self._lights = self._find_lights(moving)
 
@@ -84,8 +73,11 @@ class MovingSceneQuery(SceneQuery):
     def owner(self, pi: mi.PreliminaryIntersection3f) -> tuple[mi.UInt32, mi.Bool]:
         """The number of the mover that a ray has hit, and whether it has hit one."""
         shape = dr.select(pi.instance != None, pi.instance, pi.shape)  # noqa: E711
-        owner = dr.gather(mi.UInt32, self._owners, _number(shape), pi.valid)
-        return owner, pi.valid & (owner != _NOBODY)
+        number = _number(shape)
+        # Lightweight shapes have numbers that the table may not have
+        known = pi.valid & (number < dr.width(self._owners))
+        owner = dr.gather(mi.UInt32, self._owners, number, known)
+        return owner, known & (owner != _NOBODY)
 
     def pose(self, index: mi.UInt32, time: mi.Float) -> Pose:
         """The pose of a mover."""
@@ -154,29 +146,6 @@ class MovingSceneQuery(SceneQuery):
         table = np.zeros(max(lights) + 1, dtype=np.uint32)
         table[list(lights)] = list(lights.values())
         return from_numpy(mi.UInt32, table)
-
-
-class _Box:
-    """The bounding box of a mover. Most rays miss it; if all rays of a packet do, their
-    transformation and the traversal of the mover's scene are skipped."""
-
-    def __init__(self, bounds: mi.ScalarBoundingBox3f) -> None:
-        # Covers rounding errors of the poses on the device
-        margin = 1e-5 * max(map(abs, [*bounds.min, *bounds.max]))
-        self._low = mi.Point3f(bounds.min) - margin
-        self._high = mi.Point3f(bounds.max) + margin
-        # Opaque: other motions share the kernel
-        dr.make_opaque(self._low, self._high)
-
-    def is_met(self, ray: mi.Ray3f) -> mi.Bool:
-        """May there be a hit before ``ray.maxt``?"""
-        # A zero component of the direction gives ±∞, and NaN only for an origin in the plane of a
-        # side, where the mover has no surface
-        inverse = dr.rcp(ray.d)
-        a, b = (self._low - ray.o) * inverse, (self._high - ray.o) * inverse
-        near, far = dr.max(dr.fmin(a, b)), dr.min(dr.fmax(a, b))
-        # The margin is slightly larger than the rounding errors of both distances
-        return (near <= far * (1 + 1e-6)) & (far >= 0) & (near <= ray.maxt)
 
 
 def _number(shape: mi.ShapePtr) -> mi.UInt32:

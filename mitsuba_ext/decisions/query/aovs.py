@@ -1,0 +1,73 @@
+"""Output variables, as Mitsuba's ``aov`` has them, of scenes with shapes that it does not see."""
+
+from __future__ import annotations
+
+import re
+
+import drjit as dr
+import mitsuba as mi
+
+from .lightweight_scene import LightweightQuery
+from .moving_aovs import moving_aovs
+from .moving_scene import MovingSceneQuery
+from .scene import scene_query
+
+
+def output_variables(
+    aov: mi.SamplingIntegrator,
+    aovs: str,
+    scene: mi.Scene,
+    sampler: mi.Sampler,
+    ray: mi.RayDifferential3f,
+) -> list[mi.Float]:
+    """The channels along camera rays, at their times.
+
+    Parameters:
+        aov: Mitsuba's integrator, made with the list ``aovs``.
+    """
+    query = scene_query(scene)
+    rest = query.rest if isinstance(query, LightweightQuery) else query
+    if isinstance(rest, MovingSceneQuery):
+        values = moving_aovs(aov, aovs, rest, scene, sampler, ray)
+    else:
+        values = aov.sample(scene, sampler, ray, None, mi.Bool(True))[2]
+    if query is rest:
+        return values
+    ray_alone = mi.Ray3f(ray)
+    pi = query.closest(scene, ray_alone, coherent=True, active=mi.Bool(True))
+    is_lightweight = query.is_lightweight(pi)
+    si = dr.select(
+        is_lightweight, query.interaction(pi, ray_alone), dr.zeros(mi.SurfaceInteraction3f)
+    )
+    kinds = [item.partition(":")[2] for item in filter(None, re.split("[, ]", aovs))]
+    mine = [channel for kind in kinds for channel in _channels(kind, si, ray, is_lightweight)]
+    return [dr.select(is_lightweight, a, b) for a, b in zip(mine, values)]
+
+
+def _channels(
+    kind: str, si: mi.SurfaceInteraction3f, ray: mi.RayDifferential3f, active: mi.Bool
+) -> list[mi.Float]:
+    if kind == "albedo":
+        return list(_albedo(si, ray, active))
+    if kind == "depth":
+        return [si.t]
+    if kind == "sh_normal":  # Of the shape: the frames of normal maps are out of reach
+        return list(si.sh_frame.n)
+    if kind in ("duv_dx", "duv_dy"):
+        si.compute_uv_partials(ray)
+    if kind == "prim_index":
+        return [mi.Float(si.prim_index)]
+    if kind == "shape_index":
+        return [mi.Float(dr.reinterpret_array(mi.UInt32, si.shape))]
+    return list(getattr(si, {"position": "p", "geo_normal": "n"}.get(kind, kind)))
+
+
+def _albedo(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Color3f:
+    albedo = mi.unpolarized_spectrum(si.bsdf(ray).eval_diffuse_reflectance(si, active))
+    if mi.is_monochromatic:
+        return mi.Color3f(albedo.x)
+    if not mi.is_spectral:
+        return albedo
+    pdf = mi.pdf_rgb_spectrum(ray.wavelengths)
+    albedo *= dr.select(pdf != 0, dr.rcp(pdf), 0)
+    return mi.spectrum_to_srgb(albedo, ray.wavelengths, active)

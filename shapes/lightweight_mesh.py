@@ -1,0 +1,172 @@
+"""Meshes whose acceleration structure takes little memory."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from mitsuba_ext.lightweight.mesh_geometry import MeshGeometry
+from mitsuba_ext.lightweight.packed_mesh import PackedMesh
+from mitsuba_ext.parameters import read_parameter
+from mitsuba_ext.scene.bounds import shape_bounds
+from mitsuba_ext.scene.placeholder import span
+from mitsuba_ext.startup import registry
+
+
+@registry.plugin
+class LightweightMesh(mi.Mesh):
+    r"""
+    .. _shape-lightweight_mesh:
+
+    Lightweight meshes (:monosp:`lightweight_mesh`)
+    -----------------------------------------------
+
+    Finds the triangles of the mesh that is nested in it by an acceleration structure of 2.7 bytes
+    for each triangle. That of Embree, in Mitsuba, has about 70, and twice as many while it is
+    built.
+
+    .. pluginparameters::
+
+     * - (nested plugin)
+       - |shape|
+       - The mesh: :monosp:`ply`, :monosp:`obj`, :monosp:`serialized`, or any other shape that
+         Mitsuba represents by triangles, with its material, and with its light or media, if it has
+         some.
+     * - quantized
+       - |bool|
+       - Whether corners are rounded to 65536 steps along each axis of the mesh's box, normals to
+         steps of a few thousandths of a degree, and texture coordinates to 65536 steps between
+         their smallest and their largest value. The mesh then takes 9 to 15 bytes for each
+         triangle in all; else 21 to 31, as Mitsuba stores it. (Default: |false|)
+
+    **Use it when** a scene does not fit into memory: scans, displaced surfaces, terrain. For a
+    regular grid of heights, :monosp:`heightfield` takes far less.
+    **Not when** it fits: all rays that meet the box of the mesh take longer. Compared with Embree,
+    camera rays have 1/5 of the speed and rays in all directions a half in a mesh of a million
+    triangles (``docs/results/lightweight.md``). Each lightweight mesh has a structure of its own
+    and adds to the time in which kernels are compiled: use it for a few large meshes, and not for
+    many small ones.
+
+    All surface data of the mesh are those of Mitsuba: normals, texture coordinates, vertex and face
+    attributes, materials, media, and area lights of any type. Triangles are sorted: the variable
+    :monosp:`prim_index` counts them in another order than the file. No ray passes between two
+    triangles that share an edge or a corner; it does in Embree, as Mitsuba uses it, for one of
+    seven rays that are aimed exactly at an edge.
+
+    With :monosp:`quantized`, area lights and attributes are refused. Meshes that touch are rounded
+    each on its own grid, and there may be gaps between them of the size of a step.
+
+    Only integrators of this package see these triangles. **Mitsuba's own**, such as :monosp:`path`
+    or :monosp:`aov`, **render the scene without them, and we cannot make them refuse it** (a light
+    among them is still sampled, with a wrong weight); use :monosp:`composed_path`, which is
+    :monosp:`path` otherwise. The parameter :monosp:`aovs` of our integrators sees them; its
+    :monosp:`sh_normal` is without normal and bump maps.
+
+    A lightweight mesh cannot be nested in :monosp:`moving`, and is not seen in a
+    :monosp:`shapegroup`. :monosp:`mi.traverse` shows its material and its light, and a placeholder
+    in place of its vertices: they cannot be changed after loading.
+
+    Source: D. Cline, PhD dissertation, Brigham Young University, 2007, chapter 3: a complete tree
+    of four children, without pointers, and with four triangles in each leaf. Boxes are different:
+    bytes relative to their own node, as in H. Ylitie, T. Karras, S. Laine, *Efficient Incoherent
+    Ray Traversal on GPUs Through Compressed Wide BVHs*, HPG 2017. The test of triangles follows S.
+    Woop, C. Benthin, I. Wald, *Watertight Ray/Triangle Intersection*, JCGT 2(1), 2013.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <shape type="lightweight_mesh">
+                <boolean name="quantized" value="true"/>
+                <shape type="ply">
+                    <string name="filename" value="statue.ply"/>
+                    <bsdf type="roughplastic"/>
+                </shape>
+            </shape>
+
+        .. code-tab:: python
+
+            'type': 'lightweight_mesh',
+            'quantized': True,
+            'mesh': {
+                'type': 'ply',
+                'filename': 'statue.ply',
+                'bsdf': {'type': 'roughplastic'}
+            }
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.name = props.plugin_name()
+        self.quantized = read_parameter(self.name, props, "quantized", False)
+        mesh = self._nested(props)
+        if self.quantized:
+            self._refuse_what_is_not_packed(mesh)
+        self.triangles = mesh.face_count()
+        # The base class gets what a scene asks its shapes for
+        own = mi.Properties(self.name)
+        own.set_id(props.id())
+        parts = {
+            "bsdf": mesh.bsdf(), "emitter": mesh.emitter(),
+            "interior": mesh.interior_medium(), "exterior": mesh.exterior_medium(),
+        }  # fmt: skip
+        for key, part in parts.items():
+            if part is not None:
+                own[key] = part
+        super().__init__(self.name, vertex_count=3, face_count=2, props=own)
+        self._span(mesh)
+        self.lightweight = PackedMesh(mesh) if self.quantized else MeshGeometry(mesh)
+
+    def to_string(self) -> str:
+        return (
+            f"{self.name}[\n  triangles = {self.triangles},\n"
+            f"  quantized = {str(self.quantized).lower()},\n"
+            f"  memory = {self.lightweight.nbytes / self.triangles:.1f} bytes per triangle\n]"
+        )
+
+    # ---- Helpers ----
+
+    def _span(self, mesh: mi.Mesh) -> None:
+        box = shape_bounds(mesh)
+        try:
+            span(self, box.min, box.max)
+        except RuntimeError:
+            # Mitsuba would now make this shape that of the emitter, which already has one: the
+            # mesh. That is what we need. All else is done by then.
+            if not mesh.is_emitter():
+                raise
+
+    def _nested(self, props: mi.Properties) -> mi.Mesh:
+        shapes = list(props.objects())
+        if len(shapes) != 1:
+            raise self._error(f"one mesh must be nested in it, found {len(shapes)} objects")
+        ((key, shape),) = shapes
+        if not isinstance(shape, mi.Shape):
+            raise self._error(
+                f'what is nested in it must be a mesh, found {shape.class_name()} ("{key}"); '
+                f"materials, lights and media belong into the nested mesh"
+            )
+        if not shape.is_mesh() or hasattr(shape, "motion") or hasattr(shape, "lightweight"):
+            raise self._error(
+                f"only a mesh of triangles of Mitsuba can be nested in it, such as ply, obj or "
+                f"serialized; found {shape.class_name()}"
+            )
+        if shape.is_sensor():
+            raise self._error("a mesh that is a sensor cannot be nested in it")
+        if shape.face_count() == 0:
+            raise self._error("the nested mesh has no triangles")
+        return shape
+
+    def _refuse_what_is_not_packed(self, mesh: mi.Mesh) -> None:
+        if mesh.is_emitter():
+            raise self._error(
+                'a mesh that emits light cannot be quantized: leave out "quantized", or its emitter'
+            )
+        own = ("faces", "vertex_positions", "vertex_normals", "vertex_texcoords")
+        keys = [key for key in mi.traverse(mesh).keys() if key.startswith(("vertex_", "face_"))]
+        attributes = [key for key in keys if key not in own]
+        if attributes:
+            raise self._error(
+                f'the attribute "{attributes[0]}" of the nested mesh cannot be quantized: leave '
+                f'out "quantized", or use a texture'
+            )
+
+    def _error(self, text: str) -> ValueError:
+        return ValueError(f'"{self.name}": {text}')
