@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 
 from mitsuba_ext.lightweight.mesh_geometry import MeshGeometry
@@ -113,6 +114,7 @@ class LightweightMesh(mi.Mesh):
         super().__init__(self.name, vertex_count=3, face_count=2, props=own)
         self._span(mesh)
         self.lightweight = PackedMesh(mesh) if self.quantized else MeshGeometry(mesh)
+        dr.flush_malloc_cache()  # what building has needed
 
     def to_string(self) -> str:
         return (

@@ -100,7 +100,7 @@ def test_integrators_see_it(tmp_path, integrator: str) -> None:
     if integrator in ("ecoc_dof", "adaptive"):
         nested = {"nested": {"type": "composed_path", "max_depth": 5}}
     expected, found = (
-        _image(stage(camera=camera, ring=shape), integrator, **nested)
+        _image(stage(camera=camera, ring=shape), integrator, 256 if nested else 16, **nested)
         for shape in (ring, _around(ring))
     )
     # What is learned differs with the time that it takes, if with nothing else
@@ -109,7 +109,9 @@ def test_integrators_see_it(tmp_path, integrator: str) -> None:
     assert np.abs(blocks[0] - blocks[1]).max() < 0.25 * blocks[1].mean()
 
 
-@pytest.mark.parametrize("integrator", ["composed_path", "bdpt", "composed_path linear"])
+@pytest.mark.parametrize(
+    "integrator", ["composed_path", "bdpt", "composed_path linear", "composed_path spatial_lights"]
+)
 def test_mesh_that_emits_light_gives_the_light_of_the_mesh(integrator: str) -> None:
     lamp = _ring(emitter=area(4.0), bsdf=diffuse(0.2))
     around = _around(_ring(emitter=area(4.0), bsdf=diffuse(0.2)))

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..regions.voxel_sides import SIDES, sides, voxel_number
+from ..scene.lightweight_shapes import surface
 from .spectra import brightness, comparison_wavelengths
 
 #: Cells of one emitter, at most.
@@ -74,7 +75,7 @@ _WHOLE = np.array([[0.0, 0.0, 1.0, 1.0]])
 
 def emitter_shapes(scene: mi.Scene) -> list[mi.Shape | None]:
     """The shape of each emitter (``emitter.get_shape()`` hides that it is a mesh)."""
-    shapes = {shape.emitter().ptr: shape for shape in scene.shapes() if shape.is_emitter()}
+    shapes = {shape.emitter().ptr: surface(shape) for shape in scene.shapes() if shape.is_emitter()}
     return [shapes.get(emitter.ptr) for emitter in scene.emitters()]
 
 

@@ -74,10 +74,13 @@ def _apply(boxes: np.ndarray, order: np.ndarray, start: int, nodes: int, size: i
     part = slice(start, start + nodes * size)
     mine = boxes[:, part].reshape(6, nodes, size)
     axis = _axes(mine, left)
-    centres = np.empty((nodes, size), dtype=np.float32)
-    for k in range(3):
-        chosen = axis == k
-        centres[chosen] = mine[k][chosen] + mine[3 + k][chosen]
+    if nodes == 1:
+        centres = mine[axis[0]] + mine[3 + axis[0]]
+    else:
+        centres = np.empty((nodes, size), dtype=np.float32)
+        for k in range(3):
+            chosen = axis == k
+            centres[chosen] = mine[k][chosen] + mine[3 + k][chosen]
     by_centre = _separated(centres, left)
     for row in (*boxes, order):
         row[part] = row[part][by_centre]
@@ -107,13 +110,19 @@ def _area(boxes: np.ndarray) -> np.ndarray:
 
 
 def _separated(values: np.ndarray, left: int) -> np.ndarray:
-    """The order, over all rows, in which each row begins with its ``left`` smallest values."""
+    """The order, over all rows, in which each row begins with its ``left`` smallest values.
+
+    Parameters:
+        values: Shape (rows, size), float32. Overwritten.
+    """
+    rows, size = values.shape
     # Integers that sort as the values do, with their places in the lower half
-    bits = np.ascontiguousarray(values).view(np.uint32)
-    keys = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31)).astype(np.uint64)
+    bits = values.view(np.uint32)
+    bits ^= (bits.view(np.int32) >> 31).view(np.uint32) | np.uint32(1 << 31)
+    keys = bits.astype(np.uint64)
     keys <<= np.uint64(32)
-    keys |= np.arange(values.shape[1], dtype=np.uint64)
+    keys |= np.arange(size, dtype=np.uint32)
     keys.partition(left, axis=1)
     keys &= _LOW
-    keys += np.arange(len(values), dtype=np.uint64)[:, None] * np.uint64(values.shape[1])
+    keys += np.arange(rows, dtype=np.uint64)[:, None] * np.uint64(size)
     return keys.ravel().view(np.int64)

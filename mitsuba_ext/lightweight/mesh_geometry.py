@@ -43,7 +43,7 @@ class MeshGeometry(Lightweight):
 def _sort_faces(parameters: mi.SceneParameters, faces: np.ndarray, order: np.ndarray) -> None:
     for key in parameters.keys():
         if key.startswith("face_"):
-            values = np.array(parameters[key]).reshape(len(faces), -1)
+            values = parameters[key].numpy().reshape(len(faces), -1)
             parameters[key] = from_numpy(mi.Float, values[order])
     parameters["faces"] = from_numpy(mi.UInt32, faces[order])
     # As if the vertices had changed: Mitsuba then computes the areas of a light's triangles again,

@@ -12,15 +12,9 @@ from ..arrays import from_numpy
 from .building import distribute
 from .heap import ARITY, LEAF_SIZE, Heap
 from .nodes import MIN_EXPONENT, RANGE, WORDS, Grid, boxes_of_nodes, encode
+from .slabs import ERROR, with_inverse
 from .traversal import NONE, Hit, traverse
 from .triangles import Projection
-
-#: Rounding errors of the distance to a side of a box, relative to the distances of which it is the
-#: difference.
-_ERROR = 2.0**-21
-
-#: Components of directions that are smaller are replaced by this: their inverse is finite.
-_TINY = 1e-18
 
 #: How many triangles are read at a time.
 _CHUNK = 1 << 18
@@ -34,20 +28,21 @@ class Corners(Protocol):
 
 
 def positions_and_faces(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices of a mesh, and those of each triangle. Shapes (vertices, 3), (triangles, 3).
+    """The vertices of a mesh, and those of each triangle. Shapes (vertices, 3), (triangles, 3). On
+    the CPU, this is the memory of the mesh.
 
     Raises:
         ValueError: A vertex is not finite.
     """
     parameters = mi.traverse(mesh)
-    positions = np.array(parameters["vertex_positions"]).reshape(-1, 3)
+    positions = parameters["vertex_positions"].numpy().reshape(-1, 3)
     is_finite = np.isfinite(positions).all(axis=1)
     if not is_finite.all():
         raise ValueError(
             f'"lightweight_mesh": the nested mesh cannot be used: its vertex '
             f"{np.argmin(is_finite)} is not finite"
         )
-    return positions, np.array(parameters["faces"]).reshape(-1, 3)
+    return positions, parameters["faces"].numpy().reshape(-1, 3)
 
 
 class MeshTree:
@@ -96,9 +91,8 @@ class _RaysInTree:
         self._tree, self._corners, self._projection = tree, corners, Projection(ray)
         # In the space of the grid, with the same distances
         self._o = (ray.o - tree.low) * tree.scale
-        d = dr.select(dr.abs(ray.d) < _TINY, dr.mulsign(mi.Vector3f(_TINY), ray.d), ray.d)
-        self._inverse = dr.rcp(d * tree.scale)
-        self._error = _ERROR * (dr.abs(self._o) + RANGE) * dr.abs(self._inverse)
+        self._inverse = with_inverse(ray.d * tree.scale)[1]
+        self._error = ERROR * (dr.abs(self._o) + RANGE) * dr.abs(self._inverse)
 
     def is_leaf(self, node):
         return node >= self._tree.inner

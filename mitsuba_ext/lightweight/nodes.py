@@ -73,7 +73,8 @@ def boxes_of_nodes(boxes: np.ndarray, heap: Heap) -> np.ndarray:
         result[row, leaves] = union.reduceat(values, starts)
         for level in reversed(heap.levels):
             children = result[row, ARITY * level.start + 1 : ARITY * level.stop + 1]
-            result[row, level.start : level.stop] = union.reduce(children.reshape(-1, ARITY), axis=1)
+            below = children.reshape(-1, ARITY)
+            result[row, level.start : level.stop] = union.reduce(below, axis=1)
     return result
 
 

@@ -51,11 +51,11 @@ class PackedMesh(Lightweight):
         self._normals = self._uv = None
         tables = [self._faces, self._points]
         if mesh.has_vertex_normals():
-            normals = np.array(parameters["vertex_normals"]).reshape(-1, 3)[vertices]
+            normals = parameters["vertex_normals"].numpy().reshape(-1, 3)[vertices]
             self._normals = Pairs(_packed_directions(normals))
             tables.append(self._normals)
         if mesh.has_vertex_texcoords():
-            uv = np.array(parameters["vertex_texcoords"]).reshape(-1, 2)[vertices]
+            uv = parameters["vertex_texcoords"].numpy().reshape(-1, 2)[vertices]
             self._texcoord = Quantizer(uv)
             self._uv = Pairs(self._texcoord.encode(uv))
             tables.append(self._uv)

@@ -64,7 +64,7 @@ def traverse(tree: Tree, ray: mi.Ray3f, active: mi.Bool, any_hit: bool) -> Hit:
             (node, size, stack, hit[0]), active & ~is_leaf, visit, lambda *state: state
         )
         node, hit = dr.if_stmt(
-            (node, hit), active & is_leaf,
+            (node, hit), active & is_leaf & (node != NONE),
             lambda node, hit: (mi.UInt32(NONE), tree.intersect(node, hit)),
             lambda *state: state,
         )  # fmt: skip

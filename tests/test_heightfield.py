@@ -1,0 +1,456 @@
+"""The shape ``heightfield``: the same surface as a mesh of Mitsuba with the same triangles."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsuba_ext.arrays import from_numpy
+from mitsuba_ext.lightweight.height_tree import cell
+from mitsuba_ext.lightweight.traversal import NONE
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SIZES = ((2, 2), (3, 5), (17, 33), (100, 70), (2, 40))  # rows and columns
+
+
+def terrain(rows: int, columns: int, roughness: float = 0.1) -> np.ndarray:
+    """Smooth hills, and noise on them."""
+    y, x = np.mgrid[0:rows, 0:columns]
+    hills = 0.3 * np.sin(5 * x / columns) * np.cos(4 * y / rows)
+    noise = np.random.default_rng(rows).uniform(-1, 1, (rows, columns))
+    return (hills + roughness * noise).astype(np.float32)
+
+
+def poses() -> dict[str, mi.ScalarTransform4f]:
+    t = mi.ScalarTransform4f
+    turned = t().translate([0.5, -2, 1]).rotate([1, 2, -0.5], 130).scale([2, 0.6, 1.5])
+    return {"identity": t(), "turned": turned}
+
+
+def heightfield(values: np.ndarray, **parameters):
+    return mi.load_dict({
+        "type": "heightfield", "bitmap": mi.Bitmap(values[..., None]), **parameters,
+    })  # fmt: skip
+
+
+def mesh_of(
+    heights: np.ndarray, to_world: mi.ScalarTransform4f, face_normals: bool = False,
+    flip_normals: bool = False, bsdf: dict | None = None,
+) -> mi.Mesh:  # fmt: skip
+    """The same triangles as a mesh, with vertex normals from differences of heights."""
+    rows, columns = heights.shape
+    y, x = np.mgrid[0:rows, 0:columns]
+    matrix = np.array(to_world.matrix, dtype=np.float64)
+    x, y = 2 * x / (columns - 1) - 1, 2 * y / (rows - 1) - 1
+    vertices = np.stack([x, y, heights.astype(np.float64)], axis=-1).reshape(-1, 3)
+    along_y, along_x = np.gradient(heights.astype(np.float64))
+    normals = np.stack(
+        [-along_x * (columns - 1) / 2, -along_y * (rows - 1) / 2, np.ones_like(x)], axis=-1
+    ).reshape(-1, 3) @ np.linalg.inv(matrix[:3, :3])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    a = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    left, right = (a, a + columns + 1, a + columns), (a, a + 1, a + columns + 1)
+    faces = np.stack([np.stack(t, axis=1) for t in (left, right)], axis=1)
+    props = mi.Properties()
+    props["flip_normals"] = flip_normals
+    if bsdf is not None:
+        props["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh("grid", rows * columns, faces.size // 3, props, not face_normals, True)
+    parameters = mi.traverse(mesh)
+    vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    parameters["vertex_positions"] = from_numpy(mi.Float, vertices)
+    parameters["faces"] = from_numpy(mi.UInt32, faces)
+    if not face_normals:
+        parameters["vertex_normals"] = from_numpy(mi.Float, normals)
+    uv = np.stack([(x + 1) / 2, (y + 1) / 2], axis=-1)
+    parameters["vertex_texcoords"] = from_numpy(mi.Float, uv)
+    parameters.update()
+    return mesh
+
+
+def scene_of(mesh: mi.Mesh) -> mi.Scene:
+    return mi.load_dict({"type": "scene", "mesh": mesh}, optimize=False)
+
+
+def make_rays(origins: np.ndarray, targets: np.ndarray) -> mi.Ray3f:
+    d = targets - origins
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    o, d = (from_numpy(mi.Float, p) for p in (origins.ravel(), d.ravel()))
+    return mi.Ray3f(dr.unravel(mi.Point3f, o), dr.unravel(mi.Vector3f, d))
+
+
+def rays_at(bounds: mi.ScalarBoundingBox3f, kind: str, count: int = 20_000) -> mi.Ray3f:
+    """Rays to points of a box, from a camera or from all around."""
+    rng = np.random.default_rng(3)
+    low, high = np.array(bounds.min), np.array(bounds.max)
+    high[2] += high[2] == low[2]  # flat
+    targets = rng.uniform(low, high, (count, 3))
+    if kind == "camera":
+        origins = np.tile(high + [0.5, 1.5, 1], (count, 1))
+    else:
+        origins = rng.uniform(2 * low - high, 2 * high - low, (count, 3))
+    return make_rays(origins, targets)
+
+
+def number_in_mesh(triangle: mi.UInt32, columns: int) -> np.ndarray:
+    x, y, is_right = (np.array(part).astype(np.int64) for part in cell(triangle))
+    return 2 * (y * (columns - 1) + x) + is_right
+
+
+def triangle_of(number: mi.UInt32, columns: int) -> mi.UInt32:
+    cell_, is_right = number >> 1, number & 1
+    return cell_ % (columns - 1) | cell_ // (columns - 1) << 15 | is_right << 30
+
+
+@pytest.mark.parametrize("kind", ["camera", "random"])
+@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize("pose", ["identity", "turned"])
+def test_rays_hit_what_they_hit_in_a_mesh(size, pose, kind):
+    heights, to_world = terrain(*size), poses()[pose]
+    _check_hits(heights, to_world, kind)
+
+
+@pytest.mark.parametrize(
+    "heights",
+    [np.zeros((9, 14)), np.full((12, 7), -3.5), 40 * terrain(20, 30), terrain(30, 20) + 1000],
+    ids=["zero", "flat", "steep", "high"],
+)
+def test_flat_steep_and_high_surfaces_are_hit(heights):
+    _check_hits(heights.astype(np.float32), mi.ScalarTransform4f(), "random")
+
+
+def _check_hits(heights: np.ndarray, to_world: mi.ScalarTransform4f, kind: str) -> None:
+    shape = heightfield(heights, to_world=to_world)
+    mesh = mesh_of(heights, to_world)
+    rays = rays_at(mesh.bbox(), kind)
+    expected = scene_of(mesh).ray_intersect_preliminary(rays, coherent=False)
+    t, triangle, uv = shape.lightweight.closest(rays, mi.Bool(True))
+    occluded = shape.lightweight.occluded(rays, mi.Bool(True))
+    is_hit = triangle != NONE
+    assert dr.all(occluded == is_hit)
+    # A ray along the border may or may not hit
+    assert dr.count(is_hit != expected.is_valid())[0] <= 4
+    both = np.array(is_hit & expected.is_valid())
+    if np.ptp(heights) > 0 or kind == "camera":
+        assert both.sum() > 1000
+    scale = np.abs([mesh.bbox().min, mesh.bbox().max]).max()
+    off = np.abs(np.array(t - expected.t))[both] > 2e-5 * scale
+    assert off.sum() <= 4
+    is_same = both & (number_in_mesh(triangle, heights.shape[1]) == np.array(expected.prim_index))
+    assert is_same.sum() > 0.998 * both.sum()
+    difference = np.abs(np.array(uv) - np.array(expected.prim_uv)).max(axis=0)[is_same]
+    assert np.median(difference) < 2e-5 and np.quantile(difference, 0.999) < 0.02
+    b, c = np.array(uv)[:, both]
+    assert b.min() >= 0 and c.min() >= 0 and (b + c).max() <= 1
+
+
+def test_rays_begin_and_end_where_they_should():
+    shape = heightfield(np.zeros((5, 5), np.float32))
+    down = mi.Ray3f(mi.Point3f([0.1, 0.1, 0.1, 0.1, 1.1], 0.3, [1, 1, -0.1, 1, 1]), [0, 0, -1])
+    down.maxt = mi.Float(np.inf, 0.999, np.inf, 1.001, np.inf)
+    t, triangle, _ = shape.lightweight.closest(down, mi.Bool(True))
+    assert (triangle != NONE).numpy().tolist() == [True, False, False, True, False]
+    assert dr.allclose(t, [1, 0.999, np.inf, 1, np.inf])
+    _, triangle, _ = shape.lightweight.closest(down, mi.Bool([False, True, True, True, True]))
+    assert triangle.numpy()[0] == NONE
+
+
+@pytest.mark.parametrize("face_normals", [False, True])
+@pytest.mark.parametrize("flip_normals", [False, True])
+@pytest.mark.parametrize("scale", [1.0, -2.5])
+def test_surface_interactions_are_those_of_a_mesh(face_normals, flip_normals, scale):
+    heights, to_world = terrain(17, 33, 0.05), poses()["turned"]
+    normals = {"face_normals": face_normals, "flip_normals": flip_normals}
+    shape = heightfield(heights, to_world=to_world, scale=scale, **normals)
+    mesh = mesh_of(heights * np.float32(scale), to_world, **normals)
+    rays = rays_at(mesh.bbox(), "random", 5000)
+    pi = scene_of(mesh).ray_intersect_preliminary(rays, coherent=False)
+    pi.valid = pi.is_valid()
+    expected = pi.compute_surface_interaction(rays, mi.RayFlags.All | mi.RayFlags.dNSdUV)
+    pi.prim_index = triangle_of(pi.prim_index, heights.shape[1])
+    pi.shape = mi.ShapePtr(shape)
+    si = shape.lightweight.interaction(pi, rays)
+    hit = np.array(pi.valid)
+    assert hit.sum() > 1000
+    vectors = ("p", "n", "uv", "dp_du", "dp_dv", "wi", "dn_du", "dn_dv")
+    pairs = [(getattr(si, name), getattr(expected, name), name) for name in vectors]
+    pairs += [(getattr(si.sh_frame, k), getattr(expected.sh_frame, k), k) for k in "nst"]
+    for found, value, name in pairs:
+        found, value = np.array(found)[:, hit], np.array(value)[:, hit]
+        error = np.abs(found - value).max() / max(1, np.abs(value).max())
+        assert error < (1e-4 if name in "st" else 3e-5), name
+    assert dr.all(si.shape == mi.ShapePtr(shape))
+    assert dr.all(si.is_valid() == pi.valid)
+
+
+def test_normals_of_a_mirrored_heightfield_are_on_the_same_side():
+    mirrored = mi.ScalarTransform4f().scale([-1, 1, 1])
+    for flip_normals in (False, True):
+        shape = heightfield(terrain(9, 9), to_world=mirrored, flip_normals=flip_normals)
+        rays = make_rays(np.array([[0.1, 0.2, 3]]), np.array([[0.15, 0.25, 0]]))
+        si = interaction(shape, rays)
+        for n in (si.n, si.sh_frame.n):
+            assert (float(n.z[0]) < 0) == flip_normals
+
+
+def interaction(shape: mi.Shape, rays: mi.Ray3f) -> mi.SurfaceInteraction3f:
+    pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(rays))
+    pi.t, pi.prim_index, pi.prim_uv = shape.lightweight.closest(rays, mi.Bool(True))
+    pi.shape, pi.valid = mi.ShapePtr(shape), pi.prim_index != NONE
+    pi.t = dr.select(pi.valid, pi.t, dr.inf)
+    return shape.lightweight.interaction(pi, rays)
+
+
+@pytest.mark.parametrize("pose", ["identity", "turned"])
+@pytest.mark.parametrize("aim", ["vertices", "edges", "straight down"])
+def test_no_ray_passes_at_vertices_and_edges(pose, aim):
+    rows, columns, count = 65, 48, 100_000
+    heights = terrain(rows, columns, 0.01)
+    rng = np.random.default_rng(1)
+    x, y = rng.integers(2, columns - 2, count), rng.integers(2, rows - 2, count)
+    along = rng.random(count) * (aim == "edges")
+    # Along the row, along the column or along the diagonal
+    dx, dy = np.array([(1, 0), (0, 1), (1, 1)])[rng.integers(0, 3, count)].T
+    a, b = heights[y, x].astype(float), heights[y + dy, x + dx].astype(float)
+    targets = np.stack([
+        2 * (x + along * dx) / (columns - 1) - 1, 2 * (y + along * dy) / (rows - 1) - 1,
+        a + along * (b - a),
+    ], axis=1)  # fmt: skip
+    origins = rng.uniform([-0.8, -0.8, 2], [0.8, 0.8, 3], (count, 3))
+    if aim == "straight down":
+        origins[:, :2] = targets[:, :2]
+    matrix = np.array(poses()[pose].matrix, dtype=np.float64)
+    origins, targets = (p @ matrix[:3, :3].T + matrix[:3, 3] for p in (origins, targets))
+    shape = heightfield(heights, to_world=poses()[pose])
+    t, triangle, _ = shape.lightweight.closest(make_rays(origins, targets), mi.Bool(True))
+    assert dr.all(triangle != NONE)
+    distances = np.linalg.norm(targets - origins, axis=1)
+    assert np.abs(np.array(t) - distances).max() < 0.2
+
+
+@pytest.mark.parametrize("size", [*SIZES, (64, 129)], ids=str)
+@pytest.mark.parametrize("offset", [0.0, 3000.0])
+def test_ranges_of_nodes_contain_all_heights(size, offset):
+    heights = terrain(*size) + np.float32(offset)
+    tree = heightfield(heights).lightweight.tree
+    words = np.array(tree.nodes).reshape(-1, 4)
+    levels = np.array(tree.levels).reshape(-1, 2)
+    low, unit = float(tree.bottom[0]), float(tree.unit[0])
+    seen = np.zeros([-(-(n - 1) // 2) for n in size], dtype=int)
+    todo = [(0, 0, 0)]
+    while todo:
+        depth, x, y = todo.pop()
+        width, start = levels[depth]
+        blocks = 1 << len(levels) - depth - 1  # along a side of a child
+        for number, word in enumerate(words[start + y * width + x]):
+            i, j = 2 * x + (number & 1), 2 * y + (number >> 1)
+            part = heights[2 * j * blocks :, 2 * i * blocks :]
+            part = part[: 2 * blocks + 1, : 2 * blocks + 1]
+            if min(part.shape) < 2:
+                assert word & 0xFFFF > word >> 16  # empty
+                continue
+            # As the device computes them, within the margin of the traversal
+            bottom, top = low + np.array([word & 0xFFFF, word >> 16]) * unit
+            margin = 2**-24 * np.abs(heights).max()
+            assert bottom <= part.min() + margin and part.max() <= top + margin
+            assert top - bottom <= np.ptp(part) + 2.1 * unit + 2 * margin
+            if depth + 1 < len(levels):
+                todo.append((depth + 1, i, j))
+            else:
+                seen[j, i] += 1
+    assert np.all(seen == 1)
+
+
+def test_memory_is_less_than_six_bytes_for_a_cell():
+    heights = terrain(101, 100)
+    cells = 100 * 99
+    assert heightfield(heights).lightweight.tree.nbytes < 5.6 * cells
+    for dtype in (np.float16, np.uint16, np.uint8):
+        shape = heightfield((abs(heights) * 100).astype(dtype))
+        assert shape.lightweight.tree.nbytes < 3.6 * cells
+
+
+def heights_at_vertices(shape: mi.Shape, rows: int, columns: int) -> np.ndarray:
+    """What rays straight down find at vertices, close to their sides within the grid."""
+    y, x = np.mgrid[0:rows, 0:columns]
+    p = np.stack([2 * x / (columns - 1) - 1, 2 * y / (rows - 1) - 1, np.full(x.shape, 9)], axis=-1)
+    p[..., :2] *= 1 - 1e-6
+    p = p.reshape(-1, 3)
+    si = interaction(shape, make_rays(p, p - [0, 0, 1]))
+    assert dr.all(si.is_valid())
+    return np.array(si.p.z).reshape(rows, columns)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float16", "float32"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_image_files_are_read_as_they_are_stored(tmp_path, dtype, channels):
+    rng = np.random.default_rng(0)
+    if dtype.startswith("uint"):
+        file, largest = tmp_path / "heights.png", np.iinfo(dtype).max
+        pixels = rng.integers(0, largest, (7, 5, channels), endpoint=True).astype(dtype)
+    else:
+        file, largest = tmp_path / "heights.exr", 1
+        pixels = rng.uniform(-2, 2, (7, 5, channels)).astype(dtype)
+        pixels[0, 0] = 2e-6  # not normalized in half precision
+    mi.Bitmap(pixels).write(str(file))
+    shape = mi.load_dict({"type": "heightfield", "filename": str(file), "scale": 2.0})
+    expected = 2 * pixels[..., 0].astype(np.float64) / largest
+    assert np.abs(heights_at_vertices(shape, 7, 5) - expected).max() < 1e-4
+    at = shape.lightweight.tree.heights.at
+    stored = at(mi.UInt32([0, 4, 2]), mi.UInt32([0, 3, 6])).numpy()
+    assert np.array_equal(stored, pixels[[0, 3, 6], [0, 4, 2], 0].astype(np.float32))
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_spectral_variants_read_the_same_heights(variant):
+    pixels = np.random.default_rng(0).random((6, 5, 3)).astype(np.float32)
+    shape = mi.load_dict({"type": "heightfield", "bitmap": mi.Bitmap(pixels)})
+    assert np.abs(heights_at_vertices(shape, 6, 5) - pixels[..., 0]).max() < 1e-4
+
+
+def test_tensors_are_heights():
+    heights = terrain(6, 9)
+    for data in (heights, heights[..., None], np.stack([heights, heights * 0], axis=-1)):
+        shape = mi.load_dict({"type": "heightfield", "data": mi.TensorXf(data)})
+        assert np.abs(heights_at_vertices(shape, 6, 9) - heights).max() < 1e-4
+
+
+def test_texture_of_the_same_image_is_at_the_same_place():
+    pixels = np.random.default_rng(5).random((16, 16, 1)).astype(np.float32)
+    texture = mi.load_dict({
+        "type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "filter_type": "nearest",
+    })  # fmt: skip
+    # In the middle of texels; the same place on the rectangle
+    y, x = np.mgrid[0:16, 0:16]
+    p = np.stack([(2 * x + 1) / 16 - 1, (2 * y + 1) / 16 - 1, np.full(x.shape, 9)], axis=-1)
+    rays = make_rays(p.reshape(-1, 3), p.reshape(-1, 3) - [0, 0, 1])
+    si = interaction(heightfield(pixels[..., 0]), rays)
+    rectangle = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
+    assert np.allclose(si.uv, rectangle.ray_intersect(rays).uv, atol=1e-6)
+    assert np.array_equal(np.array(texture.eval_1(si)).reshape(16, 16), pixels[..., 0])
+    # Half a texel from the vertex
+    assert np.abs(np.array(si.p.z) - pixels.ravel()).mean() < 0.2
+
+
+def test_grid_of_one_cell_is_the_rectangle():
+    shape = heightfield(np.zeros((2, 2), np.float32))
+    rectangle = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
+    rays = rays_at(mi.ScalarBoundingBox3f([-1, -1, -1], [1, 1, 1]), "random", 2000)
+    si, expected = interaction(shape, rays), rectangle.ray_intersect(rays)
+    valid = expected.is_valid()
+    assert dr.all(si.is_valid() == valid)
+    for name in ("p", "uv", "dp_du", "dp_dv", "n"):
+        found = dr.select(valid, getattr(si, name) - getattr(expected, name), 0)
+        assert dr.max(dr.max(dr.abs(found)))[0] < 1e-5
+
+
+def test_scene_has_the_bounds_of_the_surface():
+    heights = terrain(8, 8)
+    shape, mesh = heightfield(heights, scale=-3.0), mesh_of(-3 * heights, mi.ScalarTransform4f())
+    assert np.allclose(shape.bbox().min, mesh.bbox().min, atol=1e-5)
+    assert np.allclose(shape.bbox().max, mesh.bbox().max, atol=1e-5)
+
+
+def test_scale_of_zero_makes_it_flat():
+    shape = heightfield(terrain(8, 8), scale=0.0)
+    assert np.abs(heights_at_vertices(shape, 8, 8)).max() < 1e-6
+
+
+def test_str_shows_the_state():
+    text = str(heightfield(np.zeros((3, 4), np.float32), scale=2.0, flip_normals=True))
+    for line in ("columns = 4", "rows = 3", "stored = float32", "scale = 2"):
+        assert f"{line},\n" in text
+    assert "face_normals = false,\n  flip_normals = true\n" in text
+
+
+def _with_nan() -> np.ndarray:
+    values = np.zeros((4, 6), np.float32)
+    values[2, 3] = np.nan
+    return values
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({}, 'one of "filename", "bitmap" and "data", found none'),
+        ({"bitmap": np.zeros((3, 3)), "filename": "a.png"}, "found filename and bitmap"),
+        ({"filename": "missing.png"}, "there is no file"),
+        ({"filename": __file__}, "cannot be read as an image"),
+        ({"filename": 3}, '"filename" is 3; it must be of type string'),
+        ({"bitmap": np.zeros((1, 5))}, "has 5 x 1 values; each side must have 2 to 32769"),
+        ({"bitmap": np.zeros((2, 32770))}, "each side must have 2 to 32769"),
+        ({"bitmap": _with_nan()}, "the value nan in column 3 of row 2"),
+        ({"bitmap": np.zeros((3, 3)), "scale": "a"}, '"scale" is \'a\'; it must be of type float'),
+        ({"bitmap": np.zeros((3, 3)), "face_normals": 1}, "must be of type bool"),
+        ({"bitmap": np.zeros((3, 3)), "to_world": 1}, "must be a transform"),
+        ({"bitmap": np.zeros((3, 3)), "to_world": "flat"}, "can be inverted"),
+        ({"bitmap": np.zeros((3, 3)), "emitter": {"type": "area"}}, "an area light"),
+        ({"bitmap": np.zeros((3, 3)), "other": {"type": "homogeneous"}}, "it cannot hold"),
+        ({"bitmap": np.zeros((3, 3)), "resolution": 3}, "resolution"),
+        ({"data": 3}, "must be a tensor of floats"),
+        ({"data": "line"}, "it must be (rows, columns)"),
+    ],
+)
+def test_wrong_parameters_are_refused_in_one_sentence(parameters, message):
+    values = dict(parameters)
+    if isinstance(values.get("bitmap"), np.ndarray):
+        values["bitmap"] = mi.Bitmap(values["bitmap"].astype(np.float32)[..., None])
+    if values.get("to_world") == "flat":
+        values["to_world"] = mi.ScalarTransform4f().scale([1, 0, 1])
+    if values.get("data") == "line":
+        values["data"] = mi.TensorXf([1, 2, 3])
+    with pytest.raises(RuntimeError) as error:
+        mi.load_dict({"type": "heightfield", **values})
+    assert message in str(error.value) and "heightfield" in str(error.value)
+
+
+def test_render_agrees_with_a_mesh():
+    bsdf = {"type": "diffuse", "reflectance": {"type": "checkerboard"}}
+    heights = terrain(40, 30, 0.02)
+    to_world = mi.ScalarTransform4f().rotate([1, 0, 0], -30)
+    shapes = [
+        heightfield(heights, to_world=to_world, bsdf=bsdf), mesh_of(heights, to_world, bsdf=bsdf)
+    ]  # fmt: skip
+    images = []
+    for shape in shapes:
+        scene = mi.load_dict({
+            "type": "scene", "shape": shape,
+            "integrator": {"type": "composed_path", "max_depth": 3},
+            "light": {"type": "constant", "radiance": 0.3},
+            "lamp": {
+                "type": "sphere", "center": [0, 2, 3], "radius": 0.5,
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 8.0}},
+            },
+            "sensor": {
+                "type": "perspective", "fov": 40,
+                "to_world": mi.ScalarTransform4f().look_at([0, -2, 3], [0, 0, 0], [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 48, "height": 48},
+            },
+        }, optimize=False)  # fmt: skip
+        images.append(np.array(mi.render(scene, spp=8, seed=1)))
+    # The same paths, but for a few that rounding sends elsewhere
+    difference = np.abs(images[0] - images[1])
+    assert images[1].std() > 0.05
+    assert np.quantile(difference, 0.99) < 1e-3 and difference.mean() < 1e-3
+
+
+@pytest.mark.parametrize("direction", [(1, 0), (0, -1), (1, 1), (-1, -1), (1, -1), (2, 1)], ids=str)
+def test_no_ray_passes_along_grid_lines_and_diagonals(direction):
+    """Rays whose projections are lines of the grid, or meet many vertices."""
+    heights = terrain(65, 65, 0.002)  # lines are at multiples of 1/32: nothing is rounded
+    y, x = (n.ravel() for n in np.mgrid[8:57, 8:57])
+    for slope in (-4.0, -8.0):  # steeper than the surface
+        down = np.array([*direction, slope])
+        targets = np.stack([x / 32 - 1, y / 32 - 1, heights[y, x]], axis=1)
+        origins = targets - down * 0.5 / abs(slope)
+        origins[:, 2] = targets[:, 2] + 0.5
+        o, d = from_numpy(mi.Float, origins), np.tile(down, (len(origins), 1))
+        rays = mi.Ray3f(
+            dr.unravel(mi.Point3f, o), dr.unravel(mi.Vector3f, from_numpy(mi.Float, d))
+        )
+        t, triangle, _ = heightfield(heights).lightweight.closest(rays, mi.Bool(True))
+        assert dr.all(triangle != NONE)
+        assert dr.allclose(t, 0.5 / abs(slope), atol=1e-5)
