@@ -110,7 +110,7 @@ def test_integrators_see_it(tmp_path, integrator: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "integrator", ["composed_path", "bdpt", "composed_path linear", "composed_path spatial_lights"]
+    "integrator", ["composed_path", "bdpt", "composed_path linear", "composed_path spatial"]
 )
 def test_mesh_that_emits_light_gives_the_light_of_the_mesh(integrator: str) -> None:
     lamp = _ring(emitter=area(4.0), bsdf=diffuse(0.2))
