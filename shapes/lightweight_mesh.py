@@ -145,7 +145,9 @@ class LightweightMesh(mi.Mesh):
                 f'what is nested in it must be a mesh, found {shape.class_name()} ("{key}"); '
                 f"materials, lights and media belong into the nested mesh"
             )
-        if not shape.is_mesh() or hasattr(shape, "motion") or hasattr(shape, "lightweight"):
+        is_ours = hasattr(shape, "motion") or hasattr(shape, "lightweight")
+        # Mitsuba's rectangle calls itself a mesh, but has no faces that could be sorted
+        if is_ours or not shape.is_mesh() or "faces" not in mi.traverse(shape):
             raise self._error(
                 f"only a mesh of triangles of Mitsuba can be nested in it, such as ply, obj or "
                 f"serialized; found {shape.class_name()}"

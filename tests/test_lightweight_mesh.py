@@ -219,6 +219,7 @@ def test_integrators_that_do_not_see_it_are_refused() -> None:
         ({}, "one mesh must be nested in it, found 0"),
         ({"a": {"type": "cube"}, "b": {"type": "cube"}}, "one mesh must be nested in it, found 2"),
         ({"a": {"type": "sphere"}}, "only a mesh of triangles"),
+        ({"a": {"type": "rectangle"}}, "only a mesh of triangles"),
         ({"a": {"type": "diffuse"}}, "belong into the nested mesh"),
         ({"a": _around({"type": "cube"})}, "only a mesh of triangles"),
         ({"a": {"type": "cube", "emitter": area(1.0)}, "quantized": True}, "cannot be quantized"),

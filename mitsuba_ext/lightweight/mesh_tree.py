@@ -75,14 +75,14 @@ class MeshTree:
 
     def closest(self, ray: mi.Ray3f, corners: Corners, active: mi.Bool) -> Hit:
         """The closest hit of each ray before ``ray.maxt``."""
-        return traverse(_RaysInTree(self, ray, corners), ray, active, any_hit=False)
+        return traverse(RaysInTree(self, ray, corners), ray, active, any_hit=False)
 
     def occluded(self, ray: mi.Ray3f, corners: Corners, active: mi.Bool) -> mi.Bool:
         """Is there any hit before ``ray.maxt``?"""
-        return traverse(_RaysInTree(self, ray, corners), ray, active, any_hit=True)[1] != NONE
+        return traverse(RaysInTree(self, ray, corners), ray, active, any_hit=True)[1] != NONE
 
 
-class _RaysInTree:
+class RaysInTree:
     """Rays that traverse a tree."""
 
     root = 0
