@@ -38,7 +38,8 @@ def compared(name: str) -> list[str]:
     best = BEST.get(name, "auto_path")
     text = (ROOT / "scenes" / f"{name}.xml").read_text(encoding="utf-8")
     first = "volpath" if "<medium" in text else "path"
-    if "moving" in text or "dispersive" in text:  # Mitsuba's own do not see these
+    # Mitsuba's own do not see these
+    if any(word in text for word in ("moving", "dispersive", "lightweight", "heightfield")):
         first = "composed_path"
     return [first, best, *([] if best == "auto" else ["auto"])]
 

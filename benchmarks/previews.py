@@ -53,6 +53,7 @@ PICTURES = {
     "near_lights": 256,
     "fog": 1024,
     "volume_caustic": 256,
+    "dunes": 256,
 }
 
 #: Scenes rendered by light paths or chains, or in which nothing is learned of visibility; all

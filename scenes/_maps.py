@@ -109,8 +109,23 @@ def hall() -> Floats:
     return image
 
 
+def dunes() -> Floats:
+    """Heights of sand dunes with ripples, between 0 and 1: steep on one side of their crests."""
+    count = 320
+    y, x = np.mgrid[:count, :count] / (count - 1)
+    bend = 0.09 * np.sin(5 * y + 1) + 0.05 * np.sin(11 * y + 3 * x) + 0.02 * np.sin(23 * y - 7 * x)
+    phase = (2.6 * (x + bend) + 0.3 * y) % 1
+    # Up with the wind over two thirds of the way, then down
+    rise = np.where(phase < 0.68, phase / 0.68, (1 - phase) / 0.32)
+    crest = 0.5 - 0.5 * np.cos(np.pi * rise)
+    height = crest * (0.55 + 0.3 * np.sin(4 * y + 2 * x) + 0.15 * np.sin(9 * x + 1))
+    ripples = 0.011 * np.sin(330 * (x + 0.4 * bend) + 12 * np.sin(6 * y)) * (1 - crest)
+    return 0.05 + 0.9 * height + ripples
+
+
 def write_exr(path: Path, image: Floats) -> None:
     """Writes linear half floats, rounded to a thousandth: repeatable, and smaller files."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {"RGB": np.round(image, 3).astype(np.float16)}) as exr:
+    name = "Y" if image.ndim == 2 else "RGB"
+    with OpenEXR.File(header, {name: np.round(image, 3).astype(np.float16)}) as exr:
         exr.write(str(path))

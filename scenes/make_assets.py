@@ -14,7 +14,7 @@ from pathlib import Path
 from _geometry import icosphere, torus_knot, write_ply
 from _glassware import globe, tumbler
 from _lamps import lamps
-from _maps import checker, clear_sky, hall, painting, planks, sunny_sky, tiles, write_exr
+from _maps import checker, clear_sky, dunes, hall, painting, planks, sunny_sky, tiles, write_exr
 from _pool import pool, water
 from _things import cupboard, door, fittings, furniture, plant, pot, prism, ring, school, tableware
 from _walls import house, keyhole, wall_with_holes, window_room
@@ -45,6 +45,7 @@ def main() -> None:
         "sunny_sky": sunny_sky(),
         "clear_sky": clear_sky(),
         "hall": hall(),
+        "dunes": dunes(),
     }
     for name, image in maps.items():
         write_exr(folder / f"{name}.exr", image)

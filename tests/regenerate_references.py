@@ -82,6 +82,7 @@ REGRESSIONS = {
         Regression("ecoc_dof", "defocus", {"nested": "path"}),
         Regression("reweighted_time", "fan", {"nested": "composed_path"}),
         Regression("composed_path", "fast_balls"),
+        Regression("composed_path", "dunes"),
         Regression("composed_path", "lantern", max_depth=2, spp=512),
         Regression("swarm_path", "six_balls", {"always_use": True}, max_depth=2, spp=64),
         Regression("swarm_path", "peppers_ghost", {"always_use": True}, spp=1024, is_slow=True),
