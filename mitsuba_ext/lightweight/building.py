@@ -72,18 +72,21 @@ def _apply(boxes: np.ndarray, order: np.ndarray, start: int, nodes: int, size: i
     if not 0 < left < size:
         return
     part = slice(start, start + nodes * size)
-    mine = boxes[:, part].reshape(6, nodes, size)
-    axis = _axes(mine, left)
-    if nodes == 1:
-        centres = mine[axis[0]] + mine[3 + axis[0]]
-    else:
-        centres = np.empty((nodes, size), dtype=np.float32)
-        for k in range(3):
-            chosen = axis == k
-            centres[chosen] = mine[k][chosen] + mine[3 + k][chosen]
-    by_centre = _separated(centres, left)
+    by_centre = _separated(_centres(boxes[:, part].reshape(6, nodes, size), left), left)
     for row in (*boxes, order):
         row[part] = row[part][by_centre]
+
+
+def _centres(boxes: np.ndarray, left: int) -> np.ndarray:
+    """Twice the centres along the axis of each node. Shape (nodes, size)."""
+    axis = _axes(boxes, left)
+    if len(axis) == 1:
+        return boxes[axis[0]] + boxes[3 + axis[0]]
+    centres = np.empty(boxes.shape[1:], dtype=np.float32)
+    for k in range(3):
+        chosen = axis == k
+        centres[chosen] = boxes[k][chosen] + boxes[3 + k][chosen]
+    return centres
 
 
 def _axes(boxes: np.ndarray, left: int) -> np.ndarray:
@@ -120,6 +123,7 @@ def _separated(values: np.ndarray, left: int) -> np.ndarray:
     bits = values.view(np.uint32)
     bits ^= (bits.view(np.int32) >> 31).view(np.uint32) | np.uint32(1 << 31)
     keys = bits.astype(np.uint64)
+    del values, bits  # for one node with all triangles, this is much
     keys <<= np.uint64(32)
     keys |= np.arange(size, dtype=np.uint32)
     keys.partition(left, axis=1)

@@ -46,7 +46,7 @@ class Heap:
         leaves = -(-triangles // LEAF_SIZE)
         self.inner = max(1, -(-(leaves - 1) // (ARITY - 1)))
         slots = (ARITY - 1) * self.inner + 1
-        self.counts = np.empty(self.inner + slots, dtype=np.int64)
+        self.counts = np.empty(self.inner + slots, dtype=np.int32)
         self.counts[self.inner :] = np.clip(
             triangles - LEAF_SIZE * np.arange(slots), 0, LEAF_SIZE
         )
@@ -78,7 +78,8 @@ class Heap:
         """The leaves from left to right: those of the bottom row come first."""
         bottom = self._bottom
         return np.concatenate([
-            np.arange(bottom, len(self.counts)), np.arange(self.inner, bottom)
+            np.arange(bottom, len(self.counts), dtype=np.int32),
+            np.arange(self.inner, bottom, dtype=np.int32),
         ])  # fmt: skip
 
     def by_leaf(self, triangles: np.ndarray) -> np.ndarray:

@@ -65,9 +65,8 @@ def boxes_of_nodes(boxes: np.ndarray, heap: Heap) -> np.ndarray:
     result = np.empty((6, len(heap.counts)), dtype=np.float32)
     result[:3], result[3:] = np.inf, -np.inf
     leaves = heap.leaves_from_left()
-    counts = heap.counts[leaves]
-    starts = np.cumsum(counts) - counts
-    leaves, starts = leaves[counts > 0], starts[counts > 0]
+    leaves = leaves[heap.counts[leaves] > 0]
+    starts = np.concatenate([[0], np.cumsum(heap.counts[leaves[:-1]])])
     for row, values in enumerate(boxes):
         union = np.minimum if row < 3 else np.maximum
         result[row, leaves] = union.reduceat(values, starts)
