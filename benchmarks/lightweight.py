@@ -1,15 +1,16 @@
 """Memory and speed of lightweight meshes, against Embree in Mitsuba.
 
-    python benchmarks/lightweight.py rays                  # a bumpy ball of 1e5, 1e6 and 1e7 triangles
+    python benchmarks/lightweight.py rays                  # a ball of 1e5, 1e6 and 1e7 triangles
     python benchmarks/lightweight.py rays SCENE.xml        # all meshes of a scene as one
+    python benchmarks/lightweight.py heights               # heightfields of 1000 x 1000 cells
     python benchmarks/lightweight.py memory --triangles 2e7
     python benchmarks/lightweight.py renders
 
-``rays`` times the tree with boxes of several precisions: as floats, shorts and bytes relative to the
-mesh, as in the source, and bytes relative to the node, which the plugin uses; and with other
-numbers of triangles in a leaf. Camera rays come from a grid of pixels, diffuse rays from the points
-that they hit, shadow rays end at points of the box. Times are medians over rounds in which the
-structures take turns, in units of Embree's.
+``rays`` times the tree with boxes of several precisions: as floats, shorts and bytes relative to
+the mesh, as in the source, and bytes relative to the node, which the plugin uses. Camera rays come
+from a grid of pixels, diffuse rays from the second surface on the way of a path, and shadow rays
+end at points of the box. Times are medians over rounds in which the structures take turns, in units
+of Embree's.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import click
@@ -118,7 +120,7 @@ def _evaluated(ray: mi.Ray3f) -> mi.Ray3f:
 
 def structures(positions: np.ndarray, faces: np.ndarray, all_of_them: bool) -> dict:
     """The trees by name: functions that make them."""
-    from lightweight_nodes import PRECISIONS, PreciseGeometry
+    from lightweight_nodes import PRECISIONS
 
     from mitsuba_ext.lightweight.mesh_geometry import MeshGeometry
     from mitsuba_ext.lightweight.packed_mesh import PackedMesh
@@ -129,8 +131,14 @@ def structures(positions: np.ndarray, faces: np.ndarray, all_of_them: bool) -> d
     }
     if all_of_them:
         for name in PRECISIONS:
-            made[name] = lambda name=name: PreciseGeometry(mesh(positions, faces), name)
+            made[name] = partial(_precise, positions, faces, name)
     return made
+
+
+def _precise(positions: np.ndarray, faces: np.ndarray, name: str):
+    from lightweight_nodes import PreciseGeometry
+
+    return PreciseGeometry(mesh(positions, faces), name)
 
 
 def interleaved(tasks: dict[str, Callable], rounds: int) -> dict[str, float]:
@@ -174,16 +182,66 @@ def rays(scenes, triangles: str, side: int, rounds: int, few: bool) -> None:
         print(f"{name}: {len(faces)} triangles")
         results = {}
         for kind, ray in (("camera", camera), ("diffuse", diffuse), ("shadow", shadow)):
-            tasks = {"Embree": lambda: _embree(scene, ray, kind)}
+            tasks = {"Embree": partial(_embree, scene, ray, kind)}
             for label, (tree, _) in trees.items():
-                tasks[label] = lambda tree=tree: _ours(tree, ray, kind)
+                tasks[label] = partial(_ours, tree, ray, kind)
             results[kind] = interleaved(tasks, rounds)
         million = {kind: side * side / 1e6 / times["Embree"] for kind, times in results.items()}
         print("  Embree: " + ", ".join(f"{v:.1f} M {k} rays/s" for k, v in million.items()))
         for label, (tree, seconds) in trees.items():
-            ratios = (f"{kind} {times[label] / times['Embree']:.2f}" for kind, times in results.items())
+            ratios = (f"{kind} {t[label] / t['Embree']:.2f}" for kind, t in results.items())
             print(f"  {label}: {tree.nbytes / len(faces):.2f} bytes a triangle, built in "
                   f"{seconds:.1f} s, times {', '.join(ratios)}")  # fmt: skip
+
+
+@main.command()
+@click.option("--cells", default=1000)
+@click.option("--side", default=1000)
+@click.option("--rounds", default=7)
+def heights(cells: int, side: int, rounds: int) -> None:
+    """Times of rays in heightfields, in units of Embree's in meshes of the same triangles."""
+    y, x = np.mgrid[: cells + 1, : cells + 1] / cells
+    hills = np.sin(9 * x) * np.sin(11 * y) + np.sin(37 * x + 3) * np.sin(41 * y) / 4
+    hills += np.sin(301 * x) * np.sin(297 * y) / 40
+    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    above = corner + cells + 1
+    faces = [np.stack([corner, corner + 1, above + 1]), np.stack([corner, above + 1, above])]
+    faces = np.concatenate(faces, axis=1).T.astype("u4")
+    for scale in (0.3, 0.03):
+        z = (scale * hills).astype("f4")
+        positions = np.stack([2 * x - 1, 2 * y - 1, z], axis=-1).reshape(-1, 3).astype("f4")
+        scene = mi.load_dict({"type": "scene", "mesh": mesh(positions, faces)}, optimize=False)
+        camera = _evaluated(mi.Ray3f(*_from_above(side)))
+        diffuse = diffuse_rays(scene, camera)
+        sorts = {"camera": camera, "diffuse": diffuse, "shadow": shadow_rays(diffuse, scene.bbox())}
+        print(f"{cells} x {cells} cells, heights of {scale}")
+        for kind in ("float32", "uint16"):
+            data = {"data": mi.TensorXf(z)}
+            if kind == "uint16":
+                low, high = z.min(), z.max()
+                image = np.rint((z - low) / (high - low) * 65535).astype("u2")
+                to_world = mi.ScalarTransform4f().translate([0, 0, float(low)])
+                data = {"bitmap": mi.Bitmap(image), "scale": float(high - low)}
+                data["to_world"] = to_world
+            begin = time.perf_counter()
+            field = mi.load_dict({"type": "heightfield", **data}).lightweight
+            seconds = time.perf_counter() - begin
+            ratios = []
+            for name, ray in sorts.items():
+                times = interleaved({
+                    "Embree": partial(_embree, scene, ray, name),
+                    "ours": partial(_ours, field, ray, name),
+                }, rounds)  # fmt: skip
+                ratios.append(f"{name} {times['ours'] / times['Embree']:.2f}")
+            print(f"  {kind}: {field.tree.nbytes / cells**2:.2f} bytes a cell, built in "
+                  f"{seconds:.2f} s, times {', '.join(ratios)}")  # fmt: skip
+
+
+def _from_above(side: int) -> tuple[mi.Point3f, mi.Vector3f]:
+    lane = dr.arange(mi.UInt32, side * side)
+    place = (mi.Point2f(lane % side, lane // side) + 0.5) / side - 0.5
+    o = mi.Point3f(0, -1.8, 1.2)
+    return o, dr.normalize(mi.Point3f(1.6 * place.x, 1.6 * place.y, 0) - o)
 
 
 def _embree(scene: mi.Scene, ray: mi.Ray3f, kind: str) -> None:
@@ -195,7 +253,8 @@ def _embree(scene: mi.Scene, ray: mi.Ray3f, kind: str) -> None:
 
 
 def _ours(tree, ray: mi.Ray3f, kind: str) -> None:
-    dr.eval(tree.occluded(ray, mi.Bool(True)) if kind == "shadow" else tree.closest(ray, mi.Bool(True)))
+    query = tree.occluded if kind == "shadow" else tree.closest
+    dr.eval(query(ray, mi.Bool(True)))
     dr.sync_thread()
 
 
@@ -210,7 +269,7 @@ def memory(triangles: float, normals: bool) -> None:
     file = Path(os.environ.get("TMPDIR", "/tmp")) / f"ball_{int(triangles)}.ply"
     if not file.exists():
         write_ply(file, *ball(int(triangles)))
-    for kind in ("mesh", "lightweight_mesh", "quantized"):
+    for kind in ("mesh", "lightweight_mesh", "quantized", "heightfield"):
         command = [sys.executable, __file__, "one", kind, str(file)]
         subprocess.run(command + ["--normals"] * normals, check=True)
 
@@ -234,7 +293,12 @@ def one(kind: str, file: str, normals: bool) -> None:
     dr.eval(mi.Float([1, 2]))
     base = _resident()
     shape = {"type": "ply", "filename": file, "face_normals": not normals}
-    if kind != "mesh":
+    if kind == "heightfield":  # with as many triangles
+        count = round((int(file.split("_")[-1][:-4]) / 2) ** 0.5) + 1
+        rows = mi.Float(np.sin(np.linspace(0, 40, count * count, dtype="f4")))
+        heights = mi.TensorXf(rows, (count, count))
+        shape = {"type": "heightfield", "data": heights, "scale": 0.2, "face_normals": not normals}
+    elif kind != "mesh":
         shape = {"type": "lightweight_mesh", "quantized": kind == "quantized", "mesh": shape}
     to_world = mi.ScalarTransform4f().look_at([0, -2.6, 0.3], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 320, "height": 240}
@@ -281,13 +345,18 @@ def renders(triangles: str, rounds: int) -> None:
                 box.pop(key)
             scenes[kind] = mi.load_dict({**box, "ball": shape}, optimize=False)
         integrator = mi.load_dict({"type": "composed_path", "max_depth": 8})
-        times = interleaved({
-            kind: lambda scene=scene: dr.eval(integrator.render(scene, spp=16)) or dr.sync_thread()
-            for kind, scene in scenes.items()
-        }, rounds)  # fmt: skip
+        tasks = {
+            kind: partial(_rendered, integrator, scene) for kind, scene in scenes.items()
+        }  # fmt: skip
+        times = interleaved(tasks, rounds)
         print(f"{size} triangles: mesh {times['mesh']:.2f} s, " + ", ".join(
             f"{kind} {seconds / times['mesh']:.2f} ×" for kind, seconds in times.items()
         ))  # fmt: skip
+
+
+def _rendered(integrator: mi.Integrator, scene: mi.Scene) -> None:
+    dr.eval(integrator.render(scene, spp=16))
+    dr.sync_thread()
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-"""Nodes as in the source of ``lightweight_mesh``: boxes as floats, or as shorts or bytes relative to
-the mesh. For ``lightweight.py``."""
+"""Nodes as in the source of ``lightweight_mesh``: boxes as floats, or as shorts or bytes relative
+to the mesh. For ``lightweight.py``."""
 
 from __future__ import annotations
 
