@@ -51,11 +51,12 @@ def passes(names, counts, seeds, reference, max_depth) -> None:
     equal_samples.py, and how fast they fall from count to count: the power of the number of passes.
     The reference is ``vcm`` with a radius of four pixels at first."""
     from mitsuba_ext.bidirectional.merging import median_footprint
+    from mitsuba_ext.transport.scene_query import SceneQuery
 
     print_header(["scene", "", "passes", "variance", "power", "bias²", "power", "mean"])
     for name in names:
         scene = load(name, SIZE)
-        radius = 4 * median_footprint(scene, scene.sensors()[0])
+        radius = 4 * median_footprint(scene, scene.sensors()[0], SceneQuery())
         long = [image(scene, "vcm", reference, 5000 + k, max_depth, radius=radius) for k in (0, 1)]
         true = np.mean(long, axis=0)
         noise = np.var(long, axis=0, ddof=1) / 2

@@ -159,7 +159,7 @@ class PhotonMapping(WalkIntegrator):
         return PhotonMaps.trace(
             scene, walk, self.photons, seed, self.final_gather,
             (self.radii["caustic"], self.radii["global"]), self.lookup_size,
-            median_footprint(scene, sensor),
+            median_footprint(scene, sensor, query),
         )  # fmt: skip
 
     def _check(self, scene: mi.Scene) -> None:

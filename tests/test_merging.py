@@ -23,6 +23,7 @@ from mitsuba_ext.decisions.camera.shared_numbers import (
     WAVELENGTH_STEP,
     SharedNumbers,
 )
+from mitsuba_ext.transport.scene_query import SceneQuery
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -145,7 +146,7 @@ def test_the_footprint_is_the_width_of_a_pixel() -> None:
     }  # fmt: skip
     scene = mi.load_dict({"type": "scene", "wall": wall, "sensor": camera})
     width = 2 * 4 * math.tan(math.radians(5)) / 32
-    assert median_footprint(scene, scene.sensors()[0]) == pytest.approx(width, rel=0.01)
+    assert median_footprint(scene, scene.sensors()[0], SceneQuery()) == pytest.approx(width, rel=0.01)
 
 
 # ---- Images ----

@@ -18,7 +18,7 @@ import numpy as np
 from ..scene.bounds import scene_bounds
 from ..transport.bsdfs import eval_bsdf
 from ..transport.heroes import Heroes
-from ..transport.path_decisions import Subpaths
+from ..transport.path_decisions import SceneQuery, Subpaths
 from ..transport.vertex import Vertex
 from .light_vertices import LightVertex, LightVertices, PackedVertices, VertexCache, group_of
 from .light_walk import LightWalk
@@ -55,7 +55,7 @@ FEW, WIDEST = 64, 8.0
 LARGEST = 0.04
 
 
-def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
+def median_footprint(scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery) -> float:
     """The width of a pixel where the camera sees the scene: the median over the film. If rays
     through a grid of places on the film hit nothing, or the sensor does not tell how far pixels are
     apart, a thousandth of the diagonal of the scene."""
@@ -64,9 +64,9 @@ def median_footprint(scene: mi.Scene, sensor: mi.Sensor) -> float:
     position = (mi.Point2f(lane % count, lane // count) + 0.5) / count
     ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
     if ray.has_differentials:
-        si = scene.ray_intersect(ray)
-        width = dr.norm((ray.o_x + ray.d_x * si.t) - (ray.o + ray.d * si.t))
-        found = width.numpy()[si.is_valid().numpy()]
+        pi = query.closest(scene, mi.Ray3f(ray), coherent=True, active=mi.Bool(True))
+        width = dr.norm((ray.o_x + ray.d_x * pi.t) - (ray.o + ray.d * pi.t))
+        found = width.numpy()[pi.is_valid().numpy()]
         found = found[np.isfinite(found)]
         if len(found) and np.median(found) > 0:
             return float(np.median(found))

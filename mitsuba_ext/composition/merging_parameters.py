@@ -63,7 +63,7 @@ class MergingParameters:
         :func:`suitable_radius`."""
         if only_caustic and not _may_have_caustics(scene):
             return None
-        footprint = median_footprint(scene, sensor)
+        footprint = median_footprint(scene, sensor, light_walk.query)
         width, height = film_extent(sensor.film())
         pixels = width * height
         radius, widest = self.radius, math.inf
@@ -81,7 +81,7 @@ class MergingParameters:
     ) -> MergingRadius:
         """As :meth:`radius_of`, for balls in participating media; ``given`` is their radius, 0 for
         one that suits the scene."""
-        footprint = median_footprint(scene, sensor)
+        footprint = median_footprint(scene, sensor, light_walk.query)
         width, height = film_extent(sensor.film())
         radius = given or suitable_ball(scene, sensor, light_walk, footprint, width * height)
         radius = radius or WIDEST_BALL * footprint
