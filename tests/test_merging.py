@@ -146,7 +146,8 @@ def test_the_footprint_is_the_width_of_a_pixel() -> None:
     }  # fmt: skip
     scene = mi.load_dict({"type": "scene", "wall": wall, "sensor": camera})
     width = 2 * 4 * math.tan(math.radians(5)) / 32
-    assert median_footprint(scene, scene.sensors()[0], SceneQuery()) == pytest.approx(width, rel=0.01)
+    footprint = median_footprint(scene, scene.sensors()[0], SceneQuery())
+    assert footprint == pytest.approx(width, rel=0.01)
 
 
 # ---- Images ----
