@@ -23,12 +23,22 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 
 class Pair(NamedTuple):
-    """A scene, an integrator of ours, the longest paths, and what stands beside it."""
+    """A scene, an integrator of ours, the longest paths, and what stands beside it.
+
+    Attributes:
+        sampler: Replaces that of the scene, for ours; see :func:`equal_samples.load`.
+        beside: The scene of ``path``, if it is another one.
+        label: What our picture is called, if not by its integrator.
+        seconds: For each render, if not those of the command.
+    """
 
     scene: str
     ours: dict[str, Any]
     max_depth: int = 8
-    path: dict[str, Any] = {"type": "composed_path"}  # noqa: RUF012
+    sampler: str = ""
+    beside: str = ""
+    label: str = ""
+    seconds: float = 0.0
 
 
 #: The pictures of the README, by scene.
@@ -40,6 +50,7 @@ README = {
     "caustic": Pair("caustic", {"type": "bdpt"}),
 }
 
+#: ``path``, which ends at a timeout.
 _PATH = {"type": "composed_path"}
 
 #: The pictures of the plugins' pages. Integrators around others have them around ``path``.
@@ -57,11 +68,35 @@ PLUGINS = {
     "erpt": Pair("pool", {"type": "erpt"}),
     "pssmlt": Pair("pool", {"type": "pssmlt"}),
     "mlt": Pair("mirrored_lamp", {"type": "mlt"}),
-    "composed_path": Pair("many_lamps", {**_PATH, "next_event": "power"}),
+    "composed_path": Pair(
+        "many_lamps", {**_PATH, "next_event": "power"}, label="next_event=power"
+    ),
     "reweighted_time": Pair("fast_balls", {"type": "reweighted_time", "nested": _PATH}),
     "reweighted_lens": Pair("defocus", {"type": "reweighted_lens", "nested": _PATH}),
     "ecoc_dof": Pair("defocus", {"type": "ecoc_dof", "nested": _PATH}),
     "adaptive": Pair("spotlights", {"type": "adaptive", "nested": _PATH}),
+    # Decisions
+    **{
+        name: Pair(scene, {**_PATH, slot: {"type": name}}, label=name)
+        for name, slot, scene in (
+            ("guided_directions", "directions", "door_ajar"),
+            ("learned_lights", "next_event", "rooms"),
+            ("spatial_lights", "next_event", "many_lamps"),
+            ("resampled_lights", "next_event", "spotlights"),
+            ("two_stage_lights", "next_event", "colonnade"),
+            ("portal_lights", "next_event", "portal_room"),
+            ("visibility_roulette", "shadow_test", "rooms"),
+            ("weighted_connections", "connections", "open"),
+        )
+    },
+    # Samplers: few samples show what they do
+    **{
+        name: Pair("cornell_box", _PATH, sampler=name, label=name, seconds=0.7)
+        for name in ("sobol_owen", "halton", "hammersley", "faure", "latin_hypercube", "lattice")
+    },
+    "solid_angle_area": Pair(
+        "near_lights", _PATH, beside="near_lights:light=area", label="solid_angle_area"
+    ),
 }
 
 #: Where the brightest values of our image come to lie, before the sRGB curve.
@@ -82,11 +117,14 @@ def rendered(scene: mi.Scene, integrator: dict, seconds: float, max_depth: int):
 
 def side_by_side(pair: Pair, seconds: float, size: tuple[int, int]) -> tuple[Image.Image, str]:
     """Both pictures in one, and a sentence about their samples."""
-    scene = load(pair.scene, size)
-    halves = {"path": pair.path, pair.ours["type"]: pair.ours}
-    if len(halves) == 1:
-        halves = {"path": pair.path, "next_event=power": pair.ours}
-    made = {k: rendered(scene, v, seconds, pair.max_depth) for k, v in halves.items()}
+    seconds = pair.seconds or seconds
+    scene = load(pair.scene, size, pair.sampler)
+    beside = load(pair.beside or pair.scene, size) if pair.beside or pair.sampler else scene
+    label = pair.label or pair.ours["type"]
+    made = {
+        "path": rendered(beside, _PATH, seconds, pair.max_depth),
+        label: rendered(scene, pair.ours, seconds, pair.max_depth),
+    }
     scale = _WHITE / np.quantile([*made.values()][1][0], 0.98)
     picture = Image.new("RGB", (2 * size[0] + 4, size[1]), "white")
     samples = []

@@ -97,7 +97,7 @@ def main(names: tuple[str, ...], seconds: float, seeds: int, reference_spp: int)
         shutil.copy(folder / "report.html", PAGES / f"{name}.html")
         text = caption(json.loads((folder / "results.json").read_text()))
         cards.append(
-            f"## {name}\n\n![{name}](../../scenes/previews/{name}.png)\n\n{text}: "
+            f"## {name}\n\n![{name}](../../scenes/previews/{name}.jpg)\n\n{text}: "
             f"[flip book, error maps and numbers]({name}.html), "
             f"[the scene](../../scenes/{name}.xml)\n"
         )

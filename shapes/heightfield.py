@@ -88,9 +88,9 @@ class Heightfield(mi.Mesh):
     material, and a placeholder mesh in place of the heights, which cannot be changed once they are
     loaded.
 
-    Source: D. Cline, *Sampling Methods in Ray-Based Global Illumination*, PhD dissertation, Brigham
-    Young University, 2007, section 3.3.3 (lightweight bounding volumes of regular tessellations);
-    here with ranges of heights instead of boxes, and grids of any size.
+    Source: D. Cline, PhD dissertation, Brigham Young University, 2007, section 3.3.3 (lightweight
+    bounding volumes of regular tessellations); here with ranges of heights instead of boxes, and
+    grids of any size.
 
     .. tabs::
         .. code-tab:: xml
