@@ -33,6 +33,10 @@ _LIGHT_PATHS = ("bdpt", "vcm", "erpt", "sppm")
 _REFERENCES = {"fog": "volpath", "volume_caustic": "sppm"}
 
 
+#: Samples of references that need more than others.
+_REFERENCE_SPP = {"colour_wheel": 32768, "spotlights": 16384}
+
+
 def compared(name: str) -> list[str]:
     """The integrators of a scene: Mitsuba's or its equivalent, the best other one, and ``auto``."""
     best = BEST.get(name, "auto_path")
@@ -57,7 +61,7 @@ def compare(name: str, seconds: float, seeds: int, reference_spp: int) -> Path:
     command = [
         sys.executable, "-m", "mitsuba_ext", "compare", f"scenes/{name}.xml", *compared(name),
         "--time", f"{seconds:g}", "--seeds", str(seeds), "--size", f"{width}x180",
-        "--reference-integrator", reference(name), "--reference-spp", str(reference_spp),
+        "--reference-integrator", reference(name), "--reference-spp", str(_REFERENCE_SPP.get(name, reference_spp)),
         "--variant", "llvm_ad_spectral" if name in SPECTRAL else "llvm_ad_rgb",
         "--out", str(out),
     ]  # fmt: skip
@@ -73,9 +77,14 @@ def caption(results: dict) -> str:
     parts = []
     for other in others:
         ratios = other["levels"][0]["ratios"] if other["levels"] else {}
-        ratio = ratios.get("efficiency", {}).get("value")
-        parts.append(f"`{other['label']}` {ratio:.3g}" if ratio else f"`{other['label']}` failed")
-    return f"{', '.join(parts)} × the efficiency of `{first['label']}`"
+        ratio = (ratios.get("efficiency") or {}).get("value")
+        label = f"`{other['label']}`"
+        if ratio:
+            parts.append(f"{label} {ratio:.3g} ×")
+        else:
+            why = "failed" if other["error"] else "has less error than the reference"
+            parts.append(f"{label} {why}")
+    return f"In units of the efficiency of `{first['label']}`: {', '.join(parts)}"
 
 
 @click.command()

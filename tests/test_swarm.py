@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import mitsuba as mi
@@ -91,6 +92,13 @@ def test_maps_lower_the_noise_where_they_promise_to() -> None:
     ours = batches(scene, integrator, 32, [1, 2]).var(axis=0).mean()
     assert ours < 0.6 * noise
     assert "less variance" in integrator.statistics.learned
+
+
+def test_pilots_in_several_passes_count_each_sample_with_its_own_numbers() -> None:
+    integrator = swarm(max_depth=2, samples_per_pass=3)
+    mi.render(load("six_balls", width=64, height=36), integrator=integrator, spp=64)
+    gain = re.search(r"times: .* about (\d+)% less variance", integrator.statistics.learned)
+    assert gain and int(gain[1]) > 60, integrator.statistics.learned
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ class CameraMapLearner(MapLearner):
         return self.decision.drawn
 
     def choices(self, radiance: mi.Float) -> Choices:
-        cell, density = self.decision.drawn
+        cell, density = self.last_drawn
         return Choices(mi.UInt32(0), cell, density, radiance, mi.Bool(True))
 
     def stop(self) -> None:

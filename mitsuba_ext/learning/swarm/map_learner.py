@@ -76,6 +76,8 @@ class MapLearner(Learner):
 
     Attributes:
         decision: See above.
+        last_drawn: At the end of a pass: what :meth:`drawn` was. The camera draws the numbers of the
+            next pass before that is counted.
         total, importance: At the end of a pass: the radiance of each lane, and the factor from it
             to the contribution to its pixel.
         tiles: The tiles whose pixels share maps.
@@ -102,6 +104,7 @@ class MapLearner(Learner):
         self._counts: TileCounts | None = TileCounts(self.tiles, maps, cells.count)
         self._pixel: mi.UInt32 | None = None
         self._radiance: mi.Float | None = None
+        self.last_drawn: Any = None
 
     # ---- For subclasses ----
 
@@ -144,9 +147,10 @@ class MapLearner(Learner):
         self._radiance = dr.sqrt(dr.squared_norm(mi.Color3f(rgb)) / 3)
         self.total = brightness(L)
         self.importance = dr.select(self.total > 0, self._radiance / self.total, 0)
+        self.last_drawn = self.drawn()
         # `choices` is called once the pass is over: reading the scattered arrays now would start
         # it, and variables that are not scheduled here would be traced a second time
-        dr.schedule(self._radiance, self.total, self.importance, self._pixel, self.drawn())
+        dr.schedule(self._radiance, self.total, self.importance, self._pixel, self.last_drawn)
 
     # ---- Between the stages ----
 
@@ -238,7 +242,7 @@ class MapLearner(Learner):
     def stop(self) -> None:
         """Ends learning."""
         self._counts = self._rays = self._pixel = self._radiance = None
-        self.total = self.importance = None
+        self.total = self.importance = self.last_drawn = None
 
     def _collect(self) -> None:
         """Counts the last pass."""
