@@ -61,7 +61,8 @@ def compare(name: str, seconds: float, seeds: int, reference_spp: int) -> Path:
     command = [
         sys.executable, "-m", "mitsuba_ext", "compare", f"scenes/{name}.xml", *compared(name),
         "--time", f"{seconds:g}", "--seeds", str(seeds), "--size", f"{width}x180",
-        "--reference-integrator", reference(name), "--reference-spp", str(_REFERENCE_SPP.get(name, reference_spp)),
+        "--reference-integrator", reference(name),
+        "--reference-spp", str(_REFERENCE_SPP.get(name, reference_spp)),
         "--variant", "llvm_ad_spectral" if name in SPECTRAL else "llvm_ad_rgb",
         "--out", str(out),
     ]  # fmt: skip
