@@ -29,8 +29,11 @@ BEST = {**INTEGRATORS, **dict.fromkeys(["pool", "caustic", "ring"], "vcm")}
 #: Scenes without motion whose references light paths render with less noise than ``path``.
 _LIGHT_PATHS = ("bdpt", "vcm", "erpt", "sppm")
 
-#: The reference, where `bdpt` cannot be it: fog, and things that move.
-_REFERENCES = {"fog": "volpath", "volume_caustic": "sppm"}
+#: The reference, where it follows from no rule.
+_REFERENCES = {
+    "fog": "volpath", "volume_caustic": "sppm",
+    "paperweight": "bdpt",  # its spot lights shine through glass: no camera path finds them
+}
 
 
 #: Samples of references that need more than others.
