@@ -1,0 +1,1 @@
+from .virtual_light_choice import UniformChoice as ClusteredChoice
