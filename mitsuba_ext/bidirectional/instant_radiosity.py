@@ -51,7 +51,7 @@ class InstantRadiosity:
         sets: How samples share virtual lights.
         bound: Bounds what a connection adds.
         connections: Number of connections of a vertex.
-        choice: Makes the choice of virtual lights, from these and the set of each lane.
+        choice: Makes the choice of virtual lights, from these, the set of each lane, and the bound.
         selection: Chooses regions of virtual lights instead, if it has any.
         tally: Counts.
     """
@@ -61,7 +61,7 @@ class InstantRadiosity:
     sets: Sets
     bound: Bound
     connections: int
-    choice: Callable[[VirtualLights, mi.UInt32], VirtualLightChoice] = UniformChoice
+    choice: Callable[..., VirtualLightChoice] = UniformChoice
     selection: SubpathSelection = field(default_factory=SubpathSelection)
     tally: Tally = field(default_factory=Tally)
 
@@ -89,7 +89,7 @@ class InstantRadiosity:
             if selection is not None:
                 choice = LearnedChoice(lights.vertices, selection)
             else:
-                choice = self.choice(lights, self.sets.of_lanes(rays))
+                choice = self.choice(lights, self.sets.of_lanes(rays), self.bound.largest)
             subpaths = VirtualLightConnections(
                 scene, lights.vertices, choice, self.bound, walk.query, self.connections,
                 walk.max_depth, walk.observer,

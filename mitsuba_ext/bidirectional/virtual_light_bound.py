@@ -63,10 +63,13 @@ class Bound:
         bound: The largest kernel, in 1 / length².
         compensates: Does the camera path make up for all of what is cut off? If not, only for what
             is cut off because surfaces are glossy.
+
+    Attributes:
+        largest (mi.Float): The largest kernel.
     """
 
     def __init__(self, bound: float, compensates: bool) -> None:
-        self._bound, self._compensates = dr.opaque(mi.Float, bound), compensates
+        self.largest, self._compensates = dr.opaque(mi.Float, bound), compensates
 
     def connected(self, kernel: mi.Float, far_pdf: mi.Float) -> mi.Float:
         """The weight of a connection.
@@ -90,7 +93,7 @@ class Bound:
         return link.share * dr.select(found_twice, rest, 1)
 
     def _bounded(self, kernel: mi.Float) -> mi.Float:
-        return dr.select(kernel > self._bound, self._bound / kernel, 1)
+        return dr.select(kernel > self.largest, self.largest / kernel, 1)
 
 
 class Compensation(Weights):

@@ -45,11 +45,12 @@ class UniformChoice:
     Parameters:
         lights: The virtual lights.
         set_index: The set of each lane.
+        largest: The bound of the kernel.
     """
 
     is_stratified = True
 
-    def __init__(self, lights: VirtualLights, set_index: mi.UInt32) -> None:
+    def __init__(self, lights: VirtualLights, set_index: mi.UInt32, largest: mi.Float) -> None:
         self._share = lights.share
         self._begin = dr.gather(mi.UInt32, lights.begin, set_index)
         self._number = dr.gather(mi.UInt32, lights.number, set_index)
@@ -68,8 +69,8 @@ class PowerChoice(UniformChoice):
     """The probability of a virtual light is proportional to the flux that it emits; a tenth of the
     choices is uniform."""
 
-    def __init__(self, lights: VirtualLights, set_index: mi.UInt32) -> None:
-        super().__init__(lights, set_index)
+    def __init__(self, lights: VirtualLights, set_index: mi.UInt32, largest: mi.Float) -> None:
+        super().__init__(lights, set_index, largest)
         self._sums = from_numpy(mi.Float, _running_sums(lights))
         self._steps = max(1, int(np.max(lights.number.numpy())).bit_length())
 

@@ -12,8 +12,8 @@ from .light_numbers import LightPathRays, light_numbers
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
 
-#: The most light paths of a pass.
-MOST_PATHS = 1 << 21
+#: The most light paths of a pass, and its least number of samples for each, beyond the first set.
+MOST_PATHS, _SAMPLES_PER_PATH = 1 << 21, 4
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,8 @@ class Sets:
     def count(self, lanes: int) -> int:
         """The number of sets of a pass of so many samples."""
         wanted = self._spp(lanes) * self.interleaving**2
-        return max(1, min(wanted, MOST_PATHS // self.paths))
+        most = min(MOST_PATHS, lanes // _SAMPLES_PER_PATH) // self.paths
+        return max(1, min(wanted, max(self.interleaving**2, most), MOST_PATHS // self.paths))
 
     def of_lanes(self, rays: CameraRays) -> mi.UInt32:
         """The set of each sample."""
