@@ -21,6 +21,7 @@ from statistical import (
     load,
     some,
 )
+from test_furnace import FURNACES
 from test_light_tracer import EMITTERS, MATERIALS, T, _balls, below_the_lamp
 from test_photon_map import things
 
@@ -104,9 +105,11 @@ def test_furnace_has_the_exact_radiance(choice: str) -> None:
     scene = load("furnace_box", width=16, height=16)
     integrator = make(4, choice=choice)
     images = batches(scene, integrator, 64, SEEDS[:MANY_SEEDS])
-    exact = batches(scene, mi.load_dict({"type": "path", "max_depth": 4}), 4096, [1]).mean()
-    assert_exact(images, exact, uniform=False, allowance=2e-3 * exact, precision=0.005,
-                 independent=False)  # fmt: skip
+    (region,) = FURNACES["furnace_box"].regions
+    assert_exact(
+        images, region.exact(4), region.pixels(16, 16), False, region.allowance, 0.005,
+        independent=False,
+    )  # fmt: skip
 
 
 @pytest.mark.slow

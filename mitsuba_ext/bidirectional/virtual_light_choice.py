@@ -10,15 +10,14 @@ import numpy as np
 
 from ..arrays import from_numpy
 from ..transport.bsdfs import eval_bsdf
+from ..transport.frozen import frozen
 from ..transport.vertex import Vertex
+from .light_vertices import VertexCache
 from .vertex_choice import Chosen
 from .virtual_lights import VirtualLights
 
-#: Share of the choices that are uniform.
-_DEFENSIVE = 0.1
-
-#: Probabilities are multiples of this number, as random numbers are.
-_GRAIN = 2.0**-24
+#: Slots for each virtual light, on average.
+_SLOTS = 8
 
 
 class VirtualLightChoice(Protocol):
@@ -66,43 +65,43 @@ class UniformChoice:
 
 
 class PowerChoice(UniformChoice):
-    """The probability of a virtual light is proportional to the flux that it emits; a tenth of the
-    choices is uniform."""
+    """The probability of a virtual light grows with the flux that it emits: each has one of eight
+    slots for itself, and a part of the others in proportion to its flux. A random number chooses a
+    slot, so that the probabilities are exact, and neighbouring numbers choose neighbours."""
 
     def __init__(self, lights: VirtualLights, set_index: mi.UInt32, largest: mi.Float) -> None:
         super().__init__(lights, set_index, largest)
-        self._sums = from_numpy(mi.Float, _running_sums(lights))
-        self._steps = max(1, int(np.max(lights.number.numpy())).bit_length())
+        owner, number = _slots(lights)
+        self._owner, self._slot_count = (
+            from_numpy(mi.UInt32, values) for values in (owner, number)
+        )
 
-    @dr.syntax
     def choose(self, numbers, vertex, active):
-        low, high = mi.UInt32(0), mi.UInt32(self._number)
-        exists = active & (self._number > 0)
-        x, step = numbers[0].x, mi.UInt32(0)
-        # The first one whose running sum exceeds the random number
-        while step < self._steps:
-            middle = (low + high) >> 1
-            below = dr.gather(
-                mi.Float, self._sums, self._begin + middle, exists & (low < high)
-            ) <= x
-            searching = low < high
-            low = dr.select(searching & below, middle + 1, low)
-            high = dr.select(searching & ~below, middle, high)
-            step += 1
-        index = self._begin + dr.minimum(low, dr.maximum(self._number, 1) - 1)
-        end = dr.gather(mi.Float, self._sums, index, exists)
-        before = dr.gather(mi.Float, self._sums, index - 1, exists & (low > 0))
-        probability = end - before
-        exists &= probability > 0
-        return Chosen(index, self._share / dr.select(exists, probability, 1), exists)
+        slots, exists = self._number * _SLOTS, active & (self._number > 0)
+        slot = dr.minimum(mi.UInt32(numbers[0].x * mi.Float(slots)), slots - 1)
+        index = dr.gather(mi.UInt32, self._owner, self._begin * _SLOTS + slot, exists)
+        own = dr.gather(mi.UInt32, self._slot_count, index, exists)
+        factor = self._share * mi.Float(slots) / mi.Float(dr.maximum(own, 1))
+        return Chosen(index, factor, exists)
 
 
-def emitted_flux(lights: VirtualLights) -> mi.Float:
+def emitted_flux(lights: VirtualLights) -> np.ndarray:
     """Estimates the flux that each virtual light emits: what it receives, times the albedo that its
     BSDF would have if it scattered in all directions what it scatters along the normal."""
     vertices = lights.vertices
-    active = dr.full(mi.Bool, True, vertices.count)
-    vertex = vertices.at(dr.arange(mi.UInt32, vertices.count), active)
+    # Rounded up, so that passes share a recording
+    index = dr.arange(mi.UInt32, vertices.room)
+    active = index < dr.opaque(mi.UInt32, vertices.count)
+    dr.eval(index, active)
+    return _flux(lights.scene, vertices, index, active).numpy()[: vertices.count].astype(np.float64)
+
+
+@frozen
+def _flux(
+    scene: mi.Scene, vertices: VertexCache, index: mi.UInt32, active: mi.Bool
+) -> mi.Float:
+    # ``scene`` holds the BSDFs that are called
+    vertex = vertices.at(index, active)
     si = vertex.si
     along_normal = mi.Vector3f(0, 0, dr.select(si.wi.z < 0, mi.Float(-1), 1))
     cosine = dr.maximum(dr.abs(si.wi.z), 1e-3)
@@ -111,21 +110,24 @@ def emitted_flux(lights: VirtualLights) -> mi.Float:
     value, _pdf = eval_bsdf(si.bsdf(), mi.BSDFContext(), to_camera, si.wi, active)
     # Glossy surfaces scatter little along the normal: none is to be left out
     albedo = dr.clip(dr.pi * dr.max(value) / cosine, 0.05, 1)
-    flux = dr.mean(dr.abs(vertex.β)) * albedo
-    return dr.select(dr.isfinite(flux), flux, 0)
+    flux = dr.sum(dr.abs(vertex.β)) * albedo
+    return dr.select(active & dr.isfinite(flux), flux, 0)
 
 
-def _running_sums(lights: VirtualLights) -> np.ndarray:
-    """Of each set: the running sums of the probabilities."""
-    flux = emitted_flux(lights).numpy().astype(np.float64)
-    sums = np.empty(len(flux), np.float32)
+def _slots(lights: VirtualLights) -> tuple[np.ndarray, np.ndarray]:
+    """The virtual light that owns each slot, and the number of slots of each virtual light. Both
+    have room for more, so that passes share a recording."""
+    flux = emitted_flux(lights)
+    count = np.empty(len(flux), np.uint32)
     for begin, number in zip(lights.begin.numpy(), lights.number.numpy()):
-        part = slice(int(begin), int(begin + number))
-        total = flux[part].sum()
-        share = flux[part] / total if total > 0 else np.full(number, 1 / max(number, 1))
-        probability = (1 - _DEFENSIVE) * share + _DEFENSIVE / max(number, 1)
-        running = np.round(np.cumsum(probability) / _GRAIN) * _GRAIN
+        part = flux[begin : begin + number]
+        total = part.sum()
+        share = part / total if total > 0 else np.full(number, 1 / max(number, 1))
+        # Rounded such that all numbers add up
+        edges = np.rint(np.cumsum(share) * (_SLOTS - 1) * number)
         if number:
-            running[-1] = 1.0
-        sums[part] = running
-    return sums
+            edges[-1] = (_SLOTS - 1) * number
+        count[begin : begin + number] = 1 + np.diff(edges, prepend=0)
+    owner = np.repeat(np.arange(len(flux), dtype=np.uint32), count)
+    unused = lights.vertices.room - len(count)
+    return np.pad(owner, (0, _SLOTS * unused)), np.pad(count, (0, unused))

@@ -122,8 +122,8 @@ def _trees(lights: VirtualLights) -> tuple[np.ndarray, np.ndarray]:
     transmits = mi.has_flag(vertex.si.bsdf().flags(), mi.BSDFFlags.Transmission)
     normal = dr.select(transmits, 0, normal)
     position = mi.Point3f(vertex.si.p)
-    dr.eval(position, normal, flux)
-    p, n, flux = position.numpy().T, normal.numpy().T, flux.numpy()
+    dr.eval(position, normal)
+    p, n = position.numpy().T, normal.numpy().T
     number = lights.number.numpy().astype(np.int64)
     owner = np.repeat(np.arange(sets), number)
     order = np.lexsort((_along_curve(p), owner))

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.estimator import CameraRays
+from ..transport.numbers import Numbers
 from .light_numbers import LightPathRays, light_numbers
 from .light_vertices import LightVertices, PackedVertices, VertexCache
 from .light_walk import LightWalk
@@ -59,19 +60,21 @@ class VirtualLights:
     """The virtual lights of a pass.
 
     Parameters:
+        scene: The scene.
         vertices: The vertices of all sets, set by set.
         set_count: Number of sets.
         paths: Number of light paths of a set.
 
     Attributes:
-        vertices: The parameter.
-        set_count: The parameter.
+        scene, vertices, set_count: The parameters.
         begin, number (mi.UInt32): Of each set: its first vertex, and how many it has.
         share (mi.Float): 1 / number of light paths of a set.
     """
 
-    def __init__(self, vertices: VertexCache, set_count: int, paths: int) -> None:
-        self.vertices, self.set_count = vertices, set_count
+    def __init__(
+        self, scene: mi.Scene, vertices: VertexCache, set_count: int, paths: int
+    ) -> None:
+        self.scene, self.vertices, self.set_count = scene, vertices, set_count
         self.share = dr.opaque(mi.Float, 1 / paths)
         first = dr.arange(mi.UInt32, set_count) * dr.opaque(mi.UInt32, paths)
         last = first + dr.opaque(mi.UInt32, paths - 1)
@@ -86,7 +89,7 @@ class VirtualLights:
         cls,
         scene: mi.Scene,
         walk: LightWalk,
-        sampler,
+        sampler: Numbers,
         rays: CameraRays,
         set_count: int,
         paths: int,
@@ -107,4 +110,4 @@ class VirtualLights:
         )  # fmt: skip
         if not rounds:
             return None, scatter_count
-        return cls(VertexCache(rounds, count), set_count, paths), scatter_count
+        return cls(scene, VertexCache(rounds, count), set_count, paths), scatter_count
