@@ -47,7 +47,7 @@ class InstantRadiosityIntegrator(WalkIntegrator):
 
      * - light_paths
        - |int|
-       - Number of light paths of a set of virtual lights. (Default: 1000)
+       - Number of light paths of a set of virtual lights. (Default: 300)
      * - interleaving
        - |int|
        - Neighbouring pixels have different sets, in a pattern of so many pixels in both directions;
@@ -127,14 +127,14 @@ class InstantRadiosityIntegrator(WalkIntegrator):
         .. code-tab:: xml
 
             <integrator type="instant_radiosity">
-                <integer name="light_paths" value="1000"/>
+                <integer name="light_paths" value="500"/>
                 <integer name="max_depth" value="8"/>
             </integrator>
 
         .. code-tab:: python
 
             'type': 'instant_radiosity',
-            'light_paths': 1000,
+            'light_paths': 500,
             'max_depth': 8
     """
 
@@ -143,7 +143,7 @@ class InstantRadiosityIntegrator(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.light_paths = self.parameter(
-            props, "light_paths", 1000, minimum=1, maximum=MOST_PATHS
+            props, "light_paths", 300, minimum=1, maximum=MOST_PATHS
         )
         self.interleaving = self.parameter(props, "interleaving", 1, minimum=1, maximum=64)
         self.connections = self.parameter(props, "connections", 1, minimum=1, maximum=65536)
