@@ -329,8 +329,8 @@ TECHNIQUES: dict[str, Technique] = {
         "instant_radiosity", {"light_paths": 200}, is_plugin=True, makes_splats=True,
         checks=Checks(furnaces=["furnace_box"], depths=[3], cases=["no_light"]),
         thorough=Checks(
-            ["cornell_box", "mirrors_and_glass"], ["llvm_ad_mono"], FURNACES, [2, -1],
-            [case for case in _LIGHT_PATHS if case != "moving"],
+            ["cornell_box", "rooms"], ["llvm_ad_mono"], FURNACES, [2, -1],
+            _LIGHT_PATHS,
         ),
     ),
     "light_tracer": Technique(

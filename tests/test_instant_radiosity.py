@@ -273,14 +273,14 @@ def test_wrong_parameters_are_refused(parameters: dict, words: str) -> None:
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
 def test_spectral_variants_are_refused(variant: str) -> None:
     scene = mi.load_dict(stage(), optimize=False)
-    with pytest.raises((NotImplementedError, RuntimeError), match="the variant is spectral: camera"):
+    with pytest.raises((NotImplementedError, RuntimeError), match="the variant is spectral:"):
         make().render(scene, spp=1)
 
 
 def test_moving_shapes_are_refused() -> None:
     ball = {"type": "moving", "translate": [0, 0, 1], "in": {"type": "sphere", "radius": 0.1}}
     scene = mi.load_dict(stage(ball=ball), optimize=False)
-    with pytest.raises((NotImplementedError, RuntimeError), match="shapes or lights move: camera"):
+    with pytest.raises((NotImplementedError, RuntimeError), match="shapes or lights move:"):
         make().render(scene, spp=1)
 
 
@@ -288,5 +288,5 @@ def test_media_are_refused() -> None:
     fog = {"type": "sphere", "radius": 0.3, "bsdf": {"type": "null"},
            "interior": {"type": "homogeneous"}}  # fmt: skip
     scene = mi.load_dict(stage(fog=fog), optimize=False)
-    with pytest.raises((NotImplementedError, RuntimeError), match='"instant_radiosity", whose light'):
+    with pytest.raises((NotImplementedError, RuntimeError), match='"instant_radiosity", whose'):
         make().render(scene, spp=1)

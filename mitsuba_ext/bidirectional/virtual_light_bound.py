@@ -23,8 +23,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.path_decisions import Roulette, SubpathSelection, Weights, unguided_throughput
-from ..transport.path_decisions import LARGEST_PROBABILITY
+from ..transport.path_decisions import (
+    LARGEST_PROBABILITY,
+    Roulette,
+    SubpathSelection,
+    Weights,
+    unguided_throughput,
+)
 from .both_ends import from_both_ends
 
 

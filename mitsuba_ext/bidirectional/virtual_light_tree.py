@@ -3,12 +3,13 @@
 Each set has a complete binary tree over its virtual lights, sorted along a space-filling curve. A
 choice goes down from the root, and takes a child with a probability proportional to an estimate of
 what its virtual lights contribute: their flux, times a geometry term between the vertex and the
-bounding sphere of the child, at most the bound. The estimate is never 0 where there is flux, so that
-an estimate that is wrong makes noise, but no bias.
+bounding sphere of the child, at most the bound. The estimate is not 0 where there is flux, so that
+a wrong one makes noise, but no bias.
 
 Source: B. Walter et al., *Lightcuts: A Scalable Approach to Illumination*, ACM Transactions on
-Graphics 24(3), 2005 (the tree, and the bounds of cosines and distances); A. Conty Estevez, C. Kulla,
-*Importance Sampling of Many Lights with Adaptive Tree Splitting*, HPG 2018 (going down at random).
+Graphics 24(3), 2005 (the tree, and the bounds of cosines and distances); A. Conty Estevez,
+C. Kulla, *Importance Sampling of Many Lights with Adaptive Tree Splitting*, HPG 2018 (going down
+at random).
 """
 
 from __future__ import annotations
