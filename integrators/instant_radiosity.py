@@ -199,7 +199,10 @@ class InstantRadiosityIntegrator(WalkIntegrator):
         if next_event is not None:
             decisions["next_event"] = next_event
         walk = self.walk(**decisions)
-        light_walk = LightWalk(side.emission, self.max_depth, self.rr_depth, query=walk.query)
+        # Two more segments lead from the last virtual light to the sensor
+        light_walk = LightWalk(
+            side.emission, self.max_depth - 1, self.rr_depth, query=walk.query
+        )
         chosen = {} if selection is None else {"selection": selection}
         return InstantRadiosity(
             walk, light_walk, sets, Bound(self._largest, self.compensation), self.connections,
