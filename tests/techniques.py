@@ -324,6 +324,15 @@ TECHNIQUES: dict[str, Technique] = {
                    "hidden_emitters"),
         ),
     ),
+    # ``test_instant_radiosity.py`` has choices, bounds and materials
+    "instant_radiosity": Technique(
+        "instant_radiosity", {"light_paths": 200}, is_plugin=True, makes_splats=True,
+        checks=Checks(furnaces=["furnace_box"], depths=[3], cases=["no_light"]),
+        thorough=Checks(
+            ["cornell_box", "rooms"], ["llvm_ad_mono"], FURNACES, [2, -1],
+            _LIGHT_PATHS,
+        ),
+    ),
     "light_tracer": Technique(
         "light_tracer", is_plugin=True, makes_splats=True,
         checks=Checks(cases=["no_light"]),

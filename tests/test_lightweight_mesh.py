@@ -90,7 +90,8 @@ def test_image_and_output_variables_are_those_of_the_mesh(
 @pytest.mark.parametrize(
     "integrator", ["bdpt", "neepp", *(pytest.param(name, marks=pytest.mark.slow) for name in (
         "auto", "auto_path", "light_tracer", "vcm", "sppm", "mlt", "pssmlt", "erpt", "swarm_path",
-        "adaptive", "ecoc_dof", "photon_map", "pss_guided", "two_stage"))]
+        "adaptive", "ecoc_dof", "photon_map", "pss_guided", "two_stage",
+        "instant_radiosity"))]
 )  # fmt: skip
 def test_integrators_see_it(tmp_path, integrator: str) -> None:
     ring = _ply(tmp_path)

@@ -26,8 +26,8 @@ DECISIONS = registry.decision_names()
 SEQUENCES = sorted(set(FOLDERS["samplers"]) - set(DECISIONS))
 #: The integrators that nest no other one.
 WALKS = [
-    "auto_path", "composed_path", "erpt", "mlt", "neepp", "pss_guided", "photon_map", "pssmlt",
-    "reweighted_direct", "sppm", "two_stage",
+    "auto_path", "composed_path", "erpt", "instant_radiosity", "mlt", "neepp", "pss_guided",
+    "photon_map", "pssmlt", "reweighted_direct", "sppm", "two_stage",
 ]
 
 #: A value that each parameter accepts, besides the words that its row begins with.
@@ -51,7 +51,8 @@ VALUES = {
     **dict.fromkeys(["mutations_per_pixel", "most_consecutive", "proposal_filter"], 3),
     **dict.fromkeys(["sample_count", "seed", "dimensions", "film_width"], 6),
     "radius": 0.5, "radius_in_media": 0.5, "radius_decay": 0.5, "merging": "all",
-    "light_paths": 0.5,
+    "light_paths": 0.5, ("instant_radiosity", "light_paths"): 16, "interleaving": 2,
+    "choice": "clustered", "bound": 2.0, "compensation": False,
     **dict.fromkeys(["photons", "lookup_size"], 16), "global_radius": 0.5, "caustic_radius": 0.5,
     **dict.fromkeys(["final_gather", "guided", "photon_aovs"], True),
     "checkpoint": "kept", "checkpoint_every": "9s",
@@ -66,6 +67,8 @@ CONDITIONS = {
        for key in ("pilot_spp", "save_learned", "load_learned", "learn_every")},
     **{("two_stage", key): {"visibility": "primary"}
        for key in ("reallocated", "pilot_spp", "save_learned", "load_learned")},
+    **{("instant_radiosity", key): {"choice": "learned"}
+       for key in ("pilot_spp", "save_learned", "load_learned")},
     ("two_stage_lights", "reallocated"): {"visibility": "world"},
     ("pss_guided", "tile"): {"regions": "tiles"},
     ("guided_directions", "tile"): {"regions": "tiles"},
@@ -154,7 +157,7 @@ def test_pages_have_what_their_readers_look_for(name):
 def test_every_parameter_of_a_page_is_known(name):
     for key in described(name):
         condition = CONDITIONS.get((name, key), CHECKPOINT.get(key, {}))
-        _, unknown = make(name, **{key: VALUES[key], **condition})
+        _, unknown = make(name, **{key: VALUES.get((name, key), VALUES.get(key)), **condition})
         assert not unknown
 
 

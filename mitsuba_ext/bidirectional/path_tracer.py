@@ -179,11 +179,20 @@ class BidirectionalPathTracer:
         return whole
 
     def _camera_paths(self, walk, scene, sampler, rays, active) -> Sample:
-        if self.observer is not None or not walk.observer.can_be_frozen:
+        if self.observer is not None:
             return walk(scene, sampler, rays, active)
-        sample, place = _walked(walk, scene, sampler, rays, mi.Bool(active))
-        go_to(sampler, place)
-        return sample
+        return camera_paths(walk, scene, sampler, rays, active)
+
+
+def camera_paths(
+    walk: Walk, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
+) -> Sample:
+    """The samples of ``walk``, whose kernels are recorded, where nobody observes what cannot be."""
+    if not walk.observer.can_be_frozen:
+        return walk(scene, sampler, rays, active)
+    sample, place = _walked(walk, scene, sampler, rays, mi.Bool(active))
+    go_to(sampler, place)
+    return sample
 
 
 @frozen

@@ -1,4 +1,4 @@
-"""What photons remember of their way."""
+"""What photons and virtual lights remember of their way."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.path_decisions import SubpathSelection
+from .both_ends import from_both_ends
 from .partial_sums import Sums
 
 
@@ -30,3 +32,23 @@ class PhotonHistory:
     def leave(self, sums, cosine, pdf, reverse_pdf, is_delta, is_first=False) -> Sums:
         """Behind a vertex."""
         return replace(sums, dVCM=dr.select(is_delta, sums.dVCM, 1))
+
+
+class VertexRegions(PhotonHistory):
+    """Tells the region in which each vertex lies.
+
+    Parameters:
+        selection: Divides surfaces into regions.
+    """
+
+    def __init__(self, selection: SubpathSelection) -> None:
+        self.selection = selection
+
+    def first(self, scene, emitted, si, active) -> Sums:
+        sums = super().first(scene, emitted, si, active)
+        sums.region = dr.zeros(mi.UInt32, dr.width(emitted.ray))
+        sums.count = dr.full(mi.Float, 1, dr.width(emitted.ray))
+        return sums
+
+    def arrive(self, sums, si, squared_distance, is_first, by_light) -> Sums:
+        return replace(sums, region=self.selection.region(from_both_ends(si), si.is_valid()))

@@ -1,0 +1,220 @@
+"""Instant radiosity: virtual point lights, with bounded connections and exact compensation."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any
+
+import mitsuba as mi
+
+from mitsuba_ext.bidirectional.instant_radiosity import InstantRadiosity, Tally
+from mitsuba_ext.bidirectional.light_walk import LightWalk
+from mitsuba_ext.bidirectional.merging import scene_diagonal
+from mitsuba_ext.bidirectional.virtual_light_bound import Bound
+from mitsuba_ext.bidirectional.virtual_light_choice import PowerChoice, UniformChoice
+from mitsuba_ext.bidirectional.virtual_light_tree import ClusteredChoice
+from mitsuba_ext.bidirectional.virtual_lights import MOST_PATHS, Sets
+from mitsuba_ext.composition.light_side import LightSide
+from mitsuba_ext.composition.slots import read_slot
+from mitsuba_ext.composition.subpath_selection import LearnedSubpaths
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.rendering.camera import film_extent
+from mitsuba_ext.scene.movers import movers
+from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.estimator import Estimator
+
+#: How virtual lights are chosen; "learned" is a slot of the walk.
+_CHOICES = {
+    "uniform": UniformChoice, "power": PowerChoice, "clustered": ClusteredChoice, "learned": None,
+}  # fmt: skip
+
+
+@registry.plugin
+class InstantRadiosityIntegrator(WalkIntegrator):
+    r"""
+    .. _integrator-instant_radiosity:
+
+    Instant radiosity (:monosp:`instant_radiosity`)
+    -----------------------------------------------
+
+    Vertices of a few light paths become virtual point lights, which all pixels share. Camera paths
+    are connected to them where they first meet a surface that is no mirror, and mostly end there.
+    Connections are bounded, and what is cut off is found by BSDF sampling: the image is that of
+    :monosp:`path`.
+
+    .. pluginparameters::
+
+     * - light_paths
+       - |int|
+       - Number of light paths of a set of virtual lights. (Default: 300)
+     * - interleaving
+       - |int|
+       - Neighbouring pixels have different sets, in a pattern of so many pixels in both directions;
+         with 1, all pixels share one. (Default: 1)
+     * - connections
+       - |int|
+       - To how many virtual lights a vertex is connected. (Default: 1)
+     * - choice
+       - |string|
+       - How virtual lights are chosen: :monosp:`uniform`; :monosp:`power` (by the flux that they
+         emit); :monosp:`clustered` (by flux, distance and cosines, with a light tree); or
+         :monosp:`learned` (by regions, from what pilot samples found visible and bright).
+         (Default: power)
+     * - bound
+       - |float|
+       - The largest geometry term that a connection counts with, in units of 1 / (diagonal of the
+         scene)². Larger values are faster, and noisier in corners; 0 makes it :monosp:`path`.
+         (Default: 5)
+     * - compensation
+       - |bool|
+       - Is what the bound cuts off found by BSDF sampling? If not, corners are too dark, and the
+         image is biased: for previews. (Default: true)
+     * - pilot_spp, save_learned, load_learned
+       - |int| or |string|
+       - As in :class:`composed_path`; only with the choice :monosp:`learned`. (Default: 16, none,
+         none)
+     * - next_event, shadow_test
+       - |string| or decision
+       - How lights are chosen for direct light; see :class:`composed_path`.
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
+
+    **Use it when** diffuse surfaces light each other, in rooms with hidden lamps; or for a preview
+    of indirect light in a second, without compensation. **Not when** surfaces are glossy, caustics
+    matter (:class:`vcm`), or light is mostly direct: it then is :monosp:`path` at a higher price.
+
+    **Direct light** is sampled as by :monosp:`path`, with its MIS weights; the points of lamps are
+    no virtual lights. Virtual lights lie where a BSDF has a part that is not a delta distribution;
+    light paths pass mirrors and clear glass. A camera path is connected at vertices of such
+    surfaces, after any chain of mirrors and glass.
+
+    **The bound.** A connection has the weight min(1, b / K). A camera path that goes on, and meets
+    a surface where a virtual light could be, carries on with the weight max(0, 1 − b / K) for all
+    that leaves this surface by reflection; where that is 0, it ends. On diffuse surfaces, K is the
+    geometry term G. Elsewhere, K = π p cos' / distance² · max(1, π p'), where p is the density of
+    BSDF samples at the camera path's vertex, in the place of its cosine, and p' that at the virtual
+    light, of the direction from which its light comes. Both are large in narrow lobes: connections
+    by way of glossy surfaces hardly count, and the camera path goes on there as at mirrors. No
+    roughness has to be chosen at which this begins. Without compensation, only this glossy part of
+    the difference is still found by camera paths.
+
+    **Sets.** A pass takes some samples of each pixel. The first samples of all pixels share one
+    set, the second ones another, and so on; a set has no more light paths than a quarter of the
+    samples that use it, where there are several. With :monosp:`learned`, a sample chooses from all
+    sets of the pass. Several connections of a vertex are spread evenly over the set, in its order
+    or that of the tree. All choices give each virtual light a probability above 0, by which its
+    contribution is divided.
+
+    ``statistics.learned`` tells the number of virtual lights and the bound, in units of the scene.
+
+    Virtual lights on glossy surfaces are seen as dim, noisy reflections of lamps (virtual spherical
+    lights are not built). Spectral variants, moving shapes and lights, and participating media are
+    refused: camera paths of other wavelengths and times cannot share virtual lights. Of lights of
+    the type :monosp:`directionalarea`, which :monosp:`path` does not find, only the indirect light
+    is rendered. As with :class:`bdpt`, images differ from :monosp:`path` in scenes far from the
+    origin. Gradients are not supported (use :class:`composed_prb`), nor nesting in
+    :monosp:`moment` and :monosp:`aov`.
+
+    Source: A. Keller, *Instant Radiosity*, SIGGRAPH 1997; T. Kollig, A. Keller, *Illumination in
+    the Presence of Weak Singularities*, MCQMC 2004, section 3 (bound and compensation; K for glossy
+    surfaces is ours); B. Walter et al., *Lightcuts*, ACM Transactions on Graphics 24(3), 2005 (the
+    tree); D. Cline, PhD thesis, 2007, section 7.8, figure 7.15.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="instant_radiosity">
+                <integer name="light_paths" value="500"/>
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'instant_radiosity',
+            'light_paths': 500,
+            'max_depth': 8
+    """
+
+    has_light_paths = True
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.light_paths = self.parameter(
+            props, "light_paths", 300, minimum=1, maximum=MOST_PATHS
+        )
+        self.interleaving = self.parameter(props, "interleaving", 1, minimum=1, maximum=64)
+        self.connections = self.parameter(props, "connections", 1, minimum=1, maximum=65536)
+        self.choice = self.parameter(props, "choice", "power", choices=tuple(_CHOICES))
+        self.bound = self.parameter(props, "bound", 5.0, minimum=0.0)
+        self.compensation = self.parameter(props, "compensation", True)
+        slots = {key: read_slot(self.name, props, key) for key in ("next_event", "shadow_test")}
+        if self.choice == "learned":
+            slots["subpath_selection"] = LearnedSubpaths()
+        self.fill(props, **slots)
+        self._tally, self._largest = Tally(), math.inf
+
+    def parameters(self) -> dict[str, Any]:
+        return {
+            "light_paths": self.light_paths,
+            "interleaving": self.interleaving,
+            "connections": self.connections,
+            "choice": self.choice,
+            "bound": self.bound,
+            "compensation": self.compensation,
+            **super().parameters(),
+        }
+
+    @property
+    def sample_cost(self) -> int:
+        return max(2, super().sample_cost)
+
+    def estimators(self, scene, sensor):
+        self._check(scene)
+        if not scene.emitters() or self.max_depth < 3:
+            return self.walk
+        side = LightSide.of(self.name, scene, sensor, has_image=False)
+        self._largest = self.bound / scene_diagonal(scene) ** 2
+        width, height = film_extent(sensor.film())
+        sets = Sets(width * height, width, self.light_paths, self.interleaving)
+        return functools.partial(self._estimator, side, sets)
+
+    def _check(self, scene: mi.Scene) -> None:
+        """
+        Raises:
+            NotImplementedError: Virtual lights cannot be shared by all camera paths in this scene.
+        """
+        reason = "the variant is spectral" if mi.is_spectral else "shapes or lights move"
+        if mi.is_spectral or movers(scene):
+            raise NotImplementedError(
+                f'"{self.name}": {reason}: camera paths of other wavelengths and times cannot '
+                f'share virtual lights; use "bdpt" or "path"'
+            )
+
+    def _estimator(self, side: LightSide, sets: Sets, **decisions: Any) -> Estimator:
+        selection = decisions.pop("subpath_selection", None)
+        next_event = side.next_event(decisions.pop("next_event", None))
+        if next_event is not None:
+            decisions["next_event"] = next_event
+        walk = self.walk(**decisions)
+        # Two more segments lead from the last virtual light to the sensor
+        light_walk = LightWalk(
+            side.emission, self.max_depth - 1, self.rr_depth, query=walk.query
+        )
+        chosen = {} if selection is None else {"selection": selection}
+        return InstantRadiosity(
+            walk, light_walk, sets, Bound(self._largest, self.compensation), self.connections,
+            _CHOICES[self.choice] or UniformChoice, tally=self._tally, **chosen,
+        )  # fmt: skip
+
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
+        self._tally, self._largest = Tally(), math.inf
+        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
+        if self._tally.sets:
+            lights = self._tally.lights / self._tally.sets
+            what = f"{lights:.0f} virtual lights in a set, {self._tally.sets} sets, connections "
+            what += f"bounded by {self._largest:.3g} / length²"
+            self.statistics.learned = "; ".join(filter(None, (self.statistics.learned, what)))
+        return image

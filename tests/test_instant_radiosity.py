@@ -1,0 +1,292 @@
+"""Instant radiosity: its images against ``path``, its choices, its bound, and what it refuses.
+(``techniques.py`` has the tests that all integrators share.)"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy import stats
+from stage import diffuse, film, lookat, rectangle, sensor, stage
+from statistical import (
+    MANY_SEEDS,
+    REFERENCE_SEEDS,
+    SEEDS,
+    assert_exact,
+    assert_same_quarters,
+    batches,
+    load,
+    some,
+)
+from test_furnace import FURNACES
+from test_light_tracer import EMITTERS, MATERIALS, T, _balls, below_the_lamp
+from test_photon_map import things
+
+from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.bidirectional.light_walk import LightWalk
+from mitsuba_ext.bidirectional.virtual_light_choice import PowerChoice, UniformChoice
+from mitsuba_ext.bidirectional.virtual_light_tree import ClusteredChoice
+from mitsuba_ext.bidirectional.virtual_lights import Sets, VirtualLights
+from mitsuba_ext.transport.estimator import CameraRays
+from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def make(max_depth: int = 4, **parameters: Any) -> mi.Integrator:
+    parameters = {"light_paths": 200, **parameters}
+    return mi.load_dict({"type": "instant_radiosity", "max_depth": max_depth, **parameters})
+
+
+def assert_image_of_path(
+    scene: mi.Scene | dict[str, Any],
+    max_depth: int = 4,
+    spp: int = 128,
+    precision: float = 0.01,
+    both: dict[str, Any] | None = None,
+    **parameters: Any,
+) -> None:
+    """The means of the image and of its quarters are those of ``path``."""
+    if isinstance(scene, dict):
+        scene = mi.load_dict(scene, optimize=False)
+    path = mi.load_dict({"type": "path", "max_depth": max_depth, **(both or {})})
+    images = batches(scene, make(max_depth, **(both or {}), **parameters), spp, SEEDS[:MANY_SEEDS])
+    expected = batches(scene, path, 4 * spp, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert_same_quarters(images, expected, precision)
+
+
+# ---- The mean ----
+
+
+@pytest.mark.parametrize("max_depth", some(5, of=[2, 3, 5, -1]))
+def test_the_mean_is_that_of_path_at_each_depth(max_depth: int) -> None:
+    """By way of diffuse and rough things, a mirror, glass, and a ball with a delta lobe."""
+    scene = stage(camera=below_the_lamp(), **things())
+    assert_image_of_path(scene, max_depth, 256, 0.02)
+
+
+WAYS = {
+    "power": {"choice": "power"},
+    "clustered": {"choice": "clustered", "connections": 3},
+    "learned": {"choice": "learned", "pilot_spp": 32},
+    "interleaved": {"interleaving": 3, "connections": 2},
+    "path": {"bound": 0.0},
+    "few": {"light_paths": 3},
+    "tight": {"bound": 0.5, "choice": "power"},
+    "loose": {"bound": 100.0, "connections": 4},
+    "late roulette": {"both": {"rr_depth": 1}},
+    "hidden": {"both": {"hide_emitters": True}},
+    "lights by power": {"next_event": "power"},
+}
+
+
+@pytest.mark.parametrize("name", some("clustered", "power", of=WAYS))
+def test_each_way_to_connect_has_the_same_mean(name: str) -> None:
+    assert_image_of_path(stage(camera=below_the_lamp()), **WAYS[name])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EMITTERS)
+def test_each_emitter_lights_the_scene_as_in_path(name: str) -> None:
+    assert_image_of_path(stage(light=EMITTERS[name](), camera=below_the_lamp()), spp=256)
+
+
+@pytest.mark.parametrize("name", some(of=MATERIALS))
+def test_a_material_reflects_light_as_in_path(name: str) -> None:
+    assert_image_of_path(_balls(MATERIALS[name]()), spp=256, bound=1.0)
+
+
+@pytest.mark.parametrize("choice", ["uniform", "clustered"])
+def test_furnace_has_the_exact_radiance(choice: str) -> None:
+    """A closed box in which radiance is 1 + ρ + … everywhere, also in its corners."""
+    scene = load("furnace_box", width=16, height=16)
+    integrator = make(4, choice=choice)
+    images = batches(scene, integrator, 64, SEEDS[:MANY_SEEDS])
+    (region,) = FURNACES["furnace_box"].regions
+    assert_exact(
+        images, region.exact(4), region.pixels(16, 16), False, region.allowance, 0.005,
+        independent=False,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["thinlens", "cropped"])
+def test_films_and_sensors_are_those_of_path(name: str) -> None:
+    changes = {"thinlens": {"plugin": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.0},
+               "cropped": {"film": film(31, 29, crop_offset_x=5, crop_offset_y=9, crop_width=13,
+                                        crop_height=11, rfilter={"type": "gaussian"})}}[name]
+    assert_image_of_path(stage(camera=below_the_lamp(**changes)), interleaving=2)
+
+
+def test_the_same_seed_gives_the_same_image() -> None:
+    scene = mi.load_dict(stage(), optimize=False)
+    first, second = (batches(scene, make(choice="clustered"), 4, [3]) for _ in range(2))
+    np.testing.assert_allclose(first, second, rtol=1e-4, atol=1e-5)
+
+
+# ---- The choices ----
+
+
+def _lights(scene: mi.Scene, paths: int = 16) -> VirtualLights:
+    """Two sets of virtual lights."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 4 * paths)
+    rays = CameraRays(dr.zeros(mi.RayDifferential3f, 4 * paths))
+    walk = LightWalk(LightEmission(scene), 5, 5)
+    lights, _ = VirtualLights.trace(scene, walk, sampler, rays, 2, paths)
+    return lights
+
+
+@pytest.mark.parametrize("kind", [UniformChoice, PowerChoice, ClusteredChoice])
+def test_virtual_lights_are_chosen_as_often_as_their_weights_say(kind: type) -> None:
+    """χ² of the choices at one vertex, from one set; its other set is never chosen from."""
+    scene = mi.load_dict(stage(), optimize=False)
+    lights, count = _lights(scene), 1 << 18
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(1, count)
+    ray = mi.Ray3f(mi.Point3f(0.3, -1, 1), mi.Vector3f(0, 0.4, -1))
+    si = scene.ray_intersect(ray)
+    arrival = Arrival(mi.Interaction3f(si), mi.Float(1), mi.Bool(True))
+    path = PathState(mi.Spectrum(1), mi.Float(1), mi.Float(1), mi.UInt32(0), arrival, ())
+    choice = kind(lights, dr.full(mi.UInt32, 1, count), mi.Float(2.0))
+    active = dr.full(mi.Bool, True, count)
+    chosen = choice.choose(choice.numbers(sampler), Vertex(si, si.bsdf(), path), active)
+    begin, number = int(lights.begin[1]), int(lights.number[1])
+    index = chosen.index.numpy() - begin
+    assert chosen.active.numpy().all() and 0 <= index.min() and index.max() < number
+    probability = float(lights.share[0]) / (chosen.factor.numpy() + np.zeros(count))
+    expected = np.zeros(number)
+    expected[index] = probability
+    found = np.bincount(index, minlength=number)
+    often = expected * count > 5
+    # All that is never, or hardly ever, chosen has the rest of the probability
+    assert expected.sum() == pytest.approx(1, abs=2e-3)
+    observed = np.append(found[often], found[~often].sum())
+    wanted = np.append(expected[often], max(1 - expected[often].sum(), 1e-12)) * count
+    if wanted[-1] < 5:
+        observed, wanted = observed[:-1], wanted[:-1] * observed[:-1].sum() / wanted[:-1].sum()
+    assert stats.chisquare(observed, wanted * observed.sum() / wanted.sum()).pvalue > 1e-4
+
+
+def test_several_connections_are_spread_over_the_virtual_lights() -> None:
+    """As many connections as virtual lights use about each of them: there is less noise than that
+    of independent choices, which falls with their number."""
+    scene = mi.load_dict(stage(), optimize=False)
+    noise = [
+        batches(scene, make(3, connections=n, bound=1.0), 16, SEEDS[:4]).var(axis=0).mean()
+        for n in (1, 16)
+    ]
+    assert noise[1] < noise[0]
+
+
+@pytest.mark.parametrize(("interleaving", "pattern"), [(1, {0, 1}), (2, set(range(8)))])
+def test_samples_share_sets_as_the_pattern_says(interleaving: int, pattern: set) -> None:
+    """Two samples for each of 4 × 4 pixels."""
+    sets = Sets(16, 4, 1, interleaving)
+    pixel = dr.arange(mi.UInt32, 32) // 2
+    rays = CameraRays(dr.zeros(mi.RayDifferential3f, 32), pixel)
+    index = sets.of_lanes(rays).numpy()
+    assert sets.count(32) == len(pattern) and set(index) == pattern
+    # The samples of a pixel have different ones, and a pixel's neighbour at the pattern's distance
+    # has the same ones
+    assert (index[::2] != index[1::2]).all()
+    np.testing.assert_array_equal(index[:2], index[2 * interleaving : 2 * interleaving + 2])
+
+
+# ---- The bound ----
+
+
+def _corner() -> mi.Scene:
+    """Two walls, seen from near, that light each other."""
+    wall = rectangle(T().translate([0, 1, 1]).rotate([1, 0, 0], 90), bsdf=diffuse(0.8))
+    floor = rectangle(T(), bsdf=diffuse(0.8))
+    view = lookat([0, 0.2, 0.8], [0, 1, 0], [0, 0, 1])
+    lamp = {"type": "point", "position": [0, -0.5, 1.5], "intensity": {"type": "rgb", "value": 1.0}}
+    return mi.load_dict({
+        "type": "scene", "sensor": sensor(to_world=view, fov=20.0), "wall": wall, "floor": floor,
+        "lamp": lamp,
+    })  # fmt: skip
+
+
+def test_a_bounded_corner_without_compensation_is_darker() -> None:
+    """And the more so the tighter the bound; with compensation, it is not."""
+    scene = _corner()
+    means = [
+        batches(scene, make(3, bound=bound, compensation=compensation), 128, SEEDS[:4]).mean()
+        for bound, compensation in ((0.5, False), (10.0, False), (0.5, True))
+    ]
+    direct = batches(scene, make(2), 16, [1]).mean()
+    path = batches(scene, mi.load_dict({"type": "path", "max_depth": 3}), 512, [1]).mean()
+    assert direct < means[0] < means[1] < 0.99 * path
+    assert means[2] == pytest.approx(path, rel=0.01)
+
+
+def test_the_bound_tames_the_weak_singularity_in_a_corner() -> None:
+    """Also with compensation, no sample is far brighter than the image."""
+    scene = _corner()
+    bounded, unbounded = (
+        batches(scene, make(3, bound=bound), 1, range(1, 33)) for bound in (3.0, 1e9)
+    )
+    assert bounded.max() < 5 * bounded.mean()
+    assert unbounded.max() > 10 * unbounded.mean()
+    assert bounded.var(axis=0).mean() < 0.3 * unbounded.var(axis=0).mean()
+
+
+def test_without_compensation_gloss_is_still_seen() -> None:
+    """What is cut off because a surface is glossy is found by camera paths."""
+    mirror = rectangle(T(), bsdf={"type": "roughconductor", "alpha": 0.05})
+    scene = mi.load_dict(stage(floor={**mirror, "to_world": T().scale(2)}), optimize=False)
+    found = batches(scene, make(3, compensation=False, bound=10.0), 256, SEEDS[:4]).mean()
+    expected = batches(scene, mi.load_dict({"type": "path", "max_depth": 3}), 1024, [1]).mean()
+    assert 0.9 * expected < found < 1.02 * expected
+
+
+# ---- What it says, and what it refuses ----
+
+
+def test_statistics_tell_the_virtual_lights_and_the_bound() -> None:
+    integrator = make(4, light_paths=50)
+    mi.render(mi.load_dict(stage(), optimize=False), integrator=integrator, spp=2)
+    learned = integrator.statistics.learned
+    assert "virtual lights in a set, 2 sets" in learned and "bounded by" in learned
+
+
+def test_a_scene_without_light_is_black() -> None:
+    scene = mi.load_dict(stage(light={}), optimize=False)
+    assert not batches(scene, make(), 2, [1]).any()
+
+
+@pytest.mark.parametrize(("parameters", "words"), [
+    ({"choice": "best"}, '"choice" is \'best\'; it must be one of uniform, power, clustered'),
+    ({"light_paths": 0}, '"light_paths" is 0; it must be at least 1'),
+    ({"bound": -1.0}, '"bound" is -1.0; it must be at least 0'),
+    ({"connections": 0}, '"connections" is 0; it must be at least 1'),
+])  # fmt: skip
+def test_wrong_parameters_are_refused(parameters: dict, words: str) -> None:
+    with pytest.raises((ValueError, RuntimeError), match=words):
+        make(**parameters)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
+def test_spectral_variants_are_refused(variant: str) -> None:
+    scene = mi.load_dict(stage(), optimize=False)
+    with pytest.raises((NotImplementedError, RuntimeError), match="the variant is spectral:"):
+        make().render(scene, spp=1)
+
+
+def test_moving_shapes_are_refused() -> None:
+    ball = {"type": "moving", "translate": [0, 0, 1], "in": {"type": "sphere", "radius": 0.1}}
+    scene = mi.load_dict(stage(ball=ball), optimize=False)
+    with pytest.raises((NotImplementedError, RuntimeError), match="shapes or lights move:"):
+        make().render(scene, spp=1)
+
+
+def test_media_are_refused() -> None:
+    fog = {"type": "sphere", "radius": 0.3, "bsdf": {"type": "null"},
+           "interior": {"type": "homogeneous"}}  # fmt: skip
+    scene = mi.load_dict(stage(fog=fog), optimize=False)
+    with pytest.raises((NotImplementedError, RuntimeError), match='"instant_radiosity", whose'):
+        make().render(scene, spp=1)
