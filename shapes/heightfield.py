@@ -57,12 +57,12 @@ class Heightfield(mi.Mesh):
        - |bool|
        - Whether shading normals are those of the triangles. Otherwise, they are interpolated from
          those at the vertices, which follow from the differences of neighbouring heights.
-         (Default: |false|)
+         (Default: false)
      * - flip_normals
        - |bool|
-       - Whether normals point down, to lower z, and not up. (Default: |false|)
+       - Whether normals point down, to lower z, and not up. (Default: false)
      * - (nested plugin)
-       - |bsdf|, |medium|
+       - |bsdf| or |several|
        - The material, and the media :monosp:`interior` (below) and :monosp:`exterior` (above).
 
     **Use it when** a surface is given by heights: it takes a fraction of the memory of a mesh, and

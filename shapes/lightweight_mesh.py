@@ -37,7 +37,7 @@ class LightweightMesh(mi.Mesh):
        - Whether corners are rounded to 65536 steps along each axis of the mesh's box, normals to
          steps of a few thousandths of a degree, and texture coordinates to 65536 steps between
          their smallest and their largest value. The mesh then takes 9 to 15 bytes for each
-         triangle in all; else 21 to 31, as Mitsuba stores it. (Default: |false|)
+         triangle in all; else 21 to 31, as Mitsuba stores it. (Default: false)
 
     **Use it when** a scene does not fit into memory: scans, displaced surfaces, terrain. For a
     regular grid of heights, :monosp:`heightfield` takes far less.

@@ -76,8 +76,8 @@ class MapLearner(Learner):
 
     Attributes:
         decision: See above.
-        last_drawn: At the end of a pass: what :meth:`drawn` was. The camera draws the numbers of the
-            next pass before that is counted.
+        last_drawn: What :meth:`drawn` was at the end of the last pass. The camera draws the numbers
+            of the next pass before the last one is counted.
         total, importance: At the end of a pass: the radiance of each lane, and the factor from it
             to the contribution to its pixel.
         tiles: The tiles whose pixels share maps.
