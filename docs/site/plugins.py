@@ -34,8 +34,8 @@ _LIST = ".. pluginparameters::"
 
 #: What stands for a type in a list of parameters.
 _TYPES = (
-    "bitmap", "bool", "bsdf", "decision", "emitter", "float", "int", "integrator", "point", "sensor", "several",
-    "shape", "spectrum", "string", "tensor", "texture", "transform", "vector",
+    "bitmap", "bool", "bsdf", "decision", "emitter", "float", "int", "integrator", "point",
+    "sensor", "several", "shape", "spectrum", "string", "tensor", "texture", "transform", "vector",
 )  # fmt: skip
 _PROLOG = [*(f".. |{name}| replace:: {name}" for name in _TYPES), ""]
 
