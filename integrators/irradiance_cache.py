@@ -36,9 +36,9 @@ class IrradianceCache(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.accuracy = self.parameter(props, "accuracy", 0.15, minimum=0.01, maximum=1.0)
-        self.min_spacing = self.parameter(props, "min_spacing", 1.5, minimum=0.1, maximum=1e6)
-        self.max_spacing = self.parameter(props, "max_spacing", 20.0, minimum=0.1, maximum=1e6)
+        self.accuracy = self.parameter(props, "accuracy", 0.3, minimum=0.01, maximum=1.0)
+        self.min_spacing = self.parameter(props, "min_spacing", 3.0, minimum=0.1, maximum=1e6)
+        self.max_spacing = self.parameter(props, "max_spacing", 40.0, minimum=0.1, maximum=1e6)
         self.gather_samples = self.parameter(
             props, "gather_samples", 512, minimum=4, maximum=1 << 16
         )
@@ -86,5 +86,5 @@ class IrradianceCache(WalkIntegrator):
         self.records, self.rounds = rounds.records, rounds.rounds
         return replace(
             walk, rr_depth=0, roulette=EndsAtTheCache(self.rr_depth), mis=CameraPhases(),
-            subpaths=CachedLight(rounds.grid, self.max_depth, can_be_hit(scene)),
+            subpaths=CachedLight(rounds.final_grid(), self.max_depth, can_be_hit(scene)),
         )  # fmt: skip

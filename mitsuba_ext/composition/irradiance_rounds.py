@@ -30,6 +30,10 @@ from ..transport.walk import Walk
 #: the share of uncovered pixels at which the last one ends.
 _FIRST_STRIDE, _FULL_ROUNDS, _FEW = 16, 4, 5e-4
 
+#: Records are valid this much farther in the image than where they are placed: more of them overlap,
+#: which smooths their noise. (cornell_box: 0.85 of the error of 1.0; 2.0 takes twice as long.)
+_OVERLAP = 1.3
+
 #: The side of the grid of film positions that measures how wide pixels are.
 _PROBES = 16
 
@@ -98,7 +102,7 @@ class CacheRounds:
         self._scene, self._sensor, self._gatherer = scene, sensor, gatherer
         self._parameters, self._seed, self.records = parameters, seed, records
         self.rounds: list[Round] = []
-        self.grid = RecordGrid(records, parameters.accuracy)
+        self._grid = RecordGrid(records, parameters.accuracy)
         self._walk = Walk(
             walk.max_depth, 0, walk.hide_emitters, query=walk.query,
             next_event=NoConnections(), roulette=EndsAtTheCache(walk.rr_depth),
@@ -118,6 +122,10 @@ class CacheRounds:
             if done.uncovered <= _FEW * done.asked:
                 return
 
+    def final_grid(self) -> RecordGrid:
+        """The records, as the image uses them."""
+        return RecordGrid(self.records, _OVERLAP * self._parameters.accuracy)
+
     def _round(self, stride: int) -> Round:
         places, asked = self._uncovered(stride)
         p = self._parameters
@@ -125,7 +133,7 @@ class CacheRounds:
         if len(index):
             made = self._gatherer.records(places[index])
             self.records = self.records.joined(made).clamped()
-            self.grid = RecordGrid(self.records, p.accuracy)
+            self._grid = RecordGrid(self.records, p.accuracy)
         self.rounds.append(Round(asked, len(places), len(index)))
         return self.rounds[-1]
 
@@ -147,7 +155,7 @@ class CacheRounds:
         sampler.seed(dr.opaque(mi.UInt32, seed[0]), count)
         numbers = camera.draw_numbers(self._sensor, sampler, lanes, CameraSamples())
         rays = camera.camera_rays(self._sensor, lanes, numbers, 1)
-        finds = FindsPlaces(self.grid, self._walk.max_depth, count)
+        finds = FindsPlaces(self._grid, self._walk.max_depth, count)
         self._walk.subpaths = finds
         dr.eval(self._walk(self._scene, sampler, rays, mi.Bool(True)).L)
         asks, covered = finds.asks.numpy(), finds.covered.numpy()

@@ -9,19 +9,20 @@ import numpy as np
 from ..arrays import from_numpy
 from .records import Records
 
-#: The most levels of cells, and words of a record: place, reach, normal and level in two packets
-#: of four; then, for each channel, E and its two gradients in two packets.
+#: The most levels of cells, and words of a packet, which a kernel reads at once. A record has two of
+#: place, reach, normal and level; then, for each channel, two of E and its gradients.
 _MOST_LEVELS, _PACKET = 24, 4
 
-#: How far a point may lie behind a record, in units of its reach times the accuracy.
-_BEHIND = 0.2
+#: How far a point may lie behind a record (in the direction of their mean normal), and how far from
+#: its tangent plane, in units of its radius.
+_BEHIND, _BESIDE = 0.2, 0.6
 
 
 class RecordGrid:
     """The records in a hash grid of several levels.
 
-    Cells of a level are twice as wide as its records are valid, so that a record lies in at most
-    eight of them. A point looks at one cell of each level.
+    Cells of a level are one to two times as wide as its records are valid. A record is listed in
+    each cell that it can serve, at most 27 of them. A point looks at one cell of each level.
 
     Parameters:
         records: The records; may be empty.
@@ -36,12 +37,12 @@ class RecordGrid:
         level = np.floor(np.log2(np.maximum(radius / least, 1)) + 1e-9).astype(np.int64)
         level = np.minimum(level, _MOST_LEVELS - 1)
         # Radii of level 0 are up to 2 · least; a little wider, as kernels round otherwise
-        width = 4.02 * least
+        width = 2.01 * least
         self._width = dr.opaque(mi.Float, width)
         self._levels = dr.opaque(mi.UInt32, int(level.max()) + 1 if count else 0)
-        buckets = 1 << max(4, (8 * count - 1).bit_length())
+        buckets = 1 << max(4, (16 * count - 1).bit_length())
         self._mask = dr.opaque(mi.UInt32, buckets - 1)
-        starts, entries = _sorted(records.p, radius, level, width, buckets)
+        starts, entries = _sorted(records, radius, level, width, buckets)
         self._starts = from_numpy(mi.UInt32, starts)
         # Never empty: a masked gather from an empty array is an error
         self._entries = from_numpy(mi.UInt32, entries if len(entries) else [0])
@@ -62,26 +63,30 @@ class RecordGrid:
         """The irradiance at a point, and whether any record is valid there."""
         total, weights = mi.Spectrum(0), mi.Float(0)
         level, place, end = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-        searches = active & (self._levels > 0)
-        while dr.hint(searches, label="interpolate"):
-            # ----- Go on to the cell of the next level if this one is at its end -----
-            is_new = place >= end
-            bucket = self._bucket(p, level)
-            start = dr.gather(mi.UInt32, self._starts, bucket, searches & is_new)
-            stop = dr.gather(mi.UInt32, self._starts, bucket + 1, searches & is_new)
-            place, end = dr.select(is_new, start, place), dr.select(is_new, stop, end)
-            level += dr.select(is_new, 1, 0)
+        goes_on = active & (self._levels > 0)
+        while dr.hint(goes_on, label="interpolate"):
+            # Lanes of a kernel search for different times. All wait here, and then read gradients
+            index, weight, searches = mi.UInt32(0), mi.Float(0), mi.Bool(goes_on)
+            while dr.hint(searches, label="search"):
+                # ----- Go on to the cell of the next level if this one is at its end -----
+                is_new = searches & (place >= end)
+                bucket = self._bucket(p, level)
+                start = dr.gather(mi.UInt32, self._starts, bucket, is_new)
+                stop = dr.gather(mi.UInt32, self._starts, bucket + 1, is_new)
+                place, end = dr.select(is_new, start, place), dr.select(is_new, stop, end)
+                level += dr.select(is_new, 1, 0)
 
-            # ----- Look at the next record -----
-            exists = searches & (place < end)
-            index = dr.gather(mi.UInt32, self._entries, place, exists)
-            weight = self._weight(index, p, n, level - 1, exists)
-            is_valid = exists & (weight > 0)
+                # ----- Look at the next record -----
+                exists = searches & (place < end)
+                index = dr.gather(mi.UInt32, self._entries, place, exists)
+                weight = self._weight(index, p, n, level - 1, exists)
+                place += dr.select(exists, 1, 0)
+                goes_on = (place < end) | (level < self._levels)
+                searches = searches & goes_on & (weight <= 0)
+            is_valid = weight > 0
             E = self._extrapolated(index, p, n, is_valid)
             total += dr.select(is_valid, weight * E, 0)
             weights += dr.select(is_valid, weight, 0)
-            place += dr.select(exists, 1, 0)
-            searches = searches & ((place < end) | (level < self._levels))
         found = weights > 0
         return total * dr.select(found, dr.rcp(weights), 0), found
 
@@ -93,22 +98,23 @@ class RecordGrid:
     def _weight(
         self, index: mi.UInt32, p: mi.Point3f, n: mi.Normal3f, level: mi.UInt32, active: mi.Bool
     ) -> mi.Float:
-        """The weight of a record: 1/ε − 1/a, positive where ε < a, so that nothing jumps where a
-        record ceases to be valid."""
+        """The weight of a record: 1 − ε/a where ε < a, so that nothing jumps where a record ceases
+        to be valid. (Eq. 10.9 has 1/ε: the noise of each record then shows at its place.)"""
         row = index * (2 + 2 * self._channels)
         first = dr.gather(mi.Vector4f, self._records, row, active)
         second = dr.gather(mi.Vector4f, self._records, row + 1, active)
         way = mi.Vector3f(p.x - first.x, p.y - first.y, p.z - first.z)
         normal = mi.Vector3f(second.x, second.y, second.z)
-        # Eq. 10.8. Of a point exactly at a record, ε would be 0
-        change = dr.norm(way) * first.w + dr.safe_sqrt(1 - dr.dot(n, normal))
-        change = dr.maximum(change, 0.02 * self._accuracy)
+        # Eq. 10.8, in units of a
+        scale = dr.rcp(self._accuracy)
+        change = (dr.norm(way) * first.w + dr.safe_sqrt(1 - dr.dot(n, normal))) * scale
         # Points behind a record see what it does not (Ward et al. 1988)
-        height = dr.dot(way, n + normal) * 0.5
-        is_valid = height * first.w > -_BEHIND * self._accuracy
+        to_radius = first.w * scale
+        is_valid = dr.dot(way, n + normal) * 0.5 * to_radius > -_BEHIND
+        is_valid &= dr.abs(dr.dot(way, normal)) * to_radius < _BESIDE
         # Cells of two levels may share a bucket
-        is_valid &= second.w == mi.Float(level)
-        return dr.select(is_valid, dr.rcp(change) - dr.rcp(self._accuracy), 0)
+        is_valid &= active & (second.w == mi.Float(level))
+        return dr.select(is_valid, dr.maximum(1 - change, 0), 0)
 
     def _extrapolated(
         self, index: mi.UInt32, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool
@@ -142,19 +148,24 @@ def _packed(records: Records, level: np.ndarray) -> np.ndarray:
 
 
 def _sorted(
-    p: np.ndarray, radius: np.ndarray, level: np.ndarray, width: float, buckets: int
+    records: Records, radius: np.ndarray, level: np.ndarray, width: float, buckets: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """The first entry of each bucket, and the entries: the records, by bucket and by number."""
-    count = len(p)
-    widths = (width * 2.0**level)[:, None]
-    low = np.floor((p - 1.001 * radius[:, None]) / widths).astype(np.int64)
-    high = np.floor((p + 1.001 * radius[:, None]) / widths).astype(np.int64)
+    count, p, n = len(records), records.p.astype(np.float64), records.n.astype(np.float64)
+    widths = width * 2.0**level
+    low = np.floor((p - radius[:, None]) / widths[:, None]).astype(np.int64)
     pairs = []
-    for corner in range(8):
-        bits = np.array([corner & 1, corner >> 1 & 1, corner >> 2 & 1], bool)
-        cell = np.where(bits, high, low).astype(np.uint32)
-        bucket = _hash(cell[:, 0], cell[:, 1], cell[:, 2], level.astype(np.uint32))
-        pairs.append((bucket & np.uint32(buckets - 1)).astype(np.int64) * count + np.arange(count))
+    for corner in np.ndindex(3, 3, 3):
+        cell = low + corner
+        way = (cell + 0.5) * widths[:, None] - p
+        # Does the cell touch the cube around the record, and the layer at its tangent plane?
+        touches = (np.abs(way) <= (radius + 0.5 * widths)[:, None]).all(axis=1)
+        half = 0.505 * widths * np.abs(n).sum(axis=1)
+        touches &= np.abs((way * n).sum(axis=1)) <= _BESIDE * radius + half
+        index = np.flatnonzero(touches)
+        x, y, z = cell[index].astype(np.uint32).T
+        bucket = _hash(x, y, z, level[index].astype(np.uint32)) & np.uint32(buckets - 1)
+        pairs.append(bucket.astype(np.int64) * count + index)
     # A record is once in each bucket
     pairs = np.unique(np.concatenate(pairs))
     sizes = np.bincount(pairs // max(count, 1), minlength=buckets)
