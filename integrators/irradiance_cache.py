@@ -42,6 +42,7 @@ class IrradianceCache(WalkIntegrator):
         self.gather_samples = self.parameter(
             props, "gather_samples", 512, minimum=4, maximum=1 << 16
         )
+        self.max_share = self.parameter(props, "max_share", 0.05, minimum=0.001, maximum=1.0)
         self.cache_file = self.parameter(props, "cache_file", "")
         #: The records of the last render, and what each round of it did.
         self.records, self.rounds = Records.none(3), []
@@ -54,6 +55,7 @@ class IrradianceCache(WalkIntegrator):
             "min_spacing": self.min_spacing,
             "max_spacing": self.max_spacing,
             "gather_samples": self.gather_samples,
+            "max_share": self.max_share,
             "cache_file": self.cache_file or "none",
             **super().parameters(),
         }
@@ -77,7 +79,7 @@ class IrradianceCache(WalkIntegrator):
         )  # fmt: skip
         gatherer = Gatherer(
             scene, inner, Strata.about(self.gather_samples), parameters.bounds,
-            self.min_spacing, self._seed,
+            self.min_spacing, self.max_share, self._seed,
         )  # fmt: skip
         rounds = CacheRounds(
             scene, sensor, walk, gatherer, parameters, self._seed, self.records

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -23,12 +23,13 @@ from ..irradiance.record_grid import RecordGrid
 from ..irradiance.records import Places, Records
 from ..rendering import camera
 from ..rendering.camera_samples import CameraSamples
+from ..rendering.pass_samples import look
 from ..transport.path_decisions import NoConnections
 from ..transport.walk import Walk
 
 #: The distance of the pixels of the first round; the most rounds in which all pixels take part, and
 #: the share of uncovered pixels at which the last one ends.
-_FIRST_STRIDE, _FULL_ROUNDS, _FEW = 16, 4, 5e-4
+_FIRST_STRIDE, _FULL_ROUNDS, _FEW = 16, 5, 1e-3
 
 #: Records are valid this much farther in the image than where they are placed: more of them overlap,
 #: which smooths their noise. (cornell_box: 0.85 of the error of 1.0; 2.0 takes twice as long.)
@@ -106,8 +107,9 @@ class CacheRounds:
         self._walk = Walk(
             walk.max_depth, 0, walk.hide_emitters, query=walk.query,
             next_event=NoConnections(), roulette=EndsAtTheCache(walk.rr_depth),
-            mis=CameraPhases(*pixel_cone(scene, sensor)),
+            mis=CameraPhases(),
         )  # fmt: skip
+        self._apart, self._angle = pixel_cone(scene, sensor)
 
     def run(self, goes_on: Callable[[], bool]) -> None:
         """Runs the rounds, as long as ``goes_on`` says so."""
@@ -132,7 +134,7 @@ class CacheRounds:
         index = chosen(places, self.records, p.accuracy, p.bounds, len(self.rounds))
         if len(index):
             made = self._gatherer.records(places[index])
-            self.records = self.records.joined(made).clamped()
+            self.records = self.records.joined(made).adapted(p.accuracy)
             self._grid = RecordGrid(self.records, p.accuracy)
         self.rounds.append(Round(asked, len(places), len(index)))
         return self.rounds[-1]
@@ -147,20 +149,16 @@ class CacheRounds:
             np.minimum(np.arange(0, width, stride) + offset, width - 1),
             np.minimum(np.arange(0, height, stride) + offset, height - 1),
         )
-        pixel = from_numpy(mi.UInt32, (y * width + x).ravel())
-        lanes = camera.PixelLanes(pixel).lanes(film)
-        count = dr.width(pixel)
+        lanes = camera.PixelLanes(from_numpy(mi.UInt32, (y * width + x).ravel()))
         sampler = mi.load_dict({"type": "independent"})
         seed = mi.sample_tea_32(mi.UInt32(self._seed), mi.UInt32(len(self.rounds) + 0x20000))[0]
-        sampler.seed(dr.opaque(mi.UInt32, seed[0]), count)
-        numbers = camera.draw_numbers(self._sensor, sampler, lanes, CameraSamples())
-        rays = camera.camera_rays(self._sensor, lanes, numbers, 1)
-        finds = FindsPlaces(self._grid, self._walk.max_depth, count)
-        self._walk.subpaths = finds
-        dr.eval(self._walk(self._scene, sampler, rays, mi.Bool(True)).L)
+        sampler.seed(dr.opaque(mi.UInt32, seed[0]), lanes.count)
+        finds = FindsPlaces(self._grid, self._walk.max_depth, lanes.count)
+        walk = replace(self._walk, subpaths=finds)
+        dr.eval(look(walk, CameraSamples(), self._scene, self._sensor, sampler, lanes, 1))
         asks, covered = finds.asks.numpy(), finds.covered.numpy()
         arrays = (np.array(v).T for v in (finds.p, finds.n, finds.geometric))
-        places = Places(*arrays, finds.footprint.numpy())
+        places = Places(*arrays, self._apart + self._angle * finds.length.numpy())
         valid = np.isfinite(places.p).all(axis=1) & np.isfinite(places.n).all(axis=1)
         valid &= np.isfinite(places.footprint) & (places.footprint > 0)
         return places[np.flatnonzero(asks & ~covered & valid)], int(asks.sum())

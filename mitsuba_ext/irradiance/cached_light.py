@@ -19,12 +19,10 @@ import mitsuba as mi
 from ..transport.path_decisions import Roulette, Subpaths, Weights
 from .record_grid import RecordGrid
 
-#: The parts of a camera path: it has not met the cache; it has left the vertex at which it did; it
+#: The parts of a camera path that has not met the cache: it has been scattered by mirrors and clear
+#: glass at most; by glossy lobes too. Then, it has left the vertex at which it met the cache; or it
 #: is over.
-BEFORE, LEAVES, ENDED = range(3)
-
-#: The angle by which a cone of rays widens at a glossy lobe: what is seen there is blurred.
-_GLOSSY_SPREAD = 0.1
+SHARP, BLURRED, LEAVES, ENDED = range(4)
 
 
 @dataclass
@@ -32,51 +30,36 @@ class Progress:
     """The state of a camera path, in the place of its MIS sums.
 
     Attributes:
-        phase: Which part of the path this is (:data:`BEFORE`, …).
-        footprint: Width, at the vertex, of the cone of rays of one pixel.
-        spread: The angle by which it widens.
+        phase: Which part of the path this is (:data:`SHARP`, …).
+        length: The way from the camera to the vertex.
     """
 
     phase: mi.UInt32
-    footprint: mi.Float
-    spread: mi.Float
+    length: mi.Float
 
 
 class CameraPhases(Weights):
     """The MIS weights of ``path`` up to the vertex that asks the cache, and for light that reaches
-    this vertex directly. The cache knows all other light.
-
-    Parameters:
-        footprint, spread: Of the cone of a pixel where it leaves the camera.
-    """
-
-    def __init__(self, footprint: float = 0.0, spread: float = 0.0) -> None:
-        super().__init__()
-        self._footprint = dr.opaque(mi.Float, footprint)
-        self._spread = dr.opaque(mi.Float, spread)
+    this vertex directly. The cache knows all other light."""
 
     def begin(self, ray):
-        lanes = dr.zeros(mi.Float, dr.width(ray))
-        return Progress(mi.UInt32(BEFORE), lanes + self._footprint, lanes + self._spread)
+        return Progress(mi.UInt32(SHARP), dr.zeros(mi.Float, dr.width(ray)))
 
     def arrive(self, path, si):
         sums = path.sums
-        widened = sums.footprint + dr.select(si.is_valid(), sums.spread * si.t, 0)
-        return Progress(sums.phase, widened, sums.spread)
+        return Progress(sums.phase, sums.length + dr.select(si.is_valid(), si.t, 0))
 
     def emission(self, scene, si, ds, path, pdf):
         return dr.select(path.sums.phase != ENDED, super().emission(scene, si, ds, path, pdf), 0)
 
     def connection(self, scene, vertex, ds, pdf, scattering_pdf):
         weight = super().connection(scene, vertex, ds, pdf, scattering_pdf)
-        return dr.select(vertex.path.sums.phase == BEFORE, weight, 0)
+        return dr.select(vertex.path.sums.phase <= BLURRED, weight, 0)
 
     def leave(self, vertex, bs):
-        sums = vertex.path.sums
-        phase = dr.select(sums.phase == BEFORE, mi.UInt32(BEFORE), ENDED)
-        is_glossy = ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        spread = dr.select(is_glossy, dr.maximum(sums.spread, _GLOSSY_SPREAD), sums.spread)
-        return Progress(phase, sums.footprint, spread)
+        sums, is_delta = vertex.path.sums, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        before = dr.select(is_delta, sums.phase, BLURRED)
+        return Progress(dr.select(sums.phase <= BLURRED, before, ENDED), sums.length)
 
 
 class EndsAtTheCache(Roulette):
@@ -109,10 +92,11 @@ class _AtDiffuseLobes(Subpaths):
     def gather(self, scene, sampler, vertex, active):
         return mi.Spectrum(0), mi.UInt32(0)
 
-    def _asks(self, vertex, bs, active) -> mi.Bool:
-        """Does indirect light count there? It takes two more segments, at least."""
+    def _asks(self, vertex, bs, active, last) -> mi.Bool:
+        """Is this such a place, in a part of the path up to ``last``? Indirect light takes two more
+        segments, at least."""
         is_diffuse = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Diffuse) & (bs.pdf > 0)
-        is_first = vertex.path.sums.phase == BEFORE
+        is_first = vertex.path.sums.phase <= last
         return active & is_diffuse & is_first & (vertex.depth + 3 <= self._max_depth)
 
     def _normal(self, vertex, bs) -> mi.Normal3f:
@@ -134,15 +118,16 @@ class CachedLight(_AtDiffuseLobes):
         self._grid, self._after = grid, LEAVES if finds_lights else ENDED
 
     def beyond(self, vertex, bs, β, sums, active):
-        asks = self._asks(vertex, bs, active)
+        asks = self._asks(vertex, bs, active, BLURRED)
         E, found = self._grid.interpolated(vertex.si.p, self._normal(vertex, bs), asks)
         phase = dr.select(found, self._after, sums.phase)
         light = dr.select(found, β * E * dr.inv_pi, 0)
-        return light, Progress(phase, sums.footprint, sums.spread)
+        return light, Progress(phase, sums.length)
 
 
 class FindsPlaces(_AtDiffuseLobes):
-    """Stores where camera paths ask the cache, and which of these places no record covers.
+    """Stores where camera paths ask the cache, and which of these places no record covers. It leaves
+    out what is seen by way of glossy lobes: such places are many, and all over the scene.
 
     Parameters:
         grid: Finds records.
@@ -155,22 +140,22 @@ class FindsPlaces(_AtDiffuseLobes):
         self._grid, self._lane = grid, dr.arange(mi.UInt32, lanes)
         self.p, self.n = dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Normal3f, lanes)
         self.geometric = dr.zeros(mi.Normal3f, lanes)
-        self.footprint = dr.zeros(mi.Float, lanes)
+        self.length = dr.zeros(mi.Float, lanes)
         self.asks, self.covered = dr.zeros(mi.Bool, lanes), dr.zeros(mi.Bool, lanes)
-        dr.eval(self._lane, self.p, self.n, self.geometric, self.footprint)
+        dr.eval(self._lane, self.p, self.n, self.geometric, self.length)
         dr.eval(self.asks, self.covered)
 
     def beyond(self, vertex, bs, β, sums, active):
         si, n = vertex.si, self._normal(vertex, bs)
-        asks = self._asks(vertex, bs, active)
+        asks = self._asks(vertex, bs, active, SHARP)
         _, covered = self._grid.interpolated(si.p, n, asks)
         for target, value in (
             (self.p, si.p), (self.n, n), (self.geometric, si.n), (self.asks, mi.Bool(True)),
-            (self.footprint, vertex.path.sums.footprint), (self.covered, covered),
+            (self.length, vertex.path.sums.length), (self.covered, covered),
         ):  # fmt: skip
             dr.scatter(target, value, self._lane, asks)
-        phase = dr.select(asks, ENDED, sums.phase)
-        return 0.0, Progress(phase, sums.footprint, sums.spread)
+        phase = dr.select(asks | (sums.phase != SHARP), mi.UInt32(ENDED), SHARP)
+        return 0.0, Progress(phase, sums.length)
 
 
 class IndirectOnly(Weights):

@@ -17,6 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 
 
+#: Each time that outliers are cut off, the sum becomes smaller, of which they may hold a share.
+_CUTS = 8
+
+
 @dataclass(frozen=True)
 class Strata:
     """The strata of a hemisphere.
@@ -50,12 +54,31 @@ class Irradiance:
             the frame of the place.
         translation: The change with the place, likewise: the gradient.
         distance: The harmonic mean of the distances of what is seen: [record].
+        deviation: Standard error of the brightest channel, as if there were no strata: [record].
     """
 
     value: np.ndarray
     rotation: np.ndarray
     translation: np.ndarray
     distance: np.ndarray
+    deviation: np.ndarray
+
+
+def without_outliers(radiance: np.ndarray, share: float) -> np.ndarray:
+    """The radiance, of which no stratum holds more than ``share`` of a record's irradiance; what
+    exceeds that is cut off. Paths of gather rays find some lights rarely, and then much of their
+    light at once: the record that one of them belongs to would be a bright spot.
+
+    Parameters:
+        radiance: [record, sector, ring, channel].
+    """
+    if share >= 1:
+        return radiance
+    brightest = radiance.max(axis=3)
+    cut = brightest
+    for _ in range(_CUTS):
+        cut = np.minimum(brightest, share * cut.sum(axis=(1, 2), keepdims=True))
+    return radiance * (cut / np.maximum(brightest, 1e-30))[..., None]
 
 
 def irradiance(
@@ -80,6 +103,7 @@ def irradiance(
         _rotation(strata, radiance),
         _translation(strata, radiance, np.minimum(inverse, 1 / least[:, None, None])),
         1 / np.maximum(mean, 1e-30),
+        math.pi / math.sqrt(M * N) * radiance.std(axis=(1, 2)).max(axis=1),
     )
 
 

@@ -13,6 +13,10 @@ from .hemisphere import Irradiance
 #: neighbour to neighbour.
 _NEIGHBOURS, _ROUNDS = 12, 8
 
+#: Two records disagree if they differ by so many standard errors more than the accuracy allows. A
+#: record then reaches this share of the way between them.
+_NOISE, _SHORTER = 2.0, 0.7
+
 
 @dataclass
 class Places:
@@ -47,6 +51,7 @@ class Records:
         rotation, translation: Gradients, in world space: [record, channel, 3].
         reach: R of Eq. 10.8, the distance over which irradiance may change by its own size.
         least: The smallest value that ``reach`` may have, so that records are not dense.
+        deviation: Standard error of the irradiance, in the brightest channel.
     """
 
     p: np.ndarray
@@ -56,6 +61,7 @@ class Records:
     translation: np.ndarray
     reach: np.ndarray
     least: np.ndarray
+    deviation: np.ndarray
 
     @classmethod
     def none(cls, channels: int) -> Records:
@@ -63,7 +69,7 @@ class Records:
         vector, tensor = np.zeros((0, 3), np.float32), np.zeros((0, channels, 3), np.float32)
         number = np.zeros(0, np.float32)
         colour = np.zeros((0, channels), np.float32)
-        return cls(vector, vector, colour, tensor, tensor, number, number)
+        return cls(vector, vector, colour, tensor, tensor, number, number, number)
 
     def __len__(self) -> int:
         return len(self.p)
@@ -73,18 +79,26 @@ class Records:
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return Records(*(np.concatenate(pair) for pair in pairs))
 
-    def clamped(self) -> Records:
-        """The records, none of which reaches much farther than its neighbours do: R_i ≤ R_j +
-        |x_i − x_j|. Where one record has seen a small thing nearby, others may have missed it.
+    def adapted(self, accuracy: float) -> Records:
+        """The records, valid where their neighbours confirm it.
+
+        - A record that predicts another one wrongly, by more than the accuracy and the noise of the
+          two, is not valid there. Distances and gradients do not tell of edges.
+        - None reaches much farther than its neighbours do: R_i ≤ R_j + |x_i − x_j|. Where one
+          record has seen a small thing nearby, others may have missed it.
 
         Source: J. Křivánek, K. Bouatouch, S. Pattanaik, J. Žára, *Making Radiance and Irradiance
         Caching Practical: Adaptive Caching and Neighbor Clamping*, EGSR 2006.
+
+        Parameters:
+            accuracy: a of Eq. 10.9.
         """
         count = min(_NEIGHBOURS + 1, len(self))
         if count < 2:
             return self
         distance, index = cKDTree(self.p).query(self.p, count)
-        reach = self.reach
+        bound = np.where(self._is_wrong(index, accuracy), distance / accuracy, np.inf).min(axis=1)
+        reach = np.maximum(np.minimum(self.reach, _SHORTER * bound), self.least)
         for _ in range(_ROUNDS):
             bound = (reach[index] + distance).min(axis=1)
             clamped = np.maximum(np.minimum(reach, bound), self.least)
@@ -92,6 +106,21 @@ class Records:
                 break
             reach = clamped
         return replace(self, reach=reach.astype(np.float32))
+
+    def _is_wrong(self, index: np.ndarray, accuracy: float) -> np.ndarray:
+        """Which of its neighbours does a record predict wrongly, within its reach?"""
+        way = self.p[index] - self.p[:, None]
+        turn = np.cross(self.n[:, None], self.n[index])
+        predicted = self.irradiance[:, None] + np.einsum("rcx,rkx->rkc", self.translation, way)
+        predicted += np.einsum("rcx,rkx->rkc", self.rotation, turn)
+        found = self.irradiance[index]
+        error = np.abs(np.maximum(predicted, 0) - found).max(axis=2)
+        size = 0.5 * (self.irradiance[:, None] + found).max(axis=2)
+        noise = self.deviation[:, None] + self.deviation[index]
+        cosine = (self.n[:, None] * self.n[index]).sum(axis=2)
+        change = np.linalg.norm(way, axis=2) / self.reach[:, None]
+        change += np.sqrt(np.maximum(1 - cosine, 0))
+        return (error > accuracy * size + _NOISE * noise) & (change < accuracy)
 
 
 def made_of(
@@ -115,6 +144,6 @@ def made_of(
     excess = np.minimum(1, changes / np.maximum(least, 1e-30))
     arrays = (
         places.p, places.n, found.value, rotation, translation * excess[:, None, None],
-        np.clip(reach, least, most), least,
+        np.clip(reach, least, most), least, found.deviation,
     )  # fmt: skip
     return Records(*(array.astype(np.float32) for array in arrays))
