@@ -55,6 +55,7 @@ class Irradiance:
         translation: The change with the place, likewise: the gradient.
         distance: The harmonic mean of the distances of what is seen: [record].
         deviation: Standard error of the brightest channel, as if there were no strata: [record].
+        slope_deviation: The same of the length of ``translation``.
     """
 
     value: np.ndarray
@@ -62,6 +63,7 @@ class Irradiance:
     translation: np.ndarray
     distance: np.ndarray
     deviation: np.ndarray
+    slope_deviation: np.ndarray
 
 
 def without_outliers(radiance: np.ndarray, share: float) -> np.ndarray:
@@ -98,12 +100,17 @@ def irradiance(
         inverse = 1 / np.maximum(distance, 1e-30)
     value = math.pi / (M * N) * radiance.sum(axis=(1, 2))
     mean = inverse.mean(axis=(1, 2))
+    translation, factor = _translation(
+        strata, radiance, np.minimum(inverse, 1 / least[:, None, None])
+    )
+    spread = radiance.std(axis=(1, 2)).max(axis=1)
     return Irradiance(
         value,
         _rotation(strata, radiance),
-        _translation(strata, radiance, np.minimum(inverse, 1 / least[:, None, None])),
+        translation,
         1 / np.maximum(mean, 1e-30),
-        math.pi / math.sqrt(M * N) * radiance.std(axis=(1, 2)).max(axis=1),
+        math.pi / math.sqrt(M * N) * spread,
+        factor * spread,
     )
 
 
@@ -121,27 +128,38 @@ def _rotation(strata: Strata, radiance: np.ndarray) -> np.ndarray:
     return math.pi / (M * N) * np.einsum("rkjc,j,kx->rcx", radiance, tangent, v, optimize=True)
 
 
-def _translation(strata: Strata, radiance: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+def _translation(
+    strata: Strata, radiance: np.ndarray, inverse: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The edges between strata move with the nearer one of the two surfaces that they separate
-    (Ward and Heckbert)."""
+    (Ward and Heckbert). Returns the gradient, and for each record the root of the sum of the
+    squares of all factors of radiance in it: noise grows by it."""
     M, N = strata.rings, strata.sectors
     u2 = np.arange(M + 1) / M  # sin² θ at the edges of rings
     sine = np.sqrt(u2)
 
     # ----- Edges between rings: 2π/N Σ u_k sin θ cos² θ / min(r) (L_j − L_j−1) -----
     nearer = np.maximum(inverse[:, :, 1:], inverse[:, :, :-1])
-    step = (radiance[:, :, 1:] - radiance[:, :, :-1]) * nearer[..., None]
+    moves = 2 * math.pi / N * _mean_over_sector(N) * (sine * (1 - u2))[1:M] * nearer
     φ = 2 * math.pi * (np.arange(N) + 0.5) / N
-    u = np.stack([np.cos(φ), np.sin(φ), np.zeros(N)], axis=1) * _mean_over_sector(N)
-    edge = (sine * (1 - u2))[1:M]
-    gradient = 2 * math.pi / N * np.einsum("rkjc,j,kx->rcx", step, edge, u, optimize=True)
+    u = np.stack([np.cos(φ), np.sin(φ), np.zeros(N)], axis=1)
+    step = radiance[:, :, 1:] - radiance[:, :, :-1]
+    gradient = np.einsum("rkjc,rkj,kx->rcx", step, moves, u, optimize=True)
+    outer = np.pad(moves, ((0, 0), (0, 0), (1, 1)))
+    along_u = outer[:, :, :-1] - outer[:, :, 1:]
 
     # ----- Edges between sectors: Σ v_k Σ (sin θ_j+ − sin θ_j−) / min(r) (L_k − L_k−1) -----
     nearer = np.maximum(inverse, np.roll(inverse, 1, axis=1))
-    step = (radiance - np.roll(radiance, 1, axis=1)) * nearer[..., None]
+    moves = np.diff(sine) * nearer
     φ = 2 * math.pi * np.arange(N) / N
     v = np.stack([-np.sin(φ), np.cos(φ), np.zeros(N)], axis=1)
-    return gradient + np.einsum("rkjc,j,kx->rcx", step, np.diff(sine), v, optimize=True)
+    step = radiance - np.roll(radiance, 1, axis=1)
+    gradient += np.einsum("rkjc,rkj,kx->rcx", step, moves, v, optimize=True)
+
+    # ----- The factors of each L_jk -----
+    factors = along_u[..., None] * u[:, None] + moves[..., None] * v[:, None]
+    factors -= np.roll(moves[..., None] * v[:, None], -1, axis=1)
+    return gradient, np.sqrt((factors**2).sum(axis=(1, 2, 3)))
 
 
 def _mean_over_sector(N: int) -> float:

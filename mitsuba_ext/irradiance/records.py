@@ -74,6 +74,15 @@ class Records:
     def __len__(self) -> int:
         return len(self.p)
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays by name, for a file."""
+        return dict(vars(self))
+
+    @classmethod
+    def of_arrays(cls, arrays: dict[str, np.ndarray]) -> Records:
+        """The records from :meth:`arrays`."""
+        return cls(**arrays)
+
     def joined(self, other: Records) -> Records:
         """These records and others."""
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
@@ -135,9 +144,12 @@ def made_of(
     least, most = (places.footprint * bound for bound in bounds)
     translation = np.einsum("rcx,rxy->rcy", found.translation, frames)
     rotation = np.einsum("rcx,rxy->rcy", found.rotation, frames)
-    # Irradiance changes by its own size over the distance E / |∇E|
+    # Noise lengthens gradients: what it may have made of nothing is left out
     slope = np.linalg.norm(translation, axis=2).max(axis=1)
-    changes = found.value.max(axis=1) / np.maximum(slope, 1e-30)
+    noise = np.minimum(found.slope_deviation / np.maximum(slope, 1e-30), 1)
+    translation *= (1 - noise**2)[:, None, None]
+    # Irradiance changes by its own size over the distance E / |∇E|
+    changes = found.value.max(axis=1) / np.maximum(slope * (1 - noise), 1e-30)
     reach = np.minimum(found.distance, changes)
     # A record that is used farther than its gradient allows has a smaller gradient
     # (G. Ward Larson, R. Shakespeare, *Rendering with Radiance*, 1998)
