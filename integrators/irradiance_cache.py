@@ -49,11 +49,11 @@ class IrradianceCache(WalkIntegrator):
      * - accuracy
        - |float|
        - *a* of Eq. 10.9: by how much of itself irradiance may change from a record to a place that
-         uses it, as far as distances and normals tell. Smaller is denser. (Default: 0.3)
+         uses it, as far as distances and normals tell. Smaller is denser. (Default: 0.4)
      * - min_spacing, max_spacing
        - |float|
        - The smallest and the largest radius in which a record is valid, in widths of a pixel at its
-         place. (Default: 3, 40)
+         place. (Default: 4.0, 60.0)
      * - gather_samples
        - |int|
        - About the number of paths from each record. (Default: 512)
@@ -61,7 +61,7 @@ class IrradianceCache(WalkIntegrator):
        - |float|
        - The largest share of a record's irradiance that one path may bring: what exceeds it is cut
          off. Otherwise rare bright paths (caustics) leave spots, as wide as records are valid. 1
-         cuts nothing off. (Default: 0.05)
+         cuts nothing off. (Default: 0.1)
      * - cache_file
        - |string|
        - A file in which records are kept. A render reads it if it exists, adds the records that its
@@ -108,8 +108,8 @@ class IrradianceCache(WalkIntegrator):
     :monosp:`moment` and :monosp:`aov`.
 
     Source: G. J. Ward, F. M. Rubinstein, R. D. Clear, *A Ray Tracing Solution for Diffuse
-    Interreflection*, SIGGRAPH 1988; G. J. Ward, P. S. Heckbert, *Irradiance Gradients*, Eurographics
-    Workshop on Rendering, 1992; J. Křivánek, K. Bouatouch, S. Pattanaik, J. Žára, *Making Radiance
+    Interreflection*, SIGGRAPH 1988; G. J. Ward, P. S. Heckbert, *Irradiance Gradients*,
+    Eurographics Workshop on Rendering, 1992; J. Křivánek, K. Bouatouch, S. Pattanaik, J. Žára, *Making Radiance
     and Irradiance Caching Practical: Adaptive Caching and Neighbor Clamping*, EGSR 2006; H. W.
     Jensen et al., *State of the Art in Monte Carlo Global Illumination*, SIGGRAPH course, 2004,
     section 10.4, Eqs. 10.6 to 10.9; D. Cline, PhD thesis, 2007, section 7.5.
@@ -133,13 +133,13 @@ class IrradianceCache(WalkIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.accuracy = self.parameter(props, "accuracy", 0.3, minimum=0.01, maximum=1.0)
-        self.min_spacing = self.parameter(props, "min_spacing", 3.0, minimum=0.1, maximum=1e6)
-        self.max_spacing = self.parameter(props, "max_spacing", 40.0, minimum=0.1, maximum=1e6)
+        self.accuracy = self.parameter(props, "accuracy", 0.4, minimum=0.01, maximum=1.0)
+        self.min_spacing = self.parameter(props, "min_spacing", 4.0, minimum=0.1, maximum=1e6)
+        self.max_spacing = self.parameter(props, "max_spacing", 60.0, minimum=0.1, maximum=1e6)
         self.gather_samples = self.parameter(
             props, "gather_samples", 512, minimum=4, maximum=1 << 16
         )
-        self.max_share = self.parameter(props, "max_share", 0.05, minimum=0.001, maximum=1.0)
+        self.max_share = self.parameter(props, "max_share", 0.1, minimum=0.001, maximum=1.0)
         self.cache_file = self.parameter(props, "cache_file", "")
         #: The records of the last render, and what each round of it did.
         self.records, self.rounds = Records.none(3), []

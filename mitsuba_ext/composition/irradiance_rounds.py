@@ -31,8 +31,9 @@ from ..transport.walk import Walk
 #: the share of uncovered pixels at which the last one ends.
 _FIRST_STRIDE, _FULL_ROUNDS, _FEW = 16, 5, 1e-3
 
-#: Records are valid this much farther in the image than where they are placed: more of them overlap,
-#: which smooths their noise. (cornell_box: 0.85 of the error of 1.0; 2.0 takes twice as long.)
+#: Records are valid this much farther in the image than where they are placed: more of them
+#: overlap, which smooths their noise. (cornell_box: 0.9 of the error of 1.0; 2.0 takes twice as
+#: long.)
 _OVERLAP = 1.3
 
 #: The side of the grid of film positions that measures how wide pixels are.

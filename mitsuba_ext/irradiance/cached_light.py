@@ -1,7 +1,7 @@
 """Camera paths that end at cached irradiance.
 
-Up to the first vertex at which a *diffuse lobe* is sampled, a camera path is one of ``path``. There,
-the cache tells the irradiance of indirect light. One more segment finds direct light, as in
+Up to the first vertex at which a *diffuse lobe* is sampled, a camera path is one of ``path``.
+There, the cache tells the irradiance of indirect light. One more segment finds direct light, as in
 ``path``; whatever it hits, the path ends there. Where no record is valid, the path goes on as one
 of ``path``.
 
@@ -126,8 +126,8 @@ class CachedLight(_AtDiffuseLobes):
 
 
 class FindsPlaces(_AtDiffuseLobes):
-    """Stores where camera paths ask the cache, and which of these places no record covers. It leaves
-    out what is seen by way of glossy lobes: such places are many, and all over the scene.
+    """Stores where camera paths ask the cache, and which of these places no record covers. What is
+    seen by way of glossy lobes is left out: such places are many, and all over the scene.
 
     Parameters:
         grid: Finds records.

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-
 #: Each time that outliers are cut off, the sum becomes smaller, of which they may hold a share.
 _CUTS = 8
 

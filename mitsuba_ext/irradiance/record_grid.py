@@ -9,8 +9,8 @@ import numpy as np
 from ..arrays import from_numpy
 from .records import Records
 
-#: The most levels of cells, and words of a packet, which a kernel reads at once. A record has two of
-#: place, reach, normal and level; then, for each channel, two of E and its gradients.
+#: The most levels of cells, and words of a packet, which a kernel reads at once. A record has two
+#: of place, reach, normal and level; then, for each channel, two of E and its gradients.
 _MOST_LEVELS, _PACKET = 24, 4
 
 #: How far a point may lie behind a record (in the direction of their mean normal), and how far from
