@@ -50,10 +50,13 @@ class IrradianceCache(WalkIntegrator):
        - |float|
        - *a* of Eq. 10.9: by how much of itself irradiance may change from a record to a place that
          uses it, as far as distances and normals tell. Smaller is denser. (Default: 0.4)
-     * - min_spacing, max_spacing
+     * - min_spacing
        - |float|
-       - The smallest and the largest radius in which a record is valid, in widths of a pixel at its
-         place. (Default: 4.0, 60.0)
+       - The smallest radius in which a record is valid, in widths of a pixel at its place. (Default:
+         4)
+     * - max_spacing
+       - |float|
+       - The largest one, likewise. (Default: 60)
      * - gather_samples
        - |int|
        - About the number of paths from each record. (Default: 512)
@@ -109,10 +112,10 @@ class IrradianceCache(WalkIntegrator):
 
     Source: G. J. Ward, F. M. Rubinstein, R. D. Clear, *A Ray Tracing Solution for Diffuse
     Interreflection*, SIGGRAPH 1988; G. J. Ward, P. S. Heckbert, *Irradiance Gradients*,
-    Eurographics Workshop on Rendering, 1992; J. Křivánek, K. Bouatouch, S. Pattanaik, J. Žára, *Making Radiance
-    and Irradiance Caching Practical: Adaptive Caching and Neighbor Clamping*, EGSR 2006; H. W.
-    Jensen et al., *State of the Art in Monte Carlo Global Illumination*, SIGGRAPH course, 2004,
-    section 10.4, Eqs. 10.6 to 10.9; D. Cline, PhD thesis, 2007, section 7.5.
+    Eurographics Workshop on Rendering, 1992; J. Křivánek, K. Bouatouch, S. Pattanaik, J. Žára,
+    *Making Radiance and Irradiance Caching Practical: Adaptive Caching and Neighbor Clamping*, EGSR
+    2006; H. W. Jensen et al., *State of the Art in Monte Carlo Global Illumination*, SIGGRAPH
+    course, 2004, section 10.4, Eqs. 10.6 to 10.9; D. Cline, PhD thesis, 2007, section 7.5.
 
     .. tabs::
         .. code-tab:: xml
