@@ -52,8 +52,8 @@ class IrradianceCache(WalkIntegrator):
          uses it, as far as distances and normals tell. Smaller is denser. (Default: 0.4)
      * - min_spacing
        - |float|
-       - The smallest radius in which a record is valid, in widths of a pixel at its place. (Default:
-         4)
+       - The smallest radius in which a record is valid, in widths of a pixel at its place.
+         (Default: 2)
      * - max_spacing
        - |float|
        - The largest one, likewise. (Default: 60)
@@ -137,7 +137,7 @@ class IrradianceCache(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.accuracy = self.parameter(props, "accuracy", 0.4, minimum=0.01, maximum=1.0)
-        self.min_spacing = self.parameter(props, "min_spacing", 4.0, minimum=0.1, maximum=1e6)
+        self.min_spacing = self.parameter(props, "min_spacing", 2.0, minimum=0.1, maximum=1e6)
         self.max_spacing = self.parameter(props, "max_spacing", 60.0, minimum=0.1, maximum=1e6)
         self.gather_samples = self.parameter(
             props, "gather_samples", 512, minimum=4, maximum=1 << 16
