@@ -20,6 +20,7 @@ from mitsuba_ext.irradiance.gathering import Gatherer
 from mitsuba_ext.irradiance.hemisphere import Strata
 from mitsuba_ext.irradiance.record_grid import RecordGrid
 from mitsuba_ext.irradiance.records import Records
+from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.emission import can_be_hit
@@ -60,6 +61,10 @@ class IrradianceCache(WalkIntegrator):
      * - gather_samples
        - |int|
        - About the number of paths from each record. (Default: 512)
+     * - effort
+       - |float|
+       - The most paths from records, in units of the samples of the image: a render of few samples
+         makes few records, and goes on as :monosp:`path` elsewhere. (Default: 4)
      * - max_share
        - |float|
        - The largest share of a record's irradiance that one path may bring: what exceeds it is cut
@@ -93,8 +98,8 @@ class IrradianceCache(WalkIntegrator):
     times the accuracy, or less where the gradient is steep. It is clamped by that of neighbours,
     and a record that mispredicts a neighbour does not reach it. The image then takes its samples:
     where a camera path samples a diffuse lobe, the records around tell the indirect light there.
-    Places that no record covers (a thousandth of the pixels, and what is seen in glossy
-    reflections) go on as in :monosp:`path`.
+    Places that no record covers (with enough samples, a thousandth of the pixels, and what is seen
+    in glossy reflections) go on as in :monosp:`path`.
 
     The image is biased with any number of samples: interpolation errs, and each record has noise
     that all pixels around it share. The error falls with :monosp:`accuracy` and
@@ -142,6 +147,7 @@ class IrradianceCache(WalkIntegrator):
         self.gather_samples = self.parameter(
             props, "gather_samples", 512, minimum=4, maximum=1 << 16
         )
+        self.effort = self.parameter(props, "effort", 4.0, minimum=0.0, maximum=1e6)
         self.max_share = self.parameter(props, "max_share", 0.1, minimum=0.001, maximum=1.0)
         self.cache_file = self.parameter(props, "cache_file", "")
         #: The records of the last render, and what each round of it did.
@@ -160,6 +166,7 @@ class IrradianceCache(WalkIntegrator):
             "min_spacing": self.min_spacing,
             "max_spacing": self.max_spacing,
             "gather_samples": self.gather_samples,
+            "effort": self.effort,
             "max_share": self.max_share,
             "cache_file": self.cache_file or "none",
             **super().parameters(),
@@ -177,7 +184,9 @@ class IrradianceCache(WalkIntegrator):
         return super().query(scene)
 
     def schedule(self, scene, sensor, samples, seed):
+        width, height = film_extent(sensor.film())
         self._begin, self._seed = time.perf_counter(), seed
+        self._samples = sum(samples) * width * height
         self.records, self.rounds = Records.none(len(mi.Spectrum())), []
         return super().schedule(scene, sensor, samples, seed)
 
@@ -202,12 +211,14 @@ class IrradianceCache(WalkIntegrator):
         inner = replace(
             walk, max_depth=depth, rr_depth=max(1, self.rr_depth - 1), hide_emitters=False
         )
+        strata = Strata.about(self.gather_samples)
         gatherer = Gatherer(
-            scene, inner, Strata.about(self.gather_samples), parameters.bounds,
+            scene, inner, strata, parameters.bounds,
             self.min_spacing, self.max_share, self._seed,
         )  # fmt: skip
         known = self._read(scene)
-        rounds = CacheRounds(scene, sensor, walk, gatherer, parameters, self._seed, known)
+        most = int(self.effort * self._samples / strata.count)
+        rounds = CacheRounds(scene, sensor, walk, gatherer, parameters, self._seed, known, most)
         rounds.run(deadline(0.5 * self.timeout, self._begin))
         self.records, self.rounds = rounds.records, rounds.rounds
         if self.cache_file and len(self.records) > len(known):

@@ -326,7 +326,8 @@ TECHNIQUES: dict[str, Technique] = {
     ),
     # ``test_irradiance_cache.py`` has means: it is biased
     "irradiance_cache": Technique(
-        "irradiance_cache", {"gather_samples": 64, "min_spacing": 0.5, "max_share": 1.0},
+        "irradiance_cache", {"gather_samples": 64, "min_spacing": 0.5, "max_share": 1.0,
+         "effort": 100.0},
         is_plugin=True, makes_splats=True,
         checks=Checks(cases=["no_light"]),
         thorough=Checks(

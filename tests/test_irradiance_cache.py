@@ -22,7 +22,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def make(max_depth: int = 6, **parameters: Any) -> mi.Integrator:
-    return mi.load_dict({"type": "irradiance_cache", "max_depth": max_depth, **parameters})
+    """As many records as the view needs, however few samples there are."""
+    parameters = {"max_depth": max_depth, "effort": 1e5, **parameters}
+    return mi.load_dict({"type": "irradiance_cache", **parameters})
 
 
 def things() -> dict[str, Any]:
@@ -222,6 +224,13 @@ def test_every_pixel_is_covered_after_the_rounds() -> None:
     assert last.asked > 2000 and last.uncovered < 0.01 * last.asked
     assert "records of irradiance" in cache.statistics.learned
     assert "biased" in cache.statistics.learned
+
+
+def test_a_render_of_few_samples_makes_few_records() -> None:
+    scene = mi.load_dict(stage(camera=sensor(film=film(32, 32))), optimize=False)
+    cache = make(3, gather_samples=64, effort=2.0)
+    mi.render(scene, integrator=cache, spp=1)
+    assert 0 < len(cache.records) <= 2 * 32 * 32 / 60
 
 
 def test_the_same_seed_gives_the_same_image() -> None:

@@ -54,7 +54,7 @@ VALUES = {
     "light_paths": 0.5,
     **dict.fromkeys(["photons", "lookup_size"], 16), "global_radius": 0.5, "caustic_radius": 0.5,
     **dict.fromkeys(["final_gather", "guided", "photon_aovs"], True),
-    "accuracy": 0.25, "max_share": 0.5, "gather_samples": 64, "cache_file": "cache.npz",
+    "accuracy": 0.25, "max_share": 0.5, "effort": 2.0, "gather_samples": 64, "cache_file": "cache.npz",
     "min_spacing": 2.0, "max_spacing": 8.0,
     "checkpoint": "kept", "checkpoint_every": "9s",
     "chain_file": "chains.npz", "mutations": "path", "outliers": 2.0, "p_large": 0.5,

@@ -85,6 +85,8 @@ class CacheRounds:
         gatherer: Makes the records.
         parameters: How many of them.
         seed: Seed of the render.
+        records: Those that exist.
+        most: The most records to make.
 
     Attributes:
         records: The records so far.
@@ -100,9 +102,10 @@ class CacheRounds:
         parameters: CacheParameters,
         seed: int,
         records: Records,
+        most: int,
     ) -> None:
         self._scene, self._sensor, self._gatherer = scene, sensor, gatherer
-        self._parameters, self._seed, self.records = parameters, seed, records
+        self._parameters, self._seed, self.records, self._left = parameters, seed, records, most
         self.rounds: list[Round] = []
         self._grid = RecordGrid(records, parameters.accuracy)
         self._walk = Walk(
@@ -115,11 +118,11 @@ class CacheRounds:
     def run(self, goes_on: Callable[[], bool]) -> None:
         """Runs the rounds, as long as ``goes_on`` says so."""
         stride = _FIRST_STRIDE
-        while stride > 1 and goes_on():
+        while stride > 1 and self._left and goes_on():
             self._round(stride)
             stride //= 2
         for _ in range(_FULL_ROUNDS):
-            if not goes_on():
+            if not goes_on() or not self._left:
                 return
             done = self._round(1)
             if done.uncovered <= _FEW * done.asked:
@@ -133,6 +136,11 @@ class CacheRounds:
         places, asked = self._uncovered(stride)
         p = self._parameters
         index = chosen(places, self.records, p.accuracy, p.bounds, len(self.rounds))
+        if len(index) > self._left:
+            # A random part of them
+            order = np.random.default_rng(len(self.rounds)).permutation(len(index))
+            index = np.sort(index[order[: self._left]])
+        self._left -= len(index)
         if len(index):
             made = self._gatherer.records(places[index])
             self.records = self.records.joined(made).adapted(p.accuracy)
