@@ -103,6 +103,7 @@ REGRESSIONS = {
         Regression("sppm", "pool", max_depth=8, spp=256, is_slow=True),
         Regression("auto", "water_glass", max_depth=8, spp=2048, is_slow=True),
         Regression("photon_map", "pool", max_depth=8, spp=64, is_slow=True),
+        Regression("irradiance_cache", "cornell_box", is_slow=True),
         Regression("pssmlt", "cornell_box", {"bidirectional": False, "chains": 1024}),
         Regression("erpt", "cornell_box", {"outliers": 2.0}),
         Regression("mlt", "cornell_box", {"chains": 1024}, is_slow=True),
