@@ -64,7 +64,7 @@ class IrradianceCache(WalkIntegrator):
      * - effort
        - |float|
        - The most paths from records, in units of the samples of the image: a render of few samples
-         makes few records, and goes on as :monosp:`path` elsewhere. (Default: 1)
+         makes few records, and goes on as :monosp:`path` elsewhere. (Default: 0.5)
      * - max_share
        - |float|
        - The largest share of a record's irradiance that one path may bring: what exceeds it is cut
@@ -147,7 +147,7 @@ class IrradianceCache(WalkIntegrator):
         self.gather_samples = self.parameter(
             props, "gather_samples", 512, minimum=4, maximum=1 << 16
         )
-        self.effort = self.parameter(props, "effort", 1.0, minimum=0.0, maximum=1e6)
+        self.effort = self.parameter(props, "effort", 0.5, minimum=0.0, maximum=1e6)
         self.max_share = self.parameter(props, "max_share", 0.1, minimum=0.001, maximum=1.0)
         self.cache_file = self.parameter(props, "cache_file", "")
         #: The records of the last render, and what each round of it did.
