@@ -55,7 +55,7 @@ PRECISION = 0.05
 TRIED = [
     name for name in TECHNIQUES
     if "paper" not in name and "floor" not in name
-    and name not in ("light_tracer", "photon_map", "vcm", "sppm")
+    and name not in ("light_tracer", "photon_map", "irradiance_cache", "vcm", "sppm")
 ]  # fmt: skip
 
 #: Results of a comparison: right; ``path`` cannot be the reference, or the technique refuses what

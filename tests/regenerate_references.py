@@ -105,6 +105,7 @@ REGRESSIONS = {
         Regression("auto", "water_glass", max_depth=8, spp=2048, is_slow=True),
         Regression("photon_map", "pool", max_depth=8, spp=64, is_slow=True),
         Regression("instant_radiosity", "door_ajar", max_depth=4),
+        Regression("irradiance_cache", "cornell_box", is_slow=True),
         Regression("pssmlt", "cornell_box", {"bidirectional": False, "chains": 1024}),
         Regression("erpt", "cornell_box", {"outliers": 2.0}),
         Regression("mlt", "cornell_box", {"chains": 1024}, is_slow=True),

@@ -331,6 +331,17 @@ TECHNIQUES: dict[str, Technique] = {
         thorough=Checks(
             ["cornell_box", "rooms"], ["llvm_ad_mono"], FURNACES, [2, -1],
             _LIGHT_PATHS,
+    # ``test_irradiance_cache.py`` has means: it is biased
+    "irradiance_cache": Technique(
+        "irradiance_cache", {"gather_samples": 64, "min_spacing": 0.5, "max_share": 1.0,
+         "effort": 100.0},
+        is_plugin=True, makes_splats=True,
+        checks=Checks(cases=["no_light"]),
+        thorough=Checks(
+            variants=["llvm_ad_mono"], furnaces=FURNACES[2:3],
+            cases=("plain", "delta_lights", "constant_environment", "film_of_one_pixel",
+                   "one_sample", "max_depth_0", "max_depth_unlimited", "thin_lens", "cropped_film",
+                   "hidden_emitters", "empty", "degenerate_light", "instances"),
         ),
     ),
     "light_tracer": Technique(

@@ -23,7 +23,7 @@ _ARRAYS = ("Float", "Float64", "UInt32", "UInt64", "Int32", "Bool")
 LEARNED = ("maps", "decisions", "learning")
 
 #: Estimators that are no walk from the camera.
-PATHS = ("bidirectional", "metropolis")
+PATHS = ("bidirectional", "irradiance", "metropolis")
 
 #: By room, what it imports nothing of.
 FORBIDDEN = {
@@ -33,7 +33,8 @@ FORBIDDEN = {
     "maps": {"decisions", "learning", *PATHS, "composition", "rendering", *PLUGINS},
     "decisions": {"learning", *PATHS, "composition", "rendering", *PLUGINS},
     "learning": {*PATHS, "composition", "rendering", *PLUGINS},
-    "bidirectional": {*LEARNED, "metropolis", "composition", "rendering", *PLUGINS},
+    "irradiance": {*LEARNED, "bidirectional", "metropolis", "composition", "rendering", *PLUGINS},
+    "bidirectional": {*LEARNED, "irradiance", "metropolis", "composition", "rendering", *PLUGINS},
     "metropolis/chains": {*LEARNED, "bidirectional", "composition", *PLUGINS},
     "metropolis/path_space": {*LEARNED, "metropolis/chains", "composition", *PLUGINS},
     "rendering": {*LEARNED, *PATHS, "composition", "long_renders", *PLUGINS},

@@ -26,7 +26,8 @@ DECISIONS = registry.decision_names()
 SEQUENCES = sorted(set(FOLDERS["samplers"]) - set(DECISIONS))
 #: The integrators that nest no other one.
 WALKS = [
-    "auto_path", "composed_path", "erpt", "instant_radiosity", "mlt", "neepp", "pss_guided",
+    "auto_path", "composed_path", "erpt", "instant_radiosity", "irradiance_cache", "mlt", "neepp",
+    "pss_guided",
     "photon_map", "pssmlt", "reweighted_direct", "sppm", "two_stage",
 ]
 
@@ -55,6 +56,8 @@ VALUES = {
     "choice": "clustered", "bound": 2.0, "compensation": False,
     **dict.fromkeys(["photons", "lookup_size"], 16), "global_radius": 0.5, "caustic_radius": 0.5,
     **dict.fromkeys(["final_gather", "guided", "photon_aovs"], True),
+    "accuracy": 0.25, "max_share": 0.5, "effort": 2.0, "gather_samples": 64,
+    "cache_file": "cache.npz", "min_spacing": 3.0, "max_spacing": 8.0,
     "checkpoint": "kept", "checkpoint_every": "9s",
     "chain_file": "chains.npz", "mutations": "path", "outliers": 2.0, "p_large": 0.5,
     **dict.fromkeys(["bidirectional_mutation", "lens_perturbation"], True),

@@ -331,6 +331,20 @@ class Subpaths:
         included, where the state of the path in participating media is ``inside``."""
         return 0.0
 
+    def beyond(
+        self,
+        vertex: Vertex,
+        bs: mi.BSDFSample3f,
+        β: mi.Spectrum,
+        sums: Any,
+        active: mi.Bool,
+    ) -> tuple[mi.Spectrum | float, Any]:
+        """The radiance that is known of the direction in which a path leaves ``vertex``, throughput
+        included, and the sums of MIS weights after it, which may exclude what is known from the
+        rest of the path. ``β`` is the throughput in that direction, ``sums`` are from
+        :meth:`Weights.leave`."""
+        return 0.0, sums
+
 
 class ShadowTest:
     """Whether the shadow ray of a connection is traced."""

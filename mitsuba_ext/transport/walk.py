@@ -223,14 +223,18 @@ class Walk:
             ray = self.query.starts.along(si, si.to_world(bs.wo))
             valid |= si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
             is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            β, sums = path.β * (bsdf_weight * directions_weight), self.mis.leave(vertex, bs)
+            if dr.hint(self.subpaths is not None, mode="scalar"):
+                stored, sums = self.subpaths.beyond(vertex, bs, β, sums, active_next)
+                L += stored
             onward = PathState(
-                β=path.β * (bsdf_weight * directions_weight),
+                β=β,
                 η=path.η * bs.eta,
                 sampling_weight=path.sampling_weight * (directions_weight * hero_count),
                 depth=path.depth + dr.select(si.is_valid(), mi.UInt32(1), 0),
                 arrival=Arrival(mi.Interaction3f(si), bs.pdf, is_delta),
                 hero_is_alone=hero_is_alone,
-                sums=self.mis.leave(vertex, bs),
+                sums=sums,
             )
             path = media.leave(vertex, bs, onward)
             active_next = media.is_within(path.depth, self.max_depth, active_next)

@@ -1,0 +1,261 @@
+"""Irradiance caching with gradients."""
+
+from __future__ import annotations
+
+import functools
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from mitsuba_ext.composition import learned_file
+from mitsuba_ext.composition.irradiance_rounds import CacheParameters, CacheRounds, deadline
+from mitsuba_ext.composition.slots import read_slot
+from mitsuba_ext.composition.staged_integrator import NO_LIMIT
+from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.irradiance.cached_light import CachedLight, CameraPhases, EndsAtTheCache
+from mitsuba_ext.irradiance.gathering import Gatherer
+from mitsuba_ext.irradiance.hemisphere import Strata
+from mitsuba_ext.irradiance.record_grid import RecordGrid
+from mitsuba_ext.irradiance.records import Records
+from mitsuba_ext.rendering.camera import film_extent
+from mitsuba_ext.scene.movers import movers
+from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.emission import can_be_hit
+from mitsuba_ext.transport.walk import Walk
+
+#: The parameters on which records depend.
+_OF_RECORDS = (
+    "max_depth", "rr_depth", "accuracy", "min_spacing", "max_spacing", "gather_samples",
+    "max_share",
+)  # fmt: skip
+
+
+@registry.plugin
+class IrradianceCache(WalkIntegrator):
+    r"""
+    .. _integrator-irradiance_cache:
+
+    Irradiance cache (:monosp:`irradiance_cache`)
+    ---------------------------------------------
+
+    Computes the irradiance of indirect light at a few places of diffuse surfaces, exactly and with
+    its gradients, and interpolates between them. Direct light, and all that is not diffuse, is
+    sampled as by :monosp:`path`.
+
+    .. pluginparameters::
+
+     * - accuracy
+       - |float|
+       - *a* of Eq. 10.9: by how much of itself irradiance may change from a record to a place that
+         uses it, as far as distances and normals tell. Smaller is denser. (Default: 0.4)
+     * - min_spacing
+       - |float|
+       - The smallest radius in which a record is valid, in widths of a pixel at its place.
+         (Default: 2)
+     * - max_spacing
+       - |float|
+       - The largest one, likewise. (Default: 60)
+     * - gather_samples
+       - |int|
+       - About the number of paths from each record. (Default: 512)
+     * - effort
+       - |float|
+       - The most paths from records, in units of the samples of the image: a render of few samples
+         makes few records, and goes on as :monosp:`path` elsewhere. (Default: 0.5)
+     * - max_share
+       - |float|
+       - The largest share of a record's irradiance that one path may bring: what exceeds it is cut
+         off. Otherwise rare bright paths (caustics) leave spots, as wide as records are valid. 1
+         cuts nothing off. (Default: 0.1)
+     * - cache_file
+       - |string|
+       - A file in which records are kept. A render reads it if it exists, adds the records that its
+         view needs, and writes it. It serves other cameras in the same scene with the same
+         parameters, such as the frames of an animation. (Default: none)
+     * - next_event, shadow_test
+       - |string| or decision
+       - How lights are chosen; see :class:`composed_path`. The paths from records use them too. If
+         they learn, pilot samples are those of :monosp:`path`.
+     * - (Common parameters)
+       - |several|
+       - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
+         checkpoint.
+
+    **Use it when** surfaces are mostly diffuse, indirect light makes the noise, and a smooth image
+    is wanted soon; for an animation of the camera, with :monosp:`cache_file`. **Not when** the
+    image must be right, surfaces are glossy, details are as small as pixels everywhere (plants,
+    hair: each needs records), or direct light makes the noise.
+
+    **How it works.** A *record* is a place with its irradiance, two gradients, and a radius. Camera
+    rays through a coarse grid of pixels, then finer ones, find places that no record covers. Of
+    these, some get a record, none close to another. Paths through the strata of the hemisphere make
+    it (Eqs. 10.6 and 10.7); they are those of :monosp:`path` in full length, and never ask the
+    cache, so that errors do not grow from bounce to bounce. Light that the first segment hits is
+    direct light, and not counted. The radius is the harmonic mean of the distances of what is seen,
+    times the accuracy, or less where the gradient is steep. It is clamped by that of neighbours,
+    and a record that mispredicts a neighbour does not reach it. The image then takes its samples:
+    where a camera path samples a diffuse lobe, the records around tell the indirect light there.
+    Places that no record covers (with enough samples, a thousandth of the pixels, and what is seen
+    in glossy reflections) go on as in :monosp:`path`.
+
+    The image is biased with any number of samples: interpolation errs, and each record has noise
+    that all pixels around it share. The error falls with :monosp:`accuracy` and
+    :monosp:`min_spacing`, and with more :monosp:`gather_samples`. Weights are 1 − ε/a, and not 1/ε
+    as in Eq. 10.9, which shows the noise of records; and records overlap by 1.3 times their radius.
+
+    Caustics are part of the irradiance, with the noise of :monosp:`path`, and blurred: use
+    :class:`vcm`. Normal and bump maps do not show in indirect light of diffuse lobes. Through
+    mirrors and glass, paths may be longer than :monosp:`max_depth` by the segments before the
+    diffuse surface. A :monosp:`timeout` leaves half of the time to the records.
+
+    Spectral variants, moving shapes and participating media are refused: records are shared by all
+    wavelengths and times. Gradients are not supported (use :class:`composed_prb`), nor nesting in
+    :monosp:`moment` and :monosp:`aov`.
+
+    Source: G. J. Ward, F. M. Rubinstein, R. D. Clear, *A Ray Tracing Solution for Diffuse
+    Interreflection*, SIGGRAPH 1988; G. J. Ward, P. S. Heckbert, *Irradiance Gradients*,
+    Eurographics Workshop on Rendering, 1992; J. Křivánek, K. Bouatouch, S. Pattanaik, J. Žára,
+    *Making Radiance and Irradiance Caching Practical: Adaptive Caching and Neighbor Clamping*, EGSR
+    2006; H. W. Jensen et al., *State of the Art in Monte Carlo Global Illumination*, SIGGRAPH
+    course, 2004, section 10.4, Eqs. 10.6 to 10.9; D. Cline, PhD thesis, 2007, section 7.5.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="irradiance_cache">
+                <float name="accuracy" value="0.2"/>
+                <string name="cache_file" value="flight.npz"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'irradiance_cache',
+            'accuracy': 0.2,
+            'cache_file': 'flight.npz'
+    """
+
+    sees_media = False
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.accuracy = self.parameter(props, "accuracy", 0.4, minimum=0.01, maximum=1.0)
+        self.min_spacing = self.parameter(props, "min_spacing", 2.0, minimum=0.1, maximum=1e6)
+        self.max_spacing = self.parameter(props, "max_spacing", 60.0, minimum=0.1, maximum=1e6)
+        self.gather_samples = self.parameter(
+            props, "gather_samples", 512, minimum=4, maximum=1 << 16
+        )
+        self.effort = self.parameter(props, "effort", 0.5, minimum=0.0, maximum=1e6)
+        self.max_share = self.parameter(props, "max_share", 0.1, minimum=0.001, maximum=1.0)
+        self.cache_file = self.parameter(props, "cache_file", "")
+        #: The records of the last render, and what each round of it did.
+        self.records, self.rounds = Records.none(3), []
+        if self.min_spacing > self.max_spacing:
+            raise ValueError(
+                f'"{self.name}": "min_spacing" is {self.min_spacing:g}, and "max_spacing" '
+                f"{self.max_spacing:g}: it must not be smaller"
+            )
+        slots = {key: read_slot(self.name, props, key) for key in ("next_event", "shadow_test")}
+        self.fill(props, **slots)
+
+    def parameters(self) -> dict[str, Any]:
+        return {
+            "accuracy": self.accuracy,
+            "min_spacing": self.min_spacing,
+            "max_spacing": self.max_spacing,
+            "gather_samples": self.gather_samples,
+            "effort": self.effort,
+            "max_share": self.max_share,
+            "cache_file": self.cache_file or "none",
+            **super().parameters(),
+        }
+
+    # ---- The render ----
+
+    def query(self, scene):
+        reason = "the variant is spectral" if mi.is_spectral else "shapes or lights move"
+        if mi.is_spectral or movers(scene):
+            raise NotImplementedError(
+                f'"{self.name}": {reason}: records are shared by all wavelengths and times; use '
+                f'"auto" or "photon_map"'
+            )
+        return super().query(scene)
+
+    def schedule(self, scene, sensor, samples, seed):
+        width, height = film_extent(sensor.film())
+        self._begin, self._seed = time.perf_counter(), seed
+        self._samples = sum(samples) * width * height
+        self.records, self.rounds = Records.none(len(mi.Spectrum())), []
+        return super().schedule(scene, sensor, samples, seed)
+
+    def estimators(self, scene, sensor):
+        return functools.partial(self._estimator, scene, sensor)
+
+    def _estimator(self, scene: mi.Scene, sensor: mi.Sensor, **decisions: Any) -> Walk:
+        walk = self.walk(**decisions)
+        # Pilots teach decisions that the paths of records then use
+        if "observer" in decisions or self.max_depth < 3 or not scene.emitters():
+            return walk
+        grid = self._cached(scene, sensor, walk)
+        return replace(
+            walk, rr_depth=0, roulette=EndsAtTheCache(self.rr_depth), mis=CameraPhases(),
+            subpaths=CachedLight(grid, self.max_depth, can_be_hit(scene)),
+        )  # fmt: skip
+
+    def _cached(self, scene: mi.Scene, sensor: mi.Sensor, walk: Walk) -> RecordGrid:
+        """Makes the records that the view needs."""
+        parameters = CacheParameters(self.accuracy, self.min_spacing, self.max_spacing)
+        depth = self.max_depth if self.max_depth == NO_LIMIT else self.max_depth - 1
+        inner = replace(
+            walk, max_depth=depth, rr_depth=max(1, self.rr_depth - 1), hide_emitters=False
+        )
+        strata = Strata.about(self.gather_samples)
+        gatherer = Gatherer(
+            scene, inner, strata, parameters.bounds,
+            self.min_spacing, self.max_share, self._seed,
+        )  # fmt: skip
+        known = self._read(scene)
+        most = int(self.effort * self._samples / strata.count)
+        rounds = CacheRounds(scene, sensor, walk, gatherer, parameters, self._seed, known, most)
+        rounds.run(deadline(0.5 * self.timeout, self._begin))
+        self.records, self.rounds = rounds.records, rounds.rounds
+        if self.cache_file and len(self.records) > len(known):
+            arrays = {"records": self.records.arrays()}
+            learned_file.save(Path(self.cache_file), scene, self._made_by(), arrays)
+        return rounds.final_grid()
+
+    def _read(self, scene: mi.Scene) -> Records:
+        if self.cache_file:
+            self.check_target("cache_file", self.cache_file)
+        if not self.cache_file or not Path(self.cache_file).exists():
+            return Records.none(len(mi.Spectrum()))
+        where = f'"{self.name}": the parameter "cache_file"'
+        states = learned_file.load(Path(self.cache_file), scene, self._made_by(), where)
+        return Records.of_arrays(states["records"])
+
+    def _made_by(self) -> str:
+        """The parameters on which records depend."""
+        shown = {**self.common_parameters(), **self.parameters()}
+        return ", ".join(f"{key} = {shown[key]}" for key in _OF_RECORDS) + f" ({mi.variant()})"
+
+    def render_once(self, scene, sensor, seed, spp, develop, evaluate):
+        image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
+        if self.rounds:
+            made, last = sum(r.made for r in self.rounds), self.rounds[-1]
+            told = (
+                f"{len(self.records)} records of irradiance ({made} new), "
+                f"{last.uncovered / max(1, last.asked):.2%} of the places uncovered before the "
+                f"last round; the image is biased"
+            )
+            learned = self.statistics.learned
+            self.statistics.learned = f"{learned}; {told}" if learned else told
+        return image
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        raise NotImplementedError(
+            f'"{self.name}": records are made before the render of a film: it cannot be nested in '
+            f'an integrator that asks for single samples, such as "moment" or "aov"; "variance" '
+            f'can hold it, and it has a parameter "aovs" of its own'
+        )

@@ -1,0 +1,1 @@
+"""Irradiance that is computed at a few places, and interpolated between them."""
