@@ -41,9 +41,9 @@ class LightweightMesh(mi.Mesh):
 
     **Use it when** a scene does not fit into memory: scans, displaced surfaces, terrain. For a
     regular grid of heights, :monosp:`heightfield` takes far less.
-    **Not when** it fits: all rays that meet the box of the mesh take longer. Compared with Embree, in
-    a mesh of a million triangles, camera rays take 4 times as long, rays in all directions 3 times,
-    shadow rays 2.3 times; more in a mesh of large triangles beside small ones
+    **Not when** it fits: all rays that meet the box of the mesh take longer. Compared with Embree,
+    in a mesh of a million triangles, camera rays take 4 times as long, rays in all directions 3
+    times, shadow rays 2.5 times; more in a mesh of large triangles beside small ones
     (``docs/results/lightweight.md``). Each lightweight mesh has a structure of its own and adds to
     the time in which kernels are compiled: use it for a few large meshes, and not for many small
     ones.

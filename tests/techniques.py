@@ -331,6 +331,8 @@ TECHNIQUES: dict[str, Technique] = {
         thorough=Checks(
             ["cornell_box", "rooms"], ["llvm_ad_mono"], FURNACES, [2, -1],
             _LIGHT_PATHS,
+        ),
+    ),
     # ``test_irradiance_cache.py`` has means: it is biased
     "irradiance_cache": Technique(
         "irradiance_cache", {"gather_samples": 64, "min_spacing": 0.5, "max_share": 1.0,

@@ -27,8 +27,7 @@ SEQUENCES = sorted(set(FOLDERS["samplers"]) - set(DECISIONS))
 #: The integrators that nest no other one.
 WALKS = [
     "auto_path", "composed_path", "erpt", "instant_radiosity", "irradiance_cache", "mlt", "neepp",
-    "pss_guided",
-    "photon_map", "pssmlt", "reweighted_direct", "sppm", "two_stage",
+    "photon_map", "pss_guided", "pssmlt", "reweighted_direct", "sppm", "two_stage",
 ]
 
 #: A value that each parameter accepts, besides the words that its row begins with.
