@@ -64,6 +64,8 @@ PLUGINS = {
     "vcm": Pair("pool", {"type": "vcm"}),
     "sppm": Pair("volume_caustic", {"type": "sppm"}),
     "photon_map": Pair("caustic", {"type": "photon_map"}),
+    "instant_radiosity": Pair("door_ajar", {"type": "instant_radiosity"}),
+    "irradiance_cache": Pair("window", {"type": "irradiance_cache"}),
     "light_tracer": Pair("ring", {"type": "light_tracer"}),
     "erpt": Pair("pool", {"type": "erpt"}),
     "pssmlt": Pair("pool", {"type": "pssmlt"}),

@@ -69,8 +69,8 @@ class Heightfield(mi.Mesh):
     a grid of 4000 x 4000 cells is ready in half a second.
     **Not when** it is small and there are many: each heightfield adds to the time in which kernels
     are compiled. **Not for lights:** an area light on it is refused. Compared with Embree and a
-    mesh of the same triangles, in a grid of 1000 x 1000 cells, camera rays took 1 to 1.4 times as
-    long, rays in all directions 1.2 to 1.7 times, and rays straight down a third.
+    mesh of the same triangles, in a grid of 1000 x 1000 cells, camera rays take 1.2 to 1.6 times as
+    long, and rays in all directions 1.3 to 1.5 times (``docs/results/lightweight.md``).
 
     Texture coordinates are those of :monosp:`rectangle`, on which Mitsuba shows an image upside
     down: its first row is at y = −1. A :monosp:`bitmap` texture of the same image shows the same
