@@ -41,8 +41,8 @@ class IrradianceCache(WalkIntegrator):
     Irradiance cache (:monosp:`irradiance_cache`)
     ---------------------------------------------
 
-    Computes the irradiance of indirect light at a few places of diffuse surfaces, exactly and with
-    its gradients, and interpolates between them. Direct light, and all that is not diffuse, is
+    Computes the irradiance of indirect light at a few places of diffuse surfaces, with many paths
+    each, and its gradients, and interpolates between them. Direct light, and all that is not diffuse, is
     sampled as by :monosp:`path`.
 
     .. pluginparameters::
