@@ -91,7 +91,7 @@ def test_image_and_output_variables_are_those_of_the_mesh(
     "integrator", ["bdpt", "neepp", *(pytest.param(name, marks=pytest.mark.slow) for name in (
         "auto", "auto_path", "light_tracer", "vcm", "sppm", "mlt", "pssmlt", "erpt", "swarm_path",
         "adaptive", "ecoc_dof", "photon_map", "pss_guided", "two_stage",
-        "instant_radiosity"))]
+        "instant_radiosity", "irradiance_cache"))]
 )  # fmt: skip
 def test_integrators_see_it(tmp_path, integrator: str) -> None:
     ring = _ply(tmp_path)
