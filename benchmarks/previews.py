@@ -1,4 +1,4 @@
-"""Renders the pictures of scenes/README.md (20 minutes): ``python benchmarks/previews.py``.
+"""Renders the pictures of scenes/README.md (15 minutes): ``python benchmarks/previews.py``.
 
 They are denoised. All have the same curve: a pixel of the 98th percentile is nearly white.
 """

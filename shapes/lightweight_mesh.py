@@ -22,8 +22,7 @@ class LightweightMesh(mi.Mesh):
     -----------------------------------------------
 
     Finds the triangles of the mesh that is nested in it by an acceleration structure of 2.7 bytes
-    for each triangle. That of Embree, in Mitsuba, has about 70, and twice as many while it is
-    built.
+    for each triangle. That of Embree, in Mitsuba, has about 70, and 110 while it is built.
 
     .. pluginparameters::
 
@@ -36,8 +35,9 @@ class LightweightMesh(mi.Mesh):
        - |bool|
        - Whether corners are rounded to 65536 steps along each axis of the mesh's box, normals to
          steps of a few thousandths of a degree, and texture coordinates to 65536 steps between
-         their smallest and their largest value. The mesh then takes 9 to 15 bytes for each
-         triangle in all; else 21 to 31, as Mitsuba stores it. (Default: false)
+         their smallest and their largest value. The mesh then takes 12 to 16 bytes for each
+         triangle in all, more where vertices are shared by few triangles; else 21 to 31, as Mitsuba
+         stores it. (Default: false)
 
     **Use it when** a scene does not fit into memory: scans, displaced surfaces, terrain. For a
     regular grid of heights, :monosp:`heightfield` takes far less.

@@ -1,6 +1,7 @@
-"""Bounding volume hierarchies without pointers [1], for scenes that do not fit into memory with the
+"""Bounding volume hierarchies without pointers, for scenes that do not fit into memory with the
 hierarchies of Embree or OptiX.
 
-[1] Cline, Steele, Egbert. Lightweight Bounding Volumes for Ray Tracing. Journal of Graphics Tools
-11(4), 2007; Cline. PhD dissertation, Brigham Young University, 2007, chapter 3.
+Source: D. Cline, PhD dissertation, Brigham Young University, 2007, chapter 3; also D. Cline, K.
+Steele, P. Egbert, *Lightweight Bounding Volumes for Ray Tracing*, Journal of Graphics Tools 11(4),
+2007.
 """

@@ -1,5 +1,5 @@
 """The shape of the tree: essentially complete, with four children for each node, and indexed like
-a heap, so that neither nodes nor leaves need pointers ([1], section 3.3.1).
+a heap, so that neither nodes nor leaves need pointers (Cline 2007, section 3.3.1).
 
 Node ``q`` has the children ``4q + 1`` to ``4q + 4``. Leaves follow the last inner node. They hold
 four triangles each, in the order of their indices; the last ones hold fewer or none.
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Children of a node, and triangles of a leaf ([1], section 3.4.3).
+#: Children of a node, and triangles of a leaf (Cline 2007, section 3.4.3).
 ARITY, LEAF_SIZE = 4, 4
 
 

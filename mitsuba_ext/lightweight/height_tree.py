@@ -1,10 +1,10 @@
-"""The tree of a grid of heights: a quadtree with ranges of heights ([1], section 3.3.3).
+"""The tree of a grid of heights: a quadtree with ranges of heights (Cline 2007, section 3.3.3).
 
 Where a node lies in the grid follows from its number. A leaf is a block of 2 x 2 cells, with eight
 triangles. An inner node holds the ranges of its four children in 16 bytes: all levels together take
 1.33 bytes for each cell of the grid.
 
-Unlike in [1], the grid may have any size. The nodes of a level are a grid of their own, and
+Unlike there, the grid may have any size. The nodes of a level are a grid of their own, and
 children outside of the heights have an empty range.
 """
 
