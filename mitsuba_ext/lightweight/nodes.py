@@ -1,11 +1,11 @@
 """The nodes of the tree: the boxes of four children in 32 bytes.
 
-Cline 2007 stores boxes as bytes or shorts relative to the box of the mesh. Bytes are too coarse for meshes
-of more than a few thousand triangles, and shorts take twice as much memory. Here, bytes are
-relative to the node itself: its lower corner is a point of a grid over the mesh, with 16 bits for
-each coordinate, and the unit of its bytes is a power of two of the grid's, for each axis (as
-in [1]). All that is exact in single precision. A mesh with four triangles in a leaf needs 2.67 bytes
-of nodes for each triangle, where shorts need 4, and boxes have nearly the tightness of floats.
+Cline 2007 stores boxes as bytes or shorts relative to the box of the mesh. Bytes are too coarse for
+meshes of more than a few thousand triangles, and shorts take twice the memory of bytes. Here, bytes
+are relative to the node itself. Its lower corner is a point of a grid over the mesh, with 16 bits
+for each coordinate. The unit of its bytes is a power of two of the grid's, for each axis (as in
+[1]). All that is exact in single precision. With four triangles in a leaf, nodes take 2.67 bytes
+for each triangle, where shorts take 4, and boxes are nearly as tight as floats.
 
 [1] Ylitie, Karras, Laine. Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs.
 HPG 2017.
