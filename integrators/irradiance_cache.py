@@ -41,9 +41,9 @@ class IrradianceCache(WalkIntegrator):
     Irradiance cache (:monosp:`irradiance_cache`)
     ---------------------------------------------
 
-    Computes the irradiance of indirect light at a few places of diffuse surfaces, with many paths
-    each, and its gradients, and interpolates between them. Direct light, and all that is not diffuse, is
-    sampled as by :monosp:`path`.
+    Computes the irradiance of indirect light and its gradients at a few places of diffuse surfaces,
+    with many paths each, and interpolates between them. Direct light, and all that is not diffuse,
+    is sampled as by :monosp:`path`.
 
     .. pluginparameters::
 

@@ -1,4 +1,5 @@
-"""Traverses a tree: nearer children first, with the others on a stack (Cline 2007, section 3.3.4)."""
+"""Traverses a tree: nearer children first, with the others on a stack (Cline 2007, section
+3.3.4)."""
 
 from __future__ import annotations
 
