@@ -126,6 +126,20 @@ def test_mesh_that_emits_light_gives_the_light_of_the_mesh(integrator: str) -> N
     assert_same_mean(*images)
 
 
+def test_light_is_sampled_by_area_though_its_triangles_are_sorted() -> None:
+    x = np.arange(9.0)[:, None, None] * [1.0, 0, 0]
+    edges = np.arange(1, 10.0)[:, None, None] ** 2 * [[0, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]
+    corners = (x[::-1] + edges).reshape(-1, 3)
+    lamp = mesh(corners.tolist(), np.arange(27).reshape(-1, 3).tolist(), emitter=area(1.0))
+    shape = mi.load_dict(_around(lamp)).lightweight.surface
+    count = 40_000
+    sample = np.random.default_rng(2).random((2, count)).astype(np.float32)
+    p = np.array(shape.sample_position(0, mi.Point2f(sample)).p)
+    found = np.bincount(np.rint(8 - p[0]).astype(int), minlength=9) / count
+    areas = np.arange(1, 10.0) ** 4
+    assert np.allclose(found, areas / areas.sum(), atol=0.01)
+
+
 def test_attributes_keep_their_vertices_and_faces() -> None:
     def coloured(name: str, per: int) -> mi.Mesh:
         texture = {"type": "mesh_attribute", "name": name}
