@@ -1,132 +1,170 @@
-"""Distributes triangles among the leaves of the tree (Cline 2007, section 3.3.2).
+"""Builds the tree over the triangles of a mesh: a top tree over treelets (Cline 2007, sections
+3.3.2 and 3.4.2).
 
-Each node is split twice in two. The counts of both halves are given by the shape of the tree; the
-axis along which the triangles are separated is free. The source takes the longest one. Here, each
-node takes the one with the smallest expected cost, by the surface areas of the halves. Rays take
-0.93 of the time in a ball of even triangles, and 0.43 in a kitchen.
+Treelets are heaps. Each of their nodes is split twice in two. The counts of both halves are given
+by the shape of the heap; the axis along which the triangles are separated is free. The source takes
+the longest one. Here, each node takes the one with the smallest expected cost, by the surface areas
+of the halves.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 
-from .heap import Heap
+from .boxes import area, around
+from .division import divide
+from .heap import ARITY, LEAF_SIZE, Heap
+from .sorting import separated
+from .top import Top
 
-#: How many triangles of a node decide on its axis.
-_SAMPLE = 256
+#: How many triangles a thread sorts at a time.
+_CHUNK = 1 << 16
 
-#: How many triangles a thread splits at a time.
-_CHUNK = 1 << 17
+#: Bits of the number of a treelet's inner nodes; nodes of the top tree have ``TOP``.
+INNER_BITS = 5
+TOP = (1 << INNER_BITS) - 1
 
-_LOW = np.uint64(0xFFFFFFFF)
+#: The box of no triangle.
+_EMPTY = np.array([np.inf] * 3 + [-np.inf] * 3, dtype=np.float32)[:, None, None]
 
 
-def distribute(boxes: np.ndarray, heap: Heap) -> np.ndarray:
-    """Sorts the triangles into the tree.
+@dataclass
+class Hierarchy:
+    """A tree over triangles.
+
+    Attributes:
+        children: The boxes of the four children of each inner node, lower and upper corners as
+            rows; empty ones are upside down. Shape (6, nodes, 4), float32.
+        headers: For each treelet, its first inner node, times 32, plus their number; and its first
+            leaf. For each node of the top tree, the node, times 32, plus ``TOP``; and the number of
+            its first child. Shape (numbers, 2), uint32.
+        order: The triangles, sorted by treelets and leaves. Shape (triangles,), uint32.
+        stack_size: How many children wait at most while a ray traverses the tree.
+    """
+
+    children: np.ndarray
+    headers: np.ndarray
+    order: np.ndarray
+    stack_size: int
+
+
+def build(boxes: np.ndarray) -> Hierarchy:
+    """Builds the tree.
 
     Parameters:
         boxes: Lower and upper corners of the triangles' boxes, as rows. Shape (6, triangles),
-            float32. They are sorted along.
-
-    Returns:
-        The triangles from left to right. Shape (triangles,), uint32.
+            float32. They are sorted from left to right.
     """
     order = np.arange(boxes.shape[1], dtype=np.uint32)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for level in heap.levels:
-            for splits in _splits(heap, level):
-                list(pool.map(lambda split: _apply(boxes, order, *split), splits))
-    return order
+        division = divide(boxes, order, pool)
+        of_parts = division.boxes(boxes)
+        top = Top(division, of_parts)
+        size, start = division.size[top.parts], division.start[top.parts]
+        is_treelet = top.first < 0
+        sizes, kind = np.unique(size[is_treelet], return_inverse=True)
+        heaps = [Heap(int(n)) for n in sizes]
+        inner = np.ones(len(size), dtype=np.int64)
+        inner[is_treelet] = np.array([heap.inner for heap in heaps])[kind]
+        node = np.cumsum(inner) - inner
+        # At least one, so that there is something to read from
+        children = np.zeros((6, max(1, int(inner.sum())), ARITY), dtype=np.float32)
+        children[:, node[~is_treelet]] = np.where(
+            top.children >= 0, of_parts[:, top.children], _EMPTY
+        )
+        treelets = np.flatnonzero(is_treelet)
+
+        def sort(task: tuple[Heap, np.ndarray]) -> None:
+            heap, chosen = task
+            _sort_treelets(boxes, order, children, heap, start[chosen], node[chosen])
+
+        list(pool.map(sort, [
+            (heap, chosen[k : k + step])
+            for i, heap in enumerate(heaps)
+            for chosen in [treelets[kind == i]]
+            for step in [max(1, _CHUNK // int(heap.counts[0]))]
+            for k in range(0, len(chosen), step)
+        ]))  # fmt: skip
+    first = np.where(is_treelet, start // LEAF_SIZE, top.first)
+    headers = np.stack([node << INNER_BITS | np.where(is_treelet, inner, TOP), first], axis=1)
+    levels = np.zeros(len(size), dtype=np.int64)
+    levels[is_treelet] = np.array([len(heap.levels) for heap in heaps])[kind]
+    stack_size = max(1, int((top.waiting + (ARITY - 1) * levels).max()))
+    return Hierarchy(children, headers.astype(np.uint32), order, stack_size)
 
 
-def _splits(heap: Heap, level: range) -> Iterator[list[tuple[int, int, int, int]]]:
-    """The two rounds of splits of a level: for each split, the first triangle, the number of
-    equal nodes, their size, and the size of their left halves."""
-    runs = heap.runs(level)
-    yield [
-        split
-        for run in runs
-        for split in _chunks(run.start, run.nodes, sum(run.children), sum(run.children[:2]))
-    ]
-    second = []
-    for run in runs:
-        a, b, c, d = run.children
-        if (a, b) == (c, d):
-            second += _chunks(run.start, 2 * run.nodes, a + b, a)
-        else:  # This node is alone in its run
-            second += [(run.start, 1, a + b, a), (run.start + a + b, 1, c + d, c)]
-    yield second
+def _sort_treelets(
+    boxes: np.ndarray, order: np.ndarray, children: np.ndarray, heap: Heap,
+    start: np.ndarray, node: np.ndarray,
+) -> None:  # fmt: skip
+    """Sorts the triangles of treelets of one size, and writes the boxes of their nodes.
+
+    Parameters:
+        start: The first triangles of the treelets.
+        node: Their first inner nodes.
+    """
+    places = start[:, None] + np.arange(heap.counts[0])
+    mine, triangles = boxes[:, places], order[places]
+    for level in heap.levels:
+        for run in heap.runs(level):
+            a, b, c, d = run.children
+            _separate(mine, triangles, run.start, run.nodes, a + b + c + d, a + b)
+            if (a, b) == (c, d):
+                _separate(mine, triangles, run.start, 2 * run.nodes, a + b, a)
+            else:  # This node is alone in its run
+                _separate(mine, triangles, run.start, 1, a + b, a)
+                _separate(mine, triangles, run.start + a + b, 1, c + d, c)
+    order[places] = heap.by_leaf(triangles)
+    if heap.inner:
+        of_nodes = _boxes_of_nodes(mine, heap)
+        nodes = node[:, None] + np.arange(heap.inner)
+        children[:, nodes] = of_nodes[:, :, 1:].reshape(6, len(start), heap.inner, ARITY)
 
 
-def _chunks(start: int, nodes: int, size: int, left: int) -> Iterator[tuple[int, int, int, int]]:
-    step = max(1, _CHUNK // max(size, 1))
-    for first in range(0, nodes, step):
-        yield start + first * size, min(step, nodes - first), size, left
-
-
-def _apply(boxes: np.ndarray, order: np.ndarray, start: int, nodes: int, size: int, left: int):
+def _separate(
+    boxes: np.ndarray, order: np.ndarray, start: int, nodes: int, size: int, left: int
+) -> None:
+    """Splits neighbouring nodes of equal size in each treelet."""
     if not 0 < left < size:
         return
     part = slice(start, start + nodes * size)
-    by_centre = _separated(_centres(boxes[:, part].reshape(6, nodes, size), left), left)
-    for row in (*boxes, order):
-        row[part] = row[part][by_centre]
+    mine = boxes[:, :, part].reshape(6, -1, size)
+    by_centre = separated(_centres(mine, left), left)
+    boxes[:, :, part] = mine.reshape(6, -1)[:, by_centre].reshape(6, len(order), -1)
+    order[:, part] = order[:, part].ravel()[by_centre].reshape(len(order), -1)
 
 
 def _centres(boxes: np.ndarray, left: int) -> np.ndarray:
     """Twice the centres along the axis of each node. Shape (nodes, size)."""
-    axis = _axes(boxes, left)
-    if len(axis) == 1:
-        return boxes[axis[0]] + boxes[3 + axis[0]]
-    centres = np.empty(boxes.shape[1:], dtype=np.float32)
-    for k in range(3):
-        chosen = axis == k
-        centres[chosen] = boxes[k][chosen] + boxes[3 + k][chosen]
-    return centres
+    costs = np.empty((3, boxes.shape[1]), dtype=np.float32)
+    with np.errstate(over="ignore"):  # huge meshes
+        for k in range(3):
+            by_centre = separated(boxes[k] + boxes[3 + k], left)
+            halves = boxes.reshape(6, -1)[:, by_centre].reshape(boxes.shape)
+            costs[k] = left * area(around(halves[:, :, :left]))
+            costs[k] += (boxes.shape[2] - left) * area(around(halves[:, :, left:]))
+    axis, rows = costs.argmin(axis=0), np.arange(boxes.shape[1])
+    return boxes[axis, rows] + boxes[3 + axis, rows]
 
 
-def _axes(boxes: np.ndarray, left: int) -> np.ndarray:
-    """The axis along which each node is split. Shape (nodes,)."""
-    size = boxes.shape[2]
-    boxes = boxes[:, :, :: -(-size // _SAMPLE)]
-    nodes, sample = boxes.shape[1:]
-    if sample < 2:
-        return np.zeros(nodes, dtype=int)
-    left = min(max(1, round(left * sample / size)), sample - 1)
-    costs = np.empty((3, nodes), dtype=np.float32)
-    for k in range(3):
-        by_centre = _separated(boxes[k] + boxes[3 + k], left)
-        halves = boxes.reshape(6, -1)[:, by_centre].reshape(boxes.shape)
-        costs[k] = left * _area(halves[:, :, :left])
-        costs[k] += (sample - left) * _area(halves[:, :, left:])
-    return costs.argmin(axis=0)
-
-
-def _area(boxes: np.ndarray) -> np.ndarray:
-    """Half the surface of the boxes around all triangles of each node."""
-    x, y, z = boxes[3:].max(axis=2) - boxes[:3].min(axis=2)
-    return x * y + y * z + z * x
-
-
-def _separated(values: np.ndarray, left: int) -> np.ndarray:
-    """The order, over all rows, in which each row begins with its ``left`` smallest values.
+def _boxes_of_nodes(boxes: np.ndarray, heap: Heap) -> np.ndarray:
+    """The boxes of the nodes of treelets. Shape (6, treelets, nodes).
 
     Parameters:
-        values: Shape (rows, size), float32. Overwritten.
+        boxes: Those of their triangles from left to right. Shape (6, treelets, triangles).
     """
-    rows, size = values.shape
-    # Integers that sort as the values do, with their places in the lower half
-    bits = values.view(np.uint32)
-    bits ^= (bits.view(np.int32) >> 31).view(np.uint32) | np.uint32(1 << 31)
-    keys = bits.astype(np.uint64)
-    del values, bits  # for one node with all triangles, this is much
-    keys <<= np.uint64(32)
-    keys |= np.arange(size, dtype=np.uint32)
-    keys.partition(left, axis=1)
-    keys &= _LOW
-    keys += np.arange(rows, dtype=np.uint64)[:, None] * np.uint64(size)
-    return keys.ravel().view(np.int64)
+    result = np.empty((*boxes.shape[:2], len(heap.counts)), dtype=np.float32)
+    result[:3], result[3:] = np.inf, -np.inf
+    leaves = heap.leaves_from_left()
+    leaves = leaves[heap.counts[leaves] > 0]
+    starts = np.concatenate([[0], np.cumsum(heap.counts[leaves[:-1]])])
+    for rows, union in ((slice(0, 3), np.minimum), (slice(3, 6), np.maximum)):
+        result[rows, :, leaves] = union.reduceat(boxes[rows], starts, axis=2)
+    for level in reversed(heap.levels):
+        below = result[:, :, ARITY * level.start + 1 : ARITY * level.stop + 1]
+        result[:, :, level.start : level.stop] = around(below.reshape(*below.shape[:2], -1, ARITY))
+    return result

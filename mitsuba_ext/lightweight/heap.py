@@ -1,5 +1,5 @@
-"""The shape of the tree: essentially complete, with four children for each node, and indexed like
-a heap, so that neither nodes nor leaves need pointers (Cline 2007, section 3.3.1).
+"""The shape of a treelet: an essentially complete tree with four children for each node, indexed
+like a heap, so that neither nodes nor leaves need pointers (Cline 2007, section 3.3.1).
 
 Node ``q`` has the children ``4q + 1`` to ``4q + 4``. Leaves follow the last inner node. They hold
 four triangles each, in the order of their indices; the last ones hold fewer or none.
@@ -86,12 +86,20 @@ class Heap:
         """Sorts triangles by the indices of their leaves.
 
         Parameters:
-            triangles: Something for each triangle, from left to right.
+            triangles: Something for each triangle, from left to right. Shape (…, triangles).
         """
         on_bottom = int(self.counts[self._bottom :].sum())
-        return np.concatenate([triangles[on_bottom:], triangles[:on_bottom]])
+        return np.concatenate([triangles[..., on_bottom:], triangles[..., :on_bottom]], axis=-1)
 
     @property
     def _bottom(self) -> int:
         """The first leaf of the bottom row."""
-        return max(ARITY * self.levels[-1].start + 1, self.inner)
+        return max(ARITY * self.levels[-1].start + 1, self.inner) if self.levels else 0
+
+
+#: The largest treelet: the source proposes "a few thousand triangles" (section 3.4.2). Smaller ones
+#: let more splits follow the triangles, and take more memory: 64 triangles take 3.7 bytes for each.
+CAPACITY = 256
+
+#: Bits of the index of a node in its treelet.
+HEAP_BITS = int(len(Heap(CAPACITY).counts) - 1).bit_length()

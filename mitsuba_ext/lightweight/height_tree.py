@@ -168,7 +168,7 @@ class _Rays:
 class _RaysInTree:
     """Rays that traverse a tree."""
 
-    root = 0
+    root, stack_size = 0, 3 * _BITS
 
     def __init__(self, tree: HeightTree, ray: mi.Ray3f) -> None:
         self._tree, self._rays = tree, _Rays(ray)
@@ -180,12 +180,7 @@ class _RaysInTree:
     def is_leaf(self, node):
         return node >= self._tree.depth * _DEPTH
 
-    def child(self, node, number):
-        # Twice x and y
-        position = node & (_DEPTH - 1)
-        return (node - position + _DEPTH) | position << 1 | number & 1 | number >> 1 << _BITS
-
-    def distances(self, node, maxt):
+    def children(self, node, maxt):
         depth, x, y = node >> 2 * _BITS, node & _MASK, node >> _BITS & _MASK
         width, start = dr.gather(mi.Array2u, self._tree.levels, depth)
         ranges = dr.gather(mi.Array4u, self._tree.nodes, dr.fma(y, width, x + start))
@@ -194,7 +189,7 @@ class _RaysInTree:
         columns, rows = self._sides(0, x, size), self._sides(1, y, size)
         is_down = self._rays.inverse.z < 0
         start_z, end_z = self._bottom - self._error.z, self._bottom + self._error.z
-        results = []
+        boxes = []
         for c, word in enumerate(ranges):
             low, high = word & _RANGE, word >> 16
             near = mi.Float(mi.Int32(dr.select(is_down, high, low)))
@@ -204,8 +199,10 @@ class _RaysInTree:
             enter = dr.maximum(dr.maximum(near_x, near_y), dr.maximum(near, 0))
             leave = dr.minimum(dr.minimum(far_x, far_y), dr.minimum(far, maxt))
             # An empty range is upside down
-            results.append((enter, (enter <= leave) & (low <= high)))
-        return results
+            boxes.append((enter, (enter <= leave) & (low <= high)))
+        # Twice x and y
+        first = (depth + 1) * _DEPTH | (node & (_DEPTH - 1)) << 1
+        return boxes, lambda c: first | c & 1 | c >> 1 << _BITS
 
     def _sides(self, k: int, node: mi.UInt32, size: mi.Float) -> list[tuple[mi.Float, mi.Float]]:
         """Where rays enter and leave the first and the second child of a node, along an axis."""

@@ -9,15 +9,21 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import from_numpy
-from .building import distribute
-from .heap import ARITY, LEAF_SIZE, Heap
-from .nodes import MIN_EXPONENT, RANGE, WORDS, Grid, boxes_of_nodes, encode
+from .building import INNER_BITS, TOP, build
+from .heap import ARITY, HEAP_BITS, LEAF_SIZE
+from .nodes import MIN_EXPONENT, RANGE, WORDS, Grid, encode
 from .slabs import ERROR, with_inverse
 from .traversal import NONE, Hit, traverse
 from .triangles import Projection
 
 #: How many triangles are read at a time.
 _CHUNK = 1 << 18
+
+#: The number of the first leaf.
+LEAF = 1 << 31
+
+#: Stacks have a multiple of this size.
+_STACK_STEP = 48
 
 
 class Corners(Protocol):
@@ -57,21 +63,25 @@ class MeshTree:
             (triangles,), uint32.
         grid (Grid): The space in which boxes are stored.
         nbytes (int): The memory of the nodes.
+        stack_size (int): How many nodes the stack of a traversal holds.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        heap = Heap(len(faces))
         boxes = _boxes(vertices, faces)
-        order = distribute(boxes, heap)
         self.grid = Grid.over(boxes[:3].min(axis=1), boxes[3:].max(axis=1))
-        words = encode(boxes_of_nodes(boxes, heap), heap, self.grid)
-        self.order = heap.by_leaf(order)
-        self.nbytes = words.nbytes
+        hierarchy = build(boxes)
+        del boxes
+        words = encode(hierarchy.children, self.grid)
+        self.order = hierarchy.order
+        # Few different ones, so that trees share the kernel
+        self.stack_size = -(-hierarchy.stack_size // _STACK_STEP) * _STACK_STEP
+        self.nbytes = words.nbytes + hierarchy.headers.nbytes
         self.nodes = from_numpy(mi.UInt32, words)
+        self.headers = from_numpy(mi.UInt32, hierarchy.headers)
         self.low, self.scale = mi.Point3f(self.grid.low), mi.Vector3f(self.grid.scale)
-        self.inner, self.size = mi.UInt32(heap.inner), mi.UInt32(len(faces))
+        self.size = mi.UInt32(len(faces))
         # Opaque: the trees of other meshes share the kernel
-        dr.make_opaque(self.low, self.scale, self.inner, self.size)
+        dr.make_opaque(self.low, self.scale, self.size)
 
     def closest(self, ray: mi.Ray3f, corners: Corners, active: mi.Bool) -> Hit:
         """The closest hit of each ray before ``ray.maxt``."""
@@ -89,22 +99,34 @@ class RaysInTree:
 
     def __init__(self, tree: MeshTree, ray: mi.Ray3f, corners: Corners) -> None:
         self._tree, self._corners, self._projection = tree, corners, Projection(ray)
+        self.stack_size = tree.stack_size
         # In the space of the grid, with the same distances
         self._o = (ray.o - tree.low) * tree.scale
         self._inverse = with_inverse(ray.d * tree.scale)[1]
         self._error = ERROR * (dr.abs(self._o) + RANGE) * dr.abs(self._inverse)
 
     def is_leaf(self, node):
-        return node >= self._tree.inner
+        return node >= LEAF
 
-    def child(self, node, number):
-        return ARITY * node + 1 + number
+    def children(self, node, maxt):
+        number, index = node >> HEAP_BITS, node & ((1 << HEAP_BITS) - 1)
+        address, first = dr.gather(mi.Array2u, self._tree.headers, number)
+        inner, address = address & TOP, address >> INNER_BITS
 
-    def distances(self, node, maxt):
+        def child(c):
+            in_heap = ARITY * index + 1 + c
+            is_leaf = in_heap >= inner
+            in_treelet = dr.select(is_leaf, LEAF + first - inner + in_heap, node - index + in_heap)
+            return dr.select(inner == TOP, (first + c) << HEAP_BITS, in_treelet)
+
+        return self.distances(address + index, maxt), child
+
+    def distances(self, address, maxt):
+        """For each child of a node, the distance of its box, and whether rays meet it."""
         words = [
             word
             for half in range(2)
-            for word in dr.gather(mi.Array4u, self._tree.nodes, WORDS // 4 * node + half)
+            for word in dr.gather(mi.Array4u, self._tree.nodes, WORDS // 4 * address + half)
         ]
         x_y, z_and_exponents = words[6:]
         corner = [x_y & 0xFFFF, x_y >> 16, z_and_exponents & 0xFFFF]
@@ -130,7 +152,7 @@ class RaysInTree:
 
     def intersect(self, leaf, hit):
         t, triangle, uv = hit
-        first = (leaf - self._tree.inner) * LEAF_SIZE
+        first = (leaf - LEAF) * LEAF_SIZE
         for k in range(LEAF_SIZE):
             index = first + k
             exists = index < self._tree.size

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .heap import ARITY, Heap
+from .heap import ARITY
 
 #: Words of a node, and the largest coordinate of the grid.
 WORDS, RANGE = 8, 255 * 256
@@ -55,44 +55,22 @@ class Grid:
         return (p.astype(np.float64) - self.low) * self.scale
 
 
-def boxes_of_nodes(boxes: np.ndarray, heap: Heap) -> np.ndarray:
-    """The boxes of all nodes: lower and upper corners. Shape (6, nodes), float32; empty nodes have
-    infinite ones.
+def encode(children: np.ndarray, grid: Grid) -> np.ndarray:
+    """The words of inner nodes.
 
     Parameters:
-        boxes: The boxes of the triangles from left to right. Shape (6, triangles).
-    """
-    result = np.empty((6, len(heap.counts)), dtype=np.float32)
-    result[:3], result[3:] = np.inf, -np.inf
-    leaves = heap.leaves_from_left()
-    leaves = leaves[heap.counts[leaves] > 0]
-    starts = np.concatenate([[0], np.cumsum(heap.counts[leaves[:-1]])])
-    for row, values in enumerate(boxes):
-        union = np.minimum if row < 3 else np.maximum
-        result[row, leaves] = union.reduceat(values, starts)
-        for level in reversed(heap.levels):
-            children = result[row, ARITY * level.start + 1 : ARITY * level.stop + 1]
-            below = children.reshape(-1, ARITY)
-            result[row, level.start : level.stop] = union.reduce(below, axis=1)
-    return result
-
-
-def encode(boxes: np.ndarray, heap: Heap, grid: Grid) -> np.ndarray:
-    """The words of all inner nodes.
-
-    Parameters:
-        boxes: The boxes of all nodes, as from :func:`boxes_of_nodes`.
+        children: The boxes of the children of each node, as in ``Hierarchy``. Shape (6, nodes, 4).
 
     Returns:
         For each node, six words with the bytes of its four children (lower x, y, z; upper x, y, z),
         then two with its corner (three times 16 bits) and its exponents (three times 4 bits).
-        Shape (inner nodes, 8), uint32.
+        Shape (nodes, 8), uint32.
     """
-    words = np.empty((heap.inner, WORDS), dtype=np.uint32)
-    for first in range(0, heap.inner, _CHUNK):
-        last = min(first + _CHUNK, heap.inner)
-        children = boxes[:, ARITY * first + 1 : ARITY * last + 1]
-        words[first:last] = _encode(children.reshape(2, 3, -1, ARITY), grid)
+    nodes = children.shape[1]
+    words = np.empty((nodes, WORDS), dtype=np.uint32)
+    for first in range(0, nodes, _CHUNK):
+        part = children[:, first : first + _CHUNK]
+        words[first : first + _CHUNK] = _encode(part.reshape(2, 3, -1, ARITY), grid)
     return words
 
 
