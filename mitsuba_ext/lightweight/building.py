@@ -10,6 +10,7 @@ of the halves.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -64,37 +65,34 @@ def build(boxes: np.ndarray) -> Hierarchy:
         division = divide(boxes, order, pool)
         of_parts = division.boxes(boxes)
         top = Top(division, of_parts)
-        size, start = division.size[top.parts], division.start[top.parts]
+        start, size = division.start[top.parts], division.size[top.parts]
         is_treelet = top.first < 0
-        sizes, kind = np.unique(size[is_treelet], return_inverse=True)
-        heaps = [Heap(int(n)) for n in sizes]
-        inner = np.ones(len(size), dtype=np.int64)
-        inner[is_treelet] = np.array([heap.inner for heap in heaps])[kind]
+        heaps = {n: Heap(n) for n in np.unique(size[is_treelet]).tolist()}
+        of_numbers = [heaps[n] if t else None for n, t in zip(size.tolist(), is_treelet)]
+        inner = np.array([heap.inner if heap else 1 for heap in of_numbers])
+        levels = np.array([len(heap.levels) if heap else 0 for heap in of_numbers])
         node = np.cumsum(inner) - inner
-        # At least one, so that there is something to read from
-        children = np.zeros((6, max(1, int(inner.sum())), ARITY), dtype=np.float32)
-        children[:, node[~is_treelet]] = np.where(
-            top.children >= 0, of_parts[:, top.children], _EMPTY
-        )
-        treelets = np.flatnonzero(is_treelet)
+        children = np.empty((6, int(inner.sum()), ARITY), dtype=np.float32)
+        exists = top.children >= 0
+        children[:, node[~is_treelet]] = np.where(exists, of_parts[:, top.children], _EMPTY)
 
-        def sort(task: tuple[Heap, np.ndarray]) -> None:
-            heap, chosen = task
-            _sort_treelets(boxes, order, children, heap, start[chosen], node[chosen])
+        def sort(treelets: np.ndarray) -> None:
+            heap = heaps[int(size[treelets[0]])]
+            _sort_treelets(boxes, order, children, heap, start[treelets], node[treelets])
 
-        list(pool.map(sort, [
-            (heap, chosen[k : k + step])
-            for i, heap in enumerate(heaps)
-            for chosen in [treelets[kind == i]]
-            for step in [max(1, _CHUNK // int(heap.counts[0]))]
-            for k in range(0, len(chosen), step)
-        ]))  # fmt: skip
+        list(pool.map(sort, _groups(size, is_treelet)))
     first = np.where(is_treelet, start // LEAF_SIZE, top.first)
     headers = np.stack([node << INNER_BITS | np.where(is_treelet, inner, TOP), first], axis=1)
-    levels = np.zeros(len(size), dtype=np.int64)
-    levels[is_treelet] = np.array([len(heap.levels) for heap in heaps])[kind]
-    stack_size = max(1, int((top.waiting + (ARITY - 1) * levels).max()))
+    stack_size = int((top.waiting + (ARITY - 1) * levels).max())
     return Hierarchy(children, headers.astype(np.uint32), order, stack_size)
+
+
+def _groups(size: np.ndarray, is_treelet: np.ndarray) -> Iterator[np.ndarray]:
+    """The numbers of treelets of one size that are sorted together."""
+    for n in np.unique(size[is_treelet]):
+        treelets, step = np.flatnonzero(is_treelet & (size == n)), max(1, _CHUNK // int(n))
+        for k in range(0, len(treelets), step):
+            yield treelets[k : k + step]
 
 
 def _sort_treelets(
@@ -119,10 +117,9 @@ def _sort_treelets(
                 _separate(mine, triangles, run.start, 1, a + b, a)
                 _separate(mine, triangles, run.start + a + b, 1, c + d, c)
     order[places] = heap.by_leaf(triangles)
-    if heap.inner:
-        of_nodes = _boxes_of_nodes(mine, heap)
-        nodes = node[:, None] + np.arange(heap.inner)
-        children[:, nodes] = of_nodes[:, :, 1:].reshape(6, len(start), heap.inner, ARITY)
+    nodes = node[:, None] + np.arange(heap.inner)
+    below = _boxes_of_nodes(mine, heap)[:, :, 1:]
+    children[:, nodes] = below.reshape(6, len(start), heap.inner, ARITY)
 
 
 def _separate(

@@ -94,7 +94,7 @@ class Heap:
     @property
     def _bottom(self) -> int:
         """The first leaf of the bottom row."""
-        return max(ARITY * self.levels[-1].start + 1, self.inner) if self.levels else 0
+        return max(ARITY * self.levels[-1].start + 1, self.inner)
 
 
 #: The largest treelet: the source proposes "a few thousand triangles" (section 3.4.2). Smaller ones

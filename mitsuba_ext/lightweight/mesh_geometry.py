@@ -27,7 +27,7 @@ class MeshGeometry(Lightweight):
         self._tree = MeshTree(positions, faces)
         self.nbytes = self._tree.nbytes
         del positions
-        _sort_faces(parameters, faces, self._tree.order)
+        sort_faces(parameters, faces, self._tree.order)
 
     def corners(self, triangle, active):
         vertices = self.surface.face_indices(triangle, active)
@@ -40,7 +40,8 @@ class MeshGeometry(Lightweight):
         return self._tree.occluded(ray, self, active)
 
 
-def _sort_faces(parameters: mi.SceneParameters, faces: np.ndarray, order: np.ndarray) -> None:
+def sort_faces(parameters: mi.SceneParameters, faces: np.ndarray, order: np.ndarray) -> None:
+    """Sorts the triangles of a mesh into an order."""
     for key in parameters.keys():
         if key.startswith("face_"):
             values = parameters[key].numpy().reshape(len(faces), -1)

@@ -71,7 +71,7 @@ class MeshTree:
         self.grid = Grid.over(boxes[:3].min(axis=1), boxes[3:].max(axis=1))
         hierarchy = build(boxes)
         del boxes
-        words = encode(hierarchy.children, self.grid)
+        words = self.words(hierarchy.children)
         self.order = hierarchy.order
         # Few different ones, so that trees share the kernel
         self.stack_size = -(-hierarchy.stack_size // _STACK_STEP) * _STACK_STEP
@@ -82,6 +82,10 @@ class MeshTree:
         self.size = mi.UInt32(len(faces))
         # Opaque: the trees of other meshes share the kernel
         dr.make_opaque(self.low, self.scale, self.size)
+
+    def words(self, children: np.ndarray) -> np.ndarray:
+        """The nodes as they are stored. Shape (nodes, words)."""
+        return encode(children, self.grid)
 
     def closest(self, ray: mi.Ray3f, corners: Corners, active: mi.Bool) -> Hit:
         """The closest hit of each ray before ``ray.maxt``."""
