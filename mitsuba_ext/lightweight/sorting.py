@@ -6,6 +6,9 @@ import numpy as np
 
 _LOW = np.uint64(0xFFFFFFFF)
 
+#: How many columns are numbered at a time.
+_CHUNK = 1 << 16
+
 
 def separated(values: np.ndarray, left: int) -> np.ndarray:
     """The order, over all rows, in which each row begins with its ``left`` smallest values.
@@ -30,12 +33,19 @@ def sorted_rows(values: np.ndarray) -> np.ndarray:
 
 
 def _keys(values: np.ndarray) -> np.ndarray:
-    """Integers that sort as the values do, with their places in the lower half."""
+    """Integers that sort as the values do, with their columns in the lower half."""
     bits = values.view(np.uint32)
-    bits ^= (bits.view(np.int32) >> 31).view(np.uint32) | np.uint32(1 << 31)
-    keys = bits.astype(np.uint64)
-    keys <<= np.uint64(32)
-    keys |= np.arange(values.shape[1], dtype=np.uint32)
+    # All bits of negative numbers, the sign of others
+    flips = bits.view(np.int32) >> 31
+    flips |= np.int32(-(1 << 31))
+    bits ^= flips.view(np.uint32)
+    del flips
+    keys = np.empty(values.shape, dtype="<u8")
+    halves = keys.view("<u4").reshape(*values.shape, 2)
+    halves[:, :, 1] = bits
+    for first in range(0, values.shape[1], _CHUNK):
+        columns = halves[:, first : first + _CHUNK, 0]
+        columns[:] = np.arange(first, first + columns.shape[1], dtype="<u4")
     return keys
 
 
