@@ -24,6 +24,9 @@ import mitsuba as mi  # isort: skip
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
+#: ``MITSUBA_EXT_TEST_BACKEND=cuda`` runs the tests on a GPU.
+BACKEND = os.environ.get("MITSUBA_EXT_TEST_BACKEND", "llvm")
+
 # Background jobs of a shell ignore SIGINT, those of ``nohup`` SIGHUP, and so would the processes
 # that the tests interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -46,7 +49,7 @@ def variant(request: pytest.FixtureRequest) -> Iterator[str]:
 
     Modules that render name it once: ``pytestmark = pytest.mark.usefixtures("variant")``.
     """
-    name = getattr(request, "param", DEFAULT_VARIANT)
+    name = getattr(request, "param", DEFAULT_VARIANT).replace("llvm", BACKEND)
     if mi.variant() not in (None, name):
         _clean_up()
     mi.set_variant(name)

@@ -27,6 +27,14 @@ def test_scene_is_as_large_as_the_motion() -> None:
 # ---- Scenes as files, and errors ----
 
 
+def test_motion_is_refused_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    shape = {"type": "moving", "translate": [0, 5, 0], "cube": {"type": "cube"}}
+    scene = mi.load_dict({"type": "scene", "moving": shape})
+    monkeypatch.setattr(mi, "variant", lambda: "cuda_ad_rgb")
+    with pytest.raises(NotImplementedError, match="llvm_"):
+        scene_query(scene)
+
+
 XML = """<scene version="3.0.0">
     <bsdf type="diffuse" id="paint"/>
     <shape type="shapegroup" id="group"><shape type="sphere"/></shape>
