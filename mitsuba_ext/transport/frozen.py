@@ -172,6 +172,11 @@ def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
     if registry.is_any_called() or any(map(_is_foreign, nodes)):
         mi.Log(mi.LogLevel.Debug, "nothing is recorded: there are plugins in Python")
         return None
+    is_on_gpu = dr.backend_v(mi.Float) == dr.JitBackend.CUDA
+    if is_on_gpu and any(dr.is_tensor_v(value) for _, value in parameters.items()):
+        # Dr.Jit 1.5.0 ends the process: "jit_var(r0): unknown variable"
+        mi.Log(mi.LogLevel.Debug, "nothing is recorded: there are textures of a GPU")
+        return None
     mark = next((m for m in (scene.shapes_dr(), scene.emitters_dr()) if dr.width(m) > 0), None)
     if mark is None or mark.state != dr.VarState.Evaluated:
         return None
