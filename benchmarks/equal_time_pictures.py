@@ -4,18 +4,25 @@
     python benchmarks/equal_time_pictures.py --readme   # those of the README
 
 Kernels are compiled before. ``path`` is rendered by ``composed_path`` with its defaults, which
-makes the same image and ends at a timeout. Both halves have one exposure: that of our image.
+makes the same image and ends at a timeout. Both halves have one exposure: that of our image. The
+errors under the pictures are measured with the references that ``references.py`` has rendered.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
 import numpy as np
-from equal_samples import load
+from equal_samples import SCENES, load
 from PIL import Image, ImageDraw
+from previews import WIDTHS
+from references import stored
+
+from mitsuba_ext.compare.references import load_reference
+from mitsuba_ext.images.metrics import errors
 
 import mitsuba as mi  # isort: skip
 
@@ -23,7 +30,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 
 class Pair(NamedTuple):
-    """A scene, an integrator of ours, the longest paths, and what stands beside it.
+    """A scene, an integrator of ours, and what stands beside it.
 
     Attributes:
         sampler: Replaces that of the scene, for ours; see :func:`equal_samples.load`.
@@ -34,7 +41,6 @@ class Pair(NamedTuple):
 
     scene: str
     ours: dict[str, Any]
-    max_depth: int = 8
     sampler: str = ""
     beside: str = ""
     label: str = ""
@@ -45,7 +51,7 @@ class Pair(NamedTuple):
 README = {
     "rooms": Pair("rooms", {"type": "auto_path"}),
     "door_ajar": Pair("door_ajar", {"type": "auto_path"}),
-    "glass_lamp": Pair("glass_lamp", {"type": "bdpt"}, 12),
+    "glass_lamp": Pair("glass_lamp", {"type": "bdpt"}),
     "pool": Pair("pool", {"type": "vcm"}),
     "caustic": Pair("caustic", {"type": "bdpt"}),
 }
@@ -60,7 +66,7 @@ PLUGINS = {
     "neepp": Pair("rooms", {"type": "neepp"}),
     "pss_guided": Pair("corridor", {"type": "pss_guided"}),
     "swarm_path": Pair("colour_wheel", {"type": "swarm_path"}),
-    "bdpt": Pair("glass_lamp", {"type": "bdpt"}, 12),
+    "bdpt": Pair("glass_lamp", {"type": "bdpt"}),
     "vcm": Pair("pool", {"type": "vcm"}),
     "sppm": Pair("volume_caustic", {"type": "sppm"}),
     "photon_map": Pair("caustic", {"type": "photon_map"}),
@@ -118,29 +124,47 @@ def rendered(scene: mi.Scene, integrator: dict, seconds: float, max_depth: int):
 
 
 def side_by_side(pair: Pair, seconds: float, size: tuple[int, int]) -> tuple[Image.Image, str]:
-    """Both pictures in one, and a sentence about their samples."""
+    """Both pictures in one, and sentences about their samples and errors."""
     seconds = pair.seconds or seconds
-    scene = load(pair.scene, size, pair.sampler)
-    beside = load(pair.beside or pair.scene, size) if pair.beside or pair.sampler else scene
+    max_depth, own = int(_default(pair.scene, "max_depth")), _default(pair.scene, "rfilter")
+    with_filter = f":rfilter={own}" if own else ""
+    scene = load(pair.scene + with_filter, size, pair.sampler)
+    beside = scene
+    if pair.beside or pair.sampler:
+        beside = load((pair.beside or pair.scene) + with_filter, size)
     label = pair.label or pair.ours["type"]
     made = {
-        "path": rendered(beside, _PATH, seconds, pair.max_depth),
-        label: rendered(scene, pair.ours, seconds, pair.max_depth),
+        "path": rendered(beside, _PATH, seconds, max_depth),
+        label: rendered(scene, pair.ours, seconds, max_depth),
     }
     scale = _WHITE / np.quantile([*made.values()][1][0], 0.98)
     picture = Image.new("RGB", (2 * size[0] + 4, size[1]), "white")
-    samples = []
-    for index, (label, (image, statistics)) in enumerate(made.items()):
+    for index, (label, (image, _)) in enumerate(made.items()):
         half = _to_8_bit(image, scale)
         ImageDraw.Draw(half).text((6, size[1] - 16), label, fill="white", stroke_width=1,
                                   stroke_fill="black")  # fmt: skip
         picture.paste(half, (index * (size[0] + 4), 0))
-        samples.append(f"{label} {statistics.spp}")
+    figures = {"Samples per pixel": [str(statistics.spp) for _, statistics in made.values()]}
+    if (file := stored(pair.scene)) is not None and size[0] == WIDTHS.get(pair.scene, 320):
+        reference = load_reference(file, size)
+        of_both = [errors(i, reference.mean, reference.variance) for i, _ in made.values()]
+        figures["relMSE"] = [f"{e.relmse:.2g}" for e in of_both]
+        figures["FLIP"] = [f"{e.flip:.2g}" for e in of_both]
     text = (
         f"{pair.scene}.xml, {size[0]}x{size[1]}, {seconds:g} s each on two cores, learning "
-        f"included. Samples per pixel: {', '.join(samples)}."
+        "included. "
+    ) + " ".join(
+        f"{what}: {', '.join(f'{who} {value}' for who, value in zip(made, values))}."
+        for what, values in figures.items()
     )
     return picture, text
+
+
+def _default(scene: str, name: str) -> str:
+    """The default value of a parameter of one of our scenes; empty if it has no such parameter."""
+    text = (SCENES / f"{scene}.xml").read_text(encoding="utf-8")
+    found = re.search(rf'<default name="{name}" value="([^"]*)"', text)
+    return found[1] if found else ""
 
 
 def _to_8_bit(image: np.ndarray, scale: float) -> Image.Image:
@@ -153,14 +177,15 @@ def _to_8_bit(image: np.ndarray, scale: float) -> Image.Image:
 @click.argument("names", nargs=-1)
 @click.option("--readme", is_flag=True, help="The pictures of the README.")
 @click.option("--seconds", default=5.0, show_default=True, help="For each render.")
-@click.option("--size", type=(int, int), default=(320, 180), show_default=True)
-def main(names: tuple[str, ...], readme: bool, seconds: float, size: tuple[int, int]) -> None:
+def main(names: tuple[str, ...], readme: bool, seconds: float) -> None:
     """Renders the pictures NAMES (all, if none is given)."""
     mi.set_variant("llvm_ad_rgb")
     pairs = README if readme else PLUGINS
     (DOCS / "pictures").mkdir(exist_ok=True)
     for name in names or pairs:
-        picture, text = side_by_side(pairs[name], seconds, size)
+        # Those of the README stand beside each other
+        width = 320 if readme else WIDTHS.get(pairs[name].scene, 320)
+        picture, text = side_by_side(pairs[name], seconds, (width, 180))
         print(f"{name}: {text}", flush=True)
         if readme:
             picture.save(DOCS / "figures" / f"equal_time_{name}.jpg", quality=90)

@@ -1,7 +1,8 @@
 """Makes the gallery of the documentation: for each of our scenes, a report that compares ``path``,
 the best of our other integrators, and ``auto``, at equal time.
 
-    python benchmarks/gallery.py                 # all scenes: about 50 minutes
+    python benchmarks/references.py              # first, their references
+    python benchmarks/gallery.py                 # all scenes: about 40 minutes
     python benchmarks/gallery.py rooms pool      # these
 
 Reports are kept in ``out/gallery``: scenes that are there are not rendered again. The pages are
@@ -19,26 +20,13 @@ from pathlib import Path
 
 import click
 from previews import INTEGRATORS, PICTURES, SPECTRAL, WIDTHS
+from references import stored
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "gallery"
 
 #: The best of our integrators but ``auto``.
 BEST = {**INTEGRATORS, **dict.fromkeys(["pool", "caustic", "ring"], "vcm")}
-
-#: Scenes without motion whose references light paths render with less noise than ``path``.
-_LIGHT_PATHS = ("bdpt", "vcm", "erpt", "sppm")
-
-#: The reference, where it follows from no rule.
-_REFERENCES = {
-    "fog": "volpath", "volume_caustic": "sppm",
-    "paperweight": "bdpt",  # its spot lights shine through glass: no camera path finds them
-}
-
-
-#: Samples of references that need more than others.
-_REFERENCE_SPP = {"colour_wheel": 32768, "spotlights": 16384}
-
 
 def compared(name: str) -> list[str]:
     """The integrators of a scene: Mitsuba's or its equivalent, the best other one, and ``auto``."""
@@ -51,27 +39,19 @@ def compared(name: str) -> list[str]:
     return [first, best, *([] if best == "auto" else ["auto"])]
 
 
-def reference(name: str) -> str:
-    """The integrator that renders the reference."""
-    best = BEST.get(name, "auto_path")
-    return _REFERENCES.get(name, "bdpt" if best in _LIGHT_PATHS else best)
-
-
-def compare(name: str, seconds: float, seeds: int, reference_spp: int) -> Path:
-    """Renders what is missing of a scene's report. Returns its folder."""
+def compare(name: str, seconds: float, seeds: int) -> None:
+    """Renders what is missing of a scene's report."""
     out = ROOT / "out" / "gallery" / name
     width = WIDTHS.get(name, 320)
     command = [
         sys.executable, "-m", "mitsuba_ext", "compare", f"scenes/{name}.xml", *compared(name),
         "--time", f"{seconds:g}", "--seeds", str(seeds), "--size", f"{width}x180",
-        "--reference-integrator", reference(name),
-        "--reference-spp", str(_REFERENCE_SPP.get(name, reference_spp)),
+        "--reference", str(stored(name)),
         "--variant", "llvm_ad_spectral" if name in SPECTRAL else "llvm_ad_rgb",
         "--out", str(out),
     ]  # fmt: skip
     if not (out / "report.html").exists():
         subprocess.run(command, cwd=ROOT, check=False)
-    return out
 
 
 def caption(results: dict) -> str:
@@ -95,12 +75,11 @@ def caption(results: dict) -> str:
 @click.argument("names", nargs=-1)
 @click.option("--seconds", default=5.0, show_default=True, help="For each run.")
 @click.option("--seeds", default=2, show_default=True)
-@click.option("--reference-spp", default=1024, show_default=True)
-def main(names: tuple[str, ...], seconds: float, seeds: int, reference_spp: int) -> None:
+def main(names: tuple[str, ...], seconds: float, seeds: int) -> None:
     """Compares on the scenes NAMES (all, if none is given), and writes the pages of all scenes that
     have been compared."""
     for name in names or PICTURES:
-        compare(name, seconds, seeds, reference_spp)
+        compare(name, seconds, seeds)
     PAGES.mkdir(exist_ok=True)
     cards = []
     for name in PICTURES:
