@@ -141,6 +141,12 @@ def test_triangles_in_one_place_are_split_in_the_middle() -> None:
     assert (_walk(tree, _decoded(tree), triangles, 1e-6 * float(size.max())) == 1).all()
 
 
+def test_equal_triangles_make_a_balanced_tree() -> None:
+    vertices, _ = _soup(1)
+    tree = MeshTree(vertices, np.tile(np.uint32([[0, 1, 2]]), (40 * CAPACITY, 1)))
+    assert tree.stack_size <= 48
+
+
 def test_walls_do_not_share_nodes_with_small_things() -> None:
     small, faces = _soup(20 * CAPACITY, size=0.001)
     wall = np.float32([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]])

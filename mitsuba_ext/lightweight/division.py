@@ -177,7 +177,9 @@ def _cheapest(
             leaves = around(sorted_boxes.reshape(6, rows, -1, LEAF_SIZE))
             costs[k] = left * area(_first(leaves))[:, :-1]
             costs[k] += right * area(_first(leaves[..., ::-1]))[:, -2::-1]
-    # In huge meshes, areas overflow: then all splits cost the same
+        # Where many triangles are in one place, all splits cost the same: the middle is best
+        costs *= 1 + 1e-3 * np.abs(right - left) / size[:, None].astype(np.float32)
+    # In huge meshes, areas overflow
     costs = np.where(allowed, np.fmin(costs, np.finfo(np.float32).max), np.inf)
     best = costs.transpose(1, 0, 2).reshape(rows, -1).argmin(axis=1)
     return best // len(left), left[best % len(left)], orders
