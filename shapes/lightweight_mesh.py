@@ -21,7 +21,7 @@ class LightweightMesh(mi.Mesh):
     Lightweight meshes (:monosp:`lightweight_mesh`)
     -----------------------------------------------
 
-    Finds the triangles of the mesh that is nested in it by an acceleration structure of 2.7 bytes
+    Finds the triangles of the mesh that is nested in it by an acceleration structure of 2.9 bytes
     for each triangle. That of Embree, in Mitsuba, has about 70, and 110 while it is built.
 
     .. pluginparameters::
