@@ -36,6 +36,15 @@ def from_numpy(kind: type[T], values: Any) -> T:
     return kind(aligned)
 
 
+def channel_mean(value: Any) -> mi.Float:
+    """The mean of the channels of a colour or spectrum, for each lane.
+
+    ``dr.mean`` computes the same, but divides and multiplies by the number of lanes, which becomes
+    a literal: each length of a pass would compile a kernel of its own.
+    """
+    return dr.sum(value) * (1 / len(value))
+
+
 def joined(parts: Sequence[T]) -> T:
     """Concatenates arrays, vectors of arrays, or dataclasses of these or of ``None``, all of one
     type, and evaluates the result. (``dr.concat`` compiles kernels for each size.)"""

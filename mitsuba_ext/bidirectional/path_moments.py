@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import from_numpy
+from ..arrays import channel_mean, from_numpy
 from ..images.box_filter import box_means
 from ..images.coarse_film import CoarseFilm
 from ..transport.estimator import CameraRays, Sample
@@ -207,7 +207,7 @@ class PathMoments(TechniqueObserver):
         self._moments.add(brought, mis, rivals, self._pixel, active, count)
 
     def splatted(self, s, position, value, mis, rivals, active) -> None:
-        brought = dr.mean(value)
+        brought = channel_mean(value)
         active = active & (brought > 0)
         place = mi.Point2u(position - self._corner)
         pixel = self._place(place.y * self._film_width + place.x, active)
@@ -231,7 +231,7 @@ class PathMoments(TechniqueObserver):
         return dr.select(can_be, square * _share(by_camera), 0)
 
     def _brightness(self, value: mi.Spectrum) -> mi.Float:
-        return dr.mean(value * self._importance)
+        return channel_mean(value * self._importance)
 
     def traced(self, camera: Sample, whole: Sample) -> None:
         brought = self._brightness(camera.L)
