@@ -38,10 +38,10 @@ class StagedIntegrator(mi.SamplingIntegrator):
          number of samples follows from the speed of the first passes (short ones, until one
          compiles nothing, and then one of a quarter of the time left), and not from the clock, so
          that stopping does not prefer fast samples. Pilots get at most a quarter of the samples
-         that fit; learning ends when it has taken a third of the time, and does not begin in renders
-         of about a second, or if compiling its kernels would take longer than that. The limit is
-         met as closely as the speed is steady; a short pass of each pilot that has begun, and one
-         of the last stage, are always rendered. (Default: -1)
+         that fit. Learning ends when it has taken a third of the time. It does not begin in renders
+         of about a second, nor where compiling its kernels would take longer than that. The limit
+         is met as closely as the speed is steady; a short pass of each pilot that has begun, and
+         one of the last stage, are always rendered. (Default: -1)
 
      * - checkpoint
        - |string|
