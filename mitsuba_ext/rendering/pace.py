@@ -38,13 +38,15 @@ def plan_for_timeout(job: Job) -> RenderPlan:
     if stage is None:
         return plan
     compiling, is_new = 0.0, True
-    while is_new and time.perf_counter() < budget.end:
+    while is_new:
         begin, before = time.perf_counter(), job.statistics.compile_seconds
         is_new = job._run_pass(stage, budget.short)
         # Long passes take no longer to trace than this one: their speed is that of the kernel
         tracing = job.statistics.compile_seconds - before
         seconds = time.perf_counter() - begin - tracing
         compiling += tracing if is_new else 0.0
+        if time.perf_counter() >= budget.end:
+            break
     taken, left = job.statistics.spp, max(0.0, budget.end - time.perf_counter())
     fits = taken + int(left * budget.short / max(seconds, 1e-6))
     fits = min(plan.spp, max(taken + 1, fits))
