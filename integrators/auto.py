@@ -60,7 +60,8 @@ class Auto(LightPathIntegrator):
     each camera path; with and without connections to their vertices, and merging); numbers of rays
     tell its time. The best choice is made, if it is better than guided directions and maps, with
     which light paths are not combined. This stage has 16384 samples, spread over the film, which
-    are not part of the image; in renders of less than a million samples, there is none. Where light
+    are not part of the image; in renders of less than a million samples, it has as few as 4096, and
+    below 262144 samples, there is none. Where light
     paths have less than 0.4 of the variance, the samples before are left out of the image.
 
     Light paths are not tried in participating media, in films of more than two million pixels, and

@@ -36,6 +36,25 @@ def from_numpy(kind: type[T], values: Any) -> T:
     return kind(aligned)
 
 
+def channel_mean(value: Any) -> mi.Float:
+    """The mean of the channels of a colour or spectrum, for each lane.
+
+    ``dr.mean`` computes the same, but divides and multiplies by the number of lanes, which becomes
+    a literal: each length of a pass would compile a kernel of its own.
+    """
+    return dr.sum(value) * (1 / len(value))
+
+
+def add_own(target: T, value: Any, index: mi.UInt32, active: mi.Bool | bool = True) -> None:
+    """Adds values to places of an array that belong to one lane each.
+
+    ``dr.scatter_add`` would do the same, but where several lanes may share a place, Dr.Jit keeps a
+    copy of an array of less than a million numbers for each thread. Kernels then contain its size:
+    for arrays with a place for each lane, each length of a pass would compile a kernel of its own.
+    """
+    dr.scatter_add(target, value, index, active, dr.ReduceMode.NoConflicts)
+
+
 def joined(parts: Sequence[T]) -> T:
     """Concatenates arrays, vectors of arrays, or dataclasses of these or of ``None``, all of one
     type, and evaluates the result. (``dr.concat`` compiles kernels for each size.)"""

@@ -81,6 +81,9 @@ class _TwoStages:
     def samples_per_set(self, spp):
         return 1
 
+    def pace_stage(self, scene, sensor, spp):
+        return None
+
     def schedule(self, scene, sensor, samples, seed):
         return _Schedule(Stage(_Constant(1.0)), Stage(_Constant(3.0), "something"))
 

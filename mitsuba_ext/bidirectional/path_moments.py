@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import from_numpy
+from ..arrays import add_own, channel_mean, from_numpy
 from ..images.box_filter import box_means
 from ..images.coarse_film import CoarseFilm
 from ..transport.estimator import CameraRays, Sample
@@ -154,7 +154,7 @@ class PathMoments(TechniqueObserver):
         self._by_kind = by_kind
 
     def searched(self, count: mi.UInt32) -> None:
-        dr.scatter_add(self._looked, count, self._lane)
+        add_own(self._looked, count, self._lane)
 
     def emission(self, path, ds, value, mis, pdf, active) -> None:
         brought = self._brightness(value)
@@ -170,7 +170,7 @@ class PathMoments(TechniqueObserver):
         mis = dr.select(whole > 0, brought / whole, 0)
         other = dr.select(ds.delta, 0, pdf / ds.pdf)
         self._add_own(brought, mis, other, visible)
-        dr.scatter_add(self._shadow_count, mi.UInt32(1), self._lane, tested)
+        add_own(self._shadow_count, mi.UInt32(1), self._lane, tested)
 
     def _add_own(self, brought, mis, other, active) -> None:
         """Adds a contribution that ``path`` finds too, by BSDF sampling or by next event
@@ -179,10 +179,10 @@ class PathMoments(TechniqueObserver):
         active = active & (mis > 0)
         whole = brought / mis
         part = whole * power_heuristic(mi.Float(1), other)
-        dr.scatter_add(self._path, part, self._lane, active)
-        dr.scatter_add(self._squares, dr.square(part), self._lane, active)
+        add_own(self._path, part, self._lane, active)
+        add_own(self._squares, dr.square(part), self._lane, active)
         moment = brought * whole * _share(mi.Vector2f(1, other))
-        dr.scatter_add(self._moment, moment, self._lane, active)
+        add_own(self._moment, moment, self._lane, active)
         rivals = Rivals(mi.Vector2f(1, other), self._by_kind)
         self._moments.add(brought, mis, rivals, self._pixel, active)
 
@@ -193,7 +193,7 @@ class PathMoments(TechniqueObserver):
     def merged(self, value, mis, rivals, active) -> None:
         self._add_other(value, mis, rivals, active, HANDFUL)
         square = dr.square(self._brightness(value))
-        dr.scatter_add(self._merged, square, self._lane, active & dr.isfinite(square))
+        add_own(self._merged, square, self._lane, active & dr.isfinite(square))
 
     def _add_other(self, value, mis, rivals, active, count: float = 1.0) -> None:
         """Adds what the camera path in each lane found together with a light path. ``rivals`` holds
@@ -203,11 +203,11 @@ class PathMoments(TechniqueObserver):
         moment = self._seen_by_path(
             count * dr.square(brought) / mis, rivals.by_camera, active
         )
-        dr.scatter_add(self._moment, moment, self._lane, active)
+        add_own(self._moment, moment, self._lane, active)
         self._moments.add(brought, mis, rivals, self._pixel, active, count)
 
     def splatted(self, s, position, value, mis, rivals, active) -> None:
-        brought = dr.mean(value)
+        brought = channel_mean(value)
         active = active & (brought > 0)
         place = mi.Point2u(position - self._corner)
         pixel = self._place(place.y * self._film_width + place.x, active)
@@ -231,7 +231,7 @@ class PathMoments(TechniqueObserver):
         return dr.select(can_be, square * _share(by_camera), 0)
 
     def _brightness(self, value: mi.Spectrum) -> mi.Float:
-        return dr.mean(value * self._importance)
+        return channel_mean(value * self._importance)
 
     def traced(self, camera: Sample, whole: Sample) -> None:
         brought = self._brightness(camera.L)

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import channel_mean
 from ..transport.estimator import CameraRays
 from .candidates import Available
 from .technique_observer import TechniqueObserver
@@ -67,8 +68,8 @@ class TechniqueImages(TechniqueObserver):
     def connection(
         self, choice, vertex, ds, contribution, value, pdf, visible, tested
     ) -> None:
-        whole = dr.mean(vertex.path.β * contribution)
-        mis = dr.select(whole != 0, dr.mean(value) / whole, 0)
+        whole = channel_mean(vertex.path.β * contribution)
+        mis = dr.select(whole != 0, channel_mean(value) / whole, 0)
         self._add_own(mi.UInt32(1), vertex.depth + 2, value, mis, visible)
 
     def joined(self, s, t, value, mis, rivals, active) -> None:
@@ -85,7 +86,7 @@ class TechniqueImages(TechniqueObserver):
 
     def _add(self, s, t, pixel, value, mis, active) -> None:
         active = active & (s + t <= self.segments + 1) & (mis > 0)
-        colour = mi.Color3f(value) if mi.is_rgb else mi.Color3f(dr.mean(value))
+        colour = mi.Color3f(value) if mi.is_rgb else mi.Color3f(channel_mean(value))
         place = _WORDS * (technique_number(s, t) * self._pixels + pixel)
         for channel in range(3):
             dr.scatter_add(self._sums, colour[channel], place + channel, active)

@@ -79,6 +79,13 @@ class LightPathSchedule:
             estimator, camera=CameraSamples(), is_scout=True, pixels=self._trial.samples
         )
 
+    def end_learning(self) -> None:
+        """See :class:`mitsuba_ext.rendering.stages.EndingSchedule`."""
+        if not self._is_over:
+            self._is_over = True
+            del self._inner.beside["light_paths"]
+        self._inner.end_learning()
+
     def _stage_after_trial(self) -> Stage:
         stage, self._next = self._next, None
         guide = self._inner.learners.get("directions")

@@ -35,9 +35,10 @@ _SUMS, _LIGHT_RAY, _SPLAT, _CONNECTION, _GRID, _LOOK = 0.2, 2.2, 2.8, 3.2, 0.3, 
 _ENOUGH = 1 << 15
 
 
-#: Number of samples of a sparse trial, which has at least two of each pixel of its film. It may
-#: have at most this share of all samples: one takes about seven times as long as one of ``path``.
-_SPARSE, _MOST = 1 << 14, 1 / 64
+#: Most and least samples of a sparse trial, which has at least two of each pixel of its film, and
+#: the largest share of all samples that it may have: one takes about seven times as long as one of
+#: ``path``. (Trials of all sizes kept the same techniques in twelve scenes.)
+_SPARSE, _LEAST_SPARSE, _MOST = 1 << 14, 1 << 12, 1 / 64
 
 #: The most light paths for each camera path.
 MOST_PATHS = 64.0
@@ -138,7 +139,10 @@ class LightPathTrial(Learner):
 
     def __init__(self, film: mi.Film, spp: int, is_sparse: bool = False) -> None:
         extent = film_extent(film)
-        coarse = CoarseFilm.of(*extent, _SPARSE) if is_sparse else CoarseFilm.whole(*extent)
+        if is_sparse:
+            coarse = CoarseFilm.of(*extent, _trial_samples(extent[0] * extent[1] * spp))
+        else:
+            coarse = CoarseFilm.whole(*extent)
         corner, self._width = first_pixel(film), coarse.width
         self._moments: PathMoments | None = PathMoments(coarse, corner, extent[0], spp)
         self._choice = LightPathChoice(
@@ -158,7 +162,7 @@ class LightPathTrial(Learner):
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:
         """Is a sparse trial worth its time, for a render of so many samples?"""
-        return _SPARSE <= spp * pixel_count * _MOST
+        return _LEAST_SPARSE <= spp * pixel_count * _MOST
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> LightPathChoice:
         return self._choice
@@ -230,6 +234,15 @@ class LightPathTrial(Learner):
         # In units of ``path``
         variance, time = self.variances[self._shown], self.costs[self._shown]
         return f"{kept} ({variance:.2f} of the variance, {time:.1f} x the time)"
+
+
+def _trial_samples(samples: int) -> int:
+    """The samples of a sparse trial in a render of so many. There are few sizes, as kernels contain
+    that of the coarse film."""
+    count = _SPARSE
+    while count > max(_LEAST_SPARSE, samples * _MOST):
+        count //= 2
+    return count
 
 
 def cost(techniques: Candidate, counts: Counts) -> float:

@@ -91,6 +91,10 @@ class RememberingPath(WalkIntegrator):
         # Many renders use what this one learns: pilots have up to three quarters of its samples
         return super().pilots(scene, pixel_count, 3 * spp)
 
+    def pace_stage(self, scene, sensor, spp):
+        # Its pilots are worth their time in later renders
+        return None
+
     def schedule(self, scene, sensor, samples, seed):
         self._renders += 1
         if self._knows(scene):

@@ -163,6 +163,10 @@ class Schedule:
             self._learn(is_last=self._finished_stages == self._pilot_count)
         return self.stage_again()
 
+    def end_learning(self) -> None:
+        """See :class:`mitsuba_ext.rendering.stages.EndingSchedule`."""
+        self._pilot_count = self._finished_stages + 1
+
     def stage_again(self) -> Stage:
         """The stage that :meth:`next_stage` has returned, with the decisions of now."""
         if self._finished_stages == self._pilot_count:

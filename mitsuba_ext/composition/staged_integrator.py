@@ -18,7 +18,7 @@ from ..long_renders.intervals import Interval
 from ..parameters import read_parameter
 from ..rendering import camera
 from ..rendering import render as rendering
-from ..rendering.stages import Schedule
+from ..rendering.stages import Schedule, Stage
 
 #: Stands for "no limit" in counts.
 NO_LIMIT = 0xFFFFFFFF
@@ -38,8 +38,10 @@ class StagedIntegrator(mi.SamplingIntegrator):
          number of samples follows from the speed of the first passes (short ones, until one
          compiles nothing, and then one of a quarter of the time left), and not from the clock, so
          that stopping does not prefer fast samples. Pilots get at most a quarter of the samples
-         that fit. The limit is met as closely as the speed is steady; a short pass of each pilot,
-         and one of the last stage, are always rendered. (Default: -1)
+         that fit. Learning ends when it has taken a third of the time. It does not begin in renders
+         of about a second, nor where compiling its kernels would take longer than that. The limit
+         is met as closely as the speed is steady; a short pass of each pilot that has begun, and
+         one of the last stage, are always rendered. (Default: -1)
 
      * - checkpoint
        - |string|
@@ -84,6 +86,10 @@ class StagedIntegrator(mi.SamplingIntegrator):
     def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
         """The samples per pixel of each pilot stage, out of ``spp``; empty if nothing learns."""
         return []
+
+    def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
+        """See :class:`mitsuba_ext.rendering.render.Staged`."""
+        return None
 
     @property
     def sample_cost(self) -> int:

@@ -19,6 +19,7 @@ from ..files import check_target
 from ..learning.learner import Learner
 from ..rendering.aovs import check_aovs
 from ..rendering.camera import film_extent
+from ..rendering.stages import Stage
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
 from ..scene.unseen import has_unseen_shapes
 from ..transport.estimator import CameraRays, Estimator
@@ -30,6 +31,7 @@ from .decision_parameters import DecisionParameters, ParameterReader, Setting
 from .schedule import Schedule, pilot_samples
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
 from .staged_integrator import NO_LIMIT, StagedIntegrator
+from .swarm import Swarm, stage_weights
 
 
 class WalkIntegrator(StagedIntegrator):
@@ -153,6 +155,18 @@ class WalkIntegrator(StagedIntegrator):
         if self.max_depth < 2 or self.load_learned:
             return []
         return pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
+
+    def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
+        if self.has_light_paths:
+            # Camera paths alone would miss the light of some lights, and are much faster
+            return None
+        # Where maps help much, samples without them are worth less
+        swarms = any(isinstance(p, Swarm) and p.can_learn(scene, 1) for p in self.slots.values())
+        weight = stage_weights((1, spp - 1))[0] if swarms else 1.0
+        walk = Walk(
+            self.max_depth, self.rr_depth, self.hide_emitters, query=self.query(scene)
+        )
+        return Stage(walk, weight=weight)
 
     @property
     def sample_cost(self) -> int:

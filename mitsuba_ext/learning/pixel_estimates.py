@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import from_numpy
+from ..arrays import channel_mean, from_numpy
 from ..images.box_filter import box_means, box_sums
 
 #: Added to the squared radiance of a pixel, in units of the squared mean of the image.
@@ -15,7 +15,7 @@ _FLOOR = 1e-2
 
 def brightness(L: mi.Spectrum) -> mi.Float:
     """The mean of the channels of a path's radiance: errors count the same in all channels."""
-    return dr.mean(L)
+    return channel_mean(L)
 
 
 class PixelEstimates:

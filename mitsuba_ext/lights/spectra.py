@@ -5,11 +5,13 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..arrays import channel_mean
+
 
 def brightness(value: mi.Spectrum) -> mi.Float:
     """One number for a spectrum: the luminance in RGB variants, the mean of the channels (sampled
     wavelengths) in the others."""
-    return mi.luminance(value) if mi.is_rgb else dr.mean(value)
+    return mi.luminance(value) if mi.is_rgb else channel_mean(value)
 
 
 def comparison_wavelengths(width: int) -> mi.Spectrum:

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import from_numpy
+from ..arrays import channel_mean, from_numpy
 from . import camera
 from .pixel_moments import PixelMoments
 from .render import Job, kernel_cache_misses
@@ -133,8 +133,7 @@ class AdaptiveJob(Job):
         numbers = camera.draw_numbers(self.sensor, sampler, lanes, stage.camera)
         rays = camera.camera_rays(self.sensor, lanes, numbers, self.plan.spp)
         sample = self._sample(stage, sampler, rays, dr.gather(mi.Float, weight, pixel))
-        # dr.mean() would make the number of lanes a literal: another kernel for each pass
-        brightness = dr.sum(sample.L * (rays.importance * rays.weight)) / len(sample.L)
+        brightness = channel_mean(sample.L * (rays.importance * rays.weight))
         dr.eval(brightness, self.block.tensor(), self.tally)
         dr.sync_thread()
         self.moments.add(pixels, np.broadcast_to(brightness.numpy(), size))

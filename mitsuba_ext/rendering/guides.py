@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..arrays import channel_mean
 from ..transport.bsdfs import sample_bsdf
 from ..transport.estimator import Sample
 from ..transport.path_decisions import SceneQuery
@@ -85,7 +86,7 @@ def guides_of(si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Float]:
 
 def _grey_or_rgb(value: mi.UnpolarizedSpectrum) -> mi.Color3f:
     is_grey = mi.is_spectral or mi.is_monochromatic
-    return mi.Color3f(dr.mean(value) if is_grey else value)
+    return mi.Color3f(channel_mean(value) if is_grey else value)
 
 
 def _albedo(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 
+from ..arrays import channel_mean
 from ..defocus.thin_lens import ThinLens
 from ..transport.lens_view import LensView, Passes
 from ..transport.numbers import Numbers
@@ -130,4 +131,4 @@ class PinholeView:
     ) -> mi.Bool:
         """Is the surface skipped because of its null transmission?"""
         through = si.bsdf().eval_null_transmission(si, active & si.is_valid())
-        return dr.mean(mi.unpolarized_spectrum(through)) > _MOST_TRANSMITTED
+        return channel_mean(mi.unpolarized_spectrum(through)) > _MOST_TRANSMITTED

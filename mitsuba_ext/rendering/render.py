@@ -28,9 +28,10 @@ from .dither import dithered_parts
 from .filter_weights import put_splats
 from .interrupts import deferred_interrupt
 from .notebook import statistics_table
+from .pace import plan_for_timeout
 from .pass_samples import GradientsError, count_rays, look, put_samples
 from .plan import Planned, plan_render
-from .stages import DivisibleSchedule, Schedule, Stage
+from .stages import DivisibleSchedule, EndingSchedule, Schedule, Stage
 from .time_budget import TimeBudget
 
 
@@ -45,6 +46,10 @@ class Staged(Planned, Protocol):
         self, scene: mi.Scene, sensor: mi.Sensor, samples: tuple[int, ...], seed: int
     ) -> Schedule:
         """The schedule of a render, whose stages take ``samples`` samples per pixel."""
+
+    def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
+        """The stage with which a render with a timeout, of at most ``spp`` samples per pixel,
+        measures its speed (``pace.py``); ``None`` if the first pilot does that."""
 
     def aov_names(self) -> list[str]:
         """Channels besides colour and alpha."""
@@ -207,13 +212,13 @@ class Job:
         sampler.seed(dr.opaque(mi.UInt32, seed), self._lanes(spp, pixels))
 
     def run(self, interrupt: threading.Event) -> None:
-        plan = self.plan
         mi.Log(
             mi.LogLevel.Info,
-            f"Starting render job ({plan.pixel_count} pixels, {plan.spp} samples, "
-            f"{len(plan.stages)} stage(s))",
+            f"Starting render job ({self.plan.pixel_count} pixels, {self.plan.spp} samples, "
+            f"{len(self.plan.stages)} stage(s))",
         )
         self.statistics.interrupted = True  # until the last stage has all its samples
+        plan = self.plan = plan_for_timeout(self)
         schedule = self.integrator.schedule(self.scene, self.sensor, plan.stages, plan.seed)
         parts = self._first_parts(schedule)
         for index, samples in enumerate(plan.stages):
@@ -222,8 +227,14 @@ class Job:
                 if self._stopped(interrupt):
                     return
                 continue
-            stage = self._next_stage(schedule)
             is_last = index == len(plan.stages) - 1
+            # The first two pilots find out what can be learned, and test it
+            if index >= 2 and self.budget.ends_learning(0 if is_last else samples):
+                if isinstance(schedule, EndingSchedule):
+                    schedule.end_learning()
+                    if not is_last:
+                        continue
+            stage = self._next_stage(schedule)
             self.statistics.learned = stage.learned
             self.statistics.effects = dict(stage.effects)
             if is_last:

@@ -65,6 +65,14 @@ class DivisibleSchedule(Schedule, Protocol):
         large as all before it. Called before the first stage, if the render can divide stages."""
 
 
+@runtime_checkable
+class EndingSchedule(Schedule, Protocol):
+    """A schedule that can do with fewer pilots."""
+
+    def end_learning(self) -> None:
+        """Makes the next stage the last one. Called after a pilot, in renders with a timeout."""
+
+
 class OneStage:
     """The schedule of an estimator that learns nothing."""
 

@@ -22,6 +22,11 @@ _PILOT_SHARE = 0.25
 _SECOND_SHARE = 0.25
 
 
+#: Largest share of the time that is left for pilots, for compiling their kernels, and for learning
+#: from them.
+LEARNING_SHARE = 1 / 3
+
+
 class TimeBudget:
     """The time of one render.
 
@@ -42,9 +47,17 @@ class TimeBudget:
     def __init__(self, timeout: float, start: float, pixel_count: int, pilot_spp: int) -> None:
         self.is_limited = timeout > 0
         self.end = start + timeout
+        self._learning_end = start + LEARNING_SHARE * timeout
+        self._pilot_pace = 0.0
         self.short = max(1, _SHORT_PASS // pixel_count)
         self.pilot_spp = pilot_spp
         self.pilot_factor: float | None = None
+
+    def ends_learning(self, samples: int) -> bool:
+        """Has learning taken its share of the time, or would it with another pilot of ``samples``
+        samples per pixel?"""
+        expected = time.perf_counter() + samples * self._pilot_pace
+        return self.is_limited and expected > self._learning_end
 
     def stage(self, samples: int, taken: int, is_last: bool) -> StageBudget:
         """The budget of a stage.
@@ -90,6 +103,7 @@ class _PilotBudget(StageBudget):
 
     def passed(self, spp: int, done: int, seconds: float) -> None:
         whole = self._whole
+        whole._pilot_pace = seconds / spp
         if whole.pilot_factor is None:
             left = max(0.0, whole.end - time.perf_counter()) * spp / seconds
             most = _PILOT_SHARE * (self._taken + done + left)

@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..arrays import channel_mean
 from .estimator import CameraRays
 
 
@@ -106,11 +107,11 @@ def track(
         flown = dr.minimum(dr.select(is_inside, mei.t, dr.inf), end) - mei.mint
         weight = attenuation(σ - chosen, flown) * dr.select(is_inside, dr.rcp(chosen), 1)
         # Is the collision a real one?
-        passing = dr.mean(dr.select(σ > 0, mei.sigma_n / σ, 0))
+        passing = channel_mean(dr.select(σ > 0, mei.sigma_n / σ, 0))
         is_null = is_inside & (sampler.next_1d(is_inside) < passing)
         is_real = is_inside & ~is_null
         weight *= dr.select(is_null, mei.sigma_n / passing, 1)
-        real = dr.mean(dr.select(σ > 0, mei.sigma_t / σ, 0))
+        real = channel_mean(dr.select(σ > 0, mei.sigma_t / σ, 0))
         weight *= dr.select(is_real, mei.sigma_s / real, 1)
         β = dr.select(active, β * mi.Spectrum(weight), β)
         t = dr.select(is_real, dr.norm(mei.p - start), t)

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import channel_mean
 from ...transport.path_decisions import Roulette
 
 #: A path whose expected contribution is at least this share of its pixel's radiance continues with
@@ -64,7 +65,7 @@ class AdjointRoulette(Roulette):
     def survival(self, state, vertex, path, active):
         region = self._regions.label(vertex.si, None, active)
         radiance = dr.gather(mi.Float, self._radiance, region, active)
-        expected = dr.mean(path.β) * radiance * state
+        expected = channel_mean(path.β) * radiance * state
         p = dr.clip(expected * (1 / _CERTAIN), _LEAST, 1)
         p = dr.select(radiance < 0, 1, p)
         if vertex.medium is not None:

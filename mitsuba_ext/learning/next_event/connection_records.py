@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import add_own
 from ...lights.choice import Choice
 from ...transport.mis import power_heuristic
 from ...transport.observer import Observer
@@ -88,30 +89,30 @@ class ConnectionRecords(Observer):
         change = power_heuristic(path.arrival.pdf, as_path)
         change /= power_heuristic(path.arrival.pdf, pdf)
         more = dr.square(brightness(value)) * (dr.square(change) - 1)
-        dr.scatter_add(self._more, more, self._path, active & dr.isfinite(more))
+        add_own(self._more, more, self._path, active & dr.isfinite(more))
 
     def connection(
         self, choice: Choice, vertex, ds, contribution, value, pdf, visible, tested
     ) -> None:
         is_traced = tested & self._is_recorded
         as_path = dr.gather(mi.Float, self._as_path, choice.cell, is_traced)
-        dr.scatter_add(self._counts[1], mi.Float(1), self._path, is_traced)
-        dr.scatter_add(self._counts[2], as_path / choice.probability, self._path, is_traced)
+        add_own(self._counts[1], mi.Float(1), self._path, is_traced)
+        add_own(self._counts[2], as_path / choice.probability, self._path, is_traced)
         active = visible & self._is_recorded
         ratio = choice.probability / as_path
         change = power_heuristic(ds.pdf / ratio, pdf) / power_heuristic(ds.pdf, pdf)
         square = dr.square(brightness(value))
         as_path = square * ratio * dr.select(ds.delta, 1, dr.square(change))
         active &= dr.isfinite(as_path)
-        dr.scatter_add(self._more, as_path - square, self._path, active)
+        add_own(self._more, as_path - square, self._path, active)
         active &= vertex.depth < _VERTICES
         slot = vertex.depth * self._slots + self._path
         dr.scatter(self._row, choice.row, slot, active)
         # A vertex may have several connections
-        dr.scatter_add(self._square, as_path, slot, active)
+        add_own(self._square, as_path, slot, active)
 
     def vertex(self, vertex, active) -> None:
-        dr.scatter_add(self._counts[0], mi.Float(1), self._path, active & self._is_recorded)
+        add_own(self._counts[0], mi.Float(1), self._path, active & self._is_recorded)
 
     def end(self, L: mi.Spectrum) -> None:
         dr.scatter(self._total, brightness(L), self._path, self._is_recorded)
