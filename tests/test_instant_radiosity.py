@@ -15,11 +15,13 @@ from statistical import (
     MANY_SEEDS,
     REFERENCE_SEEDS,
     SEEDS,
+    THRESHOLD,
     assert_exact,
     assert_same_quarters,
     batches,
     load,
     some,
+    z_exact,
 )
 from test_furnace import FURNACES
 from test_light_tracer import EMITTERS, MATERIALS, T, _balls, below_the_lamp
@@ -290,3 +292,59 @@ def test_media_are_refused() -> None:
     scene = mi.load_dict(stage(fog=fog), optimize=False)
     with pytest.raises((NotImplementedError, RuntimeError), match='"instant_radiosity", whose'):
         make().render(scene, spp=1)
+
+
+# ---- Its output variables ----
+
+
+def _layers(images: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The colours of images [seed, height, width, channel] of RGB films, and the layers behind."""
+    names = ("direct", "virtual", "compensation", "lights")
+    begins = range(images.shape[-1] - 12, images.shape[-1], 3)
+    return images[..., :3], {n: images[..., b : b + 3] for n, b in zip(names, begins)}
+
+
+@pytest.mark.parametrize("parameters", [
+    {"hide_emitters": True, "bound": 1.0, "connections": 2},
+    pytest.param({"choice": "learned", "compensation": False}, marks=pytest.mark.slow),
+    pytest.param({"interleaving": 2, "samples_per_pass": 2}, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_the_parts_of_the_image_add_up_to_it(parameters: dict[str, Any]) -> None:
+    """By way of diffuse and rough things, a mirror, glass, and a ball with a delta lobe."""
+    scene = mi.load_dict(stage(camera=below_the_lamp(), **things()), optimize=False)
+    image, layers = _layers(batches(scene, make(5, light_aovs=True, **parameters), 8, [1]))
+    total = layers["direct"] + layers["virtual"] + layers["compensation"]
+    np.testing.assert_allclose(total, image, rtol=1e-4, atol=1e-5)
+    assert all(layer.mean() > 0 for layer in layers.values())
+
+
+def test_direct_light_is_that_of_path_and_the_rest_is_indirect() -> None:
+    scene = _corner()
+    _, layers = _layers(batches(scene, make(3, light_aovs=True), 64, SEEDS[:4]))
+    both = [
+        batches(scene, mi.load_dict({"type": "path", "max_depth": depth}), 256, SEEDS[:4])
+        for depth in (2, 3)
+    ]
+    assert layers["direct"].mean() == pytest.approx(both[0].mean(), rel=0.01)
+    indirect = layers["virtual"].mean() + layers["compensation"].mean()
+    assert indirect == pytest.approx(both[1].mean() - both[0].mean(), rel=0.03)
+
+
+@pytest.mark.parametrize("max_depth", [1, 2])
+def test_without_virtual_lights_all_is_direct(max_depth: int) -> None:
+    scene = mi.load_dict(stage(), optimize=False)
+    image, layers = _layers(batches(scene, make(max_depth, light_aovs=True), 2, [1]))
+    np.testing.assert_array_equal(layers["direct"], image)
+    assert not any(layers[name].any() for name in ("virtual", "compensation", "lights"))
+
+
+@pytest.mark.parametrize("passes", [{}, {"samples_per_pass": 300}])
+def test_many_virtual_lights_show_the_image_of_a_light_tracer(passes: dict[str, int]) -> None:
+    """Those of light paths of one segment are where a lamp lights a surface directly."""
+    scene = mi.load_dict(stage(camera=below_the_lamp()), optimize=False)
+    integrator = make(3, light_aovs=True, light_paths=1000, **passes)
+    _, layers = _layers(batches(scene, integrator, 512, SEEDS[:MANY_SEEDS]))
+    path = (mi.load_dict({"type": "path", "max_depth": depth}) for depth in (2, 1))
+    lit, lamp = (batches(scene, integrator, 512, [1]).mean() for integrator in path)
+    z, error = z_exact(layers["lights"].mean(axis=(1, 2, 3)), lit - lamp)
+    assert abs(z) < THRESHOLD and error < 0.02
