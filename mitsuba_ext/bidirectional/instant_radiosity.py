@@ -16,18 +16,15 @@ from ..transport.walk import Walk
 from .light_walk import LightWalk
 from .path_tracer import camera_paths
 from .photon_history import VertexRegions
-from .vertex_choice import RegionChoice
 from .virtual_light_bound import Bound, Compensation, EndsWithItsShare
-from .virtual_light_choice import UniformChoice, VirtualLightChoice
+from .virtual_light_choice import LearnedChoice, UniformChoice, VirtualLightChoice
 from .virtual_light_connections import VirtualLightConnections
 from .virtual_light_parts import LightParts, PictureOfLights
 from .virtual_lights import Sets, VirtualLights
 
 
-class LearnedChoice(RegionChoice):
-    """Chooses by regions, among the virtual lights of all sets."""
-
-    is_stratified = False
+#: The most entries of learned tables for each camera sample; an entry is for a light path here.
+_ENTRIES = 2
 
 
 @dataclass
@@ -81,6 +78,9 @@ class InstantRadiosity:
         if selection is not None:
             light_walk = replace(light_walk, sums=VertexRegions(selection))
         set_count = self.sets.count(lanes)
+        if selection is not None:
+            most = _ENTRIES * lanes // (selection.count * self.sets.paths)
+            set_count = max(1, min(set_count, most))
         lights, scatter_count = VirtualLights.trace(
             scene, light_walk, sampler, rays, set_count, self.sets.paths
         )
@@ -95,7 +95,7 @@ class InstantRadiosity:
         if lights is not None:
             self.tally.lights += lights.vertices.count
             if selection is not None:
-                choice = LearnedChoice(lights.vertices, selection)
+                choice = LearnedChoice(lights, selection)
             else:
                 choice = self.choice(lights, self.sets.of_lanes(rays), self.bound.largest)
             subpaths = VirtualLightConnections(

@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import from_numpy
 from ..transport.bsdfs import eval_bsdf
 from ..transport.frozen import frozen
+from ..transport.path_decisions import SubpathSelection
 from ..transport.vertex import Vertex
 from .light_vertices import VertexCache
 from .vertex_choice import Chosen
@@ -83,6 +84,42 @@ class PowerChoice(UniformChoice):
         own = dr.gather(mi.UInt32, self._slot_count, index, exists)
         factor = self._share * mi.Float(slots) / mi.Float(dr.maximum(own, 1))
         return Chosen(index, factor, exists)
+
+
+class LearnedChoice:
+    """The probability of a virtual light grows with its brightness, and with what pilots found
+    such light to contribute from its region to that of the camera path's vertex, occlusion
+    included. It is chosen among the virtual lights of all sets.
+
+    Parameters:
+        lights: The virtual lights.
+        selection: What was learned.
+    """
+
+    is_stratified = True
+
+    def __init__(self, lights: VirtualLights, selection: SubpathSelection) -> None:
+        vertices = lights.vertices
+        # Rounded up, so that passes share kernels
+        index = dr.arange(mi.UInt32, vertices.room)
+        active = index < dr.opaque(mi.UInt32, vertices.count)
+        light = vertices.at(index, active)
+        brightness = dr.mean(light.β)
+        brightness = dr.select(active & dr.isfinite(brightness), brightness, 0)
+        self._region = dr.select(active, light.sums.region, 0)
+        dr.eval(brightness, self._region)
+        self._among = selection.among(self._region, brightness)
+        self._share = dr.opaque(mi.Float, 1 / len(vertices.first))
+
+    def numbers(self, sampler):
+        return (sampler.next_2d(),)
+
+    def choose(self, numbers, vertex, active):
+        index, probability = self._among(numbers[0], vertex.path.sums.region, active)
+        exists = active & (probability > 0)
+        factor = self._share / dr.select(exists, probability, 1)
+        region = dr.gather(mi.UInt32, self._region, index, exists)
+        return Chosen(index, factor, exists, region=region, probability=probability)
 
 
 def emitted_flux(lights: VirtualLights) -> np.ndarray:

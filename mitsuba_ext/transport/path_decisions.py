@@ -9,6 +9,7 @@ therefore a *state* that its methods take and return; its attributes are read-on
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -305,6 +306,21 @@ class SubpathSelection:
         """For MIS weights: how often, on average, a vertex in ``region`` is connected to a given
         vertex in the region ``chosen``, in units of the number of other subpaths: probability of
         choosing the region / vertices of a subpath there."""
+        raise NotImplementedError
+
+    def among(
+        self, region: mi.UInt32, brightness: mi.Float
+    ) -> Callable[[mi.Point2f, mi.UInt32, mi.Bool], tuple[mi.UInt32, mi.Float]]:
+        """Instead of a region, chooses one of given vertices.
+
+        Parameters:
+            region, brightness: Of each of these vertices: its region, and its brightness, positive
+                where it is to be chosen.
+
+        Returns:
+            A function that returns the index of a vertex and the probability of choosing it, from
+            two uniform numbers, the region of the other vertex, and a mask.
+        """
         raise NotImplementedError
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -21,29 +23,55 @@ class RegionTable(SubpathSelection):
         probability: For each region of a camera vertex, the probability of each region of light
             vertices, all positive; shape [regions, regions].
         vertices: The expected number of vertices of a light path in each region, positive.
+        power: The expected sum of their brightness, positive; by default, all are equally bright.
     """
 
     def __init__(
-        self, regions: NestedRegions, probability: np.ndarray, vertices: np.ndarray
+        self,
+        regions: NestedRegions,
+        probability: np.ndarray,
+        vertices: np.ndarray,
+        power: np.ndarray | None = None,
     ) -> None:
         self._regions, self.count = regions, regions.count
         self._table = alias_rows(
             from_numpy(mi.Float, probability), self.count, self.count
         )
         self._expected = from_numpy(mi.Float, probability / vertices)
+        # Positive also where no light arrives
+        power = np.maximum(vertices if power is None else power, 1e-30)
+        self._per_brightness = from_numpy(mi.Float, probability / power)
         # Opaque: scenes that differ in it only share their kernels
         self._size = dr.opaque(mi.UInt32, self.count)
-        dr.eval(self._expected)
+        dr.eval(self._expected, self._per_brightness)
 
     def region(self, si, active):
         return self._regions.number(si.p, lit_normal(si), active)
 
     def choose(self, sample, region, active):
-        chosen = dr.minimum(mi.UInt32(sample.x * mi.Float(self._size)), self._size - 1)
-        entry = dr.gather(mi.Vector4f, self._table, region * self._size + chosen, active)
-        is_taken = sample.y < entry[0]
-        chosen = dr.select(is_taken, chosen, dr.reinterpret_array(mi.UInt32, entry[1]))
-        return chosen, dr.select(is_taken, entry[2], entry[3])
+        return _choose(self._table, self._size, sample, region, active)
 
     def expected(self, region, chosen, active):
         return dr.gather(mi.Float, self._expected, region * self._size + chosen, active)
+
+    def among(self, region, brightness):
+        size, number = len(region), dr.opaque(mi.UInt32, len(region))
+        index = dr.arange(mi.UInt32, self.count * size)
+        row, column = index // number, index % number
+        of_column = dr.gather(mi.UInt32, region, column)
+        weight = dr.gather(mi.Float, self._per_brightness, row * self._size + of_column)
+        weight *= dr.gather(mi.Float, brightness, column)
+        table = alias_rows(weight, self.count, size)
+        return functools.partial(_choose, table, number)
+
+
+def _choose(
+    table: mi.Float, size: mi.UInt32, sample: mi.Point2f, row: mi.UInt32, active: mi.Bool
+) -> tuple[mi.UInt32, mi.Float]:
+    """The column that two numbers choose in a row of a table of ``alias_rows``, with ``size``
+    columns, and its probability."""
+    chosen = dr.minimum(mi.UInt32(sample.x * mi.Float(size)), size - 1)
+    entry = dr.gather(mi.Vector4f, table, row * size + chosen, active)
+    is_taken = sample.y < entry[0]
+    chosen = dr.select(is_taken, chosen, dr.reinterpret_array(mi.UInt32, entry[1]))
+    return chosen, dr.select(is_taken, entry[2], entry[3])
