@@ -23,10 +23,6 @@ from .virtual_light_parts import LightParts, PictureOfLights
 from .virtual_lights import Sets, VirtualLights
 
 
-#: The most entries of learned tables for each camera sample; an entry is for a light path here.
-_ENTRIES = 2
-
-
 @dataclass
 class Tally:
     """Counts what a render has traced.
@@ -78,9 +74,6 @@ class InstantRadiosity:
         if selection is not None:
             light_walk = replace(light_walk, sums=VertexRegions(selection))
         set_count = self.sets.count(lanes)
-        if selection is not None:
-            most = _ENTRIES * lanes // (selection.count * self.sets.paths)
-            set_count = max(1, min(set_count, most))
         lights, scatter_count = VirtualLights.trace(
             scene, light_walk, sampler, rays, set_count, self.sets.paths
         )

@@ -9,7 +9,6 @@ therefore a *state* that its methods take and return; its attributes are read-on
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -308,18 +307,13 @@ class SubpathSelection:
         choosing the region / vertices of a subpath there."""
         raise NotImplementedError
 
-    def among(
-        self, region: mi.UInt32, brightness: mi.Float
-    ) -> Callable[[mi.Point2f, mi.UInt32, mi.Bool], tuple[mi.UInt32, mi.Float]]:
-        """Instead of a region, chooses one of given vertices.
+    def by_power(self, power: mi.Float) -> SubpathSelection:
+        """The selection for given vertices of other subpaths: it chooses regions by what is there,
+        in place of what is there on average. It has no :meth:`expected`.
 
         Parameters:
-            region, brightness: Of each of these vertices: its region, and its brightness, positive
-                where it is to be chosen.
-
-        Returns:
-            A function that returns the index of a vertex and the probability of choosing it, from
-            two uniform numbers, the region of the other vertex, and a mask.
+            power: The sum of the brightness of these vertices in each region; regions without any
+                are not chosen.
         """
         raise NotImplementedError
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import copy
 
 import drjit as dr
 import mitsuba as mi
@@ -49,29 +49,18 @@ class RegionTable(SubpathSelection):
         return self._regions.number(si.p, lit_normal(si), active)
 
     def choose(self, sample, region, active):
-        return _choose(self._table, self._size, sample, region, active)
+        chosen = dr.minimum(mi.UInt32(sample.x * mi.Float(self._size)), self._size - 1)
+        entry = dr.gather(mi.Vector4f, self._table, region * self._size + chosen, active)
+        is_taken = sample.y < entry[0]
+        chosen = dr.select(is_taken, chosen, dr.reinterpret_array(mi.UInt32, entry[1]))
+        return chosen, dr.select(is_taken, entry[2], entry[3])
 
     def expected(self, region, chosen, active):
         return dr.gather(mi.Float, self._expected, region * self._size + chosen, active)
 
-    def among(self, region, brightness):
-        size, number = len(region), dr.opaque(mi.UInt32, len(region))
-        index = dr.arange(mi.UInt32, self.count * size)
-        row, column = index // number, index % number
-        of_column = dr.gather(mi.UInt32, region, column)
-        weight = dr.gather(mi.Float, self._per_brightness, row * self._size + of_column)
-        weight *= dr.gather(mi.Float, brightness, column)
-        table = alias_rows(weight, self.count, size)
-        return functools.partial(_choose, table, number)
-
-
-def _choose(
-    table: mi.Float, size: mi.UInt32, sample: mi.Point2f, row: mi.UInt32, active: mi.Bool
-) -> tuple[mi.UInt32, mi.Float]:
-    """The column that two numbers choose in a row of a table of ``alias_rows``, with ``size``
-    columns, and its probability."""
-    chosen = dr.minimum(mi.UInt32(sample.x * mi.Float(size)), size - 1)
-    entry = dr.gather(mi.Vector4f, table, row * size + chosen, active)
-    is_taken = sample.y < entry[0]
-    chosen = dr.select(is_taken, chosen, dr.reinterpret_array(mi.UInt32, entry[1]))
-    return chosen, dr.select(is_taken, entry[2], entry[3])
+    def by_power(self, power):
+        entry = dr.arange(mi.UInt32, self.count**2)
+        weight = self._per_brightness * dr.gather(mi.Float, power, entry % self._size)
+        table = copy.copy(self)
+        table._table = alias_rows(weight, self.count, self.count)
+        return table
