@@ -60,8 +60,8 @@ class InstantRadiosityIntegrator(WalkIntegrator):
        - |string|
        - How virtual lights are chosen: :monosp:`uniform`; :monosp:`power` (by the flux that they
          emit); :monosp:`clustered` (by flux, distance and cosines, with a light tree); or
-         :monosp:`learned` (by regions, from what pilot samples found visible and bright).
-         (Default: power)
+         :monosp:`learned` (by flux, and by what pilot samples found to arrive at this place from
+         that region, occlusion included: for long renders). (Default: power)
      * - bound
        - |float|
        - The largest geometry term that a connection counts with, in units of 1 / (diagonal of the
@@ -124,8 +124,13 @@ class InstantRadiosityIntegrator(WalkIntegrator):
 
     ``statistics.learned`` tells the number of virtual lights and the bound, in units of the scene.
 
-    Virtual lights on glossy surfaces are seen as dim, noisy reflections of lamps (virtual spherical
-    lights are not built). Spectral variants, moving shapes and lights, and participating media are
+    **The learned choice** is next event estimation++ over virtual lights. These are others in each
+    pass; so pairs of regions of surfaces are learned: how much light from the one reaches the
+    other. A region is then chosen by that and by the brightness of the virtual lights that are
+    there, and one of these by flux.
+
+    Virtual lights on glossy surfaces are seen as dim, noisy reflections of lamps. Virtual spherical
+    lights were tried, and are worse (docs/results/instant_radiosity.md). Spectral variants, moving shapes and lights, and participating media are
     refused: camera paths of other wavelengths and times cannot share virtual lights. Of lights of
     the type :monosp:`directionalarea`, which :monosp:`path` does not find, only the indirect light
     is rendered. As with :class:`bdpt`, images differ from :monosp:`path` in scenes far from the
@@ -135,7 +140,9 @@ class InstantRadiosityIntegrator(WalkIntegrator):
     Source: A. Keller, *Instant Radiosity*, SIGGRAPH 1997; T. Kollig, A. Keller, *Illumination in
     the Presence of Weak Singularities*, MCQMC 2004, section 3 (bound and compensation; K for glossy
     surfaces is ours); B. Walter et al., *Lightcuts*, ACM Transactions on Graphics 24(3), 2005 (the
-    tree); D. Cline, PhD thesis, 2007, section 7.8, figure 7.15.
+    tree); J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
+    Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, section 4.2 (learned
+    visibility between places; contributions are ours); D. Cline, PhD thesis, 2007, section 7.8, figure 7.15.
 
     .. tabs::
         .. code-tab:: xml
