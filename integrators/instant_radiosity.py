@@ -130,19 +130,20 @@ class InstantRadiosityIntegrator(WalkIntegrator):
     there, and one of these by flux.
 
     Virtual lights on glossy surfaces are seen as dim, noisy reflections of lamps. Virtual spherical
-    lights were tried, and are worse (docs/results/instant_radiosity.md). Spectral variants, moving shapes and lights, and participating media are
-    refused: camera paths of other wavelengths and times cannot share virtual lights. Of lights of
-    the type :monosp:`directionalarea`, which :monosp:`path` does not find, only the indirect light
-    is rendered. As with :class:`bdpt`, images differ from :monosp:`path` in scenes far from the
-    origin. Gradients are not supported (use :class:`composed_prb`), nor nesting in
-    :monosp:`moment` and :monosp:`aov`.
+    lights were tried, and are worse (docs/results/instant_radiosity.md). Spectral variants, moving
+    shapes and lights, and participating media are refused: camera paths of other wavelengths and
+    times cannot share virtual lights. Of lights of the type :monosp:`directionalarea`, which
+    :monosp:`path` does not find, only the indirect light is rendered. As with :class:`bdpt`, images
+    differ from :monosp:`path` in scenes far from the origin. Gradients are not supported (use
+    :class:`composed_prb`), nor nesting in :monosp:`moment` and :monosp:`aov`.
 
     Source: A. Keller, *Instant Radiosity*, SIGGRAPH 1997; T. Kollig, A. Keller, *Illumination in
     the Presence of Weak Singularities*, MCQMC 2004, section 3 (bound and compensation; K for glossy
     surfaces is ours); B. Walter et al., *Lightcuts*, ACM Transactions on Graphics 24(3), 2005 (the
     tree); J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
     Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, section 4.2 (learned
-    visibility between places; contributions are ours); D. Cline, PhD thesis, 2007, section 7.8, figure 7.15.
+    visibility between places; contributions are ours); D. Cline, PhD thesis, 2007, section 7.8,
+    figure 7.15.
 
     .. tabs::
         .. code-tab:: xml
