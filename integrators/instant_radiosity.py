@@ -13,6 +13,7 @@ from mitsuba_ext.bidirectional.light_walk import LightWalk
 from mitsuba_ext.bidirectional.merging import scene_diagonal
 from mitsuba_ext.bidirectional.virtual_light_bound import Bound
 from mitsuba_ext.bidirectional.virtual_light_choice import PowerChoice, UniformChoice
+from mitsuba_ext.bidirectional.virtual_light_parts import LIGHTS, PARTS, AllDirect, PictureOfLights
 from mitsuba_ext.bidirectional.virtual_light_tree import ClusteredChoice
 from mitsuba_ext.bidirectional.virtual_lights import MOST_PATHS, Sets
 from mitsuba_ext.composition.light_side import LightSide
@@ -59,8 +60,8 @@ class InstantRadiosityIntegrator(WalkIntegrator):
        - |string|
        - How virtual lights are chosen: :monosp:`uniform`; :monosp:`power` (by the flux that they
          emit); :monosp:`clustered` (by flux, distance and cosines, with a light tree); or
-         :monosp:`learned` (by regions, from what pilot samples found visible and bright).
-         (Default: power)
+         :monosp:`learned` (by flux, and by what pilot samples found to arrive at this place from
+         that region, occlusion included: for long renders). (Default: power)
      * - bound
        - |float|
        - The largest geometry term that a connection counts with, in units of 1 / (diagonal of the
@@ -70,6 +71,11 @@ class InstantRadiosityIntegrator(WalkIntegrator):
        - |bool|
        - Is what the bound cuts off found by BSDF sampling? If not, corners are too dark, and the
          image is biased: for previews. (Default: true)
+     * - light_aovs
+       - |bool|
+       - Writes the parts of the image, whose sum it is, to the channels :monosp:`direct.R`,
+         :monosp:`virtual.R`, :monosp:`compensation.R`, …, and a picture of the virtual lights to
+         :monosp:`lights.R`, …: see below. (Default: false)
      * - pilot_spp, save_learned, load_learned
        - |int| or |string|
        - As in :class:`composed_path`; only with the choice :monosp:`learned`. (Default: 16, none,
@@ -108,20 +114,36 @@ class InstantRadiosityIntegrator(WalkIntegrator):
     or that of the tree. All choices give each virtual light a probability above 0, by which its
     contribution is divided.
 
+    **What virtual lights give** is told by :monosp:`light_aovs`: :monosp:`virtual` is the light of
+    connections to them, :monosp:`compensation` what camera paths found with a weight below one, and
+    :monosp:`direct` all that they found with full weight: lamps that are seen, direct light, and
+    what comes by way of mirrors and glass. Where :monosp:`compensation` is noisy, a larger bound
+    helps; where :monosp:`virtual` is, more connections do. In :monosp:`lights`, each virtual light
+    that a :monosp:`perspective` or :monosp:`thinlens` sees is a dot, as bright as the radiance that
+    it sends to the camera; with many samples, the dots become the image of a light tracer.
+
     ``statistics.learned`` tells the number of virtual lights and the bound, in units of the scene.
 
-    Virtual lights on glossy surfaces are seen as dim, noisy reflections of lamps (virtual spherical
-    lights are not built). Spectral variants, moving shapes and lights, and participating media are
-    refused: camera paths of other wavelengths and times cannot share virtual lights. Of lights of
-    the type :monosp:`directionalarea`, which :monosp:`path` does not find, only the indirect light
-    is rendered. As with :class:`bdpt`, images differ from :monosp:`path` in scenes far from the
-    origin. Gradients are not supported (use :class:`composed_prb`), nor nesting in
-    :monosp:`moment` and :monosp:`aov`.
+    **The learned choice** is next event estimation++ over virtual lights. These are others in each
+    pass; so pairs of regions of surfaces are learned: how much light from the one reaches the
+    other. A region is then chosen by that and by the brightness of the virtual lights that are
+    there, and one of these by flux.
+
+    Virtual lights on glossy surfaces are seen as dim, noisy reflections of lamps. Virtual spherical
+    lights were tried, and are worse (docs/results/instant_radiosity.md). Spectral variants, moving
+    shapes and lights, and participating media are refused: camera paths of other wavelengths and
+    times cannot share virtual lights. Of lights of the type :monosp:`directionalarea`, which
+    :monosp:`path` does not find, only the indirect light is rendered. As with :class:`bdpt`, images
+    differ from :monosp:`path` in scenes far from the origin. Gradients are not supported (use
+    :class:`composed_prb`), nor nesting in :monosp:`moment` and :monosp:`aov`.
 
     Source: A. Keller, *Instant Radiosity*, SIGGRAPH 1997; T. Kollig, A. Keller, *Illumination in
     the Presence of Weak Singularities*, MCQMC 2004, section 3 (bound and compensation; K for glossy
     surfaces is ours); B. Walter et al., *Lightcuts*, ACM Transactions on Graphics 24(3), 2005 (the
-    tree); D. Cline, PhD thesis, 2007, section 7.8, figure 7.15.
+    tree); J. Guo, M. Eisemann, E. Eisemann, *Next Event Estimation++: Visibility Mapping for
+    Efficient Light Transport Simulation*, Computer Graphics Forum 39(7), 2020, section 4.2 (learned
+    visibility between places; contributions are ours); D. Cline, PhD thesis, 2007, section 7.8,
+    figure 7.15.
 
     .. tabs::
         .. code-tab:: xml
@@ -150,6 +172,7 @@ class InstantRadiosityIntegrator(WalkIntegrator):
         self.choice = self.parameter(props, "choice", "power", choices=tuple(_CHOICES))
         self.bound = self.parameter(props, "bound", 5.0, minimum=0.0)
         self.compensation = self.parameter(props, "compensation", True)
+        self.light_aovs = self.parameter(props, "light_aovs", False)
         slots = {key: read_slot(self.name, props, key) for key in ("next_event", "shadow_test")}
         if self.choice == "learned":
             slots["subpath_selection"] = LearnedSubpaths()
@@ -164,6 +187,7 @@ class InstantRadiosityIntegrator(WalkIntegrator):
             "choice": self.choice,
             "bound": self.bound,
             "compensation": self.compensation,
+            "light_aovs": self.light_aovs,
             **super().parameters(),
         }
 
@@ -174,12 +198,19 @@ class InstantRadiosityIntegrator(WalkIntegrator):
     def estimators(self, scene, sensor):
         self._check(scene)
         if not scene.emitters() or self.max_depth < 3:
-            return self.walk
-        side = LightSide.of(self.name, scene, sensor, has_image=False)
+            return self._walk_alone if self.light_aovs else self.walk
+        side = LightSide.of(self.name, scene, sensor, has_image=self.light_aovs)
         self._largest = self.bound / scene_diagonal(scene) ** 2
         width, height = film_extent(sensor.film())
         sets = Sets(width * height, width, self.light_paths, self.interleaving)
-        return functools.partial(self._estimator, side, sets)
+        picture = None
+        if self.light_aovs:
+            offset = sensor.film().crop_offset()
+            picture = PictureOfLights(side.sensor, width * height, width, offset)
+        return functools.partial(self._estimator, side, sets, picture)
+
+    def _walk_alone(self, **decisions: Any) -> Estimator:
+        return AllDirect(self.walk(**decisions))
 
     def _check(self, scene: mi.Scene) -> None:
         """
@@ -193,7 +224,9 @@ class InstantRadiosityIntegrator(WalkIntegrator):
                 f'share virtual lights; use "bdpt" or "path"'
             )
 
-    def _estimator(self, side: LightSide, sets: Sets, **decisions: Any) -> Estimator:
+    def _estimator(
+        self, side: LightSide, sets: Sets, picture: PictureOfLights | None, **decisions: Any
+    ) -> Estimator:
         selection = decisions.pop("subpath_selection", None)
         next_event = side.next_event(decisions.pop("next_event", None))
         if next_event is not None:
@@ -206,8 +239,13 @@ class InstantRadiosityIntegrator(WalkIntegrator):
         chosen = {} if selection is None else {"selection": selection}
         return InstantRadiosity(
             walk, light_walk, sets, Bound(self._largest, self.compensation), self.connections,
-            _CHOICES[self.choice] or UniformChoice, tally=self._tally, **chosen,
+            _CHOICES[self.choice] or UniformChoice, tally=self._tally, picture=picture, **chosen,
         )  # fmt: skip
+
+    def aov_names(self) -> list[str]:
+        channels = "RGB" if len(mi.Spectrum()) > 1 else "Y"
+        own = [f"{layer}.{c}" for layer in (*PARTS, LIGHTS) for c in channels]
+        return (own if self.light_aovs else []) + super().aov_names()
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         self._tally, self._largest = Tally(), math.inf

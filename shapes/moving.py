@@ -90,8 +90,8 @@ class Moving(mi.Mesh):
     are small in the view, more where they fill it). Put shapes that move together into one
     :monosp:`moving`.
 
-    In :monosp:`cuda_*` variants, our integrators refuse scenes with moving shapes: Dr.Jit traces the
-    rays of a kernel in one scene only.
+    In :monosp:`cuda_*` variants, our integrators refuse scenes with moving shapes: Dr.Jit traces
+    the rays of a kernel in one scene only.
 
     A nested shape may be nowhere else in the scene. Sensors, and meshes with vertex attributes,
     cannot be nested, and a medium in moving shapes must be homogeneous. The scene's

@@ -15,11 +15,13 @@ from statistical import (
     MANY_SEEDS,
     REFERENCE_SEEDS,
     SEEDS,
+    THRESHOLD,
     assert_exact,
     assert_same_quarters,
     batches,
     load,
     some,
+    z_exact,
 )
 from test_furnace import FURNACES
 from test_light_tracer import EMITTERS, MATERIALS, T, _balls, below_the_lamp
@@ -27,9 +29,18 @@ from test_photon_map import things
 
 from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.light_walk import LightWalk
-from mitsuba_ext.bidirectional.virtual_light_choice import PowerChoice, UniformChoice
+from mitsuba_ext.bidirectional.photon_history import VertexRegions
+from mitsuba_ext.bidirectional.virtual_light_bound import Link
+from mitsuba_ext.bidirectional.virtual_light_choice import (
+    LearnedChoice,
+    PowerChoice,
+    UniformChoice,
+)
 from mitsuba_ext.bidirectional.virtual_light_tree import ClusteredChoice
 from mitsuba_ext.bidirectional.virtual_lights import Sets, VirtualLights
+from mitsuba_ext.decisions.subpaths.region_table import RegionTable
+from mitsuba_ext.regions.nested_regions import NestedRegions
+from mitsuba_ext.regions.surface_sides import lit_normal
 from mitsuba_ext.transport.estimator import CameraRays
 from mitsuba_ext.transport.vertex import Arrival, PathState, Vertex
 
@@ -130,34 +141,41 @@ def test_the_same_seed_gives_the_same_image() -> None:
 # ---- The choices ----
 
 
-def _lights(scene: mi.Scene, paths: int = 16) -> VirtualLights:
-    """Two sets of virtual lights."""
+def _lights(
+    scene: mi.Scene, paths: int = 16, table: RegionTable | None = None
+) -> VirtualLights:
+    """Two sets of virtual lights, which know their regions if there is a table of these."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, 4 * paths)
     rays = CameraRays(dr.zeros(mi.RayDifferential3f, 4 * paths))
-    walk = LightWalk(LightEmission(scene), 5, 5)
+    sums = VertexRegions(table) if table is not None else None
+    walk = LightWalk(LightEmission(scene), 5, 5, sums)
     lights, _ = VirtualLights.trace(scene, walk, sampler, rays, 2, paths)
     return lights
 
 
-@pytest.mark.parametrize("kind", [UniformChoice, PowerChoice, ClusteredChoice])
-def test_virtual_lights_are_chosen_as_often_as_their_weights_say(kind: type) -> None:
-    """χ² of the choices at one vertex, from one set; its other set is never chosen from."""
-    scene = mi.load_dict(stage(), optimize=False)
-    lights, count = _lights(scene), 1 << 18
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(1, count)
+def _camera_vertices(scene: mi.Scene, sums: Any = ()) -> Vertex:
+    """The same vertex in many lanes."""
     ray = mi.Ray3f(mi.Point3f(0.3, -1, 1), mi.Vector3f(0, 0.4, -1))
     si = scene.ray_intersect(ray)
     arrival = Arrival(mi.Interaction3f(si), mi.Float(1), mi.Bool(True))
-    path = PathState(mi.Spectrum(1), mi.Float(1), mi.Float(1), mi.UInt32(0), arrival, ())
-    choice = kind(lights, dr.full(mi.UInt32, 1, count), mi.Float(2.0))
+    path = PathState(mi.Spectrum(1), mi.Float(1), mi.Float(1), mi.UInt32(0), arrival, (), sums)
+    return Vertex(si, si.bsdf(), path)
+
+
+def _assert_chosen_by_weight(
+    choice: Any, vertex: Vertex, paths: int, begin: int, number: int
+) -> None:
+    """χ² of the choices at one vertex against the probabilities that their weights tell, which add
+    up to one over the virtual lights from ``begin`` on."""
+    count = 1 << 18
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(1, count)
     active = dr.full(mi.Bool, True, count)
-    chosen = choice.choose(choice.numbers(sampler), Vertex(si, si.bsdf(), path), active)
-    begin, number = int(lights.begin[1]), int(lights.number[1])
+    chosen = choice.choose(choice.numbers(sampler), vertex, active)
     index = chosen.index.numpy() - begin
     assert chosen.active.numpy().all() and 0 <= index.min() and index.max() < number
-    probability = float(lights.share[0]) / (chosen.factor.numpy() + np.zeros(count))
+    probability = 1 / paths / (chosen.factor.numpy() + np.zeros(count))
     expected = np.zeros(number)
     expected[index] = probability
     found = np.bincount(index, minlength=number)
@@ -169,6 +187,33 @@ def test_virtual_lights_are_chosen_as_often_as_their_weights_say(kind: type) -> 
     if wanted[-1] < 5:
         observed, wanted = observed[:-1], wanted[:-1] * observed[:-1].sum() / wanted[:-1].sum()
     assert stats.chisquare(observed, wanted * observed.sum() / wanted.sum()).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("kind", [UniformChoice, PowerChoice, ClusteredChoice])
+def test_virtual_lights_are_chosen_as_often_as_their_weights_say(kind: type) -> None:
+    """From one set; its other set is never chosen from."""
+    scene = mi.load_dict(stage(), optimize=False)
+    lights = _lights(scene)
+    choice = kind(lights, dr.full(mi.UInt32, 1, 1 << 18), mi.Float(2.0))
+    begin, number = int(lights.begin[1]), int(lights.number[1])
+    _assert_chosen_by_weight(choice, _camera_vertices(scene), 16, begin, number)
+
+
+def test_learned_virtual_lights_are_chosen_as_often_as_their_weights_say() -> None:
+    """From all sets, with any probabilities of regions, also of some where no light is."""
+    scene = mi.load_dict(stage(), optimize=False)
+    vertices = _lights(scene, 64).vertices
+    every = dr.full(mi.Bool, True, vertices.count)
+    si = vertices.at(dr.arange(mi.UInt32, vertices.count), every).si
+    regions = NestedRegions(si.p, lit_normal(si), most=12)
+    rng = np.random.default_rng(2)
+    probability = rng.uniform(0.1, 1, (regions.count, regions.count)) ** 3
+    table = RegionTable(regions, probability, rng.uniform(0.1, 1, regions.count))
+    lights = _lights(scene, 16, table)
+    link = Link(mi.Float(1), mi.Float(0), mi.Float(0), mi.Bool(True), mi.UInt32(2))
+    vertex = _camera_vertices(scene, link)
+    choice = LearnedChoice(lights, table)
+    _assert_chosen_by_weight(choice, vertex, 32, 0, lights.vertices.count)
 
 
 def test_several_connections_are_spread_over_the_virtual_lights() -> None:
@@ -290,3 +335,59 @@ def test_media_are_refused() -> None:
     scene = mi.load_dict(stage(fog=fog), optimize=False)
     with pytest.raises((NotImplementedError, RuntimeError), match='"instant_radiosity", whose'):
         make().render(scene, spp=1)
+
+
+# ---- Its output variables ----
+
+
+def _layers(images: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The colours of images [seed, height, width, channel] of RGB films, and the layers behind."""
+    names = ("direct", "virtual", "compensation", "lights")
+    begins = range(images.shape[-1] - 12, images.shape[-1], 3)
+    return images[..., :3], {n: images[..., b : b + 3] for n, b in zip(names, begins)}
+
+
+@pytest.mark.parametrize("parameters", [
+    {"hide_emitters": True, "bound": 1.0, "connections": 2},
+    pytest.param({"choice": "learned", "compensation": False}, marks=pytest.mark.slow),
+    pytest.param({"interleaving": 2, "samples_per_pass": 2}, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_the_parts_of_the_image_add_up_to_it(parameters: dict[str, Any]) -> None:
+    """By way of diffuse and rough things, a mirror, glass, and a ball with a delta lobe."""
+    scene = mi.load_dict(stage(camera=below_the_lamp(), **things()), optimize=False)
+    image, layers = _layers(batches(scene, make(5, light_aovs=True, **parameters), 8, [1]))
+    total = layers["direct"] + layers["virtual"] + layers["compensation"]
+    np.testing.assert_allclose(total, image, rtol=1e-4, atol=1e-5)
+    assert all(layer.mean() > 0 for layer in layers.values())
+
+
+def test_direct_light_is_that_of_path_and_the_rest_is_indirect() -> None:
+    scene = _corner()
+    _, layers = _layers(batches(scene, make(3, light_aovs=True), 64, SEEDS[:4]))
+    both = [
+        batches(scene, mi.load_dict({"type": "path", "max_depth": depth}), 256, SEEDS[:4])
+        for depth in (2, 3)
+    ]
+    assert layers["direct"].mean() == pytest.approx(both[0].mean(), rel=0.01)
+    indirect = layers["virtual"].mean() + layers["compensation"].mean()
+    assert indirect == pytest.approx(both[1].mean() - both[0].mean(), rel=0.03)
+
+
+@pytest.mark.parametrize("max_depth", [1, 2])
+def test_without_virtual_lights_all_is_direct(max_depth: int) -> None:
+    scene = mi.load_dict(stage(), optimize=False)
+    image, layers = _layers(batches(scene, make(max_depth, light_aovs=True), 2, [1]))
+    np.testing.assert_array_equal(layers["direct"], image)
+    assert not any(layers[name].any() for name in ("virtual", "compensation", "lights"))
+
+
+@pytest.mark.parametrize("passes", [{}, {"samples_per_pass": 300}])
+def test_many_virtual_lights_show_the_image_of_a_light_tracer(passes: dict[str, int]) -> None:
+    """Those of light paths of one segment are where a lamp lights a surface directly."""
+    scene = mi.load_dict(stage(camera=below_the_lamp()), optimize=False)
+    integrator = make(3, light_aovs=True, light_paths=1000, **passes)
+    _, layers = _layers(batches(scene, integrator, 512, SEEDS[:MANY_SEEDS]))
+    path = (mi.load_dict({"type": "path", "max_depth": depth}) for depth in (2, 1))
+    lit, lamp = (batches(scene, integrator, 512, [1]).mean() for integrator in path)
+    z, error = z_exact(layers["lights"].mean(axis=(1, 2, 3)), lit - lamp)
+    assert abs(z) < THRESHOLD and error < 0.02

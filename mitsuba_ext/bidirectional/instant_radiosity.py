@@ -10,22 +10,17 @@ import mitsuba as mi
 
 from ..transport.estimator import CameraRays, Sample
 from ..transport.numbers import Numbers
+from ..transport.observer import Observers
 from ..transport.path_decisions import SubpathSelection
 from ..transport.walk import Walk
 from .light_walk import LightWalk
 from .path_tracer import camera_paths
 from .photon_history import VertexRegions
-from .vertex_choice import RegionChoice
 from .virtual_light_bound import Bound, Compensation, EndsWithItsShare
-from .virtual_light_choice import UniformChoice, VirtualLightChoice
+from .virtual_light_choice import LearnedChoice, UniformChoice, VirtualLightChoice
 from .virtual_light_connections import VirtualLightConnections
+from .virtual_light_parts import LightParts, PictureOfLights
 from .virtual_lights import Sets, VirtualLights
-
-
-class LearnedChoice(RegionChoice):
-    """Chooses by regions, among the virtual lights of all sets."""
-
-    is_stratified = False
 
 
 @dataclass
@@ -54,6 +49,8 @@ class InstantRadiosity:
         choice: Makes the choice of virtual lights, from these, the set of each lane, and the bound.
         selection: Chooses regions of virtual lights instead, if it has any.
         tally: Counts.
+        picture: Shows the virtual lights. If there is one, the samples' output variables are the
+            parts of :class:`LightParts`, and the picture.
     """
 
     walk: Walk
@@ -64,6 +61,7 @@ class InstantRadiosity:
     choice: Callable[..., VirtualLightChoice] = UniformChoice
     selection: SubpathSelection = field(default_factory=SubpathSelection)
     tally: Tally = field(default_factory=Tally)
+    picture: PictureOfLights | None = None
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
@@ -84,18 +82,29 @@ class InstantRadiosity:
             self.walk, mis=Compensation(self.bound, selection),
             roulette=EndsWithItsShare(self.walk.rr_depth), rr_depth=0,
         )  # fmt: skip
+        parts = LightParts(self.bound) if self.picture is not None else None
+        if parts is not None:
+            walk = replace(walk, observer=Observers([walk.observer, parts]))
         if lights is not None:
             self.tally.lights += lights.vertices.count
             if selection is not None:
-                choice = LearnedChoice(lights.vertices, selection)
+                choice = LearnedChoice(lights, selection)
             else:
                 choice = self.choice(lights, self.sets.of_lanes(rays), self.bound.largest)
             subpaths = VirtualLightConnections(
                 scene, lights.vertices, choice, self.bound, walk.query, self.connections,
-                walk.max_depth, walk.observer,
+                walk.max_depth, walk.observer, parts,
             )  # fmt: skip
             walk = replace(walk, subpaths=subpaths)
         sample = camera_paths(walk, scene, sampler, rays, active)
+        if parts is not None:
+            # The sums of the parts are complete when the kernel of the samples has run
+            dr.eval(sample)
+            values = [
+                dr.select(sample.valid, part * rays.importance, 0) for part in parts.values()
+            ]
+            values.append(self.picture.values(scene, lights, walk, sampler, rays))
+            sample = replace(sample, aovs=[channel for value in values for channel in value])
         # The first lane counts the rays of light paths
         is_first = dr.arange(mi.UInt32, lanes) == 0
         scatter_count = dr.select(is_first, dr.sum(scatter_count), 0)

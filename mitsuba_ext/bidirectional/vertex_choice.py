@@ -56,7 +56,7 @@ class VertexChoice:
         self, numbers: tuple[mi.Point2f, ...], vertex: Vertex, active: mi.Bool
     ) -> Chosen:
         """Chooses a stored vertex for each ``vertex``."""
-        return Chosen(_below(self._count, numbers[0]), self._mean, active & (self._count > 0))
+        return Chosen(below(self._count, numbers[0]), self._mean, active & (self._count > 0))
 
 
 class OwnVertexChoice(VertexChoice):
@@ -69,7 +69,7 @@ class OwnVertexChoice(VertexChoice):
     def choose(self, numbers, vertex, active):
         first = dr.gather(mi.UInt32, self._vertices.first, self._lane, active)
         number = dr.gather(mi.UInt32, self._vertices.number, self._lane, active)
-        return Chosen(first + _below(number, numbers[0]), mi.Float(number), active & (number > 0))
+        return Chosen(first + below(number, numbers[0]), mi.Float(number), active & (number > 0))
 
 
 class RegionChoice(VertexChoice):
@@ -99,7 +99,7 @@ class RegionChoice(VertexChoice):
         mine = vertex.path.sums.region
         region, probability = self._selection.choose(numbers[0], mine, active)
         first, number = dr.gather(mi.Vector2u, self._range, region, active)
-        place = first + _below(number, numbers[1])
+        place = first + below(number, numbers[1])
         exists = active & (number > 0)
         return Chosen(
             dr.gather(mi.UInt32, self._order, place, exists),
@@ -108,7 +108,7 @@ class RegionChoice(VertexChoice):
         )  # fmt: skip
 
 
-def _below(number: mi.UInt32, sample: mi.Point2f) -> mi.UInt32:
+def below(number: mi.UInt32, sample: mi.Point2f) -> mi.UInt32:
     """A uniformly chosen integer below ``number``. It takes two random numbers, since one has only
     24 bits and ``number`` may be larger."""
     bits = (mi.UInt32(sample.x * 65536) << 16) | mi.UInt32(sample.y * 65536)

@@ -14,6 +14,7 @@ from .light_vertices import VertexCache
 from .scattering import adjoint_value, geometric_cosine
 from .virtual_light_bound import Bound, is_connected
 from .virtual_light_choice import VirtualLightChoice
+from .virtual_light_parts import LightParts
 
 
 class VirtualLightConnections(Subpaths):
@@ -29,6 +30,7 @@ class VirtualLightConnections(Subpaths):
         connections: Number of connections of a vertex.
         max_depth: Longest path in segments.
         observer: Is told of connections to virtual lights that are chosen by regions.
+        parts: Is told the light of virtual lights; ``None`` if nobody asks.
     """
 
     def __init__(
@@ -41,9 +43,10 @@ class VirtualLightConnections(Subpaths):
         connections: int,
         max_depth: int,
         observer: Observer,
+        parts: LightParts | None = None,
     ) -> None:
         self._vertices, self._choice, self._bound, self._query = vertices, choice, bound, query
-        self._connections, self._observer = connections, observer
+        self._connections, self._observer, self._parts = connections, observer, parts
         self._ctx = Heroes(scene).context()
         self._max_depth = dr.opaque(mi.UInt32, max_depth)
         self._count = dr.opaque(mi.UInt32, connections)
@@ -67,6 +70,8 @@ class VirtualLightConnections(Subpaths):
                 total += value
                 shadow_count += tested
                 index += 1
+        if dr.hint(self._parts is not None, mode="scalar"):
+            self._parts.virtual(total, active)
         return total, shadow_count
 
     def _spread(self, numbers: tuple[mi.Point2f, ...], index: mi.UInt32) -> tuple:

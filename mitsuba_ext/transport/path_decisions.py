@@ -307,6 +307,16 @@ class SubpathSelection:
         choosing the region / vertices of a subpath there."""
         raise NotImplementedError
 
+    def by_power(self, power: mi.Float) -> SubpathSelection:
+        """The selection for given vertices of other subpaths: it chooses regions by what is there,
+        in place of what is there on average. It has no :meth:`expected`.
+
+        Parameters:
+            power: The sum of the brightness of these vertices in each region; regions without any
+                are not chosen.
+        """
+        raise NotImplementedError
+
 
 class Subpaths:
     """Connects vertices to those of subpaths that another walk has stored. A walk may have none."""

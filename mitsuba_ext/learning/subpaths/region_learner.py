@@ -90,7 +90,7 @@ class RegionLearner(Learner):
         power = np.bincount(number, light.brightness.numpy(), regions.count)
         # Half a vertex more in each region: no number is 0
         self._vertices = (count + 0.5) / light.paths
-        self._power = power + 0.5 * power.sum() / count.sum()
+        self._power = (power + 0.5 * power.sum() / count.sum()) / light.paths
         self._uniform = self._vertices / self._vertices.sum()
         self._probability = np.tile(self._uniform, (regions.count, 1))
         # Of all pilots: connections, and the sum of the squares that they would have if the region
@@ -179,7 +179,7 @@ class RegionLearner(Learner):
         return np.moveaxis(x, 0, axis)
 
     def _table(self) -> RegionTable:
-        return RegionTable(self._regions, self._probability, self._vertices)
+        return RegionTable(self._regions, self._probability, self._vertices, self._power)
 
     def state(self) -> dict[str, np.ndarray]:
         if self._records is None:
@@ -188,11 +188,14 @@ class RegionLearner(Learner):
             **self._regions.state(),
             "probability": self._probability,
             "vertices": self._vertices,
+            "power": self._power,
         }
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> RegionTable:
         self._regions = NestedRegions.of_state(state)
         self._probability, self._vertices = state["probability"], state["vertices"]
+        # Files of version 0.2.0 have no powers: all vertices are then alike
+        self._power = state.get("power", self._vertices)
         self._summary = f"{self._regions.count} regions of light vertices"
         return self._table()
 
