@@ -21,7 +21,7 @@ class LightweightMesh(mi.Mesh):
     Lightweight meshes (:monosp:`lightweight_mesh`)
     -----------------------------------------------
 
-    Finds the triangles of the mesh that is nested in it by an acceleration structure of 2.9 bytes
+    Finds the triangles of the mesh that is nested in it by an acceleration structure of 3.3 bytes
     for each triangle. That of Embree, in Mitsuba, has about 70, and 110 while it is built.
 
     .. pluginparameters::
@@ -42,9 +42,9 @@ class LightweightMesh(mi.Mesh):
     **Use it when** a scene does not fit into memory: scans, displaced surfaces, terrain. For a
     regular grid of heights, :monosp:`heightfield` takes far less.
     **Not when** it fits: all rays that meet the box of the mesh take longer. Compared with Embree,
-    in a mesh of a million triangles, camera rays take 4 times as long, rays in all directions 3
-    times, shadow rays 2.5 times; more in a mesh of large triangles beside small ones
-    (``docs/results/lightweight.md``). Each lightweight mesh has a structure of its own and adds to
+    in a mesh of a million triangles, camera rays take 3.6 times as long, rays in all directions 3.5
+    times, shadow rays 2.2 times; more in a whole scene as one mesh (5 to 7 times in all directions,
+    ``docs/results/lightweight.md``). Each lightweight mesh has a structure of its own and adds to
     the time in which kernels are compiled: use it for a few large meshes, and not for many small
     ones.
 
@@ -67,9 +67,11 @@ class LightweightMesh(mi.Mesh):
     :monosp:`shapegroup`. :monosp:`mi.traverse` shows its material and its light, and a placeholder
     in place of its vertices: they cannot be changed after loading.
 
-    Source: D. Cline, PhD dissertation, Brigham Young University, 2007, chapter 3: a complete tree
-    of four children, without pointers, and with four triangles in each leaf. Boxes are different:
-    bytes relative to their own node, as in H. Ylitie, T. Karras, S. Laine, *Efficient Incoherent
+    Source: D. Cline, PhD dissertation, Brigham Young University, 2007, chapter 3: complete trees
+    of four children, without pointers, and with four triangles in each leaf. Here, each holds 64
+    triangles; above them, a tree is split by surface areas (I. Wald, *On fast Construction of
+    SAH-based Bounding Volume Hierarchies*, IEEE Symposium on Interactive Ray Tracing, 2007). Boxes
+    are bytes relative to their own node, as in H. Ylitie, T. Karras, S. Laine, *Efficient Incoherent
     Ray Traversal on GPUs Through Compressed Wide BVHs*, HPG 2017. The test of triangles follows S.
     Woop, C. Benthin, I. Wald, *Watertight Ray/Triangle Intersection*, JCGT 2(1), 2013.
 

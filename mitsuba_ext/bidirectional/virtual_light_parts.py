@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..arrays import add_own
 from ..transport.estimator import CameraRays, Sample, Splats
 from ..transport.observer import Observer
 from ..transport.walk import Walk
@@ -58,7 +59,7 @@ class LightParts(Observer):
 
     def _add(self, part: str, value: mi.Spectrum, active: mi.Bool) -> None:
         place = PARTS.index(part) * self._lanes + self._lane
-        dr.scatter_add(self._sums, value, place, active)
+        add_own(self._sums, value, place, active)
 
     def values(self) -> list[mi.Spectrum]:
         """The parts of each camera path."""

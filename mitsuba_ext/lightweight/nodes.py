@@ -4,8 +4,8 @@ Cline 2007 stores boxes as bytes or shorts relative to the box of the mesh. Byte
 meshes of more than a few thousand triangles, and shorts take twice the memory of bytes. Here, bytes
 are relative to the node itself. Its lower corner is a point of a grid over the mesh, with 16 bits
 for each coordinate. The unit of its bytes is a power of two of the grid's, for each axis (as in
-[1]). All that is exact in single precision. With four triangles in a leaf, nodes take 2.8 bytes
-for each triangle, where shorts take 4.2, and boxes are nearly as tight as floats.
+[1]). All that is exact in single precision. With four triangles in a leaf, nodes take 3.2 bytes
+for each triangle, where shorts take 4.7, and boxes are nearly as tight as floats.
 
 [1] Ylitie, Karras, Laine. Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs.
 HPG 2017.
