@@ -72,8 +72,8 @@ class LightweightMesh(mi.Mesh):
     triangles; above them, a tree is split by surface areas (I. Wald, *On fast Construction of
     SAH-based Bounding Volume Hierarchies*, IEEE Symposium on Interactive Ray Tracing, 2007). Boxes
     are bytes relative to their own node, as in H. Ylitie, T. Karras, S. Laine, *Efficient
-    Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs*, HPG 2017. The test of triangles follows S.
-    Woop, C. Benthin, I. Wald, *Watertight Ray/Triangle Intersection*, JCGT 2(1), 2013.
+    Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs*, HPG 2017. The test of triangles
+    follows S. Woop, C. Benthin, I. Wald, *Watertight Ray/Triangle Intersection*, JCGT 2(1), 2013.
 
     .. tabs::
         .. code-tab:: xml
