@@ -4,7 +4,8 @@
     python benchmarks/lightweight.py rays SCENE.xml        # all meshes of a scene as one
     python benchmarks/lightweight.py heights               # heightfields of 1000 x 1000 cells
     python benchmarks/lightweight.py memory --triangles 2e7
-    python benchmarks/lightweight.py renders
+    python benchmarks/lightweight.py renders               # a ball in cornell_box
+    python benchmarks/lightweight.py renders SCENE.xml     # with its large meshes as lightweight
 
 ``rays`` times the tree with boxes of several precisions: as floats, shorts and bytes relative to
 the mesh, as in the source, and bytes relative to the node, which the plugin uses. Camera rays come
@@ -25,6 +26,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from xml.etree import ElementTree
 
 import click
 
@@ -330,31 +332,58 @@ def _resident() -> float:
 
 
 @main.command()
+@click.argument("scenes", nargs=-1, type=click.Path(exists=True, path_type=Path))
 @click.option("--triangles", default="1e5,1e6,1e7")
+@click.option("--least", default=400_000, help="Files of a scene that are wrapped, in bytes.")
 @click.option("--rounds", default=5)
-def renders(triangles: str, rounds: int) -> None:
-    """Times of ``composed_path`` with a ball in cornell_box, in units of those with Mitsuba's."""
-    for size in triangles.split(","):
-        positions, faces = ball(int(float(size)))
-        scenes = {}
-        for kind in ("mesh", "lightweight_mesh", "quantized"):
-            shape = mesh(0.45 * positions, faces)
-            if kind != "mesh":
-                shape = mi.load_dict({
-                    "type": "lightweight_mesh", "quantized": kind == "quantized", "mesh": shape,
-                })  # fmt: skip
-            box = mi.cornell_box()
-            for key in ("small-box", "large-box"):
-                box.pop(key)
-            scenes[kind] = mi.load_dict({**box, "ball": shape}, optimize=False)
+def renders(scenes, triangles: str, least: int, rounds: int) -> None:
+    """Times of ``composed_path``, in units of those with Mitsuba's meshes: with a ball in
+    cornell_box, or with the large meshes of SCENES as lightweight ones."""
+    cases = [(file.parent.name, partial(_wrapped, file, least)) for file in scenes]
+    if not scenes:
+        cases = [(f"{n} triangles", partial(_with_ball, float(n))) for n in triangles.split(",")]
+    for name, make in cases:
+        made = {kind: make(kind) for kind in ("mesh", "lightweight_mesh", "quantized")}
         integrator = mi.load_dict({"type": "composed_path", "max_depth": 8})
-        tasks = {
-            kind: partial(_rendered, integrator, scene) for kind, scene in scenes.items()
-        }  # fmt: skip
+        tasks = {kind: partial(_rendered, integrator, scene) for kind, scene in made.items()}
         times = interleaved(tasks, rounds)
-        print(f"{size} triangles: mesh {times['mesh']:.2f} s, " + ", ".join(
+        print(f"{name}: mesh {times['mesh']:.2f} s, " + ", ".join(
             f"{kind} {seconds / times['mesh']:.2f} ×" for kind, seconds in times.items()
-        ))  # fmt: skip
+        ), flush=True)  # fmt: skip
+
+
+def _with_ball(triangles: float, kind: str) -> mi.Scene:
+    positions, faces = ball(int(triangles))
+    shape = mesh(0.45 * positions, faces)
+    if kind != "mesh":
+        shape = mi.load_dict({
+            "type": "lightweight_mesh", "quantized": kind == "quantized", "mesh": shape,
+        })  # fmt: skip
+    box = mi.cornell_box()
+    for key in ("small-box", "large-box"):
+        box.pop(key)
+    return mi.load_dict({**box, "ball": shape}, optimize=False)
+
+
+def _wrapped(file: Path, least: int, kind: str) -> mi.Scene:
+    """A scene with its large meshes in lightweight ones."""
+    root, count = ElementTree.parse(file).getroot(), 0
+    for index, shape in enumerate(root):
+        name = shape.find("string[@name='filename']")
+        if shape.tag != "shape" or name is None:
+            continue
+        if kind != "mesh" and (file.parent / name.get("value")).stat().st_size >= least:
+            outer = ElementTree.Element("shape", type="lightweight_mesh")
+            ElementTree.SubElement(
+                outer, "boolean", name="quantized", value=str(kind == "quantized").lower()
+            )
+            outer.append(shape)
+            root[index] = outer
+            count += 1
+    print(f"  {kind}: {count} meshes", flush=True)
+    mi.file_resolver().prepend(str(file.parent))
+    text = ElementTree.tostring(root, encoding="unicode")
+    return mi.load_string(text, resx="320", resy="180")
 
 
 def _rendered(integrator: mi.Integrator, scene: mi.Scene) -> None:

@@ -39,8 +39,8 @@ def integrator_of(name: str, variant: str) -> str:
     """The integrator that renders the reference of a scene."""
     best = INTEGRATORS.get(name, "auto_path")
     integrator = _EXCEPTIONS.get(name, "bdpt" if best in _LIGHT_PATHS else best)
-    # On a GPU, learning costs more than it gains
-    is_plain = "cuda" in variant and integrator in ("auto_path", "swarm_path")
+    # On a GPU, learning costs more than it gains, but for the maps of swarm_path
+    is_plain = "cuda" in variant and integrator == "auto_path"
     return "composed_path" if is_plain else integrator
 
 

@@ -89,8 +89,9 @@ class InstantRadiosityIntegrator(WalkIntegrator):
          checkpoint.
 
     **Use it when** diffuse surfaces light each other, in rooms with hidden lamps; or for a preview
-    of indirect light in a second, without compensation. **Not when** surfaces are glossy, caustics
-    matter (:class:`vcm`), or light is mostly direct: it then is :monosp:`path` at a higher price.
+    of indirect light: in a second without compensation, or denoised. **Not when** surfaces are
+    glossy, caustics matter (:class:`vcm`), or light is mostly direct: it then is :monosp:`path` at
+    a higher price.
 
     **Direct light** is sampled as by :monosp:`path`, with its MIS weights; the points of lamps are
     no virtual lights. Virtual lights lie where a BSDF has a part that is not a delta distribution;

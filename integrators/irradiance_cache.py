@@ -85,7 +85,8 @@ class IrradianceCache(WalkIntegrator):
          checkpoint.
 
     **Use it when** surfaces are mostly diffuse, indirect light makes the noise, and a smooth image
-    is wanted soon; for an animation of the camera, with :monosp:`cache_file`. **Not when** the
+    is wanted soon; for an animation of the camera, with :monosp:`cache_file`. **Not when** a
+    denoiser may be used (denoised :monosp:`path` is nearer to the truth in the same time), the
     image must be right, surfaces are glossy, details are as small as pixels everywhere (plants,
     hair: each needs records), or direct light makes the noise.
 
