@@ -26,7 +26,9 @@ ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "gallery"
 
 #: The best of our integrators but ``auto``.
-BEST = {**INTEGRATORS, **dict.fromkeys(["pool", "caustic", "ring"], "vcm")}
+BEST = {
+    **INTEGRATORS, **dict.fromkeys(["pool", "caustic", "ring"], "vcm"), "keyhole": "erpt",
+}  # fmt: skip
 
 def compared(name: str) -> list[str]:
     """The integrators of a scene: Mitsuba's or its equivalent, the best other one, and ``auto``."""

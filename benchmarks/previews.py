@@ -53,7 +53,7 @@ PICTURES = {
     "pool": 512,
     "water_glass": 512,
     "mirrored_lamp": 512,
-    "keyhole": 4096,  # its chains leave spots
+    "keyhole": 5120,
     "shaded_lamp": 192,
     "corridor": 64,
     "night_classroom": 128,
@@ -78,7 +78,8 @@ INTEGRATORS = {
         ],
         "bdpt",
     ),
-    **dict.fromkeys(["pool", "keyhole"], "erpt"),
+    "pool": "erpt",
+    "keyhole": "auto",  # a denoiser keeps the spots of chains
     **dict.fromkeys(["water_glass", "mirrored_lamp"], "vcm"),
     "volume_caustic": "sppm",
     **dict.fromkeys(

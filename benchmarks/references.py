@@ -30,7 +30,7 @@ _LIGHT_PATHS = ("bdpt", "vcm", "erpt", "sppm")
 
 #: The integrator of a reference, where it follows from no rule.
 _EXCEPTIONS = {
-    "fog": "volpath", "volume_caustic": "sppm",
+    "fog": "volpath", "volume_caustic": "sppm", "keyhole": "bdpt",
     "paperweight": "bdpt",  # its spot lights shine through glass: no camera path finds them
 }
 
