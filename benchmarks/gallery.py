@@ -44,16 +44,19 @@ def compared(name: str) -> list[str]:
 def compare(name: str, seconds: float, seeds: int) -> None:
     """Renders what is missing of a scene's report."""
     out = ROOT / "out" / "gallery" / name
+    if (out / "report.html").exists():
+        return
+    if (reference := stored(name)) is None:
+        raise click.ClickException(f"{name} has no reference: run benchmarks/references.py {name}")
     width = WIDTHS.get(name, 320)
     command = [
         sys.executable, "-m", "mitsuba_ext", "compare", f"scenes/{name}.xml", *compared(name),
         "--time", f"{seconds:g}", "--seeds", str(seeds), "--size", f"{width}x180",
-        "--reference", str(stored(name)),
+        "--reference", str(reference),
         "--variant", "llvm_ad_spectral" if name in SPECTRAL else "llvm_ad_rgb",
         "--out", str(out),
     ]  # fmt: skip
-    if not (out / "report.html").exists():
-        subprocess.run(command, cwd=ROOT, check=False)
+    subprocess.run(command, cwd=ROOT, check=False)
 
 
 def caption(results: dict) -> str:
