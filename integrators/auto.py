@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from typing import Any
+
 import mitsuba as mi
 
 from mitsuba_ext.bidirectional.candidates import Candidate
 from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.bidirectional.photon_mapper import PhotonMapper
 from mitsuba_ext.composition.bidirectional_integrator import LightPathIntegrator
 from mitsuba_ext.composition.learned_slots import learned_slots
 from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
 from mitsuba_ext.composition.light_paths import LightPathsWhereTheyPay, LightPathTrial
 from mitsuba_ext.composition.merging_parameters import MergingParameters
+from mitsuba_ext.composition.photon_trial import PhotonChoice, PhotonTrial
+from mitsuba_ext.composition.photons import photon_mapper
 from mitsuba_ext.composition.staged_integrator import NO_LIMIT
 from mitsuba_ext.rendering.stages import Schedule
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.estimator import Estimator
 
 #: Light paths are not tried in films of more pixels, since a pass stores some kilobytes for each.
 _MOST_PIXELS = 1 << 21
@@ -97,7 +105,7 @@ class Auto(LightPathIntegrator):
         super().__init__(props)
         self.merging = MergingParameters(0.0, 0.75)
         self.fill(props, **learned_slots(self.name))
-        self._has_light_paths = self._has_trial = False
+        self._has_light_paths = self._has_trial = self._has_media = False
 
     @property
     def needs_equal_samples(self) -> str:
@@ -115,7 +123,9 @@ class Auto(LightPathIntegrator):
     def pilots(self, scene, pixel_count, spp):
         stages = super().pilots(scene, pixel_count, spp)
         self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene)
-        is_possible = bool(stages) and LightPathTrial.is_possible(pixel_count, spp)
+        self._has_media = may_have_media(scene)
+        trial = PhotonTrial if self._has_media else LightPathTrial
+        is_possible = bool(stages) and trial.is_possible(pixel_count, spp)
         self._has_trial = is_possible and self._has_light_paths
         return stages
 
@@ -123,7 +133,10 @@ class Auto(LightPathIntegrator):
         schedule = super().schedule(scene, sensor, samples, seed)
         if not self._has_light_paths or not (self._has_trial or self.load_learned):
             return schedule
-        trial = LightPathTrial(sensor.film(), sum(samples), is_sparse=True)
+        if self._has_media:
+            trial = PhotonTrial(sensor.film(), sum(samples))
+        else:
+            trial = LightPathTrial(sensor.film(), sum(samples), is_sparse=True)
         if self._has_trial:
             return LightPathSchedule(schedule, scene, len(samples) - 1, trial)
         schedule.beside["light_paths"] = trial
@@ -132,7 +145,16 @@ class Auto(LightPathIntegrator):
     def estimators(self, scene, sensor):
         if not self._has_light_paths or not (self._has_trial or self.load_learned):
             return self.walk
+        if self._has_media:
+            mapper = functools.cache(
+                functools.partial(photon_mapper, self, scene, sensor, self.merging)
+            )
+            return functools.partial(self._in_media, mapper)
         return super().estimators(scene, sensor)
+
+    def _in_media(self, mapper: Callable[[], PhotonMapper], **decisions: Any) -> Estimator:
+        choice: PhotonChoice = decisions.pop("light_paths", PhotonChoice())
+        return choice.estimator(self.walk(**decisions), mapper)
 
     def merging_radius(self, scene, sensor, side):
         # Only paths of equal wavelengths and times merge: all pixels would have to share these,
@@ -143,7 +165,10 @@ class Auto(LightPathIntegrator):
 
     def _can_try(self, scene: mi.Scene) -> bool:
         """Can camera paths be connected to light paths, in what this integrator does else?"""
-        if self.max_depth < 2 or may_have_media(scene):
+        if self.max_depth < 2:
+            return False
+        # Photons would need paths of equal wavelengths and times
+        if may_have_media(scene) and (mi.is_spectral or movers(scene)):
             return False
         if not LightPathsWhereTheyPay().can_learn(scene, 1):
             return False

@@ -39,6 +39,7 @@ from .merging import (
     pushed,
     scene_diagonal,
 )
+from .technique_observer import TechniqueObserver
 from .vertex_grid import VertexGrid
 
 #: The number of points at which a ray gathers light on its way through a homogeneous medium. (In
@@ -63,6 +64,7 @@ class MergedInMedia(MergedSubpaths):
         vertices, grid, heroes, max_depth, paths, shares_rays: See :class:`MergedSubpaths`.
         others: The light at surfaces.
         has_grids: May there be media that are not homogeneous?
+        observer: See :class:`MergedSubpaths`.
     """
 
     def __init__(
@@ -75,8 +77,11 @@ class MergedInMedia(MergedSubpaths):
         shares_rays: bool,
         others: Subpaths,
         has_grids: bool,
+        observer: TechniqueObserver | None = None,
     ) -> None:
-        super().__init__(vertices, grid, None, heroes, max_depth, paths, shares_rays, others)
+        super().__init__(
+            vertices, grid, None, heroes, max_depth, paths, shares_rays, others, observer
+        )
         self._has_grids = has_grids
 
     def gather(self, scene, sampler, vertex, active):
@@ -101,13 +106,14 @@ class MergedInMedia(MergedSubpaths):
         gathered, state = mi.Spectrum(0), self._grid.begin()
         group = group_of(ray.time, ray.wavelengths) if self._shares_rays else mi.UInt32(0)
         near = [mi.UInt32(0) for _ in range(BATCH)]
-        far = [mi.Float(0) for _ in range(BATCH)]
+        far, looked = [mi.Float(0) for _ in range(BATCH)], mi.UInt32(0)
         while dr.hint(searches, label="merge along a ray"):
             count, fills = mi.UInt32(0), mi.Bool(searches)
             while dr.hint(fills, label="search"):
                 state, index, found, goes_on = self._grid.next(state, ray(t), fills, group)
                 near, far = pushed(near, index, found), pushed(far, t, found)
                 count += dr.select(found, 1, 0)
+                looked += 1
                 # Go on to the next point
                 ends = fills & ~goes_on
                 number += dr.select(ends, 1, 0)
@@ -122,6 +128,8 @@ class MergedInMedia(MergedSubpaths):
                 near, far = near[1:] + near[:1], far[1:] + far[:1]
                 count -= 1
                 exists = count > 0
+        if dr.hint(self._observer is not None, mode="scalar"):
+            self._observer.searched(looked)
         weight = mi.Spectrum(σ_s) * dr.select(chosen > 0, scattered / chosen, 0)
         return path.β * gathered * weight * (self._per_vertex / _POINTS)
 
