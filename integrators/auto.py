@@ -40,7 +40,7 @@ class Auto(LightPathIntegrator):
     Begins as :monosp:`path`, and measures which techniques are worth their time in this scene:
     guided directions, learned lights, maps of times, points on the lens, wavelengths and distances
     (:class:`auto_path`); light paths, how many, connections to them, and merging with them
-    (:class:`vcm`).
+    (:class:`vcm`); in fog, photons (:class:`sppm`).
 
     .. pluginparameters::
 
@@ -69,22 +69,28 @@ class Auto(LightPathIntegrator):
     tell its time. The best choice is made, if it is better than guided directions and maps, with
     which light paths are not combined. This stage has 16384 samples, spread over the film, which
     are not part of the image; in renders of less than a million samples, it has as few as 4096, and
-    below 262144 samples, there is none. Where light
-    paths have less than 0.4 of the variance, the samples before are left out of the image.
+    below 262144 samples, there is none. Where light paths have less than 0.4 of the variance, the
+    samples before are left out of the image.
 
-    Light paths are not tried in participating media, in films of more than two million pixels, and
-    where a light cannot emit them: there, the integrator is :class:`auto_path`. In spectral
-    variants and with moving shapes, nothing is merged.
+    In scenes with participating media, there is one choice besides camera paths: photons, as
+    :class:`sppm` renders them. Renders of two million samples or more try them on a coarse film,
+    beside camera paths. The photons also tell how rarely camera paths find the light of lamps in or
+    behind glass, to which they cannot be connected.
 
-    Where vertices are merged, the image is slightly blurred, less with each sample (:class:`vcm`).
+    Light paths are not tried in films of more than two million pixels, and where a light cannot
+    emit them: there, the integrator is :class:`auto_path`. In spectral variants and with moving
+    shapes, nothing is merged, and there are no photons in media.
+
+    Where vertices are merged, or photons are used, the image is slightly blurred, less with each
+    sample (:class:`vcm`, :class:`sppm`).
 
     :monosp:`integrator.statistics.learned` says what was chosen, and what it was expected to gain.
     Gradients are not supported (use :class:`composed_prb`), nor are scalar and polarized variants.
     Nested in :monosp:`moment`, it takes no pilot samples.
 
-    Sources: those of :class:`auto_path` and :class:`vcm`; P. Grittmann, I. Georgiev, P. Slusallek,
-    *Efficiency-Aware Multiple Importance Sampling for Bidirectional Rendering Algorithms*, ACM
-    Transactions on Graphics 41(4), 2022.
+    Sources: those of :class:`auto_path`, :class:`vcm` and :class:`sppm`; P. Grittmann, I. Georgiev,
+    P. Slusallek, *Efficiency-Aware Multiple Importance Sampling for Bidirectional Rendering
+    Algorithms*, ACM Transactions on Graphics 41(4), 2022.
 
     .. tabs::
         .. code-tab:: xml
@@ -122,8 +128,8 @@ class Auto(LightPathIntegrator):
 
     def pilots(self, scene, pixel_count, spp):
         stages = super().pilots(scene, pixel_count, spp)
-        self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene)
         self._has_media = may_have_media(scene)
+        self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene)
         trial = PhotonTrial if self._has_media else LightPathTrial
         is_possible = bool(stages) and trial.is_possible(pixel_count, spp)
         self._has_trial = is_possible and self._has_light_paths
@@ -153,22 +159,19 @@ class Auto(LightPathIntegrator):
         return super().estimators(scene, sensor)
 
     def _in_media(self, mapper: Callable[[], PhotonMapper], **decisions: Any) -> Estimator:
+        """The estimator of a stage in a scene with media; ``mapper`` makes that of photons."""
         choice: PhotonChoice = decisions.pop("light_paths", PhotonChoice())
         return choice.estimator(self.walk(**decisions), mapper)
 
     def merging_radius(self, scene, sensor, side):
-        # Only paths of equal wavelengths and times merge: all pixels would have to share these,
-        # even if nothing is merged in the end
-        if mi.is_spectral or movers(scene):
-            return None
-        return super().merging_radius(scene, sensor, side)
+        return super().merging_radius(scene, sensor, side) if _can_merge(scene) else None
 
     def _can_try(self, scene: mi.Scene) -> bool:
         """Can camera paths be connected to light paths, in what this integrator does else?"""
         if self.max_depth < 2:
             return False
-        # Photons would need paths of equal wavelengths and times
-        if may_have_media(scene) and (mi.is_spectral or movers(scene)):
+        # In media there is only merging
+        if self._has_media and not _can_merge(scene):
             return False
         if not LightPathsWhereTheyPay().can_learn(scene, 1):
             return False
@@ -177,3 +180,9 @@ class Auto(LightPathIntegrator):
         except NotImplementedError:
             return False
         return True
+
+
+def _can_merge(scene: mi.Scene) -> bool:
+    """Only paths of equal wavelengths and times merge: all pixels would have to share these, even
+    if nothing is merged in the end."""
+    return not (mi.is_spectral or movers(scene))

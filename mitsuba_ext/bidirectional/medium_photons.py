@@ -103,6 +103,8 @@ class MergedInMedia(MergedSubpaths):
         scattered = _absorbed(dr.select(searches, chosen * si.t, 0))
         sample, number = sampler.next_1d(searches), mi.UInt32(0)
         t = _distance(number, sample, scattered, chosen)
+        weight = mi.Spectrum(σ_s) * dr.select(chosen > 0, scattered / chosen, 0)
+        weight *= path.β * (self._per_vertex / _POINTS)
         gathered, state = mi.Spectrum(0), self._grid.begin()
         group = group_of(ray.time, ray.wavelengths) if self._shares_rays else mi.UInt32(0)
         near = [mi.UInt32(0) for _ in range(BATCH)]
@@ -123,15 +125,17 @@ class MergedInMedia(MergedSubpaths):
                 fills &= searches & (count < BATCH)
             exists = count > 0
             while dr.hint(exists, label="evaluate"):
-                value = self._flux(mei, path, self._vertices.at(near[0], exists), exists)
-                gathered += value * attenuation(σ - chosen, far[0])
+                other = self._vertices.at(near[0], exists)
+                value = self._flux(mei, path, other, exists) * attenuation(σ - chosen, far[0])
+                gathered += value
+                if dr.hint(self._observer is not None, mode="scalar"):
+                    self._observer.photon(value * weight, path, other, exists)
                 near, far = near[1:] + near[:1], far[1:] + far[:1]
                 count -= 1
                 exists = count > 0
         if dr.hint(self._observer is not None, mode="scalar"):
             self._observer.searched(looked)
-        weight = mi.Spectrum(σ_s) * dr.select(chosen > 0, scattered / chosen, 0)
-        return path.β * gathered * weight * (self._per_vertex / _POINTS)
+        return gathered * weight
 
     def _measure(self, radius):
         return 4 / 3 * dr.pi * radius * radius * radius
@@ -140,7 +144,11 @@ class MergedInMedia(MergedSubpaths):
         return vertex.medium.scatters
 
     def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:
-        return self._flux(vertex.medium.mei, vertex.path, other, active)
+        value = self._flux(vertex.medium.mei, vertex.path, other, active)
+        if self._observer is not None:
+            brought = value * vertex.path.β * self._per_vertex
+            self._observer.photon(brought, vertex.path, other, active)
+        return value
 
     def _flux(
         self, mei: mi.MediumInteraction3f, path: PathState, other: LightVertex, active: mi.Bool

@@ -264,5 +264,8 @@ class MergedSubpaths(Subpaths):
         active &= dr.all(dr.isfinite(value))
         if self._observer is not None:
             brought = value * vertex.path.β * self._per_vertex
-            self._observer.merged(brought, mis, rivals, active)
+            if self._sums is None:
+                self._observer.photon(brought, vertex.path, other, active)
+            else:
+                self._observer.merged(brought, mis, rivals, active)
         return dr.select(active, value, 0)

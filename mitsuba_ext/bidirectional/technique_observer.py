@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
@@ -11,6 +11,10 @@ from ..transport.estimator import CameraRays, Sample
 from ..transport.observer import Observer, Observers
 from .candidates import Available
 from .partial_sums import Rivals
+
+if TYPE_CHECKING:
+    from ..transport.vertex import PathState
+    from .light_vertices import LightVertex
 
 
 class TechniqueObserver(Observer):
@@ -59,6 +63,12 @@ class TechniqueObserver(Observer):
         """The camera path in each lane was merged with a light path. This adds ``value`` to its
         radiance, the MIS weight ``mis`` included."""
 
+    def photon(
+        self, value: mi.Spectrum, path: PathState, other: LightVertex, active: mi.Bool
+    ) -> None:
+        """The camera path in each lane, whose state is ``path``, was merged with a vertex of a
+        light path, where merging is the only technique. This adds ``value`` to its radiance."""
+
     def searched(self, count: mi.UInt32) -> None:
         """At a vertex of the camera path in each lane, so many vertices were looked at."""
 
@@ -94,6 +104,10 @@ class TechniqueObservers(Observers):
     def merged(self, *arguments: Any) -> None:
         for observer in self._techniques:
             observer.merged(*arguments)
+
+    def photon(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.photon(*arguments)
 
     def searched(self, *arguments: Any) -> None:
         for observer in self._techniques:

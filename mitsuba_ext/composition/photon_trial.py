@@ -11,35 +11,34 @@ import numpy as np
 
 from ..arrays import add_own, channel_mean
 from ..bidirectional.candidates import Candidate
+from ..bidirectional.light_vertices import LightVertex
 from ..bidirectional.path_moments import Counts
 from ..bidirectional.path_tracer import camera_paths
+from ..bidirectional.photon_history import HiddenLight
 from ..bidirectional.photon_mapper import PhotonMapper
 from ..bidirectional.technique_observer import TechniqueObserver
-from ..images.box_filter import box_means, box_sums
+from ..images.box_filter import box_means
 from ..images.coarse_film import CoarseFilm
-from ..learning.benefit import is_worth, gain_of, trimmed_batches
+from ..learning.benefit import gain_of, is_worth, trimmed_batches
 from ..learning.effect import Effect
 from ..learning.learner import Learner
 from ..learning.pixel_estimates import relative_scale
 from ..rendering.camera import film_extent
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.numbers import Numbers, schedule_state
+from ..transport.vertex import PathState
 from ..transport.walk import Walk
 from .learned_slots import OF_CAMERA_PATHS
 from .light_paths import cost
 
 #: The least number of samples of a render that has a trial, the camera samples of each of its
-#: passes, and its passes of photons and of ``path``. (The trial takes about as long as 300 000
-#: samples of ``path``.)
-_LEAST, _SAMPLES, _PHOTON_PASSES, _PATH_PASSES = 1 << 20, 1 << 13, 2, 8
-
-#: Light that photons find and ``path`` does not: what exceeds the noise by so many standard errors,
-#: and this part of the light, as photons are biased.
-_CERTAIN, _BLURRED = 2.0, 0.1
+#: passes, and its passes of photons and of ``path``. (The trial takes about as long as half a
+#: million samples of ``path``.)
+_LEAST, _SAMPLES, _PHOTON_PASSES, _PATH_PASSES = 1 << 21, 1 << 13, 2, 16
 
 #: The squared relative bias of photons after one sample of each pixel; it falls with the root of
-#: the number of samples. (Measured in volume_caustic: 0.012 after 64.)
-_SQUARED_BIAS = 0.1
+#: the number of samples. (After 64, it was 0.012 in volume_caustic, and 0 to 0.001 in four others.)
+_SQUARED_BIAS = 0.03
 
 PHOTONS, NO_PHOTONS = Candidate(1.0, connects=False, merges=True), Candidate(0.0)
 
@@ -70,9 +69,13 @@ class PhotonTrial(Learner):
     of variance: the samples of a pass share photons, whose noise more samples in the pass do not
     lower. Several passes, which have photons of their own, tell the two kinds apart.
 
-    The sample variance of camera paths is far too small where they find light rarely. But photons
-    find this light. Let the mean of n samples be too small by d: a sample that finds what is
-    missing, on average one of n or fewer, must add n · d or more. The variance is n · d² at least.
+    The sample variance of camera paths is far too small where they find light rarely. This is light
+    to which no connection leads, as from a lamp in glass; a camera path has to hit the lamp. But
+    photons find this light (:class:`HiddenLight`). Let a photon bring f / p to a pixel, where a
+    camera path of density q, which hits the lamp, brings f / q, about the lamp's radiance. The
+    second moment of camera paths is the integral of f² / q, which (f / p) (f / q) estimates, as in
+    :class:`PathMoments`. Light that no camera path finds is an error of the mean: it counts as the
+    variance that makes an error of this size in the whole render.
 
     Parameters:
         film: The film of the sensor.
@@ -93,8 +96,9 @@ class PhotonTrial(Learner):
         coarse = CoarseFilm.of(width, height, _SAMPLES)
         self._width, self._spp, self._film_pixels = coarse.width, spp, coarse.pixel_count
         pixels = coarse.width * coarse.height
-        self._photons, self._path = _Samples(pixels), _Samples(pixels)
-        self._choice, self._pixel_width = PhotonChoice(PHOTONS, self), coarse.pixel_width
+        self._photons: _Samples | None = _Samples(pixels)
+        self._path: _Samples | None = _Samples(pixels)
+        self._choice, self._pixel_width = PhotonChoice(), coarse.pixel_width
         self._mapper: PhotonMapper | None = None
         self.samples, self.rival = coarse.samples, 1.0
         self.variance: float | None = None
@@ -114,28 +118,32 @@ class PhotonTrial(Learner):
         """Takes the samples: ``walk`` those of camera paths, ``mapper`` those of photons, for the
         whole film."""
         self._mapper = mapper
-        coarse = replace(
-            mapper.of_coarse_film(self._pixel_width), observer=self._photons
-        )
+        coarse = mapper.of_coarse_film(self._pixel_width)
+        light_walk = replace(coarse.light_walk, sums=HiddenLight())
+        coarse = replace(coarse, light_walk=light_walk, observer=self._photons)
         return TrialPasses(walk, coarse, self._path)
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> PhotonChoice:
-        return self._choice
+        return PhotonChoice(PHOTONS, self)
 
     def learn(self, scene: mi.Scene, is_last: bool) -> PhotonChoice:
         photons, path = np.array(self._photons.passes), np.concatenate(self._path.passes)
         image = photons.mean(axis=(0, 1)).reshape(-1, self._width)
         weight = relative_scale(image).ravel() ** 2
         of_photons = self._of_photons(photons) * weight + _SQUARED_BIAS * np.sqrt(self._spp)
-        of_path = (np.var(path, axis=0, ddof=1) + self._missing(photons, path)) * weight
-        found, error = gain_of(trimmed_batches(of_photons, of_path - of_photons))
-        self.variance = 1 - found
-        self.time = cost(PHOTONS, self._photons.counts) * len(path) / (
-            cost(NO_PHOTONS, self._path.counts) * photons.shape[0] * photons.shape[1]
+        found = np.var(path, axis=0, ddof=1) * weight
+        hidden = self._hidden() * weight
+        self.variance = _ratio(of_photons, np.maximum(found, hidden))[0]
+        self.time = (
+            cost(PHOTONS, self._photons.counts) / photons.size
+            / (cost(NO_PHOTONS, self._path.counts) / path.size)
         )  # fmt: skip
-        efficiency = 1 / (max(self.variance, 1e-6) * self.time * self.rival)
-        pays = is_worth(efficiency, error, 1.0)
+        # What was learned for camera paths seldom helps to hit a light
+        ratio, error = _ratio(of_photons, np.maximum(found / self.rival, hidden))
+        pays = is_worth(1 / (ratio * self.time), error, 1.0)
         self._choice = PhotonChoice(PHOTONS if pays else NO_PHOTONS)
+        # Frees what it holds
+        self._mapper, self._photons, self._path = None, None, None
         return self._choice
 
     def _of_photons(self, values: np.ndarray) -> np.ndarray:
@@ -151,24 +159,12 @@ class PhotonTrial(Learner):
         )  # fmt: skip
         return own + shared * of_photons
 
-    def _missing(self, photons: np.ndarray, path: np.ndarray) -> np.ndarray:
-        """The least variance of camera paths, in each pixel, because of light that they miss in it
-        and its neighbours."""
-
-        def smooth(values: np.ndarray) -> np.ndarray:
-            return box_means(values.reshape(-1, self._width)).ravel()
-
-        ones = np.ones((len(path[0]) // self._width, self._width))
-        count = len(path) * box_sums(ones).ravel()
-        passes = np.array([smooth(values) for values in photons.mean(axis=1)])
-        mean = passes.mean(axis=0)
-        noise = passes.var(axis=0, ddof=1) / len(passes)
-        noise += smooth(np.var(path, axis=0, ddof=1)) / count
-        missing = (1 - _BLURRED) * mean - smooth(path.mean(axis=0)) - _CERTAIN * np.sqrt(noise)
-        return count * np.maximum(missing, 0) ** 2
-
-    def finish(self) -> None:
-        self._mapper = None
+    def _hidden(self) -> np.ndarray:
+        """The variance of camera paths, in each pixel, due to light that connections do not find.
+        """
+        moment, lost = np.mean(self._photons.hidden, axis=(0, 2))
+        lost = box_means(lost.reshape(-1, self._width)).ravel()
+        return moment + self._spp * lost**2
 
     def state(self) -> dict[str, np.ndarray]:
         return {"light_paths": np.array(astuple(self._choice.techniques), float)}
@@ -200,18 +196,32 @@ class _Samples(TechniqueObserver):
 
     Attributes:
         passes: The values of each pass, [sample, pixel].
+        hidden: Of each pass, the second moments of camera paths that hit hidden lights, and the
+            light that these cannot find, [2, sample, pixel].
         counts: What takes time, in all of them.
     """
 
     def __init__(self, pixels: int) -> None:
         self._pixels, self.counts = pixels, Counts()
         self.passes: list[np.ndarray] = []
+        self.hidden: list[list[np.ndarray]] = []
 
     def camera(self, rays: CameraRays) -> None:
         lanes = dr.width(rays.pixel)
         self._lane, self._importance = dr.arange(mi.UInt32, lanes), rays.importance
         self._looked = dr.zeros(mi.UInt32, lanes)
-        dr.eval(self._lane, self._importance, self._looked)
+        # Second moment of camera paths, and what they do not find
+        self._moment, self._lost = dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes)
+        dr.eval(self._lane, self._importance, self._looked, self._moment, self._lost)
+
+    def photon(
+        self, value: mi.Spectrum, path: PathState, other: LightVertex, active: mi.Bool
+    ) -> None:
+        brought = channel_mean(value * self._importance)
+        hit = channel_mean(path.β * self._importance) * other.sums.dVC
+        is_hidden = active & other.sums.is_caustic & dr.isfinite(brought)
+        add_own(self._moment, brought * hit, self._lane, is_hidden)
+        add_own(self._lost, brought, self._lane, is_hidden & (hit == 0))
 
     def searched(self, count: mi.UInt32) -> None:
         add_own(self._looked, count, self._lane)
@@ -221,6 +231,10 @@ class _Samples(TechniqueObserver):
         dr.eval(camera, whole, values)
         values = values.numpy().reshape(-1, self._pixels).astype(np.float64)
         self.passes.append(np.where(np.isfinite(values), values, 0))
+        self.hidden.append([
+            x.numpy().reshape(-1, self._pixels).astype(np.float64)
+            for x in (self._moment, self._lost)
+        ])  # fmt: skip
         lanes, scattered = values.size, _total(camera.scatter_count)
         self.counts.add(
             lanes + scattered, _total(camera.shadow_count),
@@ -250,6 +264,13 @@ class TrialPasses:
             schedule_state(sampler)
             self.path.traced(sample, sample)
         return sample
+
+
+def _ratio(of_photons: np.ndarray, of_path: np.ndarray) -> tuple[float, float]:
+    """The variance of photons relative to that of camera paths, which have one in each pixel; and
+    the standard error of its logarithm."""
+    less, error = gain_of(trimmed_batches(of_photons, of_path - of_photons))
+    return max(1 - less, 1e-6), error
 
 
 def _total(count: mi.UInt32) -> int:

@@ -169,7 +169,7 @@ class Schedule:
 
     def stage_again(self) -> Stage:
         """The stage that :meth:`next_stage` has returned, with the decisions of now."""
-        if self._finished_stages == self._pilot_count:
+        if self._finished_stages >= self._pilot_count:
             return self._last_stage()
         observer = _one_observer(list(self.learners.values()))
         return Stage(
@@ -181,12 +181,15 @@ class Schedule:
         )
 
     def leave_out(self, slots: Sequence[str]) -> None:
-        """Decides as ``path`` in these slots from now on, and learns nothing more for them."""
+        """Decides as ``path`` in these slots from now on, and learns nothing more for them. If
+        nothing else learns, this stage and all after it are as the last one."""
         for slot in slots:
             self.decisions.pop(slot, None)
             self.learners.pop(slot, None)
             if hasattr(self.camera, slot):
                 setattr(self.camera, slot, None)
+        if not self.learners:
+            self._pilot_count = self._finished_stages
 
     def _restored_stage(self, states: States) -> Stage:
         for slot, learner in self._everyone.items():
