@@ -7,11 +7,12 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from fogs import fog
-from stage import lookat
+from fogs import cube, fog, homogeneous
+from stage import area, lookat
 from statistical import assert_same_image
 
 from mitsuba_ext.composition import photon_trial
+from mitsuba_ext.composition.photon_trial import PhotonTrial
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -52,11 +53,39 @@ def test_photons_render_light_that_camera_paths_miss(tmp_path) -> None:
     assert again.statistics.learned.endswith("photons pay")
 
 
-@pytest.mark.parametrize("light", ["area", "environment"])
-def test_camera_paths_render_fog_that_they_find_lit(light: str) -> None:
-    scene = mi.load_dict(fog(light))
+def test_photons_tell_the_second_moment_of_camera_paths_that_hit_lamps_in_glass(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    glass, air = (
+        {"type": "sphere", "center": [0, 0.4, 0], "radius": radius,
+         "bsdf": {"type": "dielectric", "int_ior": inside, "ext_ior": outside}}
+        for radius, inside, outside in ((0.3, 1.5, 1.0), (0.28, 1.0, 1.5))
+    )  # fmt: skip
+    glass["exterior"] = {"type": "ref", "id": "around"}
+    lamp = {"type": "sphere", "center": [0, 0.4, 0], "radius": 0.15, "emitter": area(18.0)}
+    scene = mi.load_dict({
+        "type": "scene", "around": {**homogeneous(), "id": "around"}, **fog(), "light": lamp,
+        "fog": cube({"type": "ref", "id": "around"}), "glass": glass, "air": air,
+    }, optimize=False)  # fmt: skip
+    moments, learn = [], PhotonTrial.learn
+
+    def learned(trial: PhotonTrial, scene: mi.Scene, is_last: bool) -> Any:
+        path = np.concatenate(trial._path.passes)
+        moments.append((trial._hidden(), np.mean(path**2, axis=0)))
+        return learn(trial, scene, is_last)
+
+    monkeypatch.setattr(PhotonTrial, "learn", learned)
+    monkeypatch.setattr(photon_trial, "_PATH_PASSES", 64)
+    image(make(), scene)
+    hidden, found = (values.reshape(16, 16) for values in moments[0])
+    # Beside the lamp, which the camera sees
+    np.testing.assert_allclose(hidden[10:].sum(), found[10:].sum(), rtol=0.3)
+
+
+def test_camera_paths_render_fog_that_they_find_lit() -> None:
+    scene = mi.load_dict(fog("area"))
     auto, auto_path = make(), make("auto_path")
-    assert_same_image(image(auto, scene, 128), image(auto_path, scene, 128))
+    assert_same_image(image(auto, scene), image(auto_path, scene))
     assert "photons do not pay" in auto.statistics.learned
     effect = auto.statistics.effects["light_paths"]
     assert not effect["is_kept"] and effect["variance"] * effect["time"] > 1

@@ -103,7 +103,8 @@ class MergedInMedia(MergedSubpaths):
         scattered = _absorbed(dr.select(searches, chosen * si.t, 0))
         sample, number = sampler.next_1d(searches), mi.UInt32(0)
         t = _distance(number, sample, scattered, chosen)
-        weight = mi.Spectrum(σ_s) * dr.select(chosen > 0, scattered / chosen, 0)
+        σ_s = mi.Spectrum(σ_s)
+        weight = σ_s * dr.select(chosen > 0, scattered / chosen, 0)
         weight *= path.β * (self._per_vertex / _POINTS)
         gathered, state = mi.Spectrum(0), self._grid.begin()
         group = group_of(ray.time, ray.wavelengths) if self._shares_rays else mi.UInt32(0)
@@ -129,7 +130,8 @@ class MergedInMedia(MergedSubpaths):
                 value = self._flux(mei, path, other, exists) * attenuation(σ - chosen, far[0])
                 gathered += value
                 if dr.hint(self._observer is not None, mode="scalar"):
-                    self._observer.photon(value * weight, path, other, exists)
+                    carried = path.β * σ_s * other.β
+                    self._observer.photon(value * weight, carried, other.sums, exists)
                 near, far = near[1:] + near[:1], far[1:] + far[:1]
                 count -= 1
                 exists = count > 0
@@ -146,8 +148,12 @@ class MergedInMedia(MergedSubpaths):
     def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:
         value = self._flux(vertex.medium.mei, vertex.path, other, active)
         if self._observer is not None:
+            σ_s, _, _ = vertex.medium.mei.medium.get_scattering_coefficients(
+                vertex.medium.mei, active
+            )
             brought = value * vertex.path.β * self._per_vertex
-            self._observer.photon(brought, vertex.path, other, active)
+            carried = vertex.path.β * mi.Spectrum(σ_s) * other.β
+            self._observer.photon(brought, carried, other.sums, active)
         return value
 
     def _flux(

@@ -265,7 +265,8 @@ class MergedSubpaths(Subpaths):
         if self._observer is not None:
             brought = value * vertex.path.β * self._per_vertex
             if self._sums is None:
-                self._observer.photon(brought, vertex.path, other, active)
+                carried = value * vertex.path.β * (arrives / pdf)
+                self._observer.photon(brought, carried, other.sums, active & (pdf > 0))
             else:
                 self._observer.merged(brought, mis, rivals, active)
         return dr.select(active, value, 0)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from ..arrays import channel_mean
 from ..transport.path_decisions import SubpathSelection
 from ..transport.vertex import Vertex
 from .both_ends import from_both_ends
@@ -59,16 +58,17 @@ class VertexRegions(PhotonHistory):
 class HiddenLight(PhotonHistory):
     """Tells the photons that only a camera path which hits the light can find too, in scenes with
     media: those that left the light by way of mirrors or clear glass, so that no connection leads
-    there. Their ``dVCM`` is 0, that of others is 1. ``dVC`` is the radiance that such a camera path
-    finds (the mean of the channels); 0 of lights that it cannot hit.
+    there. Their ``dVCM`` is 0, that of others is 1. ``dVC`` is radiance / power of the emitted ray:
+    the radiance that such a camera path finds, in units of what the photon carries; 0 of lights
+    that it cannot hit.
     """
 
     def first(self, scene, emitted, si, active) -> Sums:
         density = emitted.probability * emitted.pdf_position * emitted.pdf_direction
         density *= dr.select(emitted.cosine > 0, dr.rcp(emitted.cosine), 0)
         is_delta = emitted.is_delta_position | emitted.is_delta_direction
-        radiance = dr.select(is_delta, 0, channel_mean(emitted.weight) * density)
-        return Sums(dr.full(mi.Float, 1, dr.width(emitted.ray)), radiance)
+        one = dr.full(mi.Float, 1, dr.width(emitted.ray))
+        return Sums(one, dr.select(is_delta, 0, density))
 
     def scatter(self, sums: Sums, vertex: Vertex, bs: mi.BSDFSample3f) -> Sums:
         """Behind a vertex, which may lie in a medium."""

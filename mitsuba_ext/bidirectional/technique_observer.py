@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mitsuba as mi
 
 from ..transport.estimator import CameraRays, Sample
 from ..transport.observer import Observer, Observers
 from .candidates import Available
-from .partial_sums import Rivals
-
-if TYPE_CHECKING:
-    from ..transport.vertex import PathState
-    from .light_vertices import LightVertex
+from .partial_sums import Rivals, Sums
 
 
 class TechniqueObserver(Observer):
@@ -64,10 +60,12 @@ class TechniqueObserver(Observer):
         radiance, the MIS weight ``mis`` included."""
 
     def photon(
-        self, value: mi.Spectrum, path: PathState, other: LightVertex, active: mi.Bool
+        self, value: mi.Spectrum, carried: mi.Spectrum, sums: Sums, active: mi.Bool
     ) -> None:
-        """The camera path in each lane, whose state is ``path``, was merged with a vertex of a
-        light path, where merging is the only technique. This adds ``value`` to its radiance."""
+        """The camera path in each lane was merged with a vertex of a light path, whose partial sums
+        are ``sums``; merging is the only technique. This adds ``value`` to its radiance.
+        ``carried`` is the flux of the light path, times the throughput of the camera path if it
+        goes on along the light path."""
 
     def searched(self, count: mi.UInt32) -> None:
         """At a vertex of the camera path in each lane, so many vertices were looked at."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import add_own, channel_mean
 from ..bidirectional.candidates import Candidate
-from ..bidirectional.light_vertices import LightVertex
+from ..bidirectional.partial_sums import Sums
 from ..bidirectional.path_moments import Counts
 from ..bidirectional.path_tracer import camera_paths
 from ..bidirectional.photon_history import HiddenLight
@@ -26,7 +26,6 @@ from ..learning.pixel_estimates import relative_scale
 from ..rendering.camera import film_extent
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.numbers import Numbers, schedule_state
-from ..transport.vertex import PathState
 from ..transport.walk import Walk
 from .learned_slots import OF_CAMERA_PATHS
 from .light_paths import cost
@@ -215,13 +214,13 @@ class _Samples(TechniqueObserver):
         dr.eval(self._lane, self._importance, self._looked, self._moment, self._lost)
 
     def photon(
-        self, value: mi.Spectrum, path: PathState, other: LightVertex, active: mi.Bool
+        self, value: mi.Spectrum, carried: mi.Spectrum, sums: Sums, active: mi.Bool
     ) -> None:
         brought = channel_mean(value * self._importance)
-        hit = channel_mean(path.β * self._importance) * other.sums.dVC
-        is_hidden = active & other.sums.is_caustic & dr.isfinite(brought)
+        hit = channel_mean(carried * self._importance) * sums.dVC
+        is_hidden = active & sums.is_caustic & dr.isfinite(brought * hit)
         add_own(self._moment, brought * hit, self._lane, is_hidden)
-        add_own(self._lost, brought, self._lane, is_hidden & (hit == 0))
+        add_own(self._lost, brought, self._lane, is_hidden & (sums.dVC == 0))
 
     def searched(self, count: mi.UInt32) -> None:
         add_own(self._looked, count, self._lane)
