@@ -64,6 +64,11 @@ class Auto(LightPathIntegrator):
     below 262144 samples, there is none. Where light
     paths have less than 0.4 of the variance, the samples before are left out of the image.
 
+    The differences between the passes of the later pilots show the variance that light paths really
+    have. Before the last stage, the integrator goes back to what it had before if that variance,
+    times the predicted time, is more than it would be without light paths, beyond the error of the
+    measurement. (What else is learned is tested in each pilot.)
+
     Light paths are not tried in participating media, in films of more than two million pixels, and
     where a light cannot emit them: there, the integrator is :class:`auto_path`. In spectral
     variants and with moving shapes, nothing is merged.

@@ -52,7 +52,7 @@ class LightPathPromise:
         gain, self.error = gain_of(sums)
         self.variance = 1 - gain
         efficiency = 1 / (max(self.variance, 1e-6) * time)
-        return efficiency * np.exp(self.error) < rival
+        return bool(efficiency * np.exp(self.error) < rival)
 
     def _on_coarse_film(self, image: np.ndarray) -> np.ndarray:
         """The means of an image of the crop window over the rectangles of the coarse film."""
