@@ -7,7 +7,6 @@ import numpy as np
 
 from .filter_weights import mean_weights, share_of_squares
 
-
 #: A stage whose images are wanted has so many passes or more: the first one only tells what was in
 #: the film before, and a variance needs two images.
 FEWEST_PASSES = 3
