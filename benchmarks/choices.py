@@ -11,6 +11,8 @@ are means over all pixels but the 0.1 % with the largest ones, and in brackets o
 median over the seeds but the first, which compiles; learning, and what other seeds compile,
 included.
 
+``--choices 10`` renders no images: it shows what ten seeds choose for renders of that time.
+
 ``--cpu`` measures the time of all cores instead of the wall clock, for machines that do other work.
 It favours what runs on all cores. ``--table`` prints the table of all results in the folder. All
 must have been measured with the same clock.
@@ -18,6 +20,7 @@ must have been measured with the same clock.
 
 from __future__ import annotations
 
+import collections
 import json
 import statistics
 import time
@@ -87,18 +90,29 @@ def errors(images: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     return found
 
 
-def compare(
-    file: Path, seconds: float, seeds: int, size: tuple[int, int], names: tuple[str, ...], cpu: bool
-) -> dict[str, Any]:
-    """The result for one scene: times, errors, choices."""
+def _load(file: Path, size: tuple[int, int]) -> mi.Scene:
     scene = mi.load_file(str(file))
     sensor = mi.traverse(scene.sensors()[0])
     sensor["film.size"] = sensor["film.crop_size"] = list(size)
     sensor.update()
-    made = {name: mi.load_dict({"type": name, "max_depth": 6}) for name in names}
+    return scene
+
+
+def _samples_of_path(scene: mi.Scene, seconds: float, cpu: bool = True) -> int:
+    """How many samples of each pixel ``path`` takes in the given time."""
+    path = mi.load_dict({"type": "path", "max_depth": 6})
     for _ in range(3):
-        wall, busy = _render(scene, made["path"], 16, 1)[1]
-    spp = max(8, round(16 * seconds / (busy / dr.thread_count() if cpu else wall)))
+        wall, busy = _render(scene, path, 16, 1)[1]
+    return max(8, round(16 * seconds / (busy / dr.thread_count() if cpu else wall)))
+
+
+def compare(
+    file: Path, seconds: float, seeds: int, size: tuple[int, int], names: tuple[str, ...], cpu: bool
+) -> dict[str, Any]:
+    """The result for one scene: times, errors, choices."""
+    scene = _load(file, size)
+    made = {name: mi.load_dict({"type": name, "max_depth": 6}) for name in names}
+    spp = _samples_of_path(scene, seconds, cpu)
     images, times = {name: [] for name in made}, {name: [] for name in made}
     effects: dict[str, list[dict[str, Any]]] = {name: [] for name in made}
     refused = {}
@@ -124,6 +138,22 @@ def compare(
             "effects": effects[name],
         }  # fmt: skip
     return {"spp": spp, "seconds": seconds, "cpu": cpu, "integrators": result, "refused": refused}
+
+
+def choices(
+    file: Path, seconds: float, seeds: int, size: tuple[int, int], name: str = "auto"
+) -> collections.Counter[str]:
+    """What ``seeds`` seeds choose, in renders of as many samples as ``path`` takes in the given
+    time. They end when all has been learned."""
+    scene = _load(file, size)
+    spp = _samples_of_path(scene, seconds)
+    integrator = mi.load_dict({"type": name, "max_depth": 6})
+    found = collections.Counter()
+    for seed in range(seeds):
+        integrator.progress = lambda _done: integrator.statistics.learned and integrator.cancel()
+        integrator.render(scene, seed=seed, spp=spp)
+        found[_choice(integrator.statistics.effects)] += 1
+    return found
 
 
 def gain(result: dict[str, Any], name: str, key: str = "error") -> float:
@@ -180,6 +210,7 @@ def table(folder: Path, name: str = "auto") -> None:
 @click.option("--size", default=(320, 180), type=(int, int), show_default=True)
 @click.option("--integrator", "names", multiple=True, default=INTEGRATORS, help="The first: path.")
 @click.option("--cpu", is_flag=True, help="Measure the time of all cores.")
+@click.option("--choices", "chosen", default=0, help="Show what so many seeds choose.")
 @click.option("--out", default="out/choices", type=click.Path(path_type=Path), show_default=True)
 @click.option("--table", "only_table", is_flag=True, help="Print the table of the results in OUT.")
 def main(
@@ -189,6 +220,7 @@ def main(
     size: tuple[int, int],
     names: tuple[str, ...],
     cpu: bool,
+    chosen: int,
     out: Path,
     only_table: bool,
 ) -> None:
@@ -200,6 +232,10 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     for file in files:
         scene = file.parent.name if file.stem == "scene" else file.stem
+        if chosen:
+            found = choices(file, seconds, chosen, size).most_common()
+            print(f"{scene}: {', '.join(f'{n} x {what}' for what, n in found)}", flush=True)
+            continue
         result = compare(file, seconds, seeds, size, names, cpu)
         (out / f"{scene}.json").write_text(json.dumps(result))
         print(line(scene, result), flush=True)

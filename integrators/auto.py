@@ -72,10 +72,15 @@ class Auto(LightPathIntegrator):
     below 262144 samples, there is none. Where light paths have less than 0.4 of the variance, the
     samples before are left out of the image.
 
+    The differences between the passes of the later pilots show the variance that light paths really
+    have. Before the last stage, the integrator goes back to what it had before if that variance,
+    times the predicted time, is more than it would be without light paths, beyond the error of the
+    measurement. (What else is learned is tested in each pilot.)
+
     In scenes with participating media, there is one choice besides camera paths: photons, as
     :class:`sppm` renders them. Renders of two million samples or more try them on a coarse film,
     beside camera paths. The photons also tell how rarely camera paths find the light of lamps in or
-    behind glass, to which they cannot be connected.
+    behind glass, to which they cannot be connected. The choice is not tested later.
 
     Light paths are not tried in films of more than two million pixels, and where a light cannot
     emit them: there, the integrator is :class:`auto_path`. In spectral variants and with moving

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -36,7 +37,8 @@ _GROWS = 1.25
 
 class LightPathSchedule:
     """Adds a stage to a schedule in which light paths are tried, with the lights that were learned
-    until then. If they pay, more than guided directions do, the stages after it use them.
+    until then. If they pay, more than guided directions do, the stages after it use them. Before
+    the last stage, it goes back on that if the pilots after the trial show less than was promised.
 
     Parameters:
         inner: Makes the other stages.
@@ -57,12 +59,15 @@ class LightPathSchedule:
         inner.beside["light_paths"] = trial
         self._next: Stage | None = None
         self._is_over = False
+        self._take_up_again: Callable[[], None] | None = None
 
     def next_stage(self) -> Stage:
         """See :class:`mitsuba_ext.rendering.stages.Schedule`."""
         if self._next is not None:
             return self._stage_after_trial()
         stage = self._inner.next_stage()
+        if self._take_up_again is not None:
+            return self._measured_stage(stage)
         if self._is_over or stage.is_scout:
             return stage
         if self._place > 0:
@@ -100,7 +105,21 @@ class LightPathSchedule:
         if choice is None or choice.techniques.light_paths == 0:
             # Only the summary may be new
             return self._inner.stage_again() if stage.learned else stage
-        self._inner.leave_out(self._trial.leaves_out)
+        self._take_up_again = self._inner.leave_out(self._trial.leaves_out)
         self._inner.decisions["light_paths"] = choice
-        stage = self._inner.stage_again()
+        stage = self._measured_stage(self._inner.stage_again())
         return replace(stage, forgets=self._trial.chosen_variance < _FAR_LESS)
+
+    def _measured_stage(self, stage: Stage) -> Stage:
+        """A stage with light paths; or, if it is the last one, and those before it show that light
+        paths do not pay, what it would have been without them."""
+        promise = self._trial.promise
+        if promise is None:
+            return stage
+        if not self._inner.is_at_end:
+            return replace(stage, images=promise.images)
+        if self._trial.goes_back():
+            del self._inner.decisions["light_paths"]
+            self._take_up_again()
+        return self._inner.stage_again()
+

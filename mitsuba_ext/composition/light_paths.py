@@ -23,6 +23,7 @@ from ..rendering.camera import film_extent, first_pixel
 from ..scene.movers import movers
 from .decision_parameters import DecisionParameters, Setting, Slots
 from .learned_slots import OF_CAMERA_PATHS
+from .light_path_promise import LightPathPromise
 
 #: The time of what a sample does, in units of that of a ray of ``path``: camera paths carry partial
 #: sums; rays of light paths; shadow rays to the sensor; connections; a light path's vertex that is
@@ -137,6 +138,7 @@ class LightPathTrial(Learner):
         candidates: What was compared, once the choice has been made.
         variances, costs: Variance and time of each candidate, relative to ``path``.
         leaves_out: If light paths pay, these slots decide as ``path``.
+        promise: Tests what was chosen; ``None`` where there is nothing to test it against.
     """
 
     leaves_out = OF_CAMERA_PATHS
@@ -147,6 +149,7 @@ class LightPathTrial(Learner):
             coarse = CoarseFilm.of(*extent, _trial_samples(extent[0] * extent[1] * spp))
         else:
             coarse = CoarseFilm.whole(*extent)
+        self._film, self._coarse = film, coarse
         corner, self._width = first_pixel(film), coarse.width
         self._moments: PathMoments | None = PathMoments(coarse, corner, extent[0], spp)
         self._choice = LightPathChoice(
@@ -157,6 +160,7 @@ class LightPathTrial(Learner):
         self.estimate: Estimate | None = None
         self.candidates: list[Candidate] = []
         self.variances, self.costs = np.zeros(0), np.zeros(0)
+        self.promise: LightPathPromise | None = None
 
     @property
     def chosen_variance(self) -> float:
@@ -203,7 +207,18 @@ class LightPathTrial(Learner):
         else:
             self.variances = np.where(np.isfinite(variances), 0.0, 1.0)
         self._choice = LightPathChoice(moments.candidates[self._best])
+        if self._best > 0 and np.isfinite(variances[0]):
+            self.promise = LightPathPromise(self._film, self._coarse, estimate.variances[0])
         return self._choice
+
+    def goes_back(self) -> bool:
+        """Has a choice not kept its promise? It is then replaced by ``path``."""
+        if self.promise is None:
+            return False
+        if self.promise.is_broken(float(self.costs[self._best]), self.rival):
+            self._choice = LightPathChoice(Candidate(0.0))
+            return True
+        return False
 
     def state(self) -> dict[str, np.ndarray]:
         return {"light_paths": np.array(astuple(self._choice.techniques), float)}
@@ -222,7 +237,13 @@ class LightPathTrial(Learner):
             return Effect(is_kept, about=asdict(techniques))
         index = self._shown
         about = {"rival": round(self.rival, 4), **asdict(self.candidates[index])}
+        if self._measured is not None:
+            about["measured_variance"] = round(self._measured, 4)
         return Effect(is_kept, float(self.variances[index]), float(self.costs[index]), about)
+
+    @property
+    def _measured(self) -> float | None:
+        return self.promise.variance if self.promise else None
 
     @property
     def _shown(self) -> int:
@@ -237,7 +258,8 @@ class LightPathTrial(Learner):
             return kept
         # In units of ``path``
         variance, time = self.variances[self._shown], self.costs[self._shown]
-        return f"{kept} ({variance:.2f} of the variance, {time:.1f} x the time)"
+        measured = "" if self._measured is None else f", {self._measured:.2f} measured"
+        return f"{kept} ({variance:.2f} of the variance{measured}, {time:.1f} x the time)"
 
 
 def _trial_samples(samples: int) -> int:

@@ -86,9 +86,11 @@ class PhotonTrial(Learner):
             of the trial.
         leaves_out: If photons pay, these slots decide as ``path``.
         variance, time: Those of photons, relative to ``path``, once the choice has been made.
+        promise: ``None``: the short passes of pilots do not tell the variance of photons later,
+            when more samples share them.
     """
 
-    leaves_out = (*OF_CAMERA_PATHS, "next_event")
+    leaves_out, promise = (*OF_CAMERA_PATHS, "next_event"), None
 
     def __init__(self, film: mi.Film, spp: int) -> None:
         width, height = film_extent(film)

@@ -167,9 +167,14 @@ class Schedule:
         """See :class:`mitsuba_ext.rendering.stages.EndingSchedule`."""
         self._pilot_count = self._finished_stages + 1
 
+    @property
+    def is_at_end(self) -> bool:
+        """Has :meth:`next_stage` returned the last stage?"""
+        return self._finished_stages >= self._pilot_count
+
     def stage_again(self) -> Stage:
         """The stage that :meth:`next_stage` has returned, with the decisions of now."""
-        if self._finished_stages >= self._pilot_count:
+        if self.is_at_end:
             return self._last_stage()
         observer = _one_observer(list(self.learners.values()))
         return Stage(
@@ -180,9 +185,14 @@ class Schedule:
             observer=observer,
         )
 
-    def leave_out(self, slots: Sequence[str]) -> None:
+    def leave_out(self, slots: Sequence[str]) -> Callable[[], None]:
         """Decides as ``path`` in these slots from now on, and learns nothing more for them. If
-        nothing else learns, this stage and all after it are as the last one."""
+        nothing else learns, this stage and all after it are as the last one. Returns a function
+        that takes up again what was decided."""
+        decisions, learners, camera = (
+            {slot: x[slot] for slot in slots if slot in x}
+            for x in (self.decisions, self.learners, vars(self.camera))
+        )
         for slot in slots:
             self.decisions.pop(slot, None)
             self.learners.pop(slot, None)
@@ -190,6 +200,13 @@ class Schedule:
                 setattr(self.camera, slot, None)
         if not self.learners:
             self._pilot_count = self._finished_stages
+
+        def take_up_again() -> None:
+            self.decisions.update(decisions)
+            self.learners.update(learners)
+            vars(self.camera).update(camera)
+
+        return take_up_again
 
     def _restored_stage(self, states: States) -> Stage:
         for slot, learner in self._everyone.items():

@@ -28,11 +28,8 @@ def mean_weights(film: mi.Film) -> np.ndarray:
     """The mean of the filter weights that one camera sample in each pixel adds to each pixel:
     [height, width]. Pixels at the edges get less, because there are no samples outside of the
     film."""
-    rfilter = film.rfilter()
-    radius = rfilter.radius()
-    edges = np.linspace(-radius, radius, _TABLE + 1)
-    values = rfilter.eval(mi.Float(0.5 * (edges[1:] + edges[:-1]))).numpy().astype(np.float64)
-    integral = np.concatenate([[0], np.cumsum(values)]) * (2 * radius / _TABLE)
+    edges, values = _table(film.rfilter())
+    integral = np.concatenate([[0], np.cumsum(values)]) * (edges[1] - edges[0])
 
     def along(size: int) -> np.ndarray:
         centre = np.arange(size) + 0.5
@@ -40,3 +37,21 @@ def mean_weights(film: mi.Film) -> np.ndarray:
 
     width, height = film.crop_size()
     return along(height)[:, None] * along(width)
+
+
+def share_of_squares(film: mi.Film) -> float:
+    """The variance of a pixel, in units of that of the box filter with as many samples of each
+    pixel: ∫w² / (∫w)² over the plane, for the filter w. (The film divides by the sum of the weights
+    instead of its mean, which lowers the variance further where the image is even.)"""
+    edges, values = _table(film.rfilter())
+    step = edges[1] - edges[0]
+    along = (values**2).sum() * step / (values.sum() * step) ** 2
+    return float(along**2)
+
+
+def _table(rfilter: mi.ReconstructionFilter) -> tuple[np.ndarray, np.ndarray]:
+    """The ends of short intervals, and the weights in their middles."""
+    radius = rfilter.radius()
+    edges = np.linspace(-radius, radius, _TABLE + 1)
+    values = rfilter.eval(mi.Float(0.5 * (edges[1:] + edges[:-1]))).numpy()
+    return edges, values.astype(np.float64)

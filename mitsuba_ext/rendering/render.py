@@ -29,6 +29,7 @@ from .filter_weights import put_splats
 from .interrupts import deferred_interrupt
 from .notebook import statistics_table
 from .pace import plan_for_timeout
+from .pass_images import FEWEST_PASSES
 from .pass_samples import GradientsError, count_rays, look, put_samples
 from .plan import Planned, plan_render
 from .stages import DivisibleSchedule, EndingSchedule, Schedule, Stage
@@ -252,6 +253,8 @@ class Job:
         budget = self.budget.stage(samples, before, is_last)
         forgets = stage.forgets
         length, done = self.plan.pass_length(samples, stage.most_lanes), 0
+        if stage.images is not None and not self.plan.structured:
+            length = min(length, -(-samples // FEWEST_PASSES))
         while done < (wanted := self.plan.whole(before, budget.samples, samples)):
             if self._stopped(interrupt):
                 return
@@ -264,6 +267,8 @@ class Job:
                 self.splats = None
             compiled = self._run_pass(stage, spp)
             done += spp
+            if stage.images is not None:
+                stage.images.add(self.block, self.splats, before + done)
             if not compiled:
                 budget.passed(spp, done, time.perf_counter() - begin)
             if self.integrator.progress is not None:

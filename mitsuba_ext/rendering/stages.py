@@ -11,6 +11,7 @@ import numpy as np
 from ..transport.estimator import Estimator
 from ..transport.observer import Observer
 from .camera_samples import CameraSamples
+from .pass_images import PassImages
 
 
 @dataclass
@@ -33,6 +34,7 @@ class Stage:
         forgets: Are the samples of earlier stages left out of the image? For stages whose samples
             have far less variance.
         observer: Is told when a pass begins. The estimator reports all other events to it.
+        images: Gets the images of its passes, of which there are then three at least.
     """
 
     estimator: Estimator
@@ -45,6 +47,7 @@ class Stage:
     most_lanes: int = 0
     forgets: bool = False
     observer: Observer | None = None
+    images: PassImages | None = None
 
 
 class Schedule(Protocol):

@@ -1,0 +1,71 @@
+"""The images of single passes, and the variance that they show."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from .filter_weights import mean_weights, share_of_squares
+
+#: A stage whose images are wanted has so many passes or more: the first one only tells what was in
+#: the film before, and a variance needs two images.
+FEWEST_PASSES = 3
+
+
+class PassImages:
+    """Mean and variance of each pixel in one stage or several, from the images of their passes.
+
+    Passes are independent: their differences show the variance of all that a stage adds to the
+    film, splats included, without a change to its kernel.
+
+    Parameters:
+        film: The film. Special ones, which hold no colours, have no images.
+    """
+
+    def __init__(self, film: mi.Film) -> None:
+        self._film = film
+        self._is_special = mi.has_flag(film.flags(), mi.FilmFlags.Special)
+        self._before: tuple[np.ndarray, np.ndarray, int] | None = None
+        self._images: list[np.ndarray] = []
+        self._spp: list[int] = []
+
+    @property
+    def count(self) -> int:
+        """The number of images."""
+        return len(self._images)
+
+    def add(self, block: mi.ImageBlock, splats: mi.ImageBlock | None, spp: int) -> None:
+        """Called after each pass, with the sums of all samples until then, and their number for
+        each pixel. The first call only says where the sums begin."""
+        if self._is_special:
+            return
+        sums = _contents(block)
+        splatted = np.zeros_like(sums) if splats is None else _contents(splats)
+        if self._before is not None:
+            before, splatted_before, spp_before = self._before
+            image = self._image(sums - before, splatted - splatted_before, spp - spp_before)
+            self._images.append(np.where(np.isfinite(image), image, 0))
+            self._spp.append(spp - spp_before)
+        self._before = sums, splatted, spp
+
+    def _image(self, sums: np.ndarray, splatted: np.ndarray, spp: int) -> np.ndarray:
+        weight = sums[..., 4 if mi.has_flag(self._film.flags(), mi.FilmFlags.Alpha) else 3]
+        colour = sums[..., :3].mean(axis=2) / np.where(weight == 0, 1, weight)
+        return colour + splatted[..., :3].mean(axis=2) / (spp * mean_weights(self._film))
+
+    def mean(self) -> np.ndarray:
+        """The radiance of each pixel, [y, x]."""
+        return np.average(self._images, axis=0, weights=self._spp)
+
+    def variance(self) -> np.ndarray:
+        """An estimate of the variance of one sample of each pixel, [y, x], from two images or more.
+
+        A filter that is wider than a pixel averages the samples of several pixels. Their variances
+        are assumed to be about equal."""
+        spp = np.array(self._spp)[:, None, None]
+        squares = (spp * (np.array(self._images) - self.mean()) ** 2).sum(axis=0)
+        return squares / (self.count - 1) / share_of_squares(self._film)
+
+
+def _contents(block: mi.ImageBlock) -> np.ndarray:
+    return np.array(block.tensor(), dtype=np.float64)

@@ -1,0 +1,90 @@
+"""``auto`` measures the passes with light paths, and goes back where they do not pay."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from statistical import load
+
+from mitsuba_ext.composition.light_path_promise import LightPathPromise
+from mitsuba_ext.images.coarse_film import CoarseFilm
+from mitsuba_ext.rendering.pass_images import FEWEST_PASSES, PassImages
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+_SIZE, _SPP = 48, 16
+
+
+def film_of(rfilter: str, **parameters: Any) -> mi.Film:
+    size = {"width": _SIZE, "height": _SIZE}
+    return mi.load_dict({"type": "hdrfilm", "rfilter": {"type": rfilter}, **size, **parameters})
+
+
+def fill(images: PassImages, film: mi.Film, passes: int) -> None:
+    """Adds camera samples of mean 1/2 and variance 1/12, and splats of mean 1 and variance 1 (one
+    in two samples has a splat of 2 somewhere on the film)."""
+    film.prepare([])
+    block, splats = film.create_block(), film.create_block()
+    rng = np.random.default_rng(1)
+    y, x = np.mgrid[:_SIZE, :_SIZE].reshape(2, -1).repeat(_SPP, axis=1)
+    alpha = block.channel_count() - 4
+    for number in range(1, passes + 1):
+        value = mi.Float(rng.random(x.size))
+        position = mi.Point2f(x + rng.random(x.size), y + rng.random(x.size))
+        block.put(position, [value, value, value, *[mi.Float(1)] * alpha, mi.Float(1)])
+        value = mi.Float(2.0 * (rng.random(x.size) < 0.5))
+        position = mi.Point2f(*(_SIZE * rng.random((2, x.size))))
+        splats.put(position, [value, value, value, *[mi.Float(0)] * alpha, mi.Float(0)])
+        images.add(block, splats, _SPP * number)
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian", "tent"])
+@pytest.mark.parametrize("pixel_format", ["rgb", "rgba"])
+def test_passes_show_mean_and_variance(rfilter: str, pixel_format: str) -> None:
+    film = film_of(rfilter, pixel_format=pixel_format)
+    images = PassImages(film)
+    fill(images, film, 5)
+    inner = np.s_[3:-3, 3:-3]
+    assert images.count == 4
+    assert images.mean()[inner].mean() == pytest.approx(1.5, rel=0.01)
+    # The splats of a pixel are Poisson distributed: half a splat of 2 for each sample
+    expected = 1 / 12 + 0.5 * 2**2
+    assert images.variance()[inner].mean() == pytest.approx(expected, rel=0.08)
+
+
+@pytest.mark.parametrize("efficiency", [0.8, 0.99, 1.25])
+def test_a_broken_promise_is_seen(efficiency: float) -> None:
+    film = film_of("gaussian", sample_border=True)
+    border = 2 * film.rfilter().border_size()
+    coarse = CoarseFilm.of(_SIZE + border, _SIZE + border, 512)
+    of_path = np.full(coarse.width * coarse.height, 1 / 12 + 0.5 * 2**2)
+    promise = LightPathPromise(film, coarse, of_path)
+    assert not promise.is_broken(time=9.0, rival=9.0)
+    fill(promise.images, film, FEWEST_PASSES)
+    # The variance is that of ``path``
+    is_broken = promise.is_broken(time=2 / efficiency, rival=0.5)
+    assert promise.variance == pytest.approx(1, rel=0.05)
+    assert is_broken == (efficiency < 0.9)
+
+
+def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts = []
+
+    def is_broken(promise: LightPathPromise, time: float, rival: float) -> bool:
+        counts.append(promise.images.count)
+        promise.variance = 5.0
+        return True
+
+    monkeypatch.setattr(LightPathPromise, "is_broken", is_broken)
+    integrator = mi.load_dict({"type": "auto", "max_depth": 6})
+    scene = load("caustic", width=96, height=54)
+    image = np.array(integrator.render(scene, spp=64, seed=1))
+    assert np.isfinite(image).all()
+    effect = integrator.statistics.effects["light_paths"]
+    assert not effect["is_kept"] and effect["measured_variance"] == 5.0
+    learned = integrator.statistics.learned
+    assert "light paths do not pay" in learned and "guide" in learned
+    assert counts and counts[0] >= FEWEST_PASSES - 1
