@@ -80,7 +80,8 @@ class LightWalk:
         max_depth: Longest path from light to sensor, in segments: vertices up to the depth
             ``max_depth`` − 1 are stored, since one segment more leads to the sensor.
         rr_depth: Depth at which Russian roulette begins.
-        sums: Computes partial sums of MIS weights; ``None`` if they are not needed.
+        sums: Computes partial sums of MIS weights; ``None`` if they are not needed. In scenes with
+            media, a :class:`HiddenLight`.
         roulette: The Russian roulette. It is given the throughput without the light's power, since
             dim lights are already chosen rarely.
         query: Intersects rays with the scene.
@@ -244,6 +245,8 @@ class LightWalk:
                 heroes, paths, bsdf, si, bs, weight, sums, active_next
             )
             bs, weight = media.scatter(vertex, sample_1, sample_2, bs, weight)
+            if dr.hint(media.exist and self.sums is not None, mode="scalar"):
+                sums = self.sums.scatter(sums, vertex, bs)
             β = β * weight
             sampling_weight = paths.sampling_weight * hero_count
 
@@ -329,7 +332,7 @@ class LightWalk:
         )
         value *= dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
         weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
-        if self.sums is not None:
+        if self.sums is not None and self.outside is None:
             sums = self.sums.leave(
                 sums, geometric_cosine(si, bs.wo), bs.pdf, reverse_pdf,
                 is_delta | ~self._stores(bsdf),

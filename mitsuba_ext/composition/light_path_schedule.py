@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 
 from ..learning.directions.guide_learner import GuideLearner
 from ..rendering.camera_samples import CameraSamples
 from ..rendering.stages import Stage
-from .learned_slots import CAMERA_NUMBERS
-from .light_paths import LightPathTrial
+from .learned_slots import CAMERA_NUMBERS, OF_CAMERA_PATHS
 from .schedule import Schedule
 
-#: Where light paths pay, these slots decide as ``path``: what they learn is for camera paths that
-#: find all light alone.
-_OF_CAMERA_PATHS = ("directions", "roulette", *CAMERA_NUMBERS)
+if TYPE_CHECKING:
+    from .light_paths import LightPathTrial
+    from .photon_trial import PhotonTrial
 
 #: After so many pilots, or all if there are fewer, comes the trial: they are enough to tell what
 #: else is worth its time.
@@ -52,7 +52,7 @@ class LightPathSchedule:
         inner: Schedule,
         scene: mi.Scene,
         pilots: int,
-        trial: LightPathTrial,
+        trial: LightPathTrial | PhotonTrial,
     ) -> None:
         self._inner, self._scene, self._trial = inner, scene, trial
         self._place = min(_PILOTS, pilots)
@@ -77,7 +77,7 @@ class LightPathSchedule:
         choice = self._trial.start(self._scene, mi.Point3f(), mi.Normal3f())
         decisions = {
             slot: decision for slot, decision in self._inner.decisions.items()
-            if slot not in _OF_CAMERA_PATHS
+            if slot not in OF_CAMERA_PATHS
         }  # fmt: skip
         estimator = self._inner.estimator(light_paths=choice, **decisions)
         return Stage(
@@ -105,7 +105,7 @@ class LightPathSchedule:
         if choice is None or choice.techniques.light_paths == 0:
             # Only the summary may be new
             return self._inner.stage_again() if stage.learned else stage
-        self._take_up_again = self._inner.leave_out(_OF_CAMERA_PATHS)
+        self._take_up_again = self._inner.leave_out(self._trial.leaves_out)
         self._inner.decisions["light_paths"] = choice
         stage = self._measured_stage(self._inner.stage_again())
         return replace(stage, forgets=self._trial.chosen_variance < _FAR_LESS)
