@@ -134,12 +134,12 @@ class Auto(LightPathIntegrator):
             return self.walk
         return super().estimators(scene, sensor)
 
-    def merging_radius(self, scene, sensor, side):
+    def merging_radius(self, scene, sensor, side, *sums):
         # Only paths of equal wavelengths and times merge: all pixels would have to share these,
         # even if nothing is merged in the end
         if mi.is_spectral or movers(scene):
             return None
-        return super().merging_radius(scene, sensor, side)
+        return super().merging_radius(scene, sensor, side, *sums)
 
     def _can_try(self, scene: mi.Scene) -> bool:
         """Can camera paths be connected to light paths, in what this integrator does else?"""
