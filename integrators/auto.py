@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import mitsuba as mi
 
 from mitsuba_ext.bidirectional.candidates import Candidate
 from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.composition import light_path_schedule
 from mitsuba_ext.composition.bidirectional_integrator import LightPathIntegrator
 from mitsuba_ext.composition.learned_slots import learned_slots
 from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
 from mitsuba_ext.composition.light_paths import LightPathsWhereTheyPay, LightPathTrial
 from mitsuba_ext.composition.merging_parameters import MergingParameters
 from mitsuba_ext.composition.staged_integrator import NO_LIMIT
+from mitsuba_ext.composition.walk_integrator import LEARNING_KERNELS
+from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.rendering.stages import Schedule
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import movers
@@ -19,6 +24,9 @@ from mitsuba_ext.startup import registry
 
 #: Light paths are not tried in films of more pixels, since a pass stores some kilobytes for each.
 _MOST_PIXELS = 1 << 21
+
+#: The trial of light paths compiles about so many kernels as large as that of ``path``.
+_TRIAL_KERNELS = 4
 
 
 @registry.plugin
@@ -112,10 +120,13 @@ class Auto(LightPathIntegrator):
         # Stages with light paths have limits of their own
         return NO_LIMIT
 
-    def pilots(self, scene, pixel_count, spp):
-        stages = super().pilots(scene, pixel_count, spp)
+    def pilots(self, scene, pixel_count, spp, kernels=math.inf):
+        if pixel_count * spp < light_path_schedule.LEAST_SAMPLES and not self.save_learned:
+            spp = 0
+        stages = super().pilots(scene, pixel_count, spp, kernels)
         self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene)
         is_possible = bool(stages) and LightPathTrial.is_possible(pixel_count, spp)
+        is_possible &= kernels >= LEARNING_KERNELS + _TRIAL_KERNELS
         self._has_trial = is_possible and self._has_light_paths
         return stages
 
@@ -125,7 +136,8 @@ class Auto(LightPathIntegrator):
             return schedule
         trial = LightPathTrial(sensor.film(), sum(samples), is_sparse=True)
         if self._has_trial:
-            return LightPathSchedule(schedule, scene, len(samples) - 1, trial)
+            count = math.prod(film_extent(sensor.film())) * sum(samples)
+            return LightPathSchedule(schedule, scene, len(samples) - 1, trial, count)
         schedule.beside["light_paths"] = trial
         return schedule
 

@@ -12,6 +12,7 @@ import pytest
 from stage import area, stage
 
 from mitsuba_ext.arrays import add_own, channel_mean
+from mitsuba_ext.composition import light_path_schedule
 from mitsuba_ext.rendering import pace, time_budget
 from mitsuba_ext.rendering import render as rendering
 from mitsuba_ext.rendering.stages import EndingSchedule
@@ -52,9 +53,9 @@ def test_the_pilots_are_those_of_a_render_of_the_samples_that_fit(monkeypatch):
     integrator = _integrator("auto_path", timeout=10.0)
     pilots = integrator.pilots
 
-    def remembered(scene, pixel_count, spp):
+    def remembered(scene, pixel_count, spp, *kernels):
         asked.append(spp)
-        return pilots(scene, pixel_count, spp)
+        return pilots(scene, pixel_count, spp, *kernels)
 
     integrator.pilots = remembered
     integrator.render(_scene(), spp=5000)
@@ -124,7 +125,8 @@ def test_without_a_timeout_the_plan_is_that_of_all_samples(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["auto_path", "auto", "pss_guided", "neepp"])
-def test_passes_of_other_lengths_compile_no_kernels(name):
+def test_passes_of_other_lengths_compile_no_kernels(name, monkeypatch):
+    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
     scene, compiled = _scene(), []
     for spp in (32, 64, 48, 80):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

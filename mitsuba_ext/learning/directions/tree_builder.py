@@ -269,7 +269,7 @@ class TreeBuilder:
                 dr.scatter(square, new, level.splits)
             dr.eval(probability, child, square)
             below = square
-            is_even = dr.full(mi.Bool, depth % 2 == 0, level.count)
+            is_even = dr.opaque(mi.Bool, depth % 2 == 0, level.count)
             columns.append((probability, child, is_even, square))
         old = self.probability, self.child, self.is_even, self._square
         self.probability, self.child, self.is_even, self._square = (
