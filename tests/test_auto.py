@@ -64,6 +64,7 @@ def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(light_paths.LightPathTrial, "__init__", remembered)
     monkeypatch.setattr(light_paths, "_MOST", 1.0)
+    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
     for samples in (1 << 10, 1 << 14):
         monkeypatch.setattr(light_paths, "_SPARSE", samples)
         auto().render(scene, spp=32, seed=1)
