@@ -68,9 +68,15 @@ class Auto(LightPathIntegrator):
     each camera path; with and without connections to their vertices, and merging); numbers of rays
     tell its time. The best choice is made, if it is better than guided directions and maps, with
     which light paths are not combined. This stage has 16384 samples, spread over the film, which
-    are not part of the image; in renders of less than a million samples, it has as few as 4096, and
-    below 262144 samples, there is none. Where light
-    paths have less than 0.4 of the variance, the samples before are left out of the image.
+    are not part of the image; in renders of less than a million samples, it has as few as 4096.
+    Where light paths have less than 0.4 of the variance, the samples before are left out of the
+    image.
+
+    Renders of less than 262144 samples are those of :monosp:`path`, unless they save what they
+    learn: they would take longer to learn, and to compile the kernels of learning, than for all
+    samples. Light paths must gain more, the shorter a render is: 1.1 times the efficiency, and
+    twice that of the rest in renders of half a million samples. With a :monosp:`timeout`, they are
+    tried only where there is time to compile their kernels.
 
     Light paths are not tried in participating media, in films of more than two million pixels, and
     where a light cannot emit them: there, the integrator is :class:`auto_path`. In spectral
