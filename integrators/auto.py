@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ import mitsuba as mi
 from mitsuba_ext.bidirectional.candidates import Candidate
 from mitsuba_ext.bidirectional.emission import LightEmission
 from mitsuba_ext.bidirectional.photon_mapper import PhotonMapper
+from mitsuba_ext.composition import light_path_schedule
 from mitsuba_ext.composition.bidirectional_integrator import LightPathIntegrator
 from mitsuba_ext.composition.learned_slots import learned_slots
 from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
@@ -19,6 +21,8 @@ from mitsuba_ext.composition.merging_parameters import MergingParameters
 from mitsuba_ext.composition.photon_trial import PhotonChoice, PhotonTrial
 from mitsuba_ext.composition.photons import photon_mapper
 from mitsuba_ext.composition.staged_integrator import NO_LIMIT
+from mitsuba_ext.composition.walk_integrator import LEARNING_KERNELS
+from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.rendering.stages import Schedule
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import movers
@@ -27,6 +31,9 @@ from mitsuba_ext.transport.estimator import Estimator
 
 #: Light paths are not tried in films of more pixels, since a pass stores some kilobytes for each.
 _MOST_PIXELS = 1 << 21
+
+#: The trial of light paths compiles about so many kernels as large as that of ``path``.
+_TRIAL_KERNELS = 4
 
 
 @registry.plugin
@@ -68,9 +75,15 @@ class Auto(LightPathIntegrator):
     each camera path; with and without connections to their vertices, and merging); numbers of rays
     tell its time. The best choice is made, if it is better than guided directions and maps, with
     which light paths are not combined. This stage has 16384 samples, spread over the film, which
-    are not part of the image; in renders of less than a million samples, it has as few as 4096, and
-    below 262144 samples, there is none. Where light paths have less than 0.4 of the variance, the
-    samples before are left out of the image.
+    are not part of the image; in renders of less than a million samples, it has as few as 4096.
+    Where light paths have less than 0.4 of the variance, the samples before are left out of the
+    image.
+
+    Renders of less than 262144 samples are those of :monosp:`path`, unless they save what they
+    learn: they would take longer to learn, and to compile the kernels of learning, than for all
+    samples. Light paths must gain more, the shorter a render is: 1.1 times the efficiency, and
+    twice that of the rest in renders of half a million samples. With a :monosp:`timeout`, they are
+    tried only where there is time to compile their kernels.
 
     The differences between the passes of the later pilots show the variance that light paths really
     have. Before the last stage, the integrator goes back to what it had before if that variance,
@@ -131,12 +144,15 @@ class Auto(LightPathIntegrator):
         # Stages with light paths have limits of their own
         return NO_LIMIT
 
-    def pilots(self, scene, pixel_count, spp):
-        stages = super().pilots(scene, pixel_count, spp)
+    def pilots(self, scene, pixel_count, spp, kernels=math.inf):
+        if pixel_count * spp < light_path_schedule.LEAST_SAMPLES and not self.save_learned:
+            spp = 0
+        stages = super().pilots(scene, pixel_count, spp, kernels)
         self._has_media = may_have_media(scene)
         self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene)
         trial = PhotonTrial if self._has_media else LightPathTrial
         is_possible = bool(stages) and trial.is_possible(pixel_count, spp)
+        is_possible &= kernels >= LEARNING_KERNELS + _TRIAL_KERNELS
         self._has_trial = is_possible and self._has_light_paths
         return stages
 
@@ -149,7 +165,8 @@ class Auto(LightPathIntegrator):
         else:
             trial = LightPathTrial(sensor.film(), sum(samples), is_sparse=True)
         if self._has_trial:
-            return LightPathSchedule(schedule, scene, len(samples) - 1, trial)
+            count = math.prod(film_extent(sensor.film())) * sum(samples)
+            return LightPathSchedule(schedule, scene, len(samples) - 1, trial, count)
         schedule.beside["light_paths"] = trial
         return schedule
 
@@ -168,8 +185,8 @@ class Auto(LightPathIntegrator):
         choice: PhotonChoice = decisions.pop("light_paths", PhotonChoice())
         return choice.estimator(self.walk(**decisions), mapper)
 
-    def merging_radius(self, scene, sensor, side):
-        return super().merging_radius(scene, sensor, side) if _can_merge(scene) else None
+    def merging_radius(self, scene, sensor, side, *sums):
+        return super().merging_radius(scene, sensor, side, *sums) if _can_merge(scene) else None
 
     def _can_try(self, scene: mi.Scene) -> bool:
         """Can camera paths be connected to light paths, in what this integrator does else?"""

@@ -143,6 +143,8 @@ class LightWalk:
                 si = self.query.interaction(pi, emitted.ray)
                 sums = self.sums.first(scene, emitted, si, active)
             width = dr.width(emitted.ray)
+            # As wide as in later rounds, and in all renders: kernels would differ
+            ray.maxt, ray.time = (x + dr.zeros(mi.Float, width) for x in (ray.maxt, ray.time))
             paths = LightPaths(
                 ray, pi, emitted.weight, dr.full(mi.Spectrum, 1, width),
                 dr.full(mi.Float, 1, width), sums, dr.full(mi.UInt32, 1, width),

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from .light_paths import LightPathTrial
     from .photon_trial import PhotonTrial
 
+#: Renders of fewer samples learn nothing: ``path`` takes less time for so many than the fixed cost
+#: of learning, and a tenth of the time to compile the kernels of learning.
+LEAST_SAMPLES = 1 << 18
+
 #: After so many pilots, or all if there are fewer, comes the trial: they are enough to tell what
 #: else is worth its time.
 _PILOTS = 2
@@ -27,8 +31,10 @@ _PILOTS = 2
 _FAR_LESS = 0.4
 
 
-#: The least gain for which light paths are worth the time to compile their kernels.
-_MARGIN = 1.1
+#: The least gain for which light paths are worth the time to compile their kernels: they take as
+#: long as two million samples of ``path``, which is divided by the number of renders that share
+#: them, about four.
+_MARGIN, _KERNELS = 1.1, 5e5
 
 #: The efficiency of guides that are learned from all pilots, relative to that which short ones
 #: predict (door_ajar: 1.8 and 1.4).
@@ -45,6 +51,7 @@ class LightPathSchedule:
         scene: The scene.
         pilots: Number of the other pilots.
         trial: Chooses.
+        samples: Number of all samples of the render.
     """
 
     def __init__(
@@ -53,8 +60,10 @@ class LightPathSchedule:
         scene: mi.Scene,
         pilots: int,
         trial: LightPathTrial | PhotonTrial,
+        samples: int,
     ) -> None:
         self._inner, self._scene, self._trial = inner, scene, trial
+        self._margin = _MARGIN + _KERNELS / samples
         self._place = min(_PILOTS, pilots)
         inner.beside["light_paths"] = trial
         self._next: Stage | None = None
@@ -94,7 +103,7 @@ class LightPathSchedule:
     def _stage_after_trial(self) -> Stage:
         stage, self._next = self._next, None
         guide = self._inner.learners.get("directions")
-        self._trial.rival = _MARGIN
+        self._trial.rival = self._margin
         if isinstance(guide, GuideLearner) and guide.guide and guide.guidance:
             self._trial.rival *= guide.guidance.efficiency * _GROWS
         for slot in CAMERA_NUMBERS:
