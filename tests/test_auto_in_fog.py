@@ -11,7 +11,7 @@ from fogs import cube, fog, homogeneous
 from stage import area, lookat
 from statistical import assert_same_image
 
-from mitsuba_ext.composition import photon_trial
+from mitsuba_ext.composition import light_path_schedule, photon_trial
 from mitsuba_ext.composition.photon_trial import PhotonTrial
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -19,6 +19,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 @pytest.fixture(autouse=True)
 def small_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
     monkeypatch.setattr(photon_trial, "_LEAST", 1 << 14)
     monkeypatch.setattr(photon_trial, "_SAMPLES", 1 << 11)
 
