@@ -72,8 +72,8 @@ def errors(images: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     mean = {name: np.mean(some, axis=0) for name, some in images.items()}
     noise = {name: np.var(some, axis=0, ddof=1) for name, some in images.items()}
     trusted = [name for name in TRUSTED if name in images] or list(images)
-    scale = np.mean([mean[name] for name in trusted], axis=0) ** 2
-    scale += 0.01 * scale.mean()
+    image = np.mean([mean[name] for name in trusted], axis=0)
+    scale = image**2 + 0.01 * image.mean() ** 2
     found = {}
     for name, some in images.items():
         others = [other for other in trusted if other != name]

@@ -10,6 +10,7 @@ from ..arrays import from_numpy
 from .candidates import Candidate
 from .merging import HANDFUL
 from .partial_sums import Rivals
+from .rare_contributions import BINS, bin_of
 
 
 class CandidateMoments:
@@ -22,7 +23,7 @@ class CandidateMoments:
     is as if one of them had all of it.
 
     Parameters:
-        candidates: The candidates.
+        candidates: The candidates. That without light paths has the techniques of ``path`` alone.
         pixels: Number of pixels.
         samples_per_vertex: For each number of light paths that merging candidates have, how many
             samples of a pixel find the same vertex (:meth:`MergingRadius.samples_per_vertex`).
@@ -37,11 +38,12 @@ class CandidateMoments:
         shared = [samples_per_vertex.get(c.light_paths, 1.0) / HANDFUL for c in candidates]
         # Factors of the squared densities of light image, connections, merging; and c of merging
         self._factors = from_numpy(mi.Float, [
-            (c.light_paths**2, c.connects, c.merges, s) for c, s in zip(candidates, shared)
+            (c.light_paths**2, c.light_paths > 0 and c.connects, c.merges, s)
+            for c, s in zip(candidates, shared)
         ])  # fmt: skip
         self._sums = dr.zeros(mi.Float, 2 * self._count * pixels)
-        self._lost = dr.zeros(mi.UInt32, self._count)
-        dr.eval(self._sums, self._lost)
+        self._by_value = dr.zeros(mi.Float, 2 * self._count * pixels * BINS)
+        dr.eval(self._sums, self._by_value)
 
     @dr.syntax
     def add(self, brought, mis, rivals, pixel, active, count: float = 1.0) -> None:
@@ -60,16 +62,20 @@ class CandidateMoments:
             inverse, image = _split(factors, rivals, dr.rcp(mis))
             moment = square * inverse
             is_found = active & dr.isfinite(moment)
-            place = 2 * (index * mi.UInt32(self._pixels) + pixel)
-            dr.scatter_add(self._sums, moment, place, is_found)
-            dr.scatter_add(self._sums, brought * image, place + 1, is_found)
-            dr.scatter_add(self._lost, mi.UInt32(1), index, active & (inverse == 0))
+            place = index * mi.UInt32(self._pixels) + pixel
+            dr.scatter_add(self._sums, moment, 2 * place, is_found)
+            dr.scatter_add(self._sums, brought * image, 2 * place + 1, is_found)
+            value_bin = dr.select(inverse > 0, bin_of(moment / brought), BINS - 1)
+            place = 2 * (place * mi.UInt32(BINS) + value_bin)
+            dr.scatter_add(self._by_value, brought, place, is_found)
+            dr.scatter_add(self._by_value, moment, place + 1, is_found)
             index += 1
 
     def taken(self) -> tuple[np.ndarray, np.ndarray]:
-        """The sums, [candidate, pixel, 2], and of each candidate the number of samples of paths
-        that it cannot find."""
-        return self._sums.numpy().reshape(self._count, self._pixels, 2), self._lost.numpy()
+        """The sums, [candidate, pixel, 2]; and those of light and second moment by the value of
+        contributions, [candidate, pixel, bin, 2]."""
+        by_value = self._by_value.numpy().reshape(self._count, self._pixels, BINS, 2)
+        return self._sums.numpy().reshape(self._count, self._pixels, 2), by_value
 
 
 def _split(

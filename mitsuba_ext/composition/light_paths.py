@@ -13,6 +13,7 @@ import numpy as np
 
 from ..bidirectional.candidates import Candidate
 from ..bidirectional.path_moments import Counts, Estimate, PathMoments
+from ..bidirectional.rare_contributions import error_of_render, rare
 from ..bidirectional.technique_observer import TechniqueObserver
 from ..images.coarse_film import CoarseFilm
 from ..learning.benefit import expected_gain, gain_of, trimmed_batches
@@ -148,7 +149,7 @@ class LightPathTrial(Learner):
         self._choice = LightPathChoice(
             observer=self._moments, pixel_width=coarse.pixel_width
         )
-        self.samples = coarse.samples
+        self.samples, self._spp = coarse.samples, spp
         self.rival = 1.0
         self.estimate: Estimate | None = None
         self.candidates: list[Candidate] = []
@@ -174,26 +175,26 @@ class LightPathTrial(Learner):
         self._moments, self.candidates = None, moments.candidates
         self.estimate = estimate = moments.estimate()
         image = estimate.mean.reshape(-1, self._width)
-        weight = relative_scale(image).ravel() ** 2
-        everything = estimate.variances[1] * weight
-        # Of each candidate, the variance in units of that of all techniques, and the error of the
-        # logarithm. Here the batches are of pixels, not of paths
-        found = [
-            gain_of(trimmed_batches(everything, variance * weight - everything))
-            for variance in estimate.variances
+        scale = relative_scale(image, 1).ravel()
+        rares = [rare(x, scale, self._width, self._spp) for x in estimate.by_value]
+        squared_errors = [
+            error_of_render(variance, estimate.mean, x, self._spp)
+            for variance, x in zip(estimate.variances, rares)
         ]
-        variances = np.array([1 / max(1 - gain, 1e-6) for gain, _ in found])
-        errors = np.array([error for _, error in found])
-        lost = moments.unreachable > 0
-        variances[lost], errors[lost] = np.inf, 0.0
+        self.missed = np.array([x.light.sum() for x in rares]) / estimate.mean.sum()
+        self.errors, errors = _relative_to_all(squared_errors, scale)
+        variances, _ = _relative_to_all(estimate.variances, scale)
+        lost = estimate.by_value[:, :, -1, 0].sum(axis=1) > 0
+        variances[lost] = np.inf
         costs = np.array([cost(c, moments.counts) for c in moments.candidates])
         # Prior: the efficiency is that of all techniques
-        efficiencies = costs[1] / (variances * costs)
+        efficiencies = costs[1] / (self.errors * costs)
         efficiencies[0] *= self.rival
         gains = [expected_gain(*estimate) for estimate in zip(efficiencies, errors)]
         self._best = int(np.argmax(gains))
         self._best_with_light_paths = 1 + int(np.argmax(gains[1:]))
         self.costs = costs / costs[0]
+        self.errors /= self.errors[0]
         if np.isfinite(variances[0]):
             self.variances = variances / variances[0]
         else:
@@ -234,6 +235,22 @@ class LightPathTrial(Learner):
         # In units of ``path``
         variance, time = self.variances[self._shown], self.costs[self._shown]
         return f"{kept} ({variance:.2f} of the variance, {time:.1f} x the time)"
+
+
+def _relative_to_all(
+    squared_errors: list[np.ndarray], scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of each candidate, the relative squared error in units of that of all techniques, and the
+    error of the logarithm of this ratio."""
+    weight = scale**2
+    everything = squared_errors[1] * weight
+    # Here the batches are of pixels, not of paths
+    found = [
+        gain_of(trimmed_batches(everything, error * weight - everything))
+        for error in squared_errors
+    ]
+    ratios, errors = np.array(found).T
+    return 1 / np.maximum(1 - ratios, 1e-6), errors
 
 
 def _trial_samples(samples: int) -> int:

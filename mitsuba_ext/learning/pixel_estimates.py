@@ -66,9 +66,10 @@ class PixelEstimates:
         return from_numpy(mi.Float, _inverse(means, mean))
 
 
-def relative_scale(image: np.ndarray) -> np.ndarray:
-    """1 / mean radiance of each pixel of an image and its neighbours, shape [y, x]."""
-    return _inverse(box_means(image), image.mean())
+def relative_scale(image: np.ndarray, radius: int) -> np.ndarray:
+    """1 / mean radiance of each pixel of an image and its neighbours within ``radius``, shape
+    [y, x]."""
+    return _inverse(box_means(image, radius), image.mean())
 
 
 def _inverse(means: np.ndarray, mean: float) -> np.ndarray:

@@ -1,0 +1,84 @@
+"""Contributions that a render is too short to find.
+
+A sampler that finds some light with contributions of value x, which are rare, has a variance of x
+times that light: most of it is in a few pixels of a render, or in none. The other pixels lack the
+light. A user sees what is missing, not the variance.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..images.box_filter import box_sums
+
+#: Values of contributions are counted by powers of four, from 4⁻¹⁶ on; the last bin holds what is
+#: never found.
+BINS, _LEAST = 33, 16
+
+#: The share of pixels that an error leaves out.
+LEFT_OUT = 1e-3
+
+
+def bin_of(value: mi.Float) -> mi.UInt32:
+    """The bin of contributions of a value."""
+    return mi.UInt32(dr.clip(0.5 * dr.log2(value) + _LEAST, 0, BINS - 2))
+
+
+class Rare(NamedTuple):
+    """What rare contributions make of each pixel, [pixel] each.
+
+    Attributes:
+        light: Its radiance.
+        moment: Its second moment, per sample.
+        square: The square of that radiance. (The estimate is free of the noise of ``light``.)
+    """
+
+    light: np.ndarray
+    moment: np.ndarray
+    square: np.ndarray
+
+
+def rare(found: np.ndarray, scale: np.ndarray, width: int, spp: float) -> Rare:
+    """The brightest contributions, as many as ``LEFT_OUT`` of all pixels hold in a render. They
+    are bright in relation to their pixel.
+
+    Parameters:
+        found: Light and second moment of each sample, for each bin of values, shape [pixel, bin,
+            2].
+        scale: 1 / radiance of each pixel.
+        width: Pixels of a row.
+        spp: Samples per pixel of the render.
+    """
+    light, moment = np.moveaxis(found, 2, 0)
+    exists = moment > 0
+    value = np.divide(moment, light, out=np.zeros_like(light), where=exists)
+    value[:, -1] = np.inf
+    # The expected number of contributions of a bin, in a pixel of the render
+    number = np.divide(spp * light, value, out=np.zeros_like(light), where=exists)
+    order = np.argsort(-(value * scale[:, None]), axis=None)
+    is_rare = np.zeros(light.size, bool)
+    is_rare[order] = np.cumsum(number.ravel()[order]) <= LEFT_OUT * len(light)
+    is_rare = is_rare.reshape(light.shape)
+    rare_light, rare_moment = ((x * is_rare).sum(axis=1) for x in (light, moment))
+    # The product with the light of other pixels, whose noise is independent
+    image = rare_light.reshape(-1, width)
+    neighbours = box_sums(np.ones_like(image), 1) - 1
+    others = (box_sums(image, 1) - image) / np.maximum(neighbours, 1)
+    return Rare(rare_light, rare_moment, (image * others).ravel())
+
+
+def error_of_render(
+    variance: np.ndarray, mean: np.ndarray, rare: Rare, spp: float
+) -> np.ndarray:
+    """The expected squared error of each pixel of a render that lacks rare contributions, times its
+    number of samples.
+
+    Parameters:
+        variance, mean: Those of one sample of each pixel.
+    """
+    common = variance - rare.moment + mean**2 - (mean - rare.light) ** 2
+    return common + spp * rare.square
