@@ -27,12 +27,20 @@ class CandidateMoments:
         pixels: Number of pixels.
         samples_per_vertex: For each number of light paths that merging candidates have, how many
             samples of a pixel find the same vertex (:meth:`MergingRadius.samples_per_vertex`).
+        blocks: Number of blocks of pixels, for each of which there are sums by value.
+        block_of: The block of each pixel; ``None`` if each has its own.
     """
 
     def __init__(
-        self, candidates: list[Candidate], pixels: int, samples_per_vertex: dict[float, float]
+        self,
+        candidates: list[Candidate],
+        pixels: int,
+        samples_per_vertex: dict[float, float],
+        blocks: int,
+        block_of: mi.UInt32 | None,
     ) -> None:
-        self._count, self._pixels = len(candidates), pixels
+        self._count, self._pixels, self._blocks = len(candidates), pixels, blocks
+        self._block_of = block_of
         # MIS weights count a handful of vertices as one sample of a camera path; but these samples
         # share vertices
         shared = [samples_per_vertex.get(c.light_paths, 1.0) / HANDFUL for c in candidates]
@@ -42,7 +50,7 @@ class CandidateMoments:
             for c, s in zip(candidates, shared)
         ])  # fmt: skip
         self._sums = dr.zeros(mi.Float, 2 * self._count * pixels)
-        self._by_value = dr.zeros(mi.Float, 2 * self._count * pixels * BINS)
+        self._by_value = dr.zeros(mi.Float, 2 * self._count * blocks * BINS)
         dr.eval(self._sums, self._by_value)
 
     @dr.syntax
@@ -56,16 +64,20 @@ class CandidateMoments:
             count: MIS weights count so many such contributions as one sample.
         """
         square = count * dr.square(brought) / mis
+        block = pixel
+        if dr.hint(self._block_of is not None, mode="scalar"):
+            block = dr.gather(mi.UInt32, self._block_of, pixel, active)
         index = mi.UInt32(0)
         while index < mi.UInt32(self._count):
             factors = dr.gather(mi.Vector4f, self._factors, index)
             inverse, image = _split(factors, rivals, dr.rcp(mis))
             moment = square * inverse
             is_found = active & dr.isfinite(moment)
-            place = index * mi.UInt32(self._pixels) + pixel
-            dr.scatter_add(self._sums, moment, 2 * place, is_found)
-            dr.scatter_add(self._sums, brought * image, 2 * place + 1, is_found)
+            place = 2 * (index * mi.UInt32(self._pixels) + pixel)
+            dr.scatter_add(self._sums, moment, place, is_found)
+            dr.scatter_add(self._sums, brought * image, place + 1, is_found)
             value_bin = dr.select(inverse > 0, bin_of(moment / brought), BINS - 1)
+            place = index * mi.UInt32(self._blocks) + block
             place = 2 * (place * mi.UInt32(BINS) + value_bin)
             dr.scatter_add(self._by_value, brought, place, is_found)
             dr.scatter_add(self._by_value, moment, place + 1, is_found)
@@ -73,8 +85,8 @@ class CandidateMoments:
 
     def taken(self) -> tuple[np.ndarray, np.ndarray]:
         """The sums, [candidate, pixel, 2]; and those of light and second moment by the value of
-        contributions, [candidate, pixel, bin, 2]."""
-        by_value = self._by_value.numpy().reshape(self._count, self._pixels, BINS, 2)
+        contributions, [candidate, block, bin, 2]."""
+        by_value = self._by_value.numpy().reshape(self._count, self._blocks, BINS, 2)
         return self._sums.numpy().reshape(self._count, self._pixels, 2), by_value
 
 

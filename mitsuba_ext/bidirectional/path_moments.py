@@ -4,7 +4,6 @@ path tracing with all of them."""
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +18,11 @@ from .candidate_moments import CandidateMoments
 from .candidates import Available, Candidate, candidates
 from .merging import HANDFUL
 from .partial_sums import Rivals
+from .rare_contributions import BINS, Rare, error_of_render, rare
 from .technique_observer import TechniqueObserver
+
+#: About the most blocks of pixels for which there are sums by value.
+_BLOCKS = 1 << 13
 
 
 @dataclass
@@ -46,20 +49,50 @@ class Counts:
             setattr(self, field.name, getattr(self, field.name) + count)
 
 
-class Estimate(NamedTuple):
+@dataclass(frozen=True)
+class Estimate:
     """Estimates of mean and variance for each pixel, [pixel] each.
 
     Attributes:
         mean: Radiance.
         variances: Variance of one sample of each pixel, for each candidate. They may be negative if
             there are few samples.
-        by_value: Light and second moment of each sample, by the value of contributions (see
-            :mod:`rare_contributions`), [candidate, pixel, bin, 2].
+        by_value: Light and second moment of one sample, by the value of contributions (see
+            :func:`rare`), [candidate, block, bin, 2].
+        blocks: The film of whose pixels ``by_value`` tells: blocks of pixels.
     """
 
     mean: np.ndarray
     variances: list[np.ndarray]
     by_value: np.ndarray
+    blocks: CoarseFilm
+
+    def errors_of_render(
+        self, scale: np.ndarray, spp: float, share: float
+    ) -> tuple[list[np.ndarray], np.ndarray]:
+        """For each candidate, :func:`error_of_render` without the contributions that are
+        :func:`rare`; and the share of the light that these make up.
+
+        Parameters:
+            scale: 1 / radiance of each pixel.
+            spp: Samples per pixel of the render.
+            share: The pixels that may hold rare contributions.
+        """
+        of_pixel, width = self.blocks.of_pixel, self.blocks.width
+        if of_pixel is not None:
+            scale = np.bincount(of_pixel) / np.bincount(of_pixel, 1 / scale)
+        errors, missed = [], []
+        for variance, found in zip(self.variances, self.by_value):
+            lacks = rare(found, scale, width, spp, share)
+            if of_pixel is not None:
+                lacks = Rare(*(x[of_pixel] for x in lacks))
+            errors.append(error_of_render(variance, self.mean, lacks, spp))
+            missed.append(lacks.light.sum())
+        return errors, np.array(missed) / max(self.mean.sum(), 1e-30)
+
+    def never_found(self) -> np.ndarray:
+        """For each candidate, the share of the light of paths that it cannot find."""
+        return self.by_value[:, :, -1, 0].sum(axis=1) / max(self.by_value[1, :, :, 0].sum(), 1e-30)
 
 
 class PathMoments(TechniqueObserver):
@@ -109,6 +142,11 @@ class PathMoments(TechniqueObserver):
         self._of_pixel: mi.UInt32 | None = None
         if coarse.of_pixel is not None:
             self._of_pixel = from_numpy(mi.UInt32, coarse.of_pixel)
+        # Of a film with many pixels
+        self._blocks = CoarseFilm.of(coarse.width, coarse.height, 2 * _BLOCKS)
+        self._block_of: mi.UInt32 | None = None
+        if self._blocks.of_pixel is not None:
+            self._block_of = from_numpy(mi.UInt32, self._blocks.of_pixel)
         self.candidates: list[Candidate] = []
         self.samples = 0
         self.counts = Counts()
@@ -118,14 +156,16 @@ class PathMoments(TechniqueObserver):
         self._sums = np.zeros((7, self._pixels))
         # The second moment and the light image of each candidate
         self._found = np.zeros((0, self._pixels, 2))
-        self._by_value = np.zeros(0)
+        self._by_value = np.zeros((0, self._block_count, BINS, 2))
 
     # ---- Observer ----
 
     def start(self, rays: CameraRays, available: Available) -> None:
         if not self.candidates:
             self.candidates = candidates(available)
-            self._found = np.zeros((len(self.candidates), self._pixels, 2), np.float32)
+            count = len(self.candidates)
+            self._found = np.zeros((count, self._pixels, 2), np.float32)
+            self._by_value = np.zeros((count, self._block_count, BINS, 2), np.float32)
             self._shared = {
                 c.light_paths: available.samples_per_vertex(
                     c.light_paths, self._spp, self._film_pixels
@@ -142,7 +182,9 @@ class PathMoments(TechniqueObserver):
         self._merged = dr.zeros(mi.Float, lanes)
         self._shadow_count, self._looked = (dr.zeros(mi.UInt32, lanes) for _ in range(2))
         self._splats = dr.zeros(mi.Float, 2 * self._pixels)
-        self._moments = CandidateMoments(self.candidates, self._pixels, self._shared)
+        self._moments = CandidateMoments(
+            self.candidates, self._pixels, self._shared, self._block_count, self._block_of
+        )
         dr.eval(
             self._path, self._squares, self._merged, self._shadow_count, self._looked,
             self._splats, self._importance,
@@ -239,7 +281,7 @@ class PathMoments(TechniqueObserver):
         )  # fmt: skip
         found, by_value = self._moments.taken()
         self._found += found
-        self._by_value = by_value + self._by_value if self._by_value.size else by_value
+        self._by_value += by_value
         lanes = len(pixel)
         self.samples += lanes
         tested, scattered = _total(self._shadow_count), _total(camera.scatter_count)
@@ -274,7 +316,13 @@ class PathMoments(TechniqueObserver):
             m / n + products * ratio**2 - x**2 for m, x, ratio in zip(moments, brought, ratios)
         ]
         variances[0] = (moments[0] + own_products) / n - squared_mean
-        return Estimate(mean, variances, self._by_value / n[:, None, None])
+        block = np.arange(self._pixels) if self._block_of is None else self._blocks.of_pixel
+        by_value = self._by_value / np.bincount(block, n)[:, None, None]
+        return Estimate(mean, variances, by_value, self._blocks)
+
+    @property
+    def _block_count(self) -> int:
+        return self._blocks.width * self._blocks.height
 
     def _smooth(self, values: np.ndarray) -> np.ndarray:
         return box_means(values.reshape(-1, self._width)).ravel()

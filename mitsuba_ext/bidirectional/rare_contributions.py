@@ -19,9 +19,6 @@ from ..images.box_filter import box_sums
 #: never found.
 BINS, _LEAST = 33, 16
 
-#: The share of pixels that an error leaves out.
-LEFT_OUT = 1e-3
-
 
 def bin_of(value: mi.Float) -> mi.UInt32:
     """The bin of contributions of a value."""
@@ -42,9 +39,9 @@ class Rare(NamedTuple):
     square: np.ndarray
 
 
-def rare(found: np.ndarray, scale: np.ndarray, width: int, spp: float) -> Rare:
-    """The brightest contributions, as many as ``LEFT_OUT`` of all pixels hold in a render. They
-    are bright in relation to their pixel.
+def rare(found: np.ndarray, scale: np.ndarray, width: int, spp: float, share: float) -> Rare:
+    """The brightest contributions, as many as fewer than ``share`` of all pixels hold in a render.
+    They are bright in relation to their pixel.
 
     Parameters:
         found: Light and second moment of each sample, for each bin of values, shape [pixel, bin,
@@ -52,16 +49,17 @@ def rare(found: np.ndarray, scale: np.ndarray, width: int, spp: float) -> Rare:
         scale: 1 / radiance of each pixel.
         width: Pixels of a row.
         spp: Samples per pixel of the render.
+        share: Part of the pixels.
     """
-    light, moment = np.moveaxis(found, 2, 0)
-    exists = moment > 0
-    value = np.divide(moment, light, out=np.zeros_like(light), where=exists)
+    light, moment = np.moveaxis(found, 2, 0).astype(np.float64)
+    is_found = (light > 0) & (moment > 0)
+    value = np.divide(moment, light, out=np.zeros_like(light), where=is_found)
     value[:, -1] = np.inf
     # The expected number of contributions of a bin, in a pixel of the render
-    number = np.divide(spp * light, value, out=np.zeros_like(light), where=exists)
+    number = np.divide(spp * light, value, out=np.zeros_like(light), where=is_found)
     order = np.argsort(-(value * scale[:, None]), axis=None)
     is_rare = np.zeros(light.size, bool)
-    is_rare[order] = np.cumsum(number.ravel()[order]) <= LEFT_OUT * len(light)
+    is_rare[order] = np.cumsum(number.ravel()[order]) <= share * len(light)
     is_rare = is_rare.reshape(light.shape)
     rare_light, rare_moment = ((x * is_rare).sum(axis=1) for x in (light, moment))
     # The product with the light of other pixels, whose noise is independent
@@ -71,14 +69,14 @@ def rare(found: np.ndarray, scale: np.ndarray, width: int, spp: float) -> Rare:
     return Rare(rare_light, rare_moment, (image * others).ravel())
 
 
-def error_of_render(
-    variance: np.ndarray, mean: np.ndarray, rare: Rare, spp: float
-) -> np.ndarray:
-    """The expected squared error of each pixel of a render that lacks rare contributions, times its
-    number of samples.
+def error_of_render(variance: np.ndarray, mean: np.ndarray, rare: Rare, spp: float) -> np.ndarray:
+    """The expected squared error of each pixel of a render that lacks rare contributions, times the
+    number of its samples.
 
     Parameters:
         variance, mean: Those of one sample of each pixel.
+        rare: What the render lacks.
+        spp: Samples per pixel of the render.
     """
     common = variance - rare.moment + mean**2 - (mean - rare.light) ** 2
     return common + spp * rare.square
