@@ -63,9 +63,10 @@ class CandidateMoments:
             pixel: Where it is.
             count: MIS weights count so many such contributions as one sample.
         """
+        active &= brought > 0
         square = count * dr.square(brought) / mis
         block = pixel
-        if dr.hint(self._block_of is not None, mode="scalar"):
+        if self._block_of is not None:
             block = dr.gather(mi.UInt32, self._block_of, pixel, active)
         index = mi.UInt32(0)
         while index < mi.UInt32(self._count):

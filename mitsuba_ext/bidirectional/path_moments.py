@@ -22,7 +22,7 @@ from .rare_contributions import BINS, Rare, error_of_render, rare
 from .technique_observer import TechniqueObserver
 
 #: About the most blocks of pixels for which there are sums by value.
-_BLOCKS = 1 << 13
+_BLOCKS = 1 << 14
 
 
 @dataclass

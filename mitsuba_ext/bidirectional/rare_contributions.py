@@ -52,16 +52,16 @@ def rare(found: np.ndarray, scale: np.ndarray, width: int, spp: float, share: fl
         share: Part of the pixels.
     """
     light, moment = np.moveaxis(found, 2, 0).astype(np.float64)
-    is_found = (light > 0) & (moment > 0)
-    value = np.divide(moment, light, out=np.zeros_like(light), where=is_found)
-    value[:, -1] = np.inf
+    place, value_bin = np.nonzero((light > 0) & ((moment > 0) | (np.arange(BINS) == BINS - 1)))
+    own_light, own_moment = light[place, value_bin], moment[place, value_bin]
+    value = np.where(value_bin == BINS - 1, np.inf, own_moment / own_light)
     # The expected number of contributions of a bin, in a pixel of the render
-    number = np.divide(spp * light, value, out=np.zeros_like(light), where=is_found)
-    order = np.argsort(-(value * scale[:, None]), axis=None)
-    is_rare = np.zeros(light.size, bool)
-    is_rare[order] = np.cumsum(number.ravel()[order]) <= share * len(light)
-    is_rare = is_rare.reshape(light.shape)
-    rare_light, rare_moment = ((x * is_rare).sum(axis=1) for x in (light, moment))
+    order = np.argsort(-value * scale[place], kind="stable")
+    number = np.cumsum((spp * own_light / value)[order])
+    first = order[number <= share * len(light)]
+    rare_light, rare_moment = (
+        np.bincount(place[first], x[first], len(light)) for x in (own_light, own_moment)
+    )
     # The product with the light of other pixels, whose noise is independent
     image = rare_light.reshape(-1, width)
     neighbours = box_sums(np.ones_like(image), 1) - 1
