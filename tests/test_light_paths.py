@@ -47,15 +47,20 @@ def test_without_lights_there_is_nothing_to_choose() -> None:
     assert integrator.statistics.learned == ""
 
 
-def test_light_that_path_cannot_find_keeps_light_paths() -> None:
-    """A caustic of a point: one splat of it is enough."""
+@pytest.mark.parametrize("sky, is_kept", [(0.01, True), (100.0, False)])
+def test_light_that_path_cannot_find_keeps_light_paths_if_it_exceeds_the_noise(
+    sky: float, is_kept: bool
+) -> None:
+    """A caustic of a point, under a dim and under a bright sky."""
     scene = _balls({"type": "conductor"})
     scene["light"] = {"type": "point", "position": [0.8, -1, 1.5], "intensity": rgb(1.0)}
-    scene["sky"] = {"type": "constant", "radiance": rgb(100.0)}
+    scene["sky"] = {"type": "constant", "radiance": rgb(sky)}
     integrator = _auto()
     mi.render(mi.load_dict(scene, optimize=False), integrator=integrator, spp=64)
-    learned = integrator.statistics.learned
-    assert learned.startswith("light paths pay: ") and "(0.00 of" in learned
+    effect = integrator.statistics.effects["light_paths"]
+    assert effect["is_kept"] == is_kept and effect["long_run_variance"] == 0
+    assert (effect["missed_by_path"] > 1e-3) == is_kept
+    assert "is missing" not in integrator.statistics.learned
 
 
 @pytest.mark.parametrize("light", some("constant", of=["constant", "rectangle"]))
