@@ -64,6 +64,13 @@ class Auto(LightPathIntegrator):
     below 262144 samples, there is none. Where light
     paths have less than 0.4 of the variance, the samples before are left out of the image.
 
+    The best choice is that with the least expected squared error in a render of this length, times
+    its time. Light that only light paths find counts as missing without them, by its square: in
+    short renders, the noise of light paths can be worse. **A short render may therefore miss light
+    that** :monosp:`path` **misses** (the caustic of a lamp that is a point, for example); a long
+    one finds it. :monosp:`statistics.learned` then says how much of the light is missing, and
+    :monosp:`statistics.effects["light_paths"]` has it as :monosp:`missed`.
+
     Light paths are not tried in participating media, in films of more than two million pixels, and
     where a light cannot emit them: there, the integrator is :class:`auto_path`. In spectral
     variants and with moving shapes, nothing is merged.

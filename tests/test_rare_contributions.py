@@ -26,7 +26,7 @@ def _found(*contributions: tuple[int, float, float]) -> np.ndarray:
 
 
 def _rare(found: np.ndarray, spp: float, share: float = 1e-3):
-    return rare(found, np.ones(PIXELS), WIDTH, spp, share)
+    return rare(found, np.ones(PIXELS), WIDTH, spp, [share])[0]
 
 
 def test_light_that_no_sample_finds_is_missing() -> None:
@@ -55,7 +55,7 @@ def test_sparks_are_missing_in_short_renders_and_variance_in_long_ones(
 def test_contributions_are_bright_in_relation_to_their_pixel() -> None:
     found = _found((SOME, 1e-3, 1e3))
     scale = np.where(np.arange(PIXELS) % 2, 1.0, 1e-3)
-    lacks = rare(found, scale, WIDTH, spp=1000, share=0.5005e-3)
+    (lacks,) = rare(found, scale, WIDTH, spp=1000, shares=[0.5005e-3])
     np.testing.assert_allclose(lacks.light[1::2], 1e-3)
     assert not lacks.light[::2].any()
 

@@ -3,6 +3,7 @@ path tracing with all of them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import drjit as dr
@@ -68,27 +69,29 @@ class Estimate:
     blocks: CoarseFilm
 
     def errors_of_render(
-        self, scale: np.ndarray, spp: float, share: float
-    ) -> tuple[list[np.ndarray], np.ndarray]:
-        """For each candidate, :func:`error_of_render` without the contributions that are
-        :func:`rare`; and the share of the light that these make up.
+        self, scale: np.ndarray, spp: float, shares: Sequence[float]
+    ) -> list[tuple[list[np.ndarray], np.ndarray]]:
+        """For each of ``shares`` and each candidate, :func:`error_of_render` without the
+        contributions that are :func:`rare`; and the share of the light that these make up.
 
         Parameters:
             scale: 1 / radiance of each pixel.
             spp: Samples per pixel of the render.
-            share: The pixels that may hold rare contributions.
+            shares: Parts of the pixels that may hold rare contributions.
         """
         of_pixel, width = self.blocks.of_pixel, self.blocks.width
         if of_pixel is not None:
             scale = np.bincount(of_pixel) / np.bincount(of_pixel, 1 / scale)
-        errors, missed = [], []
+        errors: list[list[np.ndarray]] = [[] for _ in shares]
+        missed: list[list[float]] = [[] for _ in shares]
+        whole = max(self.mean.sum(), 1e-30)
         for variance, found in zip(self.variances, self.by_value):
-            lacks = rare(found, scale, width, spp, share)
-            if of_pixel is not None:
-                lacks = Rare(*(x[of_pixel] for x in lacks))
-            errors.append(error_of_render(variance, self.mean, lacks, spp))
-            missed.append(lacks.light.sum())
-        return errors, np.array(missed) / max(self.mean.sum(), 1e-30)
+            for i, lacks in enumerate(rare(found, scale, width, spp, shares)):
+                if of_pixel is not None:
+                    lacks = Rare(*(x[of_pixel] for x in lacks))
+                errors[i].append(error_of_render(variance, self.mean, lacks, spp))
+                missed[i].append(lacks.light.sum() / whole)
+        return [(some, np.array(share)) for some, share in zip(errors, missed)]
 
     def never_found(self) -> np.ndarray:
         """For each candidate, the share of the light of paths that it cannot find."""
@@ -318,8 +321,8 @@ class PathMoments(TechniqueObserver):
         ]
         variances[0] = (moments[0] + own_products) / n - squared_mean
         block = np.arange(self._pixels) if self._block_of is None else self._blocks.of_pixel
-        by_value = self._by_value / np.bincount(block, n)[:, None, None]
-        return Estimate(mean, variances, by_value, self._blocks)
+        self._by_value /= np.bincount(block, n).astype(np.float32)[:, None, None]
+        return Estimate(mean, variances, self._by_value, self._blocks)
 
     @property
     def _block_count(self) -> int:

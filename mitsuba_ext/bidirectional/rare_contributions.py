@@ -7,6 +7,7 @@ light. A user sees what is missing, not the variance.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import drjit as dr
@@ -39,9 +40,11 @@ class Rare(NamedTuple):
     square: np.ndarray
 
 
-def rare(found: np.ndarray, scale: np.ndarray, width: int, spp: float, share: float) -> Rare:
-    """The brightest contributions, as many as fewer than ``share`` of all pixels hold in a render.
-    They are bright in relation to their pixel.
+def rare(
+    found: np.ndarray, scale: np.ndarray, width: int, spp: float, shares: Sequence[float]
+) -> list[Rare]:
+    """The brightest contributions, as many as fewer than each of ``shares`` of all pixels hold in a
+    render. They are bright in relation to their pixel.
 
     Parameters:
         found: Light and second moment of each sample, for each bin of values, shape [pixel, bin,
@@ -49,24 +52,27 @@ def rare(found: np.ndarray, scale: np.ndarray, width: int, spp: float, share: fl
         scale: 1 / radiance of each pixel.
         width: Pixels of a row.
         spp: Samples per pixel of the render.
-        share: Part of the pixels.
+        shares: Parts of the pixels.
     """
-    light, moment = np.moveaxis(found, 2, 0).astype(np.float64)
-    place, value_bin = np.nonzero((light > 0) & ((moment > 0) | (np.arange(BINS) == BINS - 1)))
-    own_light, own_moment = light[place, value_bin], moment[place, value_bin]
-    value = np.where(value_bin == BINS - 1, np.inf, own_moment / own_light)
+    place, value_bin = np.nonzero(found[..., 0])
+    light, moment = found[place, value_bin].T.astype(np.float64)
+    # Of the value 0 are products that are too small for a float
+    value = np.where(value_bin == BINS - 1, np.inf, np.maximum(moment / light, 1e-30))
+    order = np.argsort(-value * scale[place])
     # The expected number of contributions of a bin, in a pixel of the render
-    order = np.argsort(-value * scale[place], kind="stable")
-    number = np.cumsum((spp * own_light / value)[order])
-    first = order[number <= share * len(light)]
-    rare_light, rare_moment = (
-        np.bincount(place[first], x[first], len(light)) for x in (own_light, own_moment)
-    )
-    # The product with the light of other pixels, whose noise is independent
-    image = rare_light.reshape(-1, width)
-    neighbours = box_sums(np.ones_like(image), 1) - 1
-    others = (box_sums(image, 1) - image) / np.maximum(neighbours, 1)
-    return Rare(rare_light, rare_moment, (image * others).ravel())
+    number = np.cumsum((spp * light / value)[order])
+    result = []
+    for share in shares:
+        first = order[: np.searchsorted(number, share * len(found), side="right")]
+        rare_light, rare_moment = (
+            np.bincount(place[first], x[first], len(found)) for x in (light, moment)
+        )
+        # The product with the light of other pixels, whose noise is independent
+        image = rare_light.reshape(-1, width)
+        neighbours = box_sums(np.ones_like(image), 1) - 1
+        others = (box_sums(image, 1) - image) / np.maximum(neighbours, 1)
+        result.append(Rare(rare_light, rare_moment, (image * others).ravel()))
+    return result
 
 
 def error_of_render(variance: np.ndarray, mean: np.ndarray, rare: Rare, spp: float) -> np.ndarray:

@@ -55,10 +55,10 @@ class PredictedErrors:
         """
         # Wider neighbourhoods would judge the pixels of a lamp by the wall behind it
         scale = relative_scale(estimate.mean.reshape(-1, width), 1).ravel()
-        errors, missed = estimate.errors_of_render(scale, spp, _LEAST / pixel_count)
-        variances, uncertainty = _relative_to_all(errors, scale)
-        errors, _ = estimate.errors_of_render(scale, spp, _LEFT_OUT)
-        trimmed, _ = _relative_to_all(errors, scale)
+        shares = _LEAST / pixel_count, _LEFT_OUT
+        (whole, missed), (trimmed, _) = estimate.errors_of_render(scale, spp, shares)
+        variances, uncertainty = _relative_to_all(whole, scale)
+        trimmed, _ = _relative_to_all(trimmed, scale)
         long_run, _ = _relative_to_all(estimate.variances, scale)
         misses = estimate.never_found() > _NOTHING
         if misses[0]:
