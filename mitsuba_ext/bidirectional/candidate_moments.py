@@ -25,8 +25,8 @@ class CandidateMoments:
     Parameters:
         candidates: The candidates. That without light paths has the techniques of ``path`` alone.
         pixels: Number of pixels.
-        merging: For each number of light paths that merging candidates have, the variance of
-            merging in a render (:meth:`MergingRadius.variance_of_merging`).
+        samples_per_vertex: For each number of light paths that merging candidates have, how many
+            samples of a pixel find the same vertex (:meth:`MergingRadius.samples_per_vertex`).
         blocks: Number of blocks of pixels, for each of which there are sums by value.
         block_of: The block of each pixel; ``None`` if each has its own.
     """
@@ -35,14 +35,15 @@ class CandidateMoments:
         self,
         candidates: list[Candidate],
         pixels: int,
-        merging: dict[float, float],
+        samples_per_vertex: dict[float, float],
         blocks: int,
         block_of: mi.UInt32 | None,
     ) -> None:
         self._count, self._pixels, self._blocks = len(candidates), pixels, blocks
         self._block_of = block_of
-        # MIS weights count a handful of vertices as one sample of a camera path
-        shared = [merging.get(c.light_paths, 1.0) / HANDFUL for c in candidates]
+        # MIS weights count a handful of vertices as one sample of a camera path; but these samples
+        # share vertices
+        shared = [samples_per_vertex.get(c.light_paths, 1.0) / HANDFUL for c in candidates]
         # Factors of the squared densities of light image, connections, merging; and c of merging
         self._factors = from_numpy(mi.Float, [
             (c.light_paths**2, c.light_paths > 0 and c.connects, c.merges, s)

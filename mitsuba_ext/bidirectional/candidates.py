@@ -53,17 +53,15 @@ class Available:
     are_shared: bool
     most_lanes: int = 0
 
-    def variance_of_merging(
-        self, light_paths: float, spp: int, pixels: int, pilot: float
-    ) -> float:
-        """:meth:`MergingRadius.variance_of_merging` in a render of ``spp`` samples per pixel."""
+    def samples_per_vertex(self, light_paths: float, spp: int, pixels: int) -> float:
+        """:meth:`MergingRadius.samples_per_vertex` in a render of ``spp`` samples per pixel."""
         if self.radius is None:
             return 1.0
         passes = 1
         if self.most_lanes > 0:
             in_pass = max(1, int(self.most_lanes / max(1.0, light_paths)) // pixels)
             passes = -(-spp // in_pass)
-        return self.radius.variance_of_merging(light_paths, spp / passes, passes, pilot)
+        return self.radius.samples_per_vertex(light_paths, spp / passes, passes)
 
 
 def candidates(available: Available) -> list[Candidate]:

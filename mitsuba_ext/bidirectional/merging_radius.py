@@ -58,26 +58,17 @@ class MergingRadius:
         self._passes += groups
         return self._radius(per_pixel, number)
 
-    def variance_of_merging(
-        self, light_paths: float, spp: float, passes: int, pilot: float
-    ) -> float:
-        """The variance that merging brings to a pixel, of one sample, divided by what the squares
-        of the contributions in a pilot add up to. Samples of a pass that find the same vertex have
-        the same error; and the fewer vertices a disk holds, the more each contributes.
+    def samples_per_vertex(self, light_paths: float, spp: float, passes: int = 1) -> float:
+        """So many samples of a pixel, of the ``spp`` of a pass, find the same vertex, where any of
+        them does: their errors are the same. The mean over the first ``passes``.
 
         Parameters:
             light_paths: Number of light paths for each camera path.
-            spp, passes: Samples per pixel of each pass, and number of passes.
-            pilot: Light paths per pixel of the pilot.
         """
-        per_pixel = light_paths * spp
-        vertices_of_pilot = self._radius(pilot, 1) ** 2 * pilot
         total = 0.0
         for number in range(1, passes + 1):
-            square = self._radius(per_pixel, number) ** 2
-            disk = math.pi * square
-            samples_per_vertex = max(1.0, spp * disk / (disk + self.footprint**2))
-            total += samples_per_vertex * vertices_of_pilot / (square * per_pixel)
+            disk = math.pi * self._radius(light_paths * spp, number) ** 2
+            total += max(1.0, spp * disk / (disk + self.footprint**2))
         return total / passes
 
     def _radius(self, per_pixel: float, number: float) -> float:

@@ -139,7 +139,7 @@ class PathMoments(TechniqueObserver):
     def __init__(
         self, coarse: CoarseFilm, corner: tuple[int, int], film_width: int, spp: int
     ) -> None:
-        self._spp, self._merging, self._film_pixels = spp, {}, coarse.pixel_count
+        self._spp, self._shared, self._film_pixels = spp, {}, coarse.pixel_count
         self._width, self._pixels = coarse.width, coarse.width * coarse.height
         self._corner, self._film_width = mi.Vector2f(corner), film_width
         self._of_pixel: mi.UInt32 | None = None
@@ -169,10 +169,9 @@ class PathMoments(TechniqueObserver):
             count = len(self.candidates)
             self._found = np.zeros((count, self._pixels, 2), np.float32)
             self._by_value = np.zeros((count, self._block_count, BINS, 2), np.float32)
-            pilot = dr.width(rays.pixel) / self._pixels
-            self._merging = {
-                c.light_paths: available.variance_of_merging(
-                    c.light_paths, self._spp, self._film_pixels, pilot
+            self._shared = {
+                c.light_paths: available.samples_per_vertex(
+                    c.light_paths, self._spp, self._film_pixels
                 )
                 for c in self.candidates[1:] if c.merges
             }  # fmt: skip
@@ -187,7 +186,7 @@ class PathMoments(TechniqueObserver):
         self._shadow_count, self._looked = (dr.zeros(mi.UInt32, lanes) for _ in range(2))
         self._splats = dr.zeros(mi.Float, 2 * self._pixels)
         self._moments = CandidateMoments(
-            self.candidates, self._pixels, self._merging, self._block_count, self._block_of
+            self.candidates, self._pixels, self._shared, self._block_count, self._block_of
         )
         dr.eval(
             self._path, self._squares, self._merged, self._shadow_count, self._looked,
@@ -306,9 +305,9 @@ class PathMoments(TechniqueObserver):
         alone = np.maximum(x2 - self._smooth(x) ** 2, 0)
         of_camera = np.where(n > 1, (x2 - x**2 / n) / np.maximum(n - 1, 1), alone)
         # Few of all light paths splat to a pixel: the sum of their squares is about their variance.
-        # So it is with merging, but the variance of a render is not that of this pilot
-        merging = self._merging.get(1.0, 1.0)
-        everything = of_camera + (splats2 + (merging - 1) * merged) / n
+        # So it is with merging, but some samples of a pixel find the same vertex
+        shared = self._shared.get(1.0, 1.0)
+        everything = of_camera + (splats2 + (shared - 1) * merged) / n
         mean = (x + splats) / n
         squared_mean = np.where(n > 1, mean**2 - everything / n, self._smooth(mean) ** 2)
         moments, images = np.moveaxis(self._found, 2, 0)
