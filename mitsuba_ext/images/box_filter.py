@@ -6,15 +6,15 @@ import numpy as np
 
 #: Pixels on each side, along each axis, over which the radiance of a pixel is averaged, if nothing
 #: else is said.
-_RADIUS = 4
+RADIUS = 4
 
 
-def box_means(image: np.ndarray, radius: int = _RADIUS) -> np.ndarray:
+def box_means(image: np.ndarray, radius: int = RADIUS) -> np.ndarray:
     """The mean of each pixel of an image and its neighbours, shape [y, x]."""
     return box_sums(image, radius) / box_sums(np.ones_like(image), radius)
 
 
-def box_sums(image: np.ndarray, radius: int = _RADIUS) -> np.ndarray:
+def box_sums(image: np.ndarray, radius: int = RADIUS) -> np.ndarray:
     """Sums over the neighbours of each pixel, itself included, shape [y, x]."""
     for axis in range(2):
         size = image.shape[axis]
