@@ -64,10 +64,12 @@ def _choice(effects: dict[str, dict[str, Any]]) -> str:
     return " + ".join(words) or "path"
 
 
-def _predicted(effects: dict[str, dict[str, Any]]) -> float:
-    """The efficiency that the pilots predict for the last stage, in units of that of ``path``."""
+def _predicted(effects: dict[str, dict[str, Any]], figure: str = "trimmed_variance") -> float:
+    """The efficiency that the pilots predict for the last stage, in units of that of ``path``.
+    ``figure`` is that of light paths: without the brightest pixels, or ``variance``."""
     kept = [e for e in effects.values() if e["is_kept"] and "variance" in e]
-    return float(np.prod([1 / max(e["variance"] * e.get("time", 1.0), 1e-9) for e in kept]))
+    variances = [e.get(figure, e["variance"]) * e.get("time", 1.0) for e in kept]
+    return float(np.prod([1 / max(x, 1e-9) for x in variances]))
 
 
 def errors(images: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
@@ -75,8 +77,8 @@ def errors(images: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     mean = {name: np.mean(some, axis=0) for name, some in images.items()}
     noise = {name: np.var(some, axis=0, ddof=1) for name, some in images.items()}
     trusted = [name for name in TRUSTED if name in images] or list(images)
-    scale = np.mean([mean[name] for name in trusted], axis=0) ** 2
-    scale += 0.01 * scale.mean()
+    image = np.mean([mean[name] for name in trusted], axis=0)
+    scale = image**2 + 0.01 * image.mean() ** 2
     found = {}
     for name, some in images.items():
         others = [other for other in trusted if other != name]
@@ -186,10 +188,11 @@ def table(folder: Path, name: str = "auto") -> None:
         own, of_all = gain(result, name), gain(result, name, "error_of_all")
         effects = result["integrators"][name]["effects"]
         predicted = statistics.median(map(_predicted, effects))
+        of_whole = statistics.median(_predicted(e, "variance") for e in effects)
         chosen = " / ".join(dict.fromkeys(map(_choice, effects)))
         cells = [
             scene, result["spp"], f"`{best}`", f"{others[best]:.3g}", f"{own:.3g} ({of_all:.3g})",
-            f"{predicted:.3g}", chosen,
+            f"{predicted:.3g} ({of_whole:.3g})", chosen,
         ]  # fmt: skip
         print(f"| {' | '.join(map(str, cells))} |")
         of_path.append(own)

@@ -85,6 +85,13 @@ class Auto(LightPathIntegrator):
     twice that of the rest in renders of half a million samples. With a :monosp:`timeout`, they are
     tried only where there is time to compile their kernels.
 
+    The best choice is that with the least expected squared error in a render of this length, times
+    its time. Light that only light paths find counts as missing without them, by its square: in
+    short renders, the noise of light paths can be worse. **A short render may therefore miss light
+    that** :monosp:`path` **misses** (the caustic of a lamp that is a point, for example); a long
+    one finds it. :monosp:`statistics.learned` then says how much of the light is missing, and
+    :monosp:`statistics.effects["light_paths"]` has it as :monosp:`missed`.
+
     The differences between the passes of the later pilots show the variance that light paths really
     have. Before the last stage, the integrator goes back to what it had before if that variance,
     times the predicted time, is more than it would be without light paths, beyond the error of the

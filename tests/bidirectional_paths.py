@@ -11,7 +11,7 @@ import numpy as np
 from mitsuba_ext.bidirectional.connections import End, joining_rivals, joining_weight
 from mitsuba_ext.bidirectional.emission import EmittedRay, LightEmission
 from mitsuba_ext.bidirectional.partial_sums import PartialSums, weight
-from mitsuba_ext.bidirectional.scattering import geometric_cosine, reverse_density
+from mitsuba_ext.bidirectional.scattering import cosine_of_delta, geometric_cosine, reverse_density
 from mitsuba_ext.bidirectional.sensor import ConnectableSensor
 from mitsuba_ext.bidirectional.weights import BidirectionalWeights
 from mitsuba_ext.transport.emission import emission
@@ -28,6 +28,7 @@ class PathVertex:
         from_light, from_camera: The interaction, with ``wi`` towards the light, or the camera.
         bsdf: The BSDF.
         is_delta: Was the direction chosen by a discrete distribution?
+        η: Index of refraction on the camera's side, relative to that on the light's.
     """
 
     p: mi.Point3f
@@ -36,6 +37,7 @@ class PathVertex:
     from_camera: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
     is_delta: mi.Bool
+    η: mi.Float
 
 
 @dataclass
@@ -94,18 +96,18 @@ def trace(
         active &= ~query.occluded(scene, last, ds, active) & (ds.dist > 0.05)
         to_camera = ds.d
     vertices = []
-    for i, (si, wo, is_delta) in enumerate(from_light):
+    for i, (si, wo, is_delta, η) in enumerate(from_light):
         is_end = i + 1 == light
         other = mi.SurfaceInteraction3f(si)
         other.wi = si.to_local(to_camera) if is_end else wo
         delta = mi.Bool(False) if is_end else is_delta
-        vertices.append(PathVertex(si.p, si.n, si, other, si.bsdf(), delta))
-    for i, (si, wo, is_delta) in reversed(list(enumerate(from_camera))):
+        vertices.append(PathVertex(si.p, si.n, si, other, si.bsdf(), delta, η))
+    for i, (si, wo, is_delta, η) in reversed(list(enumerate(from_camera))):
         is_end = i + 1 == camera
         other = mi.SurfaceInteraction3f(si)
         other.wi = si.to_local(-to_camera) if is_end else wo
         delta = mi.Bool(False) if is_end else is_delta
-        vertices.append(PathVertex(si.p, si.n, other, si, si.bsdf(), delta))
+        vertices.append(PathVertex(si.p, si.n, other, si, si.bsdf(), delta, dr.rcp(η)))
     ctx = mi.BSDFContext()
     for v in vertices:
         value = v.bsdf.eval(ctx, v.from_camera, v.from_light.wi, active)
@@ -117,19 +119,21 @@ def trace(
 
 
 def _walk(scene, numbers, ray, count, active, mode):
-    """The interactions, the directions that were chosen there, and whether these are discrete."""
+    """The interactions, the directions that were chosen there, whether these are discrete, and the
+    relative index of refraction."""
     found = []
     ctx = mi.BSDFContext(mode)
     for i in range(count):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         if i + 1 == count:
-            found.append((si, mi.Vector3f(0, 0, 1), mi.Bool(False)))
+            found.append((si, mi.Vector3f(0, 0, 1), mi.Bool(False), mi.Float(1)))
             active &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
             break
         bs, value = si.bsdf().sample(ctx, si, numbers.next_1d(), numbers.next_2d(), active)
         active &= dr.max(value) > 0
-        found.append((si, mi.Vector3f(bs.wo), mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)))
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        found.append((si, mi.Vector3f(bs.wo), is_delta, mi.Float(bs.eta)))
         ray = si.spawn_ray(si.to_world(bs.wo))
     return found, active
 
@@ -172,8 +176,11 @@ def weights_of_techniques(
         si, wo = a.from_light, a.from_camera.wi
         pdf = dr.select(a.is_delta, 1, a.bsdf.pdf(ctx, si, wo, active))
         from_light.append(from_light[-1] & (pdf > 0))
+        bs = dr.zeros(mi.BSDFSample3f, dr.width(si))
+        bs.eta = a.η
+        cosine = dr.select(a.is_delta, cosine_of_delta(si, bs), geometric_cosine(si, wo))
         left = sums.leave(
-            by_light[-1], geometric_cosine(si, wo), pdf,
+            by_light[-1], cosine, pdf,
             reverse_density(ctx, a.bsdf, si, wo, active), a.is_delta, a is vertices[0],
         )  # fmt: skip
         by_light.append(
@@ -196,7 +203,7 @@ def weights_of_techniques(
         vertex = Vertex(si, v.bsdf, path)
         by_camera.insert(0, vertex)
         bs = dr.zeros(mi.BSDFSample3f, dr.width(si))
-        bs.wo = v.from_light.wi
+        bs.wo, bs.eta = v.from_light.wi, dr.rcp(v.η)
         bs.pdf = dr.select(v.is_delta, 1, v.bsdf.pdf(ctx, si, bs.wo, active))
         from_camera.insert(0, from_camera[0] & (bs.pdf > 0))
         delta, smooth = int(mi.BSDFFlags.DeltaReflection), int(mi.BSDFFlags.DiffuseReflection)

@@ -68,7 +68,7 @@ def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatc
     for samples in (1 << 10, 1 << 14):
         monkeypatch.setattr(light_paths, "_SPARSE", samples)
         auto().render(scene, spp=32, seed=1)
-        estimates.append((trials[-1].estimate.mean.mean(), trials[-1].variances[:8]))
+        estimates.append((trials[-1].estimate.mean.mean(), trials[-1].predicted.variances[:8]))
     (coarse, few), (whole, many) = estimates
     assert len(trials[0].samples) < 64 * 36 < len(trials[1].samples)
     assert coarse == pytest.approx(whole, rel=0.1)

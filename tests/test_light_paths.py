@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import pytest
-from hard_cases import area, diffuse, rectangle, rgb, stage
+from hard_cases import area, diffuse, lookat, rectangle, rgb, stage
 from statistical import REFERENCE_SEEDS, SEEDS, assert_same_quarters, batches, load, some
 from test_bdpt import assert_image_of_path, bdpt
 from test_light_tracer import EMITTERS, MANY_SEEDS, T, _balls, below_the_lamp
@@ -47,15 +47,27 @@ def test_without_lights_there_is_nothing_to_choose() -> None:
     assert integrator.statistics.learned == ""
 
 
-def test_light_that_path_cannot_find_keeps_light_paths() -> None:
-    """A caustic of a point: one splat of it is enough."""
+@pytest.mark.parametrize("spp, is_kept", [(64, False), (4096, True)])
+def test_light_that_path_cannot_find_keeps_light_paths_if_it_exceeds_the_noise(
+    spp: int, is_kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A caustic of a point, in a render of so many samples. The learner is told that number: these
+    renders have fewer."""
+    make = light_paths.LightPathTrial.__init__
+
+    def of_length(trial, film, _) -> None:
+        make(trial, film, spp)
+
+    monkeypatch.setattr(light_paths.LightPathTrial, "__init__", of_length)
     scene = _balls({"type": "conductor"})
     scene["light"] = {"type": "point", "position": [0.8, -1, 1.5], "intensity": rgb(1.0)}
-    scene["sky"] = {"type": "constant", "radiance": rgb(100.0)}
+    scene["sky"] = {"type": "constant", "radiance": rgb(0.01)}
     integrator = _auto()
     mi.render(mi.load_dict(scene, optimize=False), integrator=integrator, spp=64)
-    learned = integrator.statistics.learned
-    assert learned.startswith("light paths pay: ") and "(0.00 of" in learned
+    effect = integrator.statistics.effects["light_paths"]
+    assert effect["is_kept"] == is_kept
+    assert effect["long_run_variance"] == 0 and 0.01 < effect["missed_by_path"] < 0.1
+    assert ("of the light is missing" in integrator.statistics.learned) != is_kept
 
 
 @pytest.mark.parametrize("light", some("constant", of=["constant", "rectangle"]))
@@ -88,6 +100,14 @@ def assert_variance_of_path_is_predicted(scene: dict[str, Any], **parameters: An
 @pytest.mark.parametrize("name", some("rectangle", of=["rectangle", "constant", "sphere"]))
 def test_the_variance_of_path_is_predicted(name: str) -> None:
     assert_variance_of_path_is_predicted(stage(light=EMITTERS[name](), camera=below_the_lamp()))
+
+
+def test_the_variance_of_path_is_predicted_below_water() -> None:
+    """One refraction: densities change by the squared index of refraction."""
+    water = rectangle(T().translate([0, 0, 0.9]).scale(30), bsdf={"type": "dielectric"})
+    camera = below_the_lamp(to_world=lookat([0, -4, 0.6], [0, 0, 0], [0, 0, 1]))
+    light = EMITTERS["rectangle"]()
+    assert_variance_of_path_is_predicted(stage(light=light, camera=camera, water=water))
 
 
 @pytest.mark.parametrize("vertices", [2.5, 8.0])

@@ -10,6 +10,7 @@ from ..arrays import from_numpy
 from .candidates import Candidate
 from .merging import HANDFUL
 from .partial_sums import Rivals
+from .rare_contributions import BINS, bin_of
 
 
 class CandidateMoments:
@@ -22,26 +23,35 @@ class CandidateMoments:
     is as if one of them had all of it.
 
     Parameters:
-        candidates: The candidates.
+        candidates: The candidates. That without light paths has the techniques of ``path`` alone.
         pixels: Number of pixels.
         samples_per_vertex: For each number of light paths that merging candidates have, how many
             samples of a pixel find the same vertex (:meth:`MergingRadius.samples_per_vertex`).
+        blocks: Number of blocks of pixels, for each of which there are sums by value.
+        block_of: The block of each pixel; ``None`` if each has its own.
     """
 
     def __init__(
-        self, candidates: list[Candidate], pixels: int, samples_per_vertex: dict[float, float]
+        self,
+        candidates: list[Candidate],
+        pixels: int,
+        samples_per_vertex: dict[float, float],
+        blocks: int,
+        block_of: mi.UInt32 | None,
     ) -> None:
-        self._count, self._pixels = len(candidates), pixels
+        self._count, self._pixels, self._blocks = len(candidates), pixels, blocks
+        self._block_of = block_of
         # MIS weights count a handful of vertices as one sample of a camera path; but these samples
         # share vertices
         shared = [samples_per_vertex.get(c.light_paths, 1.0) / HANDFUL for c in candidates]
         # Factors of the squared densities of light image, connections, merging; and c of merging
         self._factors = from_numpy(mi.Float, [
-            (c.light_paths**2, c.connects, c.merges, s) for c, s in zip(candidates, shared)
+            (c.light_paths**2, c.light_paths > 0 and c.connects, c.merges, s)
+            for c, s in zip(candidates, shared)
         ])  # fmt: skip
         self._sums = dr.zeros(mi.Float, 2 * self._count * pixels)
-        self._lost = dr.zeros(mi.UInt32, self._count)
-        dr.eval(self._sums, self._lost)
+        self._by_value = dr.zeros(mi.Float, 2 * self._count * blocks * BINS)
+        dr.eval(self._sums, self._by_value)
 
     @dr.syntax
     def add(self, brought, mis, rivals, pixel, active, count: float = 1.0) -> None:
@@ -53,7 +63,11 @@ class CandidateMoments:
             pixel: Where it is.
             count: MIS weights count so many such contributions as one sample.
         """
+        active &= brought > 0
         square = count * dr.square(brought) / mis
+        block = pixel
+        if self._block_of is not None:
+            block = dr.gather(mi.UInt32, self._block_of, pixel, active)
         index = mi.UInt32(0)
         while index < mi.UInt32(self._count):
             factors = dr.gather(mi.Vector4f, self._factors, index)
@@ -63,13 +77,18 @@ class CandidateMoments:
             place = 2 * (index * mi.UInt32(self._pixels) + pixel)
             dr.scatter_add(self._sums, moment, place, is_found)
             dr.scatter_add(self._sums, brought * image, place + 1, is_found)
-            dr.scatter_add(self._lost, mi.UInt32(1), index, active & (inverse == 0))
+            value_bin = dr.select(inverse > 0, bin_of(moment / brought), BINS - 1)
+            place = index * mi.UInt32(self._blocks) + block
+            place = 2 * (place * mi.UInt32(BINS) + value_bin)
+            dr.scatter_add(self._by_value, brought, place, is_found)
+            dr.scatter_add(self._by_value, moment, place + 1, is_found)
             index += 1
 
     def taken(self) -> tuple[np.ndarray, np.ndarray]:
-        """The sums, [candidate, pixel, 2], and of each candidate the number of samples of paths
-        that it cannot find."""
-        return self._sums.numpy().reshape(self._count, self._pixels, 2), self._lost.numpy()
+        """The sums, [candidate, pixel, 2]; and those of light and second moment by the value of
+        contributions, [candidate, block, bin, 2]."""
+        by_value = self._by_value.numpy().reshape(self._count, self._blocks, BINS, 2)
+        return self._sums.numpy().reshape(self._count, self._pixels, 2), by_value
 
 
 def _split(

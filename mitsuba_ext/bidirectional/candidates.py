@@ -55,10 +55,13 @@ class Available:
 
     def samples_per_vertex(self, light_paths: float, spp: int, pixels: int) -> float:
         """:meth:`MergingRadius.samples_per_vertex` in a render of ``spp`` samples per pixel."""
+        if self.radius is None:
+            return 1.0
+        passes = 1
         if self.most_lanes > 0:
-            in_pass = int(self.most_lanes / max(1.0, light_paths)) // pixels
-            spp = min(spp, max(1, in_pass))
-        return self.radius.samples_per_vertex(light_paths, spp) if self.radius else 1.0
+            in_pass = max(1, int(self.most_lanes / max(1.0, light_paths)) // pixels)
+            passes = -(-spp // in_pass)
+        return self.radius.samples_per_vertex(light_paths, spp / passes, passes)
 
 
 def candidates(available: Available) -> list[Candidate]:

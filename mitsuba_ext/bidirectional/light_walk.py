@@ -24,7 +24,7 @@ from .light_media import medium_at_start
 from .light_vertices import Layout, LightVertices, VertexStore, bytes_per_vertex
 from .partial_sums import PartialSums, Sums
 from .photon_history import PhotonHistory
-from .scattering import delta_correction, evaluate, geometric_cosine
+from .scattering import cosine_of_delta, delta_correction, evaluate, geometric_cosine
 
 #: Vertices of a path that are stored in a round; most paths have fewer. Fewer are stored if those
 #: of all paths would take more than this number of bytes.
@@ -335,11 +335,11 @@ class LightWalk:
         value *= dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
         weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
         if self.sums is not None and self.outside is None:
+            passes = is_delta | ~self._stores(bsdf)
+            cosine = dr.select(passes, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))
             sums = self.sums.leave(
-                sums, geometric_cosine(si, bs.wo), bs.pdf, reverse_pdf,
-                is_delta | ~self._stores(bsdf),
-                paths.depth == 1,
-            )  # fmt: skip
+                sums, cosine, bs.pdf, reverse_pdf, passes, paths.depth == 1
+            )
         return dr.select(active, weight, 0), sums, hero_count, hero_is_alone
 
     def _stores(self, bsdf: mi.BSDFPtr) -> mi.Bool:

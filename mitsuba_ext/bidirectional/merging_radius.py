@@ -58,12 +58,18 @@ class MergingRadius:
         self._passes += groups
         return self._radius(per_pixel, number)
 
-    def samples_per_vertex(self, light_paths: float, spp: float) -> float:
-        """So many samples of a pixel, of the ``spp`` of a first pass, find the same vertex, where
-        any of them does: their errors are the same. ``light_paths`` is the number of these for each
-        camera path."""
-        disk = math.pi * self._radius(light_paths * spp, 1) ** 2
-        return max(1.0, spp * disk / (disk + self.footprint**2))
+    def samples_per_vertex(self, light_paths: float, spp: float, passes: int = 1) -> float:
+        """So many samples of a pixel, of the ``spp`` of a pass, find the same vertex, where any of
+        them does: their errors are the same. The mean over the first ``passes``.
+
+        Parameters:
+            light_paths: Number of light paths for each camera path.
+        """
+        total = 0.0
+        for number in range(1, passes + 1):
+            disk = math.pi * self._radius(light_paths * spp, number) ** 2
+            total += max(1.0, spp * disk / (disk + self.footprint**2))
+        return total / passes
 
     def _radius(self, per_pixel: float, number: float) -> float:
         """That of the pass of this number, with so many light paths per pixel."""

@@ -293,7 +293,8 @@ class PartialSums:
         """The sums behind a vertex, after a direction was sampled there.
 
         Parameters:
-            cosine: Between the direction and the geometric normal, not negative.
+            cosine: Between the direction and the geometric normal, not negative; behind a delta
+                lobe, :func:`cosine_of_delta`.
             pdf, reverse_pdf: Density of the direction, and of the reverse direction through the
                 vertex, per solid angle.
             is_delta: Was the direction sampled from a delta lobe? Then no technique connects here.

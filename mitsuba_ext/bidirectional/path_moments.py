@@ -3,8 +3,8 @@ path tracing with all of them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +19,11 @@ from .candidate_moments import CandidateMoments
 from .candidates import Available, Candidate, candidates
 from .merging import HANDFUL
 from .partial_sums import Rivals
+from .rare_contributions import BINS, Rare, error_of_render, rare
 from .technique_observer import TechniqueObserver
+
+#: About the most blocks of pixels for which there are sums by value.
+_BLOCKS = 1 << 14
 
 
 @dataclass
@@ -46,17 +50,52 @@ class Counts:
             setattr(self, field.name, getattr(self, field.name) + count)
 
 
-class Estimate(NamedTuple):
+@dataclass(frozen=True)
+class Estimate:
     """Estimates of mean and variance for each pixel, [pixel] each.
 
     Attributes:
         mean: Radiance.
         variances: Variance of one sample of each pixel, for each candidate. They may be negative if
             there are few samples.
+        by_value: Light and second moment of one sample, by the value of contributions (see
+            :func:`rare`), [candidate, block, bin, 2].
+        blocks: The film of whose pixels ``by_value`` tells: blocks of pixels.
     """
 
     mean: np.ndarray
     variances: list[np.ndarray]
+    by_value: np.ndarray
+    blocks: CoarseFilm
+
+    def errors_of_render(
+        self, scale: np.ndarray, spp: float, shares: Sequence[float]
+    ) -> list[tuple[list[np.ndarray], np.ndarray]]:
+        """For each of ``shares`` and each candidate, :func:`error_of_render` without the
+        contributions that are :func:`rare`; and the share of the light that these make up.
+
+        Parameters:
+            scale: 1 / radiance of each pixel.
+            spp: Samples per pixel of the render.
+            shares: Parts of the pixels that may hold rare contributions.
+        """
+        of_pixel, width = self.blocks.of_pixel, self.blocks.width
+        if of_pixel is not None:
+            scale = np.bincount(of_pixel) / np.bincount(of_pixel, 1 / scale)
+        errors: list[list[np.ndarray]] = [[] for _ in shares]
+        missed: list[list[float]] = [[] for _ in shares]
+        whole = max(self.mean.sum(), 1e-30)
+        for variance, found in zip(self.variances, self.by_value):
+            for i, lacks in enumerate(rare(found, scale, width, spp, shares)):
+                if of_pixel is not None:
+                    lacks = Rare(*(x[of_pixel] for x in lacks))
+                errors[i].append(error_of_render(variance, self.mean, lacks, spp))
+                missed[i].append(lacks.light.sum() / whole)
+        return [(some, np.array(share)) for some, share in zip(errors, missed)]
+
+    def never_found(self) -> np.ndarray:
+        """For each candidate, the share of the light of paths that it cannot find."""
+        return self.by_value[:, :, -1, 0].sum(axis=1) / max(self.by_value[1, :, :, 0].sum(), 1e-30)
 
 
 class PathMoments(TechniqueObserver):
@@ -92,7 +131,6 @@ class PathMoments(TechniqueObserver):
     Attributes:
         candidates: See :func:`candidates`. The samples are those of the second one.
         samples: Number of camera samples.
-        unreachable: For each candidate, the number of samples of paths that it cannot find.
         counts: What takes time (:class:`Counts`).
     """
 
@@ -107,25 +145,30 @@ class PathMoments(TechniqueObserver):
         self._of_pixel: mi.UInt32 | None = None
         if coarse.of_pixel is not None:
             self._of_pixel = from_numpy(mi.UInt32, coarse.of_pixel)
+        # Of a film with many pixels
+        self._blocks = CoarseFilm.of(coarse.width, coarse.height, 2 * _BLOCKS)
+        self._block_of: mi.UInt32 | None = None
+        if self._blocks.of_pixel is not None:
+            self._block_of = from_numpy(mi.UInt32, self._blocks.of_pixel)
         self.candidates: list[Candidate] = []
         self.samples = 0
-        self.unreachable = np.zeros(0, int)
         self.counts = Counts()
         # For each pixel: number of samples; sums of the samples' values, of their squares, and of
-        # the second moment of ``path``; sums of splats, and of their squares, and of the squares of
-        # what was merged
+        # products of what ``path`` finds at different vertices; sums of splats, and of their
+        # squares, and of the squares of what was merged
         self._sums = np.zeros((7, self._pixels))
-        # The second moment and the light image of each candidate but ``path``
-        self._others = np.zeros((0, self._pixels, 2))
+        # The second moment and the light image of each candidate
+        self._found = np.zeros((0, self._pixels, 2))
+        self._by_value = np.zeros((0, self._block_count, BINS, 2))
 
     # ---- Observer ----
 
     def start(self, rays: CameraRays, available: Available) -> None:
         if not self.candidates:
             self.candidates = candidates(available)
-            self.unreachable = np.zeros(len(self.candidates), int)
-            others = len(self.candidates) - 1, self._pixels, 2
-            self._others = np.zeros(others, np.float32)
+            count = len(self.candidates)
+            self._found = np.zeros((count, self._pixels, 2), np.float32)
+            self._by_value = np.zeros((count, self._block_count, BINS, 2), np.float32)
             self._shared = {
                 c.light_paths: available.samples_per_vertex(
                     c.light_paths, self._spp, self._film_pixels
@@ -135,18 +178,19 @@ class PathMoments(TechniqueObserver):
         self._pixel, self._importance = self._place(rays.pixel), rays.importance
         lanes = dr.width(rays.pixel)
         self._lane = dr.arange(mi.UInt32, lanes)
-        # For each camera path: its value with the techniques of ``path`` alone, the squares of the
-        # terms of this sum, and the second moment
-        self._path, self._squares, self._moment = (dr.zeros(mi.Float, lanes) for _ in range(3))
+        # For each camera path: its value with the techniques of ``path`` alone, and the squares of
+        # the terms of this sum
+        self._path, self._squares = (dr.zeros(mi.Float, lanes) for _ in range(2))
         # The squares of what was merged
         self._merged = dr.zeros(mi.Float, lanes)
         self._shadow_count, self._looked = (dr.zeros(mi.UInt32, lanes) for _ in range(2))
-        self._missed = dr.zeros(mi.UInt32, 1)
-        self._splats = dr.zeros(mi.Float, 3 * self._pixels)
-        self._moments = CandidateMoments(self.candidates[1:], self._pixels, self._shared)
+        self._splats = dr.zeros(mi.Float, 2 * self._pixels)
+        self._moments = CandidateMoments(
+            self.candidates, self._pixels, self._shared, self._block_count, self._block_of
+        )
         dr.eval(
-            self._path, self._squares, self._moment, self._merged, self._shadow_count, self._looked,
-            self._missed, self._splats, self._importance,
+            self._path, self._squares, self._merged, self._shadow_count, self._looked,
+            self._splats, self._importance,
         )  # fmt: skip
         self._by_kind = mi.Vector2f(0)
 
@@ -181,8 +225,6 @@ class PathMoments(TechniqueObserver):
         part = whole * power_heuristic(mi.Float(1), other)
         add_own(self._path, part, self._lane, active)
         add_own(self._squares, dr.square(part), self._lane, active)
-        moment = brought * whole * _share(mi.Vector2f(1, other))
-        add_own(self._moment, moment, self._lane, active)
         rivals = Rivals(mi.Vector2f(1, other), self._by_kind)
         self._moments.add(brought, mis, rivals, self._pixel, active)
 
@@ -200,10 +242,6 @@ class PathMoments(TechniqueObserver):
         the technique itself. MIS weights count ``count`` such contributions as one sample."""
         brought = self._brightness(value)
         active = active & (brought > 0)
-        moment = self._seen_by_path(
-            count * dr.square(brought) / mis, rivals.by_camera, active
-        )
-        add_own(self._moment, moment, self._lane, active)
         self._moments.add(brought, mis, rivals, self._pixel, active, count)
 
     def splatted(self, s, position, value, mis, rivals, active) -> None:
@@ -211,11 +249,8 @@ class PathMoments(TechniqueObserver):
         active = active & (brought > 0)
         place = mi.Point2u(position - self._corner)
         pixel = self._place(place.y * self._film_width + place.x, active)
-        square = dr.square(brought) / mis
-        moment = self._seen_by_path(square, rivals.by_camera, active)
-        dr.scatter_add(self._splats, brought, 3 * pixel, active)
-        dr.scatter_add(self._splats, dr.square(brought), 3 * pixel + 1, active)
-        dr.scatter_add(self._splats, moment, 3 * pixel + 2, active)
+        dr.scatter_add(self._splats, brought, 2 * pixel, active)
+        dr.scatter_add(self._splats, dr.square(brought), 2 * pixel + 1, active)
         own = Rivals(rivals.by_camera, rivals.by_kind + mi.Vector2f(0, 1))
         self._moments.add(brought, mis, own, pixel, active)
 
@@ -224,11 +259,6 @@ class PathMoments(TechniqueObserver):
         if self._of_pixel is None:
             return pixel
         return dr.gather(mi.UInt32, self._of_pixel, pixel, active)
-
-    def _seen_by_path(self, square, by_camera, active) -> mi.Float:
-        can_be = dr.max(by_camera) > 0
-        dr.scatter_add(self._missed, mi.UInt32(1), mi.UInt32(0), active & ~can_be)
-        return dr.select(can_be, square * _share(by_camera), 0)
 
     def _brightness(self, value: mi.Spectrum) -> mi.Float:
         return channel_mean(value * self._importance)
@@ -246,16 +276,15 @@ class PathMoments(TechniqueObserver):
 
         values = brought.numpy().astype(np.float64)
         by_path = self._path.numpy().astype(np.float64)
-        moment = self._moment.numpy() + by_path**2 - self._squares.numpy()
-        splats = self._splats.numpy().astype(np.float64).reshape(self._pixels, 3)
+        splats = self._splats.numpy().astype(np.float64).reshape(self._pixels, 2)
         self._sums += (
             np.bincount(pixel, minlength=self._pixels), per_pixel(values), per_pixel(values**2),
-            per_pixel(moment) + splats[:, 2], splats[:, 0], splats[:, 1],
+            per_pixel(by_path**2 - self._squares.numpy()), splats[:, 0], splats[:, 1],
             per_pixel(self._merged.numpy()),
         )  # fmt: skip
-        moments, lost = self._moments.taken()
-        self._others += moments
-        self.unreachable += (int(self._missed[0]), *lost)
+        found, by_value = self._moments.taken()
+        self._found += found
+        self._by_value += by_value
         lanes = len(pixel)
         self.samples += lanes
         tested, scattered = _total(self._shadow_count), _total(camera.scatter_count)
@@ -269,7 +298,7 @@ class PathMoments(TechniqueObserver):
 
     def estimate(self) -> Estimate:
         """The estimate from all passes."""
-        n, x, x2, moment, splats, splats2, merged = self._sums
+        n, x, x2, own_products, splats, splats2, merged = self._sums
         n = np.maximum(n, 1)
         # The unbiased estimate: with few samples, the square of the sample mean is too large, by
         # the variance of the mean. With one, the mean is that of the pixel's neighbours
@@ -281,25 +310,25 @@ class PathMoments(TechniqueObserver):
         everything = of_camera + (splats2 + (shared - 1) * merged) / n
         mean = (x + splats) / n
         squared_mean = np.where(n > 1, mean**2 - everything / n, self._smooth(mean) ** 2)
-        moments, images = np.moveaxis(self._others, 2, 0)
+        moments, images = np.moveaxis(self._found, 2, 0)
         # What camera paths bring, with each candidate, and products of such contributions
         brought = [self._smooth(mean - image / n) for image in images]
-        products = everything - moments[0] / n + brought[0] ** 2
-        ratios = [x / np.maximum(brought[0], 1e-30) for x in brought]
+        products = everything - moments[1] / n + brought[1] ** 2
+        ratios = [x / np.maximum(brought[1], 1e-30) for x in brought]
         variances = [
             m / n + products * ratio**2 - x**2 for m, x, ratio in zip(moments, brought, ratios)
         ]
-        return Estimate(mean, [moment / n - squared_mean, *variances])
+        variances[0] = (moments[0] + own_products) / n - squared_mean
+        block = np.arange(self._pixels) if self._block_of is None else self._blocks.of_pixel
+        self._by_value /= np.bincount(block, n).astype(np.float32)[:, None, None]
+        return Estimate(mean, variances, self._by_value, self._blocks)
+
+    @property
+    def _block_count(self) -> int:
+        return self._blocks.width * self._blocks.height
 
     def _smooth(self, values: np.ndarray) -> np.ndarray:
         return box_means(values.reshape(-1, self._width)).ravel()
-
-
-def _share(q: mi.Vector2f) -> mi.Float:
-    """(q₀³ + q₁³) / (q₀² + q₁²)²."""
-    larger = dr.max(q)
-    r = dr.min(q) / larger
-    return (1 + r**3) / dr.square(1 + dr.square(r)) / larger
 
 
 def _total(count: mi.UInt32) -> int:

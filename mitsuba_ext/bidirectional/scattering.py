@@ -70,6 +70,16 @@ def delta_correction(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Flo
     return dr.select(passes, 1, dr.select(dr.isfinite(factor), factor, 0))
 
 
+def cosine_of_delta(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> mi.Float:
+    """What ratios of densities hold instead of the cosine of a direction from a delta lobe.
+
+    The densities with which two techniques pass the vertex, in one direction and in the other, are
+    per solid angle. Étendue, η² · cosine · solid angle · area, is the same on both sides of an
+    interface, so that their ratio changes by η² (Veach, PhD thesis, section 5.2).
+    """
+    return geometric_cosine(si, si.wi) / dr.square(bs.eta)
+
+
 def geometric_cosine(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
     """The cosine between the geometric normal and a local direction, not negative."""
     return dr.abs(dr.dot(si.n, si.to_world(d)))

@@ -10,7 +10,7 @@ from ..transport.path_decisions import Weights
 from ..transport.vertex import PathState, Vertex
 from .emission import LightEmission
 from .partial_sums import PartialSums, Sums, weight
-from .scattering import geometric_cosine, reverse_density
+from .scattering import cosine_of_delta, geometric_cosine, reverse_density
 from .sensor import ConnectableSensor
 from .technique_observer import TechniqueObserver
 
@@ -117,7 +117,7 @@ class BidirectionalWeights(Weights):
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         active = si.is_valid() & ~is_delta
         reverse = reverse_density(self._ctx, vertex.bsdf, si, bs.wo, active)
-        cosine = geometric_cosine(si, bs.wo)
+        cosine = dr.select(is_delta, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))
         sums = self.sums.leave(
             vertex.path.sums, cosine, bs.pdf, reverse, is_delta, vertex.depth == 0
         )

@@ -13,18 +13,18 @@ from ..rendering.pass_images import PassImages
 
 
 class LightPathPromise:
-    """Compares the variance of stages with light paths to that which the trial has estimated for
-    ``path``. (The pilots without light paths would be no measure: the rare paths that make most of
-    the variance of ``path`` may be missing in them.)
+    """Compares the variance of stages with light paths to the error that the trial has predicted
+    for ``path``. (The pilots without light paths would be no measure: the rare paths that make most
+    of the variance of ``path`` may be missing in them.)
 
     Parameters:
         film: The film of the render.
         coarse: That of the trial.
-        of_path: The variance of one sample of ``path``, in each pixel of the coarse film.
+        of_path: The squared error of one sample of ``path``, in each pixel of the coarse film.
 
     Attributes:
         images: The images of the stages with light paths.
-        variance: Their variance, relative to that of ``path``; ``None`` before :meth:`check`.
+        variance: Their variance, relative to that error; ``None`` before :meth:`is_broken`.
         error: The standard error of its logarithm.
     """
 
@@ -46,7 +46,7 @@ class LightPathPromise:
             return False
         mean = self._on_coarse_film(self.images.mean())
         variance = self._on_coarse_film(self.images.variance())
-        weight = relative_scale(mean.reshape(self._coarse.height, -1)).ravel() ** 2
+        weight = relative_scale(mean.reshape(self._coarse.height, -1), 1).ravel() ** 2
         # Pixels are left out where either is largest
         sums = trimmed_batches(variance * weight, (self._of_path - variance) * weight)
         gain, self.error = gain_of(sums)

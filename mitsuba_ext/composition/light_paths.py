@@ -15,15 +15,15 @@ from ..bidirectional.candidates import Candidate
 from ..bidirectional.path_moments import Counts, Estimate, PathMoments
 from ..bidirectional.technique_observer import TechniqueObserver
 from ..images.coarse_film import CoarseFilm
-from ..learning.benefit import expected_gain, gain_of, trimmed_batches
+from ..learning.benefit import expected_gain
 from ..learning.effect import Effect
 from ..learning.learner import Learner
-from ..learning.pixel_estimates import relative_scale
 from ..rendering.camera import film_extent, first_pixel
 from ..scene.movers import movers
 from .decision_parameters import DecisionParameters, Setting, Slots
 from .learned_slots import OF_CAMERA_PATHS
 from .light_path_promise import LightPathPromise
+from .predicted_errors import PredictedErrors
 
 #: The time of what a sample does, in units of that of a ray of ``path``: camera paths carry partial
 #: sums; rays of light paths; shadow rays to the sensor; connections; a light path's vertex that is
@@ -41,6 +41,9 @@ _ENOUGH = 1 << 15
 #: the largest share of all samples that it may have: one takes about seven times as long as one of
 #: ``path``. (Trials of all sizes kept the same techniques in twelve scenes.)
 _SPARSE, _LEAST_SPARSE, _MOST = 1 << 14, 1 << 12, 1 / 64
+
+#: The least share of missing light of which a render tells.
+_WORTH_A_WORD = 1e-3
 
 #: The most light paths for each camera path.
 MOST_PATHS = 64.0
@@ -119,11 +122,8 @@ class LightPathsWhereTheyPay(DecisionParameters):
 
 
 class LightPathTrial(Learner):
-    """Chooses the candidate with the least variance times time. The time is estimated from the
-    number of rays.
-
-    The variance of a pixel is divided by the square of the mean radiance of the pixel and its
-    neighbours.
+    """Chooses the candidate with the least squared error of a render of this length
+    (:class:`PredictedErrors`), times its time. The time is estimated from the number of rays.
 
     Parameters:
         film: The film of the sensor.
@@ -136,9 +136,9 @@ class LightPathTrial(Learner):
         rival: The efficiency of ``path`` with what else was learned for it, relative to ``path``.
         estimate: Estimate of the image and its variance, once the choice has been made.
         candidates: What was compared, once the choice has been made.
-        variances, costs: Variance and time of each candidate, relative to ``path``.
+        predicted, costs: Errors and time of each candidate, relative to ``path``.
         leaves_out: If light paths pay, these slots decide as ``path``.
-        promise: Tests what was chosen; ``None`` where there is nothing to test it against.
+        promise: Tests what was chosen; ``None`` if that is ``path``.
     """
 
     leaves_out = OF_CAMERA_PATHS
@@ -155,17 +155,19 @@ class LightPathTrial(Learner):
         self._choice = LightPathChoice(
             observer=self._moments, pixel_width=coarse.pixel_width
         )
-        self.samples = coarse.samples
+        self.samples, self._spp, self._pixel_count = coarse.samples, spp, coarse.pixel_count
         self.rival = 1.0
         self.estimate: Estimate | None = None
         self.candidates: list[Candidate] = []
-        self.variances, self.costs = np.zeros(0), np.zeros(0)
+        self.predicted: PredictedErrors | None = None
+        self.costs = np.zeros(0)
         self.promise: LightPathPromise | None = None
 
     @property
     def chosen_variance(self) -> float:
-        """The variance of what was chosen, relative to ``path``."""
-        return float(self.variances[self._best])
+        """The variance of what was chosen, relative to ``path``; 0 if this cannot find some of the
+        light."""
+        return float(self.predicted.long_run[self._best])
 
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:
@@ -181,34 +183,21 @@ class LightPathTrial(Learner):
             return None
         self._moments, self.candidates = None, moments.candidates
         self.estimate = estimate = moments.estimate()
-        image = estimate.mean.reshape(-1, self._width)
-        weight = relative_scale(image).ravel() ** 2
-        everything = estimate.variances[1] * weight
-        # Of each candidate, the variance in units of that of all techniques, and the error of the
-        # logarithm. Here the batches are of pixels, not of paths
-        found = [
-            gain_of(trimmed_batches(everything, variance * weight - everything))
-            for variance in estimate.variances
-        ]
-        variances = np.array([1 / max(1 - gain, 1e-6) for gain, _ in found])
-        errors = np.array([error for _, error in found])
-        lost = moments.unreachable > 0
-        variances[lost], errors[lost] = np.inf, 0.0
+        self.predicted = predicted = PredictedErrors.of(
+            estimate, self._width, self._spp, self._pixel_count
+        )
         costs = np.array([cost(c, moments.counts) for c in moments.candidates])
+        self.costs = costs / costs[0]
         # Prior: the efficiency is that of all techniques
-        efficiencies = costs[1] / (variances * costs)
+        efficiencies = 1 / (predicted.variances * self.costs)
+        efficiencies /= efficiencies[1]
         efficiencies[0] *= self.rival
-        gains = [expected_gain(*estimate) for estimate in zip(efficiencies, errors)]
+        gains = [expected_gain(*x) for x in zip(efficiencies, predicted.uncertainty)]
         self._best = int(np.argmax(gains))
         self._best_with_light_paths = 1 + int(np.argmax(gains[1:]))
-        self.costs = costs / costs[0]
-        if np.isfinite(variances[0]):
-            self.variances = variances / variances[0]
-        else:
-            self.variances = np.where(np.isfinite(variances), 0.0, 1.0)
         self._choice = LightPathChoice(moments.candidates[self._best])
-        if self._best > 0 and np.isfinite(variances[0]):
-            self.promise = LightPathPromise(self._film, self._coarse, estimate.variances[0])
+        if self._best > 0:
+            self.promise = LightPathPromise(self._film, self._coarse, predicted.of_path)
         return self._choice
 
     def goes_back(self) -> bool:
@@ -235,11 +224,19 @@ class LightPathTrial(Learner):
         is_kept = techniques.light_paths > 0
         if self.estimate is None:
             return Effect(is_kept, about=asdict(techniques))
-        index = self._shown
-        about = {"rival": round(self.rival, 4), **asdict(self.candidates[index])}
+        index, predicted = self._shown, self.predicted
+        figures = {
+            "trimmed_variance": predicted.trimmed, "long_run_variance": predicted.long_run,
+            "missed": predicted.missed,
+        }  # fmt: skip
+        about = {
+            "rival": round(self.rival, 4), **asdict(self.candidates[index]),
+            **{name: round(float(values[index]), 4) for name, values in figures.items()},
+            "missed_by_path": round(float(predicted.missed[0]), 4),
+        }  # fmt: skip
         if self._measured is not None:
             about["measured_variance"] = round(self._measured, 4)
-        return Effect(is_kept, float(self.variances[index]), float(self.costs[index]), about)
+        return Effect(is_kept, float(predicted.variances[index]), float(self.costs[index]), about)
 
     @property
     def _measured(self) -> float | None:
@@ -257,9 +254,14 @@ class LightPathTrial(Learner):
         if self.estimate is None:
             return kept
         # In units of ``path``
-        variance, time = self.variances[self._shown], self.costs[self._shown]
+        predicted, index = self.predicted, self._shown
         measured = "" if self._measured is None else f", {self._measured:.2f} measured"
-        return f"{kept} ({variance:.2f} of the variance{measured}, {time:.1f} x the time)"
+        text = (
+            f"{kept} ({predicted.variances[index]:.2f} of the variance{measured}, "
+            f"{self.costs[index]:.1f} x the time)"
+        )
+        missed = predicted.missed[self._best]
+        return text if missed < _WORTH_A_WORD else f"{text}; {missed:.1%} of the light is missing"
 
 
 def _trial_samples(samples: int) -> int:

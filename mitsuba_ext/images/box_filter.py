@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-#: Pixels on each side, along each axis, over which the radiance of a pixel is averaged.
-_RADIUS = 4
+#: Pixels on each side, along each axis, over which the radiance of a pixel is averaged, if nothing
+#: else is said.
+RADIUS = 4
 
 
-def box_means(image: np.ndarray) -> np.ndarray:
+def box_means(image: np.ndarray, radius: int = RADIUS) -> np.ndarray:
     """The mean of each pixel of an image and its neighbours, shape [y, x]."""
-    return box_sums(image) / box_sums(np.ones_like(image))
+    return box_sums(image, radius) / box_sums(np.ones_like(image), radius)
 
 
-def box_sums(image: np.ndarray) -> np.ndarray:
+def box_sums(image: np.ndarray, radius: int = RADIUS) -> np.ndarray:
     """Sums over the neighbours of each pixel, itself included, shape [y, x]."""
     for axis in range(2):
         size = image.shape[axis]
         sums = np.insert(np.cumsum(image, axis), 0, 0, axis)
         index = np.arange(size)
-        end = np.minimum(index + _RADIUS + 1, size)
-        image = sums.take(end, axis) - sums.take(np.maximum(index - _RADIUS, 0), axis)
+        end = np.minimum(index + radius + 1, size)
+        image = sums.take(end, axis) - sums.take(np.maximum(index - radius, 0), axis)
     return image

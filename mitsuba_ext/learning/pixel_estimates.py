@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import channel_mean, from_numpy
-from ..images.box_filter import box_means, box_sums
+from ..images.box_filter import RADIUS, box_means, box_sums
 
 #: Added to the squared radiance of a pixel, in units of the squared mean of the image.
 _FLOOR = 1e-2
@@ -66,9 +66,10 @@ class PixelEstimates:
         return from_numpy(mi.Float, _inverse(means, mean))
 
 
-def relative_scale(image: np.ndarray) -> np.ndarray:
-    """1 / mean radiance of each pixel of an image and its neighbours, shape [y, x]."""
-    return _inverse(box_means(image), image.mean())
+def relative_scale(image: np.ndarray, radius: int = RADIUS) -> np.ndarray:
+    """1 / mean radiance of each pixel of an image and its neighbours within ``radius``, shape
+    [y, x]."""
+    return _inverse(box_means(image, radius), image.mean())
 
 
 def _inverse(means: np.ndarray, mean: float) -> np.ndarray:

@@ -83,7 +83,8 @@ class RenderStatistics:
         effects: For each learned decision (``directions``, ``next_event``, ``light_paths``, …):
             ``is_kept``, the ``variance`` and ``time`` that pilots predict in units of those
             without it, and what else was chosen
-            (:class:`~mitsuba_ext.learning.effect.Effect`).
+            (:class:`~mitsuba_ext.learning.effect.Effect`; of light paths,
+            :class:`~mitsuba_ext.composition.predicted_errors.PredictedErrors`).
         memory: Peak of the memory that Dr.Jit held during the render, in bytes.
         interrupted: Did Ctrl-C, :meth:`cancel` or an error end the render before all samples were
             taken? Ctrl-C in the last pass does not.
