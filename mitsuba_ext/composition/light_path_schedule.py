@@ -14,8 +14,8 @@ from .learned_slots import CAMERA_NUMBERS
 from .light_paths import LightPathTrial
 from .schedule import Schedule
 
-#: Where light paths pay, these slots decide as ``path``: what they learn is for camera paths that
-#: find all light alone.
+#: Where light paths pay, what was learned for these slots is left out: it is for camera paths that
+#: find all light alone. (Guides are learned again.)
 _OF_CAMERA_PATHS = ("directions", "roulette", *CAMERA_NUMBERS)
 
 #: After so many pilots, or all if there are fewer, comes the trial: they are enough to tell what
@@ -37,7 +37,8 @@ _GROWS = 1.25
 
 class LightPathSchedule:
     """Adds a stage to a schedule in which light paths are tried, with the lights that were learned
-    until then. If they pay, more than guided directions do, the stages after it use them. Before
+    until then. If they pay, more than guided directions do, the stages after it use them; and where
+    guides paid before, they are learned again from these stages, unless vertices are merged. Before
     the last stage, it goes back on that if the pilots after the trial show less than was promised.
 
     Parameters:
@@ -94,8 +95,9 @@ class LightPathSchedule:
     def _stage_after_trial(self) -> Stage:
         stage, self._next = self._next, None
         guide = self._inner.learners.get("directions")
+        is_guided = isinstance(guide, GuideLearner) and guide.guide and guide.guidance
         self._trial.rival = _MARGIN
-        if isinstance(guide, GuideLearner) and guide.guide and guide.guidance:
+        if is_guided:
             self._trial.rival *= guide.guidance.efficiency * _GROWS
         for slot in CAMERA_NUMBERS:
             learner = self._inner.learners.get(slot)
@@ -106,6 +108,10 @@ class LightPathSchedule:
             # Only the summary may be new
             return self._inner.stage_again() if stage.learned else stage
         self._take_up_again = self._inner.leave_out(_OF_CAMERA_PATHS)
+        if is_guided and not choice.techniques.merges and not self._inner.is_at_end:
+            # MIS weights are those of unguided paths, which light paths may have as well
+            self._inner.learners["directions"] = guide.beside_light_paths(self._trial.chosen_cost)
+            self._inner.decisions["directions"] = guide.guide
         self._inner.decisions["light_paths"] = choice
         stage = self._measured_stage(self._inner.stage_again())
         return replace(stage, forgets=self._trial.chosen_variance < _FAR_LESS)

@@ -163,6 +163,11 @@ class LightPathTrial(Learner):
         """The variance of what was chosen, relative to ``path``."""
         return float(self.variances[self._best])
 
+    @property
+    def chosen_cost(self) -> float:
+        """The time of a sample of what was chosen, relative to ``path``."""
+        return float(self.costs[self._best])
+
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:
         """Is a sparse trial worth its time, for a render of so many samples?"""

@@ -97,7 +97,9 @@ class GuideLearner(Learner):
         self.guidance: Guidance | None = None
         self.roulette, self.trial = Roulette(), None
         self._rr_depth: int | None = None
-        self._pixels = PixelEstimates(film_width)
+        self._film_width, self._pixels = film_width, PixelEstimates(film_width)
+        #: The time of a sample, in units of that of ``path`` without guides
+        self._time = 1.0
         self.sample_count = 0
         self._records: PathRecords | None = None
         self._share, self._summary = _FIRST_SHARE, ""
@@ -107,6 +109,9 @@ class GuideLearner(Learner):
         if self.wants_scout and dr.width(p) == 0:
             return
         self._regions = self.make_regions(p, n)
+        self._begin_records()
+
+    def _begin_records(self) -> None:
         bytes_per_path = self.bounces * BYTES_PER_RECORD
         if self._rr_depth is not None:
             bytes_per_path += BYTES_PER_PATH
@@ -118,6 +123,19 @@ class GuideLearner(Learner):
     def learn_roulette(self, rr_depth: int) -> None:
         """Makes this learner learn a roulette as well, which begins at the depth ``rr_depth``."""
         self._rr_depth = rr_depth
+
+    def beside_light_paths(self, time: float) -> GuideLearner:
+        """A learner of the same regions for camera paths that bring less light from now on, as
+        light paths bring the rest. Its first guide is that of this learner, but it learns from new
+        samples only. ``time`` is that of a sample, in units of that of ``path``."""
+        other = GuideLearner(
+            self.make_regions, self.wants_scout, self.bounces, self.max_memory,
+            self.pilot_samples, self._film_width, self.always,
+        )  # fmt: skip
+        other.guide, other._share, other._regions = self.guide, self._share, self._regions
+        other._summary, other._time = self._summary, time
+        other._begin_records()
+        return other
 
     # ---- Observer ----
 
@@ -167,6 +185,7 @@ class GuideLearner(Learner):
             gains = self.gains(records)
             against_path = self._against_path(gains, least)
             rays = _RAYS * (1 + (records.count - records.first_new) / max(records.paths, 1))
+            rays *= self._time
             self.guidance = most_efficient(gains, self.always, *against_path, rays)
             error = 0.0 if is_trial else self._error(records)
             share, bounces, gain, efficiency = self.guidance
