@@ -108,10 +108,14 @@ class LightPathSchedule:
             # Only the summary may be new
             return self._inner.stage_again() if stage.learned else stage
         self._take_up_again = self._inner.leave_out(_OF_CAMERA_PATHS)
+        # Going back needs no margin
+        self._trial.rival /= _MARGIN
         if is_guided and not choice.techniques.merges and not self._inner.is_at_end:
             # MIS weights are those of unguided paths, which light paths may have as well
             self._inner.learners["directions"] = guide.beside_light_paths(self._trial.chosen_cost)
             self._inner.decisions["directions"] = guide.guide
+            # These guides become better too
+            self._trial.rival /= _GROWS
         self._inner.decisions["light_paths"] = choice
         stage = self._measured_stage(self._inner.stage_again())
         return replace(stage, forgets=self._trial.chosen_variance < _FAR_LESS)
