@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
 import mitsuba as mi
 
 from mitsuba_ext.bidirectional.candidates import Candidate
 from mitsuba_ext.bidirectional.emission import LightEmission
+from mitsuba_ext.bidirectional.photon_mapper import PhotonMapper
+from mitsuba_ext.composition import light_path_schedule
 from mitsuba_ext.composition.bidirectional_integrator import LightPathIntegrator
 from mitsuba_ext.composition.learned_slots import learned_slots
 from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
 from mitsuba_ext.composition.light_paths import LightPathsWhereTheyPay, LightPathTrial
 from mitsuba_ext.composition.merging_parameters import MergingParameters
+from mitsuba_ext.composition.photon_trial import PhotonChoice, PhotonTrial
+from mitsuba_ext.composition.photons import photon_mapper
 from mitsuba_ext.composition.staged_integrator import NO_LIMIT
+from mitsuba_ext.composition.walk_integrator import LEARNING_KERNELS
+from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.rendering.stages import Schedule
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
+from mitsuba_ext.transport.estimator import Estimator
 
 #: Light paths are not tried in films of more pixels, since a pass stores some kilobytes for each.
 _MOST_PIXELS = 1 << 21
+
+#: The trial of light paths compiles about so many kernels as large as that of ``path``.
+_TRIAL_KERNELS = 4
 
 
 @registry.plugin
@@ -32,7 +47,7 @@ class Auto(LightPathIntegrator):
     Begins as :monosp:`path`, and measures which techniques are worth their time in this scene:
     guided directions, learned lights, maps of times, points on the lens, wavelengths and distances
     (:class:`auto_path`); light paths, how many, connections to them, and merging with them
-    (:class:`vcm`).
+    (:class:`vcm`); in fog, photons (:class:`sppm`).
 
     .. pluginparameters::
 
@@ -61,28 +76,39 @@ class Auto(LightPathIntegrator):
     tell its time. The best choice is made, if it is better than guided directions and maps. Maps
     are then left out; guided directions that paid before are learned again, from samples with light
     paths, unless vertices are merged. This stage has 16384 samples, spread over the film, which are
-    not part of the image; in renders of less than a million samples, it has as few as 4096, and
-    below 262144 samples, there is none. Where light paths have less than 0.4 of the variance, the
-    samples before are left out of the image.
+    not part of the image; in renders of less than a million samples, it has as few as 4096. Where
+    light paths have less than 0.4 of the variance, the samples before are left out of the image.
+
+    Renders of less than 262144 samples are those of :monosp:`path`, unless they save what they
+    learn: they would take longer to learn, and to compile the kernels of learning, than for all
+    samples. Light paths must gain more, the shorter a render is: 1.1 times the efficiency, and
+    twice that of the rest in renders of half a million samples. With a :monosp:`timeout`, they are
+    tried only where there is time to compile their kernels.
 
     The differences between the passes of the later pilots show the variance that light paths really
     have. Before the last stage, the integrator goes back to what it had before if that variance,
     times the predicted time, is more than it would be without light paths, beyond the error of the
     measurement. (What else is learned is tested in each pilot.)
 
-    Light paths are not tried in participating media, in films of more than two million pixels, and
-    where a light cannot emit them: there, the integrator is :class:`auto_path`. In spectral
-    variants and with moving shapes, nothing is merged.
+    In scenes with participating media, there is one choice besides camera paths: photons, as
+    :class:`sppm` renders them. Renders of two million samples or more try them on a coarse film,
+    beside camera paths. The photons also tell how rarely camera paths find the light of lamps in or
+    behind glass, to which they cannot be connected. The choice is not tested later.
 
-    Where vertices are merged, the image is slightly blurred, less with each sample (:class:`vcm`).
+    Light paths are not tried in films of more than two million pixels, and where a light cannot
+    emit them: there, the integrator is :class:`auto_path`. In spectral variants and with moving
+    shapes, nothing is merged, and there are no photons in media.
+
+    Where vertices are merged, or photons are used, the image is slightly blurred, less with each
+    sample (:class:`vcm`, :class:`sppm`).
 
     :monosp:`integrator.statistics.learned` says what was chosen, and what it was expected to gain.
     Gradients are not supported (use :class:`composed_prb`), nor are scalar and polarized variants.
     Nested in :monosp:`moment`, it takes no pilot samples.
 
-    Sources: those of :class:`auto_path` and :class:`vcm`; P. Grittmann, I. Georgiev, P. Slusallek,
-    *Efficiency-Aware Multiple Importance Sampling for Bidirectional Rendering Algorithms*, ACM
-    Transactions on Graphics 41(4), 2022.
+    Sources: those of :class:`auto_path`, :class:`vcm` and :class:`sppm`; P. Grittmann, I. Georgiev,
+    P. Slusallek, *Efficiency-Aware Multiple Importance Sampling for Bidirectional Rendering
+    Algorithms*, ACM Transactions on Graphics 41(4), 2022.
 
     .. tabs::
         .. code-tab:: xml
@@ -103,7 +129,7 @@ class Auto(LightPathIntegrator):
         super().__init__(props)
         self.merging = MergingParameters(0.0, 0.75)
         self.fill(props, **learned_slots(self.name))
-        self._has_light_paths = self._has_trial = False
+        self._has_light_paths = self._has_trial = self._has_media = False
 
     @property
     def needs_equal_samples(self) -> str:
@@ -118,10 +144,15 @@ class Auto(LightPathIntegrator):
         # Stages with light paths have limits of their own
         return NO_LIMIT
 
-    def pilots(self, scene, pixel_count, spp):
-        stages = super().pilots(scene, pixel_count, spp)
+    def pilots(self, scene, pixel_count, spp, kernels=math.inf):
+        if pixel_count * spp < light_path_schedule.LEAST_SAMPLES and not self.save_learned:
+            spp = 0
+        stages = super().pilots(scene, pixel_count, spp, kernels)
+        self._has_media = may_have_media(scene)
         self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene)
-        is_possible = bool(stages) and LightPathTrial.is_possible(pixel_count, spp)
+        trial = PhotonTrial if self._has_media else LightPathTrial
+        is_possible = bool(stages) and trial.is_possible(pixel_count, spp)
+        is_possible &= kernels >= LEARNING_KERNELS + _TRIAL_KERNELS
         self._has_trial = is_possible and self._has_light_paths
         return stages
 
@@ -129,27 +160,40 @@ class Auto(LightPathIntegrator):
         schedule = super().schedule(scene, sensor, samples, seed)
         if not self._has_light_paths or not (self._has_trial or self.load_learned):
             return schedule
-        trial = LightPathTrial(sensor.film(), sum(samples), is_sparse=True)
+        if self._has_media:
+            trial = PhotonTrial(sensor.film(), sum(samples))
+        else:
+            trial = LightPathTrial(sensor.film(), sum(samples), is_sparse=True)
         if self._has_trial:
-            return LightPathSchedule(schedule, scene, len(samples) - 1, trial)
+            count = math.prod(film_extent(sensor.film())) * sum(samples)
+            return LightPathSchedule(schedule, scene, len(samples) - 1, trial, count)
         schedule.beside["light_paths"] = trial
         return schedule
 
     def estimators(self, scene, sensor):
         if not self._has_light_paths or not (self._has_trial or self.load_learned):
             return self.walk
+        if self._has_media:
+            mapper = functools.cache(
+                functools.partial(photon_mapper, self, scene, sensor, self.merging)
+            )
+            return functools.partial(self._in_media, mapper)
         return super().estimators(scene, sensor)
 
-    def merging_radius(self, scene, sensor, side):
-        # Only paths of equal wavelengths and times merge: all pixels would have to share these,
-        # even if nothing is merged in the end
-        if mi.is_spectral or movers(scene):
-            return None
-        return super().merging_radius(scene, sensor, side)
+    def _in_media(self, mapper: Callable[[], PhotonMapper], **decisions: Any) -> Estimator:
+        """The estimator of a stage in a scene with media; ``mapper`` makes that of photons."""
+        choice: PhotonChoice = decisions.pop("light_paths", PhotonChoice())
+        return choice.estimator(self.walk(**decisions), mapper)
+
+    def merging_radius(self, scene, sensor, side, *sums):
+        return super().merging_radius(scene, sensor, side, *sums) if _can_merge(scene) else None
 
     def _can_try(self, scene: mi.Scene) -> bool:
         """Can camera paths be connected to light paths, in what this integrator does else?"""
-        if self.max_depth < 2 or may_have_media(scene):
+        if self.max_depth < 2:
+            return False
+        # In media there is only merging
+        if self._has_media and not _can_merge(scene):
             return False
         if not LightPathsWhereTheyPay().can_learn(scene, 1):
             return False
@@ -158,3 +202,9 @@ class Auto(LightPathIntegrator):
         except NotImplementedError:
             return False
         return True
+
+
+def _can_merge(scene: mi.Scene) -> bool:
+    """Only paths of equal wavelengths and times merge: all pixels would have to share these, even
+    if nothing is merged in the end."""
+    return not (mi.is_spectral or movers(scene))

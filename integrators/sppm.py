@@ -7,24 +7,15 @@ from typing import Any
 
 import mitsuba as mi
 
-from mitsuba_ext.bidirectional.emission import LightEmission
-from mitsuba_ext.bidirectional.light_media import outer_medium
-from mitsuba_ext.bidirectional.light_vertices import Layout, bytes_per_vertex
-from mitsuba_ext.bidirectional.light_walk import STRIDE, LightWalk
-from mitsuba_ext.bidirectional.photon_mapper import PhotonMapper
+from mitsuba_ext.bidirectional.photon_mapper import most_lanes
 from mitsuba_ext.composition.light_paths import MOST_PATHS, check_shared_rays
 from mitsuba_ext.composition.merging_parameters import MergingParameters, share_rays
+from mitsuba_ext.composition.photons import photon_mapper
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera_samples import CameraSamples
 from mitsuba_ext.rendering.stages import OneStage
-from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.path_decisions import NoConnections
-from mitsuba_ext.transport.walk import Walk
-
-#: Bytes for what a pass stores; and bytes, about, that a path takes besides the vertices that are
-#: stored at a time.
-_PASS_BYTES, _PATH_BYTES = 1 << 29, 512
 
 
 @registry.plugin
@@ -140,31 +131,15 @@ class ProgressivePhotonMapping(WalkIntegrator):
 
     @property
     def most_lanes(self) -> int:
-        layout = Layout(len(mi.Spectrum()), 0, True)
-        bytes_per_path = STRIDE * bytes_per_vertex(layout) + _PATH_BYTES
-        return int(_PASS_BYTES / max(1.0, self.light_paths)) // bytes_per_path
+        return most_lanes(self.light_paths)
 
     def schedule(self, scene, sensor, samples, seed) -> OneStage:
-        query = self.query(scene)
-        walk = Walk(
-            self.max_depth, self.rr_depth, self.hide_emitters, next_event=NoConnections(),
-            query=query,
-        )  # fmt: skip
         if not scene.emitters() or self.max_depth < 2:
-            return OneStage(walk)
-        try:
-            emission = LightEmission(scene)
-        except NotImplementedError as error:
-            raise NotImplementedError(f'"{self.name}": {error}') from None
+            return OneStage(self.walk(next_event=NoConnections(), query=self.query(scene)))
         check_shared_rays(self.name, scene, self.light_paths)
-        outside = outer_medium(query, scene, sensor) if may_have_media(scene) else None
-        light_walk = LightWalk(
-            emission, self.max_depth, self.rr_depth, query=query, outside=outside
+        mapper = photon_mapper(
+            self, scene, sensor, self.merging, self.radius_in_media, self.light_paths
         )
-        before = round(self.samples_before * self.light_paths)
-        radius, ball = self.merging.radius_of(scene, sensor, light_walk, False, before), None
-        if outside is not None:
-            ball = self.merging.ball_of(scene, sensor, light_walk, before, self.radius_in_media)
         camera = CameraSamples()
         share_rays(camera, scene, seed)
-        return OneStage(PhotonMapper(walk, light_walk, radius, ball, self.light_paths), camera)
+        return OneStage(mapper, camera)

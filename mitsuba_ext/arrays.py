@@ -58,6 +58,10 @@ def add_own(target: T, value: Any, index: mi.UInt32, active: mi.Bool | bool = Tr
 def joined(parts: Sequence[T]) -> T:
     """Concatenates arrays, vectors of arrays, or dataclasses of these or of ``None``, all of one
     type, and evaluates the result. (``dr.concat`` compiles kernels for each size.)"""
+    if len(parts) == 1 and dr.depth_v(parts[0]) == 1:
+        # Opaque: with several parts, the result is no literal either
+        dr.make_opaque(parts[0])
+        return parts[0]
     widths = [dr.width(part) for part in parts]
     indices, offset = [], 0
     for width in widths:

@@ -53,7 +53,10 @@ def test_light_paths_that_merge_take_the_place_of_guides_where_they_pay() -> Non
     assert f"{light_paths['time']:.1f} x the time" in text
 
 
-def test_guides_that_paid_are_learned_again_beside_light_paths() -> None:
+def test_guides_that_paid_are_learned_again_beside_light_paths(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(light_path_schedule, "_KERNELS", 0.0)
     integrator = auto()
     scene = load("corridor", width=96, height=54)
     text = learned(scene, 64, integrator)
@@ -73,6 +76,7 @@ def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(light_paths.LightPathTrial, "__init__", remembered)
     monkeypatch.setattr(light_paths, "_MOST", 1.0)
+    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
     for samples in (1 << 10, 1 << 14):
         monkeypatch.setattr(light_paths, "_SPARSE", samples)
         auto().render(scene, spp=32, seed=1)
@@ -123,16 +127,19 @@ def test_light_paths_take_the_place_of_maps_and_keep_the_mean(case: str) -> None
     assert_same_quarters(images, expected, 0.03)
 
 
-def test_in_short_renders_it_is_auto_path() -> None:
+def test_short_renders_learn_nothing() -> None:
     scene = load("cornell_box", width=32, height=18)
     images = [
         batches(scene, mi.load_dict({"type": name, "max_depth": 4}), 32, [3])[0]
-        for name in ("auto", "auto_path")
+        for name in ("auto", "composed_path")
     ]
     assert_same_image(*images)
 
 
-def test_where_light_paths_cannot_be_tried_it_is_auto_path() -> None:
+def test_where_light_paths_cannot_be_tried_it_is_auto_path(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
     scene = mi.load_dict(fog("area"))
     images = []
     for name in ("auto", "auto_path"):

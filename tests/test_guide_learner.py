@@ -69,7 +69,7 @@ def _pilot(
 
 def _learner(kind: type[GuideLearner] = GuideLearner, **changes) -> GuideLearner:
     parameters = {"bounces": 2, "max_memory": 1 << 30, "pilot_samples": 3 * LANES,
-                  "film_width": 32, **changes}
+                  "film_size": (32, 1), **changes}
     learner = kind(lambda p, n: TileRegions(32, 1, 16), False, **parameters)
     learner.start(None, mi.Point3f(), mi.Normal3f())
     return learner

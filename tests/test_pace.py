@@ -3,6 +3,7 @@ share their kernels."""
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import drjit as dr
@@ -12,6 +13,7 @@ import pytest
 from stage import area, stage
 
 from mitsuba_ext.arrays import add_own, channel_mean
+from mitsuba_ext.composition import light_path_schedule
 from mitsuba_ext.rendering import pace, time_budget
 from mitsuba_ext.rendering import render as rendering
 from mitsuba_ext.rendering.stages import EndingSchedule
@@ -19,9 +21,9 @@ from mitsuba_ext.rendering.stages import EndingSchedule
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def _scene() -> mi.Scene:
+def _scene(**objects: Any) -> mi.Scene:
     lamp = {"type": "sphere", "center": [1, -1, 1.5], "radius": 0.2, "emitter": area(3.0)}
-    return mi.load_dict(stage(second=lamp))
+    return mi.load_dict(stage(second=lamp, **objects))
 
 
 def _integrator(name: str, **parameters: Any) -> mi.Integrator:
@@ -52,9 +54,9 @@ def test_the_pilots_are_those_of_a_render_of_the_samples_that_fit(monkeypatch):
     integrator = _integrator("auto_path", timeout=10.0)
     pilots = integrator.pilots
 
-    def remembered(scene, pixel_count, spp):
+    def remembered(scene, pixel_count, spp, *kernels):
         asked.append(spp)
-        return pilots(scene, pixel_count, spp)
+        return pilots(scene, pixel_count, spp, *kernels)
 
     integrator.pilots = remembered
     integrator.render(_scene(), spp=5000)
@@ -123,8 +125,38 @@ def test_without_a_timeout_the_plan_is_that_of_all_samples(monkeypatch):
 # ---- Kernels ----
 
 
+def _large_kernels(scene: mi.Scene, integrator: mi.Integrator, spp: int) -> Counter[str]:
+    """How often a render launches each of its large kernels."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        integrator.render(scene, spp=spp, seed=1)
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+    return Counter(k["hash"] for k in kernels if k["operation_count"] > 1000)
+
+
+def test_all_pilots_share_a_kernel():
+    integrator = _integrator("pss_guided", always_guide=True, max_depth=6)
+    # Those of the scout, of three pilots, and of the last stage
+    assert sorted(_large_kernels(_scene(), integrator, 64).values()) == [1, 1, 3]
+
+
+def test_the_light_walk_has_one_kernel():
+    glass = {"type": "sphere", "radius": 0.3, "bsdf": {"type": "dielectric"}}
+    kernels = _large_kernels(_scene(glass=glass), _integrator("vcm", max_depth=8), 4)
+    # Two rounds in the pass, and two for the radius
+    assert max(kernels.values()) == 4
+
+
+def test_learning_begins_only_where_there_is_time_to_compile():
+    integrator, scene = _integrator("auto"), _scene()
+    assert integrator.pilots(scene, 1 << 16, 64, 20) and integrator._has_trial
+    assert integrator.pilots(scene, 1 << 16, 64, 8) and not integrator._has_trial
+    assert not integrator.pilots(scene, 1 << 16, 64, 4)
+
+
 @pytest.mark.parametrize("name", ["auto_path", "auto", "pss_guided", "neepp"])
-def test_passes_of_other_lengths_compile_no_kernels(name):
+def test_passes_of_other_lengths_compile_no_kernels(name, monkeypatch):
+    monkeypatch.setattr(light_path_schedule, "LEAST_SAMPLES", 0)
     scene, compiled = _scene(), []
     for spp in (32, 64, 48, 80):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

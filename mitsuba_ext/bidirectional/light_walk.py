@@ -80,7 +80,8 @@ class LightWalk:
         max_depth: Longest path from light to sensor, in segments: vertices up to the depth
             ``max_depth`` − 1 are stored, since one segment more leads to the sensor.
         rr_depth: Depth at which Russian roulette begins.
-        sums: Computes partial sums of MIS weights; ``None`` if they are not needed.
+        sums: Computes partial sums of MIS weights; ``None`` if they are not needed. In scenes with
+            media, a :class:`HiddenLight`.
         roulette: The Russian roulette. It is given the throughput without the light's power, since
             dim lights are already chosen rarely.
         query: Intersects rays with the scene.
@@ -142,6 +143,8 @@ class LightWalk:
                 si = self.query.interaction(pi, emitted.ray)
                 sums = self.sums.first(scene, emitted, si, active)
             width = dr.width(emitted.ray)
+            # As wide as in later rounds, and in all renders: kernels would differ
+            ray.maxt, ray.time = (x + dr.zeros(mi.Float, width) for x in (ray.maxt, ray.time))
             paths = LightPaths(
                 ray, pi, emitted.weight, dr.full(mi.Spectrum, 1, width),
                 dr.full(mi.Float, 1, width), sums, dr.full(mi.UInt32, 1, width),
@@ -244,6 +247,8 @@ class LightWalk:
                 heroes, paths, bsdf, si, bs, weight, sums, active_next
             )
             bs, weight = media.scatter(vertex, sample_1, sample_2, bs, weight)
+            if dr.hint(media.exist and self.sums is not None, mode="scalar"):
+                sums = self.sums.scatter(sums, vertex, bs)
             β = β * weight
             sampling_weight = paths.sampling_weight * hero_count
 
@@ -329,7 +334,7 @@ class LightWalk:
         )
         value *= dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
         weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
-        if self.sums is not None:
+        if self.sums is not None and self.outside is None:
             sums = self.sums.leave(
                 sums, geometric_cosine(si, bs.wo), bs.pdf, reverse_pdf,
                 is_delta | ~self._stores(bsdf),

@@ -39,6 +39,7 @@ from .merging import (
     pushed,
     scene_diagonal,
 )
+from .technique_observer import TechniqueObserver
 from .vertex_grid import VertexGrid
 
 #: The number of points at which a ray gathers light on its way through a homogeneous medium. (In
@@ -63,6 +64,7 @@ class MergedInMedia(MergedSubpaths):
         vertices, grid, heroes, max_depth, paths, shares_rays: See :class:`MergedSubpaths`.
         others: The light at surfaces.
         has_grids: May there be media that are not homogeneous?
+        observer: See :class:`MergedSubpaths`.
     """
 
     def __init__(
@@ -75,8 +77,11 @@ class MergedInMedia(MergedSubpaths):
         shares_rays: bool,
         others: Subpaths,
         has_grids: bool,
+        observer: TechniqueObserver | None = None,
     ) -> None:
-        super().__init__(vertices, grid, None, heroes, max_depth, paths, shares_rays, others)
+        super().__init__(
+            vertices, grid, None, heroes, max_depth, paths, shares_rays, others, observer
+        )
         self._has_grids = has_grids
 
     def gather(self, scene, sampler, vertex, active):
@@ -98,16 +103,20 @@ class MergedInMedia(MergedSubpaths):
         scattered = _absorbed(dr.select(searches, chosen * si.t, 0))
         sample, number = sampler.next_1d(searches), mi.UInt32(0)
         t = _distance(number, sample, scattered, chosen)
+        σ_s = mi.Spectrum(σ_s)
+        weight = σ_s * dr.select(chosen > 0, scattered / chosen, 0)
+        weight *= path.β * (self._per_vertex / _POINTS)
         gathered, state = mi.Spectrum(0), self._grid.begin()
         group = group_of(ray.time, ray.wavelengths) if self._shares_rays else mi.UInt32(0)
         near = [mi.UInt32(0) for _ in range(BATCH)]
-        far = [mi.Float(0) for _ in range(BATCH)]
+        far, looked = [mi.Float(0) for _ in range(BATCH)], mi.UInt32(0)
         while dr.hint(searches, label="merge along a ray"):
             count, fills = mi.UInt32(0), mi.Bool(searches)
             while dr.hint(fills, label="search"):
                 state, index, found, goes_on = self._grid.next(state, ray(t), fills, group)
                 near, far = pushed(near, index, found), pushed(far, t, found)
                 count += dr.select(found, 1, 0)
+                looked += 1
                 # Go on to the next point
                 ends = fills & ~goes_on
                 number += dr.select(ends, 1, 0)
@@ -117,13 +126,18 @@ class MergedInMedia(MergedSubpaths):
                 fills &= searches & (count < BATCH)
             exists = count > 0
             while dr.hint(exists, label="evaluate"):
-                value = self._flux(mei, path, self._vertices.at(near[0], exists), exists)
-                gathered += value * attenuation(σ - chosen, far[0])
+                other = self._vertices.at(near[0], exists)
+                value = self._flux(mei, path, other, exists) * attenuation(σ - chosen, far[0])
+                gathered += value
+                if dr.hint(self._observer is not None, mode="scalar"):
+                    carried = path.β * σ_s * other.β
+                    self._observer.photon(value * weight, carried, other.sums, exists)
                 near, far = near[1:] + near[:1], far[1:] + far[:1]
                 count -= 1
                 exists = count > 0
-        weight = mi.Spectrum(σ_s) * dr.select(chosen > 0, scattered / chosen, 0)
-        return path.β * gathered * weight * (self._per_vertex / _POINTS)
+        if dr.hint(self._observer is not None, mode="scalar"):
+            self._observer.searched(looked)
+        return gathered * weight
 
     def _measure(self, radius):
         return 4 / 3 * dr.pi * radius * radius * radius
@@ -132,7 +146,15 @@ class MergedInMedia(MergedSubpaths):
         return vertex.medium.scatters
 
     def _merged(self, vertex: Vertex, other: LightVertex, active: mi.Bool) -> mi.Spectrum:
-        return self._flux(vertex.medium.mei, vertex.path, other, active)
+        value = self._flux(vertex.medium.mei, vertex.path, other, active)
+        if self._observer is not None:
+            σ_s, _, _ = vertex.medium.mei.medium.get_scattering_coefficients(
+                vertex.medium.mei, active
+            )
+            brought = value * vertex.path.β * self._per_vertex
+            carried = vertex.path.β * mi.Spectrum(σ_s) * other.β
+            self._observer.photon(brought, carried, other.sums, active)
+        return value
 
     def _flux(
         self, mei: mi.MediumInteraction3f, path: PathState, other: LightVertex, active: mi.Bool

@@ -264,5 +264,9 @@ class MergedSubpaths(Subpaths):
         active &= dr.all(dr.isfinite(value))
         if self._observer is not None:
             brought = value * vertex.path.β * self._per_vertex
-            self._observer.merged(brought, mis, rivals, active)
+            if self._sums is None:
+                carried = value * vertex.path.β * (arrives / pdf)
+                self._observer.photon(brought, carried, other.sums, active & (pdf > 0))
+            else:
+                self._observer.merged(brought, mis, rivals, active)
         return dr.select(active, value, 0)

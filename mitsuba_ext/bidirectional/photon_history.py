@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.path_decisions import SubpathSelection
+from ..transport.vertex import Vertex
 from .both_ends import from_both_ends
 from .partial_sums import Sums
 
@@ -52,3 +53,26 @@ class VertexRegions(PhotonHistory):
 
     def arrive(self, sums, si, squared_distance, is_first, by_light) -> Sums:
         return replace(sums, region=self.selection.region(from_both_ends(si), si.is_valid()))
+
+
+class HiddenLight(PhotonHistory):
+    """Tells the photons that only a camera path which hits the light can find too, in scenes with
+    media: those that left the light by way of mirrors or clear glass, so that no connection leads
+    there. Their ``dVCM`` is 0, that of others is 1. ``dVC`` is radiance / power of the emitted ray:
+    the radiance that such a camera path finds, in units of what the photon carries; 0 of lights
+    that it cannot hit.
+    """
+
+    def first(self, scene, emitted, si, active) -> Sums:
+        density = emitted.probability * emitted.pdf_position * emitted.pdf_direction
+        density *= dr.select(emitted.cosine > 0, dr.rcp(emitted.cosine), 0)
+        is_delta = emitted.is_delta_position | emitted.is_delta_direction
+        one = dr.full(mi.Float, 1, dr.width(emitted.ray))
+        return Sums(one, dr.select(is_delta, 0, density))
+
+    def scatter(self, sums: Sums, vertex: Vertex, bs: mi.BSDFSample3f) -> Sums:
+        """Behind a vertex, which may lie in a medium."""
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & ~vertex.medium.scatters
+        passes = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        is_hidden = (vertex.depth == 1) & is_delta & ~passes
+        return replace(sums, dVCM=dr.select(is_hidden, 0, sums.dVCM))

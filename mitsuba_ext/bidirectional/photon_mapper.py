@@ -20,12 +20,30 @@ from ..transport.numbers import Numbers
 from ..transport.path_decisions import Roulette, Weights
 from ..transport.walk import Walk
 from .light_numbers import LightPathRays
-from .light_vertices import LightVertices, PackedVertices, VertexCache
-from .light_walk import LightWalk
+from .light_vertices import (
+    Layout,
+    LightVertices,
+    PackedVertices,
+    VertexCache,
+    bytes_per_vertex,
+)
+from .light_walk import STRIDE, LightWalk
 from .medium_photons import MergedInMedia, PassesThrough
 from .merging import MergedSubpaths
 from .merging_radius import MergingRadius
+from .technique_observer import TechniqueObserver
 from .vertex_grid import VertexGrid
+
+#: Bytes for what a pass stores; and bytes, about, that a path takes besides the vertices that are
+#: stored at a time.
+_PASS_BYTES, _PATH_BYTES = 1 << 29, 512
+
+
+def most_lanes(light_paths: float) -> int:
+    """The most camera paths in a pass, with so many light paths for each."""
+    layout = Layout(len(mi.Spectrum()), 0, True)
+    bytes_per_path = STRIDE * bytes_per_vertex(layout) + _PATH_BYTES
+    return int(_PASS_BYTES / max(1.0, light_paths)) // bytes_per_path
 
 
 class OnlySpecular(Roulette):
@@ -54,6 +72,7 @@ class PhotonMapper:
         ball: Within what radius vertices in media are merged; ``None`` without media.
         light_paths: Number of light paths for each camera path; 1 in spectral variants and with
             moving shapes.
+        observer: Is told of the passes, and of the vertices that are looked at.
     """
 
     walk: Walk
@@ -61,11 +80,27 @@ class PhotonMapper:
     radius: MergingRadius
     ball: MergingRadius | None = None
     light_paths: float = 1.0
+    observer: TechniqueObserver | None = None
+
+    @property
+    def most_lanes(self) -> int:
+        """The most camera paths in a pass."""
+        return most_lanes(self.light_paths)
+
+    def of_coarse_film(self, pixel_width: float) -> PhotonMapper:
+        """That of a film with fewer pixels, each as wide as ``pixel_width`` of them."""
+        return replace(
+            self,
+            radius=self.radius.of_coarse_film(pixel_width),
+            ball=self.ball and self.ball.of_coarse_film(pixel_width),
+        )
 
     def __call__(
         self, scene: mi.Scene, sampler: Numbers, rays: CameraRays, active: mi.Bool
     ) -> Sample:
         dr.schedule(rays)
+        if self.observer is not None:
+            self.observer.camera(rays)
         lanes = dr.width(rays.ray)
         light = LightPathRays.of(sampler, rays, self.light_paths)
         rounds: list[LightVertices] = []
@@ -81,7 +116,10 @@ class PhotonMapper:
             walk = replace(walk, subpaths=self._merged(scene, vertices, light.count))
         sample = walk(scene, sampler, rays, active)
         scatter_count = light.by_camera_path(scatter_count, lanes)
-        return replace(sample, scatter_count=sample.scatter_count + scatter_count)
+        whole = replace(sample, scatter_count=sample.scatter_count + scatter_count)
+        if self.observer is not None:
+            self.observer.traced(sample, whole)
+        return whole
 
     def _merged(self, scene: mi.Scene, vertices: VertexCache, count: int) -> MergedSubpaths:
         """Adds the light of photons, from ``count`` light paths, to camera paths."""
@@ -93,11 +131,14 @@ class PhotonMapper:
         kept = None if self.ball is None else vertices.is_on_surface
         grid = VertexGrid(vertices, radius, kept, group)
         heroes, max_depth = Heroes(scene), self.walk.max_depth
-        merged = MergedSubpaths(vertices, grid, None, heroes, max_depth, paths, groups)
+        merged = MergedSubpaths(
+            vertices, grid, None, heroes, max_depth, paths, groups, None, self.observer
+        )
         if self.ball is None:
             return merged
         radius = dr.opaque(mi.Float, self.ball.next(paths, count // paths))
         grid = VertexGrid(vertices, radius, vertices.is_in_medium, group)
         return MergedInMedia(
-            vertices, grid, heroes, max_depth, paths, groups, merged, may_have_grids(scene)
+            vertices, grid, heroes, max_depth, paths, groups, merged, may_have_grids(scene),
+            self.observer,
         )  # fmt: skip

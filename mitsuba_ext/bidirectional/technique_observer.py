@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..transport.estimator import CameraRays, Sample
 from ..transport.observer import Observer, Observers
 from .candidates import Available
-from .partial_sums import Rivals
+from .partial_sums import Rivals, Sums
 
 
 class TechniqueObserver(Observer):
@@ -59,6 +59,14 @@ class TechniqueObserver(Observer):
         """The camera path in each lane was merged with a light path. This adds ``value`` to its
         radiance, the MIS weight ``mis`` included."""
 
+    def photon(
+        self, value: mi.Spectrum, carried: mi.Spectrum, sums: Sums, active: mi.Bool
+    ) -> None:
+        """The camera path in each lane was merged with a vertex of a light path, whose partial sums
+        are ``sums``; merging is the only technique. This adds ``value`` to its radiance.
+        ``carried`` is the flux of the light path, times the throughput of the camera path if it
+        goes on along the light path."""
+
     def searched(self, count: mi.UInt32) -> None:
         """At a vertex of the camera path in each lane, so many vertices were looked at."""
 
@@ -94,6 +102,10 @@ class TechniqueObservers(Observers):
     def merged(self, *arguments: Any) -> None:
         for observer in self._techniques:
             observer.merged(*arguments)
+
+    def photon(self, *arguments: Any) -> None:
+        for observer in self._techniques:
+            observer.photon(*arguments)
 
     def searched(self, *arguments: Any) -> None:
         for observer in self._techniques:

@@ -6,9 +6,11 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from ..bidirectional.candidates import Candidate
@@ -19,6 +21,7 @@ from ..bidirectional.partial_sums import PartialSums
 from ..bidirectional.path_tracer import BidirectionalPathTracer
 from ..bidirectional.technique_images import TechniqueImages
 from ..rendering.camera import film_extent
+from ..scene.movers import movers
 from ..transport.estimator import Estimator
 from ..transport.path_decisions import EmitterSampling, NoConnections, SubpathSelection
 from .light_paths import LightPathChoice, check_shared_rays
@@ -50,7 +53,7 @@ class LightPathIntegrator(WalkIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.techniques: TechniqueImages | None = None
-        self._radius: MergingRadius | None = None
+        self._radius: Callable[..., MergingRadius | None] | None = None
 
     @property
     def needs_equal_samples(self) -> str:
@@ -76,16 +79,25 @@ class LightPathIntegrator(WalkIntegrator):
         film = sensor.film()
         if self.technique_images:
             self.techniques = TechniqueImages(film, *film_extent(film), self.max_depth)
-        self._radius = self.merging_radius(scene, sensor, side)
+        self._radius = Once(functools.partial(self.merging_radius, scene, sensor, side))
         return functools.partial(self._estimator, side, self._radius)
 
     def merging_radius(
-        self, scene: mi.Scene, sensor: mi.Sensor, side: LightSide
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        side: LightSide,
+        next_event: EmitterSampling | None = None,
+        splits: bool = False,
     ) -> MergingRadius | None:
-        """Within what radius vertices of a render are merged; ``None`` if they are not."""
+        """Within what radius vertices of a render are merged; ``None`` if they are not. With the
+        ``next_event`` and ``splits`` of its sums, its light paths have the same kernel."""
         if self.merging is None:
             return None
-        sums = PartialSums(EmitterSampling(), merging=mi.Float(1))
+        sums = PartialSums(
+            next_event or EmitterSampling(), dr.opaque(mi.Float, 1), splits=splits,
+            merging=dr.opaque(mi.Float, 1), light_paths=dr.opaque(mi.Float, 1),
+        )  # fmt: skip
         light_walk = LightWalk(
             side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)
         )
@@ -96,12 +108,12 @@ class LightPathIntegrator(WalkIntegrator):
     def schedule(self, scene, sensor, samples, seed):
         self._radius = None
         schedule = super().schedule(scene, sensor, samples, seed)
-        if self._radius is not None:
+        if self._radius is not None and (mi.is_spectral or movers(scene)) and self._radius():
             share_rays(schedule.camera, scene, seed)
         return schedule
 
     def _estimator(
-        self, side: LightSide, radius: MergingRadius | None, **decisions: Any
+        self, side: LightSide, radius_of: Callable[..., MergingRadius | None], **decisions: Any
     ) -> Estimator:
         always = LightPathChoice(self.techniques_by_default, self.techniques)
         choice: LightPathChoice = decisions.pop("light_paths", always)
@@ -120,11 +132,15 @@ class LightPathIntegrator(WalkIntegrator):
         walk = self.walk(**decisions)
         if not are_traced:
             return walk
+        radius = None
+        if techniques.merges:
+            compares = choice.observer is not None and choice.observer.compares
+            radius = radius_of(walk.next_event, compares)
         if radius is not None and choice.pixel_width > 1:
             radius = radius.of_coarse_film(choice.pixel_width)
         return BidirectionalPathTracer(
             walk, side.emission, side.sensor, self.connections if techniques.connects else 0,
-            selection, choice.observer, radius=radius if techniques.merges else None,
+            selection, choice.observer, radius=radius,
             merges_all=self.merges_all, light_paths=techniques.light_paths,
             most_lanes=_most_lanes(techniques.light_paths),
         )  # fmt: skip
@@ -188,6 +204,19 @@ class BidirectionalIntegrator(LightPathIntegrator):
             "light_paths": "always",
             **super().parameters(),
         }
+
+
+class Once:
+    """A function that is called once, when its result is first needed."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function: Callable[..., Any] | None = function
+        self._result: Any = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._function is not None:
+            self._result, self._function = self._function(*arguments), None
+        return self._result
 
 
 def _most_lanes(light_paths: float) -> int:

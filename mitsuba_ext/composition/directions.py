@@ -64,6 +64,6 @@ class Guided(DecisionParameters):
             min(self.bounces, setting.max_depth - 1),
             int(self.max_memory * 2**20),
             samples,
-            width,
+            (width, height),
             self.always_guide,
         )

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 
 from ..learning.directions.guide_learner import GuideLearner
 from ..rendering.camera_samples import CameraSamples
 from ..rendering.stages import Stage
-from .learned_slots import CAMERA_NUMBERS
-from .light_paths import LightPathTrial
+from .learned_slots import CAMERA_NUMBERS, OF_CAMERA_PATHS
 from .schedule import Schedule
 
-#: Where light paths pay, what was learned for these slots is left out: it is for camera paths that
-#: find all light alone. (Guides are learned again.)
-_OF_CAMERA_PATHS = ("directions", "roulette", *CAMERA_NUMBERS)
+if TYPE_CHECKING:
+    from .light_paths import LightPathTrial
+    from .photon_trial import PhotonTrial
+
+#: Renders of fewer samples learn nothing: ``path`` takes less time for so many than the fixed cost
+#: of learning, and a tenth of the time to compile the kernels of learning.
+LEAST_SAMPLES = 1 << 18
 
 #: After so many pilots, or all if there are fewer, comes the trial: they are enough to tell what
 #: else is worth its time.
@@ -27,8 +31,10 @@ _PILOTS = 2
 _FAR_LESS = 0.4
 
 
-#: The least gain for which light paths are worth the time to compile their kernels.
-_MARGIN = 1.1
+#: The least gain for which light paths are worth the time to compile their kernels: they take as
+#: long as two million samples of ``path``, which is divided by the number of renders that share
+#: them, about four.
+_MARGIN, _KERNELS = 1.1, 5e5
 
 #: The efficiency of guides that are learned from all pilots, relative to that which short ones
 #: predict (door_ajar: 1.8 and 1.4).
@@ -46,6 +52,7 @@ class LightPathSchedule:
         scene: The scene.
         pilots: Number of the other pilots.
         trial: Chooses.
+        samples: Number of all samples of the render.
     """
 
     def __init__(
@@ -53,9 +60,11 @@ class LightPathSchedule:
         inner: Schedule,
         scene: mi.Scene,
         pilots: int,
-        trial: LightPathTrial,
+        trial: LightPathTrial | PhotonTrial,
+        samples: int,
     ) -> None:
         self._inner, self._scene, self._trial = inner, scene, trial
+        self._margin = _MARGIN + _KERNELS / samples
         self._place = min(_PILOTS, pilots)
         inner.beside["light_paths"] = trial
         self._next: Stage | None = None
@@ -78,7 +87,7 @@ class LightPathSchedule:
         choice = self._trial.start(self._scene, mi.Point3f(), mi.Normal3f())
         decisions = {
             slot: decision for slot, decision in self._inner.decisions.items()
-            if slot not in _OF_CAMERA_PATHS
+            if slot not in OF_CAMERA_PATHS
         }  # fmt: skip
         estimator = self._inner.estimator(light_paths=choice, **decisions)
         return Stage(
@@ -96,7 +105,7 @@ class LightPathSchedule:
         stage, self._next = self._next, None
         guide = self._inner.learners.get("directions")
         is_guided = isinstance(guide, GuideLearner) and guide.guide and guide.guidance
-        self._trial.rival = _MARGIN
+        self._trial.rival = self._margin
         if is_guided:
             self._trial.rival *= guide.guidance.efficiency * _GROWS
         for slot in CAMERA_NUMBERS:
@@ -107,10 +116,10 @@ class LightPathSchedule:
         if choice is None or choice.techniques.light_paths == 0:
             # Only the summary may be new
             return self._inner.stage_again() if stage.learned else stage
-        self._take_up_again = self._inner.leave_out(_OF_CAMERA_PATHS)
+        self._take_up_again = self._inner.leave_out(self._trial.leaves_out)
         # Going back needs no margin
-        self._trial.rival /= _MARGIN
-        if is_guided and not choice.techniques.merges and not self._inner.is_at_end:
+        self._trial.rival /= self._margin
+        if is_guided and self._trial.can_be_guided and not self._inner.is_at_end:
             # MIS weights are those of unguided paths, which light paths may have as well
             self._inner.learners["directions"] = guide.beside_light_paths(self._trial.chosen_cost)
             self._inner.decisions["directions"] = guide.guide

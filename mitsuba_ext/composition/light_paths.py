@@ -22,6 +22,7 @@ from ..learning.pixel_estimates import relative_scale
 from ..rendering.camera import film_extent, first_pixel
 from ..scene.movers import movers
 from .decision_parameters import DecisionParameters, Setting, Slots
+from .learned_slots import OF_CAMERA_PATHS
 from .light_path_promise import LightPathPromise
 
 #: The time of what a sample does, in units of that of a ray of ``path``: camera paths carry partial
@@ -136,8 +137,11 @@ class LightPathTrial(Learner):
         estimate: Estimate of the image and its variance, once the choice has been made.
         candidates: What was compared, once the choice has been made.
         variances, costs: Variance and time of each candidate, relative to ``path``.
+        leaves_out: If light paths pay, these slots decide as ``path``.
         promise: Tests what was chosen; ``None`` where there is nothing to test it against.
     """
+
+    leaves_out = OF_CAMERA_PATHS
 
     def __init__(self, film: mi.Film, spp: int, is_sparse: bool = False) -> None:
         extent = film_extent(film)
@@ -167,6 +171,11 @@ class LightPathTrial(Learner):
     def chosen_cost(self) -> float:
         """The time of a sample of what was chosen, relative to ``path``."""
         return float(self.costs[self._best])
+
+    @property
+    def can_be_guided(self) -> bool:
+        """Are camera paths guided beside what was chosen? (Beside merging, it was not tried.)"""
+        return not self._choice.techniques.merges
 
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:

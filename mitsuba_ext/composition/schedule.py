@@ -170,7 +170,7 @@ class Schedule:
     @property
     def is_at_end(self) -> bool:
         """Has :meth:`next_stage` returned the last stage?"""
-        return self._finished_stages == self._pilot_count
+        return self._finished_stages >= self._pilot_count
 
     def stage_again(self) -> Stage:
         """The stage that :meth:`next_stage` has returned, with the decisions of now."""
@@ -186,8 +186,9 @@ class Schedule:
         )
 
     def leave_out(self, slots: Sequence[str]) -> Callable[[], None]:
-        """Decides as ``path`` in these slots from now on, and learns nothing more for them. Returns
-        a function that takes up again what was decided."""
+        """Decides as ``path`` in these slots from now on, and learns nothing more for them. If
+        nothing else learns, this stage and all after it are as the last one. Returns a function
+        that takes up again what was decided."""
         decisions, learners, camera = (
             {slot: x[slot] for slot in slots if slot in x}
             for x in (self.decisions, self.learners, vars(self.camera))
@@ -199,6 +200,8 @@ class Schedule:
             self.learners.pop(slot, None)
             if hasattr(self.camera, slot):
                 setattr(self.camera, slot, None)
+        if not self.learners:
+            self._pilot_count = self._finished_stages
 
         def take_up_again() -> None:
             self.decisions.update(decisions)

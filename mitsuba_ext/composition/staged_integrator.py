@@ -6,6 +6,7 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
+import math
 import operator
 import time
 from collections.abc import Callable
@@ -83,8 +84,11 @@ class StagedIntegrator(mi.SamplingIntegrator):
 
     # ---- What a subclass overrides ----
 
-    def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
-        """The samples per pixel of each pilot stage, out of ``spp``; empty if nothing learns."""
+    def pilots(
+        self, scene: mi.Scene, pixel_count: int, spp: int, kernels: float = math.inf
+    ) -> list[int]:
+        """The samples per pixel of each pilot stage, out of ``spp``; empty if nothing learns. See
+        :class:`mitsuba_ext.rendering.plan.Planned`."""
         return []
 
     def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:

@@ -6,6 +6,7 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,10 @@ from .schedule import Schedule, pilot_samples
 from .slots import BIDIRECTIONAL_SLOTS, SLOTS
 from .staged_integrator import NO_LIMIT, StagedIntegrator
 from .swarm import Swarm, stage_weights
+
+#: A render that learns compiles about so many kernels as large as that of ``path``: those of its
+#: pilots, and that of the last stage, are larger, and there are many small ones.
+LEARNING_KERNELS = 6
 
 
 class WalkIntegrator(StagedIntegrator):
@@ -148,11 +153,13 @@ class WalkIntegrator(StagedIntegrator):
         """Do ``save_learned`` and ``load_learned`` have an effect?"""
         return bool(self._pilot_spp)
 
-    def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
+    def pilots(
+        self, scene: mi.Scene, pixel_count: int, spp: int, kernels: float = math.inf
+    ) -> list[int]:
         self.learners = {}
         if self.save_learned:
             self.check_target("save_learned", self.save_learned)
-        if self.max_depth < 2 or self.load_learned:
+        if self.max_depth < 2 or self.load_learned or kernels < LEARNING_KERNELS:
             return []
         return pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
 

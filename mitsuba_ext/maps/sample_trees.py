@@ -68,7 +68,8 @@ class SampleTrees:
         self._values = dr.zeros(mi.UInt32, 0 if value is None else slots)
         placed = [(dr.arange(mi.UInt32, len(root)), root)]
         for index, node in enumerate(grandchildren):
-            slot = dr.gather(mi.UInt32, block, inner) + index
+            # Opaque: they share a kernel
+            slot = dr.gather(mi.UInt32, block, inner) + dr.opaque(mi.UInt32, index)
             placed.append((slot, dr.gather(mi.UInt32, node, inner)))
         for slot, node in placed:
             packed = mi.Point2u(
@@ -100,6 +101,15 @@ class SampleTrees:
         trees.share = from_numpy(mi.Float, state["share"])
         dr.eval(trees._nodes, trees._values, trees.share)
         return trees
+
+    @classmethod
+    def uniform(cls, count: int) -> SampleTrees:
+        """So many trees without splits."""
+        return cls.of_state({
+            "nodes": np.zeros(2 * count, np.uint32),
+            "values": np.zeros(0, np.uint32),
+            "share": np.zeros(count, np.float32),
+        })  # fmt: skip
 
     @property
     def bytes(self) -> int:

@@ -18,10 +18,6 @@ from .time_budget import LEARNING_SHARE
 if TYPE_CHECKING:
     from .render import Job
 
-#: A render that learns compiles about so many kernels as large as that of ``path``: those of its
-#: pilots, and that of the last stage, are larger. (Those of earlier renders are loaded quickly.)
-_KERNELS = 8
-
 #: Seconds that learning takes besides its samples and kernels, about, in any scene: trees and
 #: tables are made on one core of the CPU. (0.3 to 0.6 s in cornell_box, flint and colour_wheel.)
 _FIXED = 0.4
@@ -50,7 +46,7 @@ def plan_for_timeout(job: Job) -> RenderPlan:
     taken, left = job.statistics.spp, max(0.0, budget.end - time.perf_counter())
     fits = taken + int(left * budget.short / max(seconds, 1e-6))
     fits = min(plan.spp, max(taken + 1, fits))
-    learns = _FIXED + _KERNELS * compiling <= LEARNING_SHARE * left
-    pilots = integrator.pilots(job.scene, plan.pixel_count, fits - taken if learns else 0)
+    kernels = (LEARNING_SHARE * left - _FIXED) / max(compiling, 1e-6)
+    pilots = integrator.pilots(job.scene, plan.pixel_count, fits - taken, kernels)
     budget.pilot_factor = 1.0
     return replace(plan, stages=(*pilots, fits - taken - sum(pilots)))

@@ -3,6 +3,7 @@ passes."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -50,8 +51,14 @@ class Planned(Protocol):
     def most_lanes(self) -> int:
         """Largest number of samples that are taken at a time, limited by memory."""
 
-    def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
-        """The samples per pixel of each pilot stage, out of ``spp``."""
+    def pilots(
+        self, scene: mi.Scene, pixel_count: int, spp: int, kernels: float = math.inf
+    ) -> list[int]:
+        """The samples per pixel of each pilot stage, out of ``spp``.
+
+        Parameters:
+            kernels: How many kernels as large as that of ``path`` learning may compile.
+        """
 
     def samples_per_set(self, spp: int) -> int:
         """The number of samples of a pixel that a timeout must not separate."""

@@ -53,7 +53,14 @@ class AdjointRoulette(Roulette):
 
     def __init__(self, regions: Regions, radiance: mi.Float, scale: mi.Float) -> None:
         self._regions, self._radiance, self._scale = regions, radiance, scale
-        dr.eval(self._radiance, self._scale)
+        dr.make_opaque(self._radiance, self._scale)
+
+    @classmethod
+    def by_throughput(cls, regions: Regions, count: int, pixels: int) -> AdjointRoulette:
+        """A roulette that knows nothing yet, of ``count`` regions and so many pixels: it ends paths
+        of low throughput. With it, the pilot that learns the first radiances has the kernel of
+        those after it."""
+        return cls(regions, dr.full(mi.Float, _CERTAIN, count), dr.full(mi.Float, 1, pixels))
 
     def state(self) -> dict[str, np.ndarray]:
         """The tables as arrays."""

@@ -20,6 +20,7 @@ from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
 from .path_records import BYTES_PER_RECORD, PathRecords
 from .roulette_trial import BYTES_PER_PATH, RouletteTrial
+from .surface_regions import SurfaceRegions
 
 #: The share of the samples that trees decide in the second pilot, and the shares from which one is
 #: chosen once their effects have been measured.
@@ -67,7 +68,7 @@ class GuideLearner(Learner):
         bounces: How many directions of a path are guided, at most.
         max_memory: Bytes for records, and for the trees built from them.
         pilot_samples: Samples of all pilots together.
-        film_width: Pixels of a row of the film, with its border where that is sampled.
+        film_size: Width and height of the film in pixels, with its border where that is sampled.
         always: Guide all ``bounces``, and learn the roulette, also where the pilots show that it
             does not pay?
 
@@ -87,7 +88,7 @@ class GuideLearner(Learner):
         bounces: int,
         max_memory: int,
         pilot_samples: int,
-        film_width: int,
+        film_size: tuple[int, int],
         always: bool = False,
     ) -> None:
         self.make_regions, self.wants_scout = regions, wants_scout
@@ -97,19 +98,32 @@ class GuideLearner(Learner):
         self.guidance: Guidance | None = None
         self.roulette, self.trial = Roulette(), None
         self._rr_depth: int | None = None
-        self._film_width, self._pixels = film_width, PixelEstimates(film_width)
+        self._film_size, self._pixels = film_size, PixelEstimates(film_size[0])
+        self._pixel_count = film_size[0] * film_size[1]
         #: The time of a sample, in units of that of ``path`` without guides
         self._time = 1.0
         self.sample_count = 0
         self._records: PathRecords | None = None
         self._share, self._summary = _FIRST_SHARE, ""
+        self._batches: list[np.ndarray] = []
 
-    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> None:
+    def start(
+        self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f
+    ) -> GuidedDirections | None:
         self._summary = "no guide: no path scatters"
         if self.wants_scout and dr.width(p) == 0:
-            return
+            return None
         self._regions = self.make_regions(p, n)
         self._begin_records()
+        if not isinstance(self._regions, SurfaceRegions):
+            return None
+        # As ``path``, but with the kernel of the pilots that follow
+        count = self._regions.count + 1
+        if self._rr_depth is not None:
+            self.roulette = AdjointRoulette.by_throughput(
+                self._regions, count, self._pixel_count
+            )
+        return GuidedDirections(SampleTrees.uniform(count), self._regions, self.bounces)
 
     def _begin_records(self) -> None:
         bytes_per_path = self.bounces * BYTES_PER_RECORD
@@ -130,7 +144,7 @@ class GuideLearner(Learner):
         samples only. ``time`` is that of a sample, in units of that of ``path``."""
         other = GuideLearner(
             self.make_regions, self.wants_scout, self.bounces, self.max_memory,
-            self.pilot_samples, self._film_width, self.always,
+            self.pilot_samples, self._film_size, self.always,
         )  # fmt: skip
         other.guide, other._share, other._regions = self.guide, self._share, self._regions
         other._summary, other._time = self._summary, time
@@ -175,7 +189,8 @@ class GuideLearner(Learner):
             self.trial.finish()
         if records.count == 0:
             self._records, self._summary = None, "no guide: no path scatters"
-            return None
+            self.roulette = Roulette()
+            return DirectionSamples()
         bounces, share, effect = self.bounces, _FIRST_SHARE, "not measured"
         self.sample_count = records.count
         if self.guide is not None and records.count > records.first_new:
@@ -270,28 +285,26 @@ class GuideLearner(Learner):
 
         place = bounce * BATCHES + dr.gather(mi.UInt32, records.batch, new)
 
-        def by_bounce(x: mi.Float) -> np.ndarray:
+        def by_bounce(x: mi.Float) -> mi.Float64:
             sums = dr.zeros(mi.Float64, records.bounces * BATCHES)
             dr.scatter_add(sums, mi.Float64(x), place)
-            sums = sums.numpy().reshape(-1, BATCHES)
-            self._batches.append(sums)
-            return sums.sum(axis=1)
+            return sums
 
-        self._batches: list[np.ndarray] = []
         # The sums of squares with uniform samples, with those drawn, and with other shares
-        uniform, actual = by_bounce(square * drawn), by_bounce(square)
+        others = (square * drawn / dr.fma(share, density, 1 - share) for share in _SHARES)
+        found = [by_bounce(x) for x in (square * drawn, square, *others)]
+        # Evaluated together: each of them alone would be a kernel of its own
+        dr.eval(found)
+        self._batches = [x.numpy().reshape(-1, BATCHES) for x in found]
+        uniform, actual, *others = (x.sum(axis=1) for x in self._batches)
         variance = max(records.variance + (uniform - actual).sum(), 1e-30)
-        gains = {
-            share: (uniform - by_bounce(square * drawn / dr.fma(share, density, 1 - share)))
-            / variance
-            for share in _SHARES
-        }
+        gains = {share: (uniform - x) / variance for share, x in zip(_SHARES, others)}
         # Where squares of large numbers overflow, no gain is shown
         return {share: np.nan_to_num(gain, nan=0.0) for share, gain in gains.items()}
 
     def _error(self, records: PathRecords) -> float:
         """The standard error of the logarithm of the variance that remains with the guidance."""
-        if len(self._batches) != 2 + len(_SHARES):
+        if not self._batches:
             return 0.0
         uniform, actual, *others = self._batches
         other = others[_SHARES.index(self.guidance.share)][: self.guidance.bounces].sum(axis=0)

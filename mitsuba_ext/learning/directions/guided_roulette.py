@@ -25,8 +25,8 @@ class RouletteLearner(Learner):
         self._guide = guide
         guide.learn_roulette(rr_depth)
 
-    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> None:
-        return None
+    def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> Roulette:
+        return self._guide.roulette
 
     def learn(self, scene: mi.Scene, is_last: bool) -> Roulette:
         return self._guide.roulette

@@ -114,12 +114,13 @@ class RouletteTrial(Observer):
             return
         total = dr.select(dr.isfinite(self._total), self._total, 0)
         weight, error = self._pixels.importance(self._pixel, total)
-        sums = [dr.sum(mi.Float64(error))]
+        columns = [mi.Float64(error)]
         for roulette, is_guided in ((False, True), (True, True), (True, False)):
             more, segments = self._other(total, roulette, is_guided)
-            sums += [dr.sum(mi.Float64(more * weight)), dr.sum(mi.Float64(segments))]
-        dr.eval(sums)
-        error, *sums = (float(x[0]) for x in sums)
+            columns += [mi.Float64(more * weight), mi.Float64(segments)]
+        # Evaluated together: each of them alone would be a kernel of its own
+        dr.eval(columns)
+        error, *sums = (float(dr.sum(x)[0]) for x in columns)
         effects = [Effect(error + more, segments) for more, segments in zip(sums[::2], sums[1::2])]
         self.drawn, self.by_throughput, self.unguided = (
             Effect(*(x + y for x, y in zip(old, new)))

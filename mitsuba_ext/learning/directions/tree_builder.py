@@ -236,8 +236,8 @@ class TreeBuilder:
         key = self._sorted[0]
         if first is None:
             first, last = mi.UInt32(0), dr.opaque(mi.UInt32, len(key))
-        # Rounded to a power of two, so that fewer kernels are compiled
-        longest = 1 << len(key).bit_length()
+        # Few numbers of steps, so that fewer kernels are compiled
+        longest = 1 << 8 * -(-len(key).bit_length() // 8)
         return first_above(key, first, last, code, mi.Bool(True), longest, reaches=True)
 
     def _sums(self, begin: mi.UInt32, end: mi.UInt32) -> list[mi.Float]:
@@ -269,7 +269,7 @@ class TreeBuilder:
                 dr.scatter(square, new, level.splits)
             dr.eval(probability, child, square)
             below = square
-            is_even = dr.full(mi.Bool, depth % 2 == 0, level.count)
+            is_even = dr.opaque(mi.Bool, depth % 2 == 0, level.count)
             columns.append((probability, child, is_even, square))
         old = self.probability, self.child, self.is_even, self._square
         self.probability, self.child, self.is_even, self._square = (
@@ -284,6 +284,8 @@ class _Level:
     def __init__(self, begin, end, code, twin, evidence) -> None:
         self.begin, self.end, self.code, self.twin = begin, end, code, twin
         self.evidence = evidence
+        # Opaque: levels without twins share the kernels of the others
+        dr.make_opaque(twin)
         dr.eval(begin, end, code, twin, evidence)
         self.count = len(begin)
         self.first_child, self.splits, self.probability = 0, mi.UInt32(), mi.Float()

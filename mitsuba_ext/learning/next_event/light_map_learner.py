@@ -263,9 +263,10 @@ class LightMapLearner(Learner):
             self._summary = f"lights as path: with {self.map}, {self._effect}"
             return False
         self._is_tested = True
+        # Later pilots go on recording: without that, they would have other kernels
         records.restart()
         if not is_trial:
-            self._records = None
+            self._finer_map = None
         return True
 
     def _probabilities(self, weights: mi.Float) -> mi.Float:
