@@ -41,7 +41,7 @@ def learned(scene: mi.Scene | dict, spp: int, integrator: mi.Integrator | None =
     return integrator.statistics.learned
 
 
-def test_light_paths_take_the_place_of_guides_where_they_pay() -> None:
+def test_light_paths_that_merge_take_the_place_of_guides_where_they_pay() -> None:
     integrator = auto()
     text = learned(load("caustic", width=96, height=54), 64, integrator)
     assert "light paths pay: " in text and "guide: " not in text
@@ -51,6 +51,18 @@ def test_light_paths_take_the_place_of_guides_where_they_pay() -> None:
     assert light_paths["is_kept"] and light_paths["light_paths"] > 0
     assert f"({light_paths['variance']:.2f} of the variance" in text
     assert f"{light_paths['time']:.1f} x the time" in text
+
+
+def test_guides_that_paid_are_learned_again_beside_light_paths(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(light_path_schedule, "_KERNELS", 0.0)
+    integrator = auto()
+    scene = load("corridor", width=96, height=54)
+    text = learned(scene, 64, integrator)
+    assert "guide: " in text and "light paths pay: " in text
+    assert integrator.statistics.effects["directions"]["is_kept"]
+    assert "roulette" not in integrator.learners
 
 
 def test_a_coarse_film_predicts_as_the_whole_film(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -139,6 +139,23 @@ def test_a_guide_that_does_not_pay_is_given_up_unless_told_otherwise(always: boo
     assert learner.guidance.gain == 0 and str(learner).startswith("no guide: ") == (not always)
 
 
+def test_beside_light_paths_it_learns_from_new_samples_only() -> None:
+    learner = _learner(always=True)
+    for seed in (1, 2):
+        _pilot(learner, seed)
+        learner.learn(None, is_last=False)
+    guide, guidance, count = learner.guide, learner.guidance, learner.sample_count
+    # Where a sample takes longer, guides cost less in comparison
+    later, slow = learner.beside_light_paths(1.0), learner.beside_light_paths(100.0)
+    for other in (later, slow):
+        assert other.guide is guide
+        _pilot(other, 3)
+        assert other.learn(None, is_last=True) is other.guide is not guide
+        assert other.sample_count == count / 2
+    assert slow.guidance.efficiency > later.guidance.efficiency
+    assert (learner.guide, learner.guidance, learner.sample_count) == (guide, guidance, count)
+
+
 def test_gains_that_are_not_numbers_are_none() -> None:
     """Squares of a path's radiance can overflow."""
     learner = _learner()

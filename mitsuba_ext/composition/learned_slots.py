@@ -11,8 +11,8 @@ from .swarm import MAPS
 #: The random numbers of a camera ray that can have learned maps.
 CAMERA_NUMBERS = ("time", "aperture", "wavelength", "distance")
 
-#: Where light paths pay, these slots decide as ``path``: what they learn is for camera paths that
-#: find all light alone.
+#: Where light paths pay, what was learned for these slots is left out: it is for camera paths that
+#: find all light alone. (Guides are learned again.)
 OF_CAMERA_PATHS = ("directions", "roulette", *CAMERA_NUMBERS)
 
 

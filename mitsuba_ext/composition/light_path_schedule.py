@@ -43,7 +43,8 @@ _GROWS = 1.25
 
 class LightPathSchedule:
     """Adds a stage to a schedule in which light paths are tried, with the lights that were learned
-    until then. If they pay, more than guided directions do, the stages after it use them. Before
+    until then. If they pay, more than guided directions do, the stages after it use them; and where
+    guides paid before, they are learned again from these stages, unless vertices are merged. Before
     the last stage, it goes back on that if the pilots after the trial show less than was promised.
 
     Parameters:
@@ -103,8 +104,9 @@ class LightPathSchedule:
     def _stage_after_trial(self) -> Stage:
         stage, self._next = self._next, None
         guide = self._inner.learners.get("directions")
+        is_guided = isinstance(guide, GuideLearner) and guide.guide and guide.guidance
         self._trial.rival = self._margin
-        if isinstance(guide, GuideLearner) and guide.guide and guide.guidance:
+        if is_guided:
             self._trial.rival *= guide.guidance.efficiency * _GROWS
         for slot in CAMERA_NUMBERS:
             learner = self._inner.learners.get(slot)
@@ -115,6 +117,14 @@ class LightPathSchedule:
             # Only the summary may be new
             return self._inner.stage_again() if stage.learned else stage
         self._take_up_again = self._inner.leave_out(self._trial.leaves_out)
+        # Going back needs no margin
+        self._trial.rival /= self._margin
+        if is_guided and self._trial.can_be_guided and not self._inner.is_at_end:
+            # MIS weights are those of unguided paths, which light paths may have as well
+            self._inner.learners["directions"] = guide.beside_light_paths(self._trial.chosen_cost)
+            self._inner.decisions["directions"] = guide.guide
+            # These guides become better too
+            self._trial.rival /= _GROWS
         self._inner.decisions["light_paths"] = choice
         stage = self._measured_stage(self._inner.stage_again())
         return replace(stage, forgets=self._trial.chosen_variance < _FAR_LESS)

@@ -169,6 +169,16 @@ class LightPathTrial(Learner):
         light."""
         return float(self.predicted.long_run[self._best])
 
+    @property
+    def chosen_cost(self) -> float:
+        """The time of a sample of what was chosen, relative to ``path``."""
+        return float(self.costs[self._best])
+
+    @property
+    def can_be_guided(self) -> bool:
+        """Are camera paths guided beside what was chosen? (Beside merging, it was not tried.)"""
+        return not self._choice.techniques.merges
+
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:
         """Is a sparse trial worth its time, for a render of so many samples?"""

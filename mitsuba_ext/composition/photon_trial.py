@@ -85,12 +85,14 @@ class PhotonTrial(Learner):
         rival: The efficiency of camera paths with what else was learned for them, relative to those
             of the trial.
         leaves_out: If photons pay, these slots decide as ``path``.
+        can_be_guided: Are camera paths guided beside photons?
         variance, time: Those of photons, relative to ``path``, once the choice has been made.
         promise: ``None``: the short passes of pilots do not tell the variance of photons later,
             when more samples share them.
     """
 
     leaves_out, promise = (*OF_CAMERA_PATHS, "next_event"), None
+    can_be_guided = False
 
     def __init__(self, film: mi.Film, spp: int) -> None:
         width, height = film_extent(film)

@@ -193,6 +193,8 @@ class Schedule:
             {slot: x[slot] for slot in slots if slot in x}
             for x in (self.decisions, self.learners, vars(self.camera))
         )
+        for learner in learners.values():
+            learner.finish()
         for slot in slots:
             self.decisions.pop(slot, None)
             self.learners.pop(slot, None)
@@ -205,6 +207,8 @@ class Schedule:
             self.decisions.update(decisions)
             self.learners.update(learners)
             vars(self.camera).update(camera)
+            if self._learned is not None:
+                self._states.update({slot: x.state() for slot, x in learners.items()})
 
         return take_up_again
 

@@ -98,8 +98,10 @@ class GuideLearner(Learner):
         self.guidance: Guidance | None = None
         self.roulette, self.trial = Roulette(), None
         self._rr_depth: int | None = None
-        self._pixels = PixelEstimates(film_size[0])
+        self._film_size, self._pixels = film_size, PixelEstimates(film_size[0])
         self._pixel_count = film_size[0] * film_size[1]
+        #: The time of a sample, in units of that of ``path`` without guides
+        self._time = 1.0
         self.sample_count = 0
         self._records: PathRecords | None = None
         self._share, self._summary = _FIRST_SHARE, ""
@@ -112,13 +114,7 @@ class GuideLearner(Learner):
         if self.wants_scout and dr.width(p) == 0:
             return None
         self._regions = self.make_regions(p, n)
-        bytes_per_path = self.bounces * BYTES_PER_RECORD
-        if self._rr_depth is not None:
-            bytes_per_path += BYTES_PER_PATH
-        stride = -(-self.pilot_samples * bytes_per_path // self.max_memory)
-        if self._rr_depth is not None:
-            self.trial = RouletteTrial(stride, self._rr_depth, self._pixels)
-        self._records = PathRecords(self._regions.label, self.bounces, stride, self._pixels)
+        self._begin_records()
         if not isinstance(self._regions, SurfaceRegions):
             return None
         # As ``path``, but with the kernel of the pilots that follow
@@ -129,9 +125,31 @@ class GuideLearner(Learner):
             )
         return GuidedDirections(SampleTrees.uniform(count), self._regions, self.bounces)
 
+    def _begin_records(self) -> None:
+        bytes_per_path = self.bounces * BYTES_PER_RECORD
+        if self._rr_depth is not None:
+            bytes_per_path += BYTES_PER_PATH
+        stride = -(-self.pilot_samples * bytes_per_path // self.max_memory)
+        if self._rr_depth is not None:
+            self.trial = RouletteTrial(stride, self._rr_depth, self._pixels)
+        self._records = PathRecords(self._regions.label, self.bounces, stride, self._pixels)
+
     def learn_roulette(self, rr_depth: int) -> None:
         """Makes this learner learn a roulette as well, which begins at the depth ``rr_depth``."""
         self._rr_depth = rr_depth
+
+    def beside_light_paths(self, time: float) -> GuideLearner:
+        """A learner of the same regions for camera paths that bring less light from now on, as
+        light paths bring the rest. Its first guide is that of this learner, but it learns from new
+        samples only. ``time`` is that of a sample, in units of that of ``path``."""
+        other = GuideLearner(
+            self.make_regions, self.wants_scout, self.bounces, self.max_memory,
+            self.pilot_samples, self._film_size, self.always,
+        )  # fmt: skip
+        other.guide, other._share, other._regions = self.guide, self._share, self._regions
+        other._summary, other._time = self._summary, time
+        other._begin_records()
+        return other
 
     # ---- Observer ----
 
@@ -182,6 +200,7 @@ class GuideLearner(Learner):
             gains = self.gains(records)
             against_path = self._against_path(gains, least)
             rays = _RAYS * (1 + (records.count - records.first_new) / max(records.paths, 1))
+            rays *= self._time
             self.guidance = most_efficient(gains, self.always, *against_path, rays)
             error = 0.0 if is_trial else self._error(records)
             share, bounces, gain, efficiency = self.guidance
