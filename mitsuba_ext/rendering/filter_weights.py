@@ -49,6 +49,15 @@ def share_of_squares(film: mi.Film) -> float:
     return float(along**2)
 
 
+def shares_of_pixels(film: mi.Film) -> np.ndarray:
+    """The share of each pixel in ∫w², for the filter around the pixel in the middle: [y, x]."""
+    edges, values = _table(film.rfilter())
+    place = np.round(0.5 * (edges[1:] + edges[:-1])).astype(int)
+    along = np.bincount(place - place.min(), values**2)
+    along /= along.sum()
+    return along[:, None] * along
+
+
 def _table(rfilter: mi.ReconstructionFilter) -> tuple[np.ndarray, np.ndarray]:
     """The ends of short intervals, and the weights in their middles."""
     radius = rfilter.radius()

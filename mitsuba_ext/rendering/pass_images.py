@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .filter_weights import mean_weights, share_of_squares
+from .filter_weights import mean_weights, share_of_squares, shares_of_pixels
 
 #: A stage whose images are wanted has so many passes or more: the first one only tells what was in
 #: the film before, and a variance needs two images.
@@ -61,10 +61,20 @@ class PassImages:
         """An estimate of the variance of one sample of each pixel, [y, x], from two images or more.
 
         A filter that is wider than a pixel averages the samples of several pixels. Their variances
-        are assumed to be about equal."""
-        spp = np.array(self._spp)[:, None, None]
-        squares = (spp * (np.array(self._images) - self.mean()) ** 2).sum(axis=0)
-        return squares / (self.count - 1) / share_of_squares(self._film)
+        are assumed to be about equal. The contrast between them is noise of the film, too, but not
+        of the samples of a pixel: it is taken from the mean."""
+        spp, mean = np.array(self._spp)[:, None, None], self.mean()
+        squares = (spp * (np.array(self._images) - mean) ** 2).sum(axis=0) / (self.count - 1)
+        return np.maximum(squares / share_of_squares(self._film) - self._contrast(mean), 0)
+
+    def _contrast(self, mean: np.ndarray) -> np.ndarray:
+        """The mean squared difference of each pixel to those around, weighted as by the squared
+        filter."""
+        shares = shares_of_pixels(self._film)
+        radius = len(shares) // 2
+        padded = np.pad(mean, radius, mode="edge")
+        around = np.lib.stride_tricks.sliding_window_view(padded, shares.shape)
+        return (shares * (around - mean[..., None, None]) ** 2).sum(axis=(2, 3))
 
 
 def _contents(block: mi.ImageBlock) -> np.ndarray:
