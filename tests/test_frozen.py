@@ -244,10 +244,22 @@ class _ReadingWalk(Walk):
         return sample
 
 
-def test_what_cannot_be_recorded_is_rendered_all_the_same() -> None:
+class _CopyingWalk(Walk):
+    """Fails as Dr.Jit does on a GPU, where it cannot record that memory is copied."""
+
+    def __call__(self, scene, sampler, rays, active):
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise RuntimeError("record(): Tried to record a memcpy_async operation")
+        sample = super().__call__(scene, sampler, rays, active)
+        sample.L *= 2
+        return sample
+
+
+@pytest.mark.parametrize("kind", [_ReadingWalk, _CopyingWalk])
+def test_what_cannot_be_recorded_is_rendered_all_the_same(kind: type[Walk]) -> None:
     scene, integrator = _scene(), mi.load_dict({"type": "composed_path", "max_depth": 3})
     expected = 2 * _traced(scene, integrator)
-    integrator.walk = lambda **decisions: _ReadingWalk(3, 5, **decisions)
+    integrator.walk = lambda **decisions: kind(3, 5, **decisions)
     for _ in range(2):
         _assert_same(_image(scene, integrator), expected)
 

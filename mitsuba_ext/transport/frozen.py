@@ -54,6 +54,9 @@ _MOST_SCENES, _MOST_RECORDINGS = 8, 256
 #: Sensors of Mitsuba 3.9.1 that hold an array of which Dr.Jit is not told.
 _UNKNOWN = frozenset({"ThinLensCamera"})
 
+#: Dr.Jit's words where it cannot record (the second ones on a GPU, where memory is copied).
+_OF_RECORDING = "frozen function", "record(): "
+
 #: Values that are their own description.
 _VALUES = (int, float, str, bytes, bool, type(None), enum.Enum, range)
 
@@ -306,7 +309,7 @@ class _Recording:
                 return self._frozen(arrays)
         except RuntimeError as error:
             cause = error.__cause__
-            if cause is None or "frozen function" in str(cause):
+            if cause is None or any(words in str(cause) for words in _OF_RECORDING):
                 raise NotRecordableError(str(cause or error)) from error
             raise cause from None
         finally:
