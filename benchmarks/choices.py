@@ -179,8 +179,8 @@ def table(folder: Path, name: str = "auto") -> None:
     efficiency, what it chose, and what it predicted; and a summary."""
     results = {file.stem: json.loads(file.read_text()) for file in folder.glob("*.json")}
     results = dict(sorted(results.items(), key=lambda item: -gain(item[1], name)))
-    print("| scene | samples | best other | its efficiency | `auto` | predicted | chosen |")
-    print("|---" * 7 + "|")
+    print("| scene | samples | `auto` chose | its efficiency | predicted | best other |")
+    print("|---" * 6 + "|")
     of_path, of_best, honest = [], [], []
     for scene, result in results.items():
         others = {n: gain(result, n) for n in result["integrators"] if n not in (name, "path")}
@@ -191,8 +191,8 @@ def table(folder: Path, name: str = "auto") -> None:
         of_whole = statistics.median(_predicted(e, "variance") for e in effects)
         chosen = " / ".join(dict.fromkeys(map(_choice, effects)))
         cells = [
-            scene, result["spp"], f"`{best}`", f"{others[best]:.3g}", f"{own:.3g} ({of_all:.3g})",
-            f"{predicted:.3g} ({of_whole:.3g})", chosen,
+            scene, result["spp"], chosen, f"{own:.3g} ({of_all:.3g})",
+            f"{predicted:.3g} ({of_whole:.3g})", f"{others[best]:.3g} (`{best}`)",
         ]  # fmt: skip
         print(f"| {' | '.join(map(str, cells))} |")
         of_path.append(own)

@@ -14,7 +14,7 @@ from mitsuba_ext.parameters import MOST_SPP, read_parameter
 from mitsuba_ext.rendering.batches import Batches, batch_seeds, each_batch, sample_count
 from mitsuba_ext.rendering.camera import develop as develop_film
 from mitsuba_ext.rendering.camera import find_sensor
-from mitsuba_ext.rendering.render import RenderStatistics
+from mitsuba_ext.rendering.statistics import RenderStatistics
 from mitsuba_ext.scene.nesting import refuse_checkpoint
 from mitsuba_ext.startup import registry
 

@@ -42,7 +42,7 @@ def _small() -> mi.Sensor:
 
 
 def test_statistics_are_escaped_and_say_what_was_not_kept() -> None:
-    from mitsuba_ext.rendering.render import RenderStatistics
+    from mitsuba_ext.rendering.statistics import RenderStatistics
 
     statistics = RenderStatistics(
         passes=1, spp=4, learned=HOSTILE, interrupted=True,

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..rendering.batches import sample_count
 from ..rendering.camera import forget_state
+from ..rendering.statistics import RenderStatistics
 from ..scene.unseen import check_all_is_seen
 
 if TYPE_CHECKING:
     import mitsuba as mi
-
-    from ..rendering.render import RenderStatistics
 
 #: Limit of ``samples_for``: with more, even a film of 16x16 pixels exceeds the 2^32 samples of a
 #: wavefront.
@@ -91,8 +90,6 @@ def timed_render(
 
 def own_statistics(integrator: mi.Integrator) -> RenderStatistics | None:
     """Statistics of the last render, if the integrator is one of ours; else ``None``."""
-    from ..rendering.render import RenderStatistics
-
     report = getattr(integrator, "statistics", None)
     return report if isinstance(report, RenderStatistics) else None
 

@@ -20,6 +20,7 @@ from ..parameters import read_parameter
 from ..rendering import camera
 from ..rendering import render as rendering
 from ..rendering.stages import Schedule, Stage
+from ..rendering.statistics import RenderStatistics
 
 #: Stands for "no limit" in counts.
 NO_LIMIT = 0xFFFFFFFF
@@ -59,7 +60,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
         sees_all: True, as it renders ``moving`` and lightweight shapes.
         progress: Called after each pass with the fraction done; it may raise or call ``cancel``.
         statistics: The statistics of the last render
-            (:class:`~mitsuba_ext.rendering.render.RenderStatistics`).
+            (:class:`~mitsuba_ext.rendering.statistics.RenderStatistics`).
     """
 
     sees_all = True
@@ -79,7 +80,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
         #: If a render is one of several batches: samples per pixel of those with smaller numbers.
         self.samples_before = 0
         self.progress: Callable[[float], None] | None = None
-        self.statistics = rendering.RenderStatistics()
+        self.statistics = RenderStatistics()
         self.is_cancelled = False
 
     # ---- What a subclass overrides ----
@@ -207,7 +208,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
         finally:
             self.timeout, self.progress, self._is_batch = timeout, progress, False
         totals = state.totals
-        self.statistics = rendering.RenderStatistics(
+        self.statistics = RenderStatistics(
             len(state.done), state.spp, time.perf_counter() - begin, totals.compile_seconds,
             totals.learning_seconds, dict(totals.rays), totals.connections,
             self.statistics.zero_radiance, totals.learned, dict(totals.effects),

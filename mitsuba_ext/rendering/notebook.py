@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup
 
 if TYPE_CHECKING:
-    from .render import RenderStatistics
+    from .statistics import RenderStatistics
 
 _ROW = Markup("<tr><th>{}</th><td>{}</td></tr>")
 

@@ -12,8 +12,7 @@ import operator
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -27,12 +26,12 @@ from . import camera
 from .dither import dithered_parts
 from .filter_weights import put_splats
 from .interrupts import deferred_interrupt
-from .notebook import statistics_table
 from .pace import plan_for_timeout
 from .pass_images import FEWEST_PASSES
 from .pass_samples import GradientsError, count_rays, look, put_samples
 from .plan import Planned, plan_render
 from .stages import DivisibleSchedule, EndingSchedule, Schedule, Stage
+from .statistics import RenderStatistics
 from .time_budget import TimeBudget
 
 
@@ -63,50 +62,6 @@ class Staged(Planned, Protocol):
 
     def no_gradients(self) -> NotImplementedError:
         """The exception to raise if gradients are requested."""
-
-
-@dataclass
-class RenderStatistics:
-    """The samples, rays, times and memory of a render.
-
-    Attributes:
-        passes: Passes whose samples are in the film.
-        spp: Samples per pixel that were taken.
-        seconds: Wall clock of the whole call, compilation and learning included.
-        compile_seconds: Of these, the time to trace passes and to compile (or load) their kernels.
-        learning_seconds: Of these, the time before the last stage began.
-        rays: Rays traced, by kind: ``camera``, ``scatter`` (found by sampling a BSDF), ``shadow``.
-        connections: Connections to lights that were considered; ``path`` traces a shadow ray for
-            each, ours only for those that would contribute and that the shadow test lets through.
-        zero_radiance: Fraction of the camera samples whose radiance is zero.
-        learned: Summary of what the integrator learned; empty if it does not learn.
-        effects: For each learned decision (``directions``, ``next_event``, ``light_paths``, …):
-            ``is_kept``, the ``variance`` and ``time`` that pilots predict in units of those
-            without it, and what else was chosen
-            (:class:`~mitsuba_ext.learning.effect.Effect`; of light paths,
-            :class:`~mitsuba_ext.composition.predicted_errors.PredictedErrors`).
-        memory: Peak of the memory that Dr.Jit held during the render, in bytes.
-        interrupted: Did Ctrl-C, :meth:`cancel` or an error end the render before all samples were
-            taken? Ctrl-C in the last pass does not.
-    """
-
-    passes: int = 0
-    spp: int = 0
-    seconds: float = 0.0
-    compile_seconds: float = 0.0
-    learning_seconds: float = 0.0
-    rays: dict[str, int] = field(
-        default_factory=lambda: {"camera": 0, "scatter": 0, "shadow": 0}
-    )
-    connections: int = 0
-    zero_radiance: float = 0.0
-    learned: str = ""
-    effects: dict[str, dict[str, Any]] = field(default_factory=dict)
-    memory: int = 0
-    interrupted: bool = False
-
-    def _repr_html_(self) -> str:
-        return statistics_table(self)
 
 
 def render(

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .camera import film_extent
+from .statistics import RenderStatistics
 
 
 @dataclass(frozen=True)
@@ -20,13 +21,13 @@ class RenderTotals:
     Attributes:
         rays: Rays traced, by kind: ``camera``, and for integrators of this package ``scatter`` and
             ``shadow``.
-        connections: See :class:`~mitsuba_ext.rendering.render.RenderStatistics`.
+        connections: See :class:`~mitsuba_ext.rendering.statistics.RenderStatistics`.
         render_seconds: The sum of the times of all renders, which may have run in parallel
             processes.
         learning_seconds, compile_seconds: Parts of ``render_seconds``.
         memory_bytes: Peak of the memory that Dr.Jit held in a render, the scene included.
         learned: Summary of what the integrator has learned.
-        effects: See :class:`~mitsuba_ext.rendering.render.RenderStatistics`.
+        effects: See :class:`~mitsuba_ext.rendering.statistics.RenderStatistics`.
     """
 
     rays: Mapping[str, int] = field(default_factory=dict)
@@ -49,9 +50,6 @@ class RenderTotals:
             spp: Samples per pixel that were taken.
             seconds: Time of the render.
         """
-        # Imported here, since the module needs an active variant
-        from .render import RenderStatistics
-
         own = getattr(integrator, "statistics", None)
         if not isinstance(own, RenderStatistics):
             rays = {"camera": math.prod(film_extent(film)) * spp}

@@ -11,7 +11,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ...rendering.camera import film_extent
-from ...rendering.render import RenderStatistics, kernel_cache_misses
+from ...rendering.render import kernel_cache_misses
+from ...rendering.statistics import RenderStatistics
 from ...rendering.time_budget import TimeBudget
 from .chains import Chains, Counts
 from .looped import LoopedChains
