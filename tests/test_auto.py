@@ -106,7 +106,11 @@ def test_the_choice_does_not_change_the_mean(light: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["moving glass and a lens", "spectral"])
-def test_light_paths_take_the_place_of_maps_and_keep_the_mean(case: str) -> None:
+def test_light_paths_take_the_place_of_maps_and_keep_the_mean(
+    case: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Although the render is short
+    monkeypatch.setattr(light_path_schedule, "_KERNELS", 0)
     ball = {"type": "sphere", "center": [-0.3, 0, 0.5], "radius": 0.4,
             "bsdf": {"type": "dielectric"}}  # fmt: skip
     camera = below_the_lamp()
