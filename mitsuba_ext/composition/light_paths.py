@@ -214,7 +214,7 @@ class LightPathTrial(Learner):
         """Has a choice not kept its promise? It is then replaced by ``path``."""
         if self.promise is None:
             return False
-        if self.promise.is_broken(float(self.costs[self._best]), self.rival):
+        if self.promise.is_broken(self.chosen_cost, self.rival):
             self._choice = LightPathChoice(Candidate(0.0))
             return True
         return False
@@ -270,7 +270,8 @@ class LightPathTrial(Learner):
             f"{kept} ({predicted.variances[index]:.2f} of the variance{measured}, "
             f"{self.costs[index]:.1f} x the time)"
         )
-        missed = predicted.missed[self._best]
+        # After going back, that of ``path``
+        missed = predicted.missed[self._best if pays else 0]
         return text if missed < _WORTH_A_WORD else f"{text}; {missed:.1%} of the light is missing"
 
 
