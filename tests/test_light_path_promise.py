@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from statistical import load
 
+from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
 from mitsuba_ext.composition.light_path_promise import LightPathPromise
+from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
 from mitsuba_ext.images.coarse_film import CoarseFilm
 from mitsuba_ext.rendering.pass_images import FEWEST_PASSES, PassImages
+from mitsuba_ext.transport.walk import Walk
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -78,7 +81,14 @@ def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
         promise.variance = 5.0
         return True
 
+    stages, next_stage = [], LightPathSchedule.next_stage
+
+    def remembered(schedule: LightPathSchedule) -> Any:
+        stages.append(next_stage(schedule))
+        return stages[-1]
+
     monkeypatch.setattr(LightPathPromise, "is_broken", is_broken)
+    monkeypatch.setattr(LightPathSchedule, "next_stage", remembered)
     integrator = mi.load_dict({"type": "auto", "max_depth": 6})
     scene = load("caustic", width=96, height=54)
     image = np.array(integrator.render(scene, spp=64, seed=1))
@@ -88,3 +98,5 @@ def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
     learned = integrator.statistics.learned
     assert "light paths do not pay" in learned and "guide" in learned
     assert counts and counts[0] >= FEWEST_PASSES - 1
+    kinds = [type(stage.estimator) for stage in stages if not stage.is_scout]
+    assert kinds[-2:] == [BidirectionalPathTracer, Walk]
