@@ -1,7 +1,7 @@
 """Does ``auto`` choose well between photons and camera paths in fog?
 
     python benchmarks/fog.py                                # all scenes
-    python benchmarks/fog.py fog window --seeds 3 --integrator sppm --integrator auto
+    python benchmarks/fog.py fog sun --seeds 3 --integrator sppm --integrator auto
 
 Renders each scene with each integrator and with so many seeds, in turns, at equal samples, and
 writes a row of Markdown for each integrator: efficiency in units of the first one (in brackets with
@@ -36,7 +36,7 @@ FILES = ("fog", "volume_caustic")
 SPP = {"fog": 160, "bulb": 146, "dark_room": 146}
 
 #: Samples per pixel of a reference, and how many batches of them there are. Photons render some.
-_REFERENCE_SPP, _BATCHES = {"bulb": 256}, 4
+_REFERENCE_SPP, _BATCHES = {"bulb": 256, "volume_caustic": 512}, 4
 _BY_PHOTONS = ("fog", "volume_caustic", "bulb")
 
 

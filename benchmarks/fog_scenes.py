@@ -78,7 +78,7 @@ def bulb(width: int, height: int) -> Scene:
     )  # fmt: skip
 
 
-def window(width: int, height: int) -> Scene:
+def sun(width: int, height: int) -> Scene:
     """Sun and sky through a window, into a room."""
     white = _diffuse(0.7, 0.7, 0.7)
     right = _t().translate([2, 0, 0]).rotate([0, 1, 0], -90)
@@ -158,4 +158,4 @@ def dark_room(width: int, height: int) -> Scene:
 
 
 #: Makes a scene with a film of the given width and height.
-FOGS = {f.__name__: f for f in (bulb, window, soft, smoke, dark_room)}
+FOGS = {f.__name__: f for f in (bulb, sun, soft, smoke, dark_room)}
