@@ -10,8 +10,8 @@ import pytest
 from statistical import load
 
 from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
-from mitsuba_ext.composition.promise import Promise
 from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
+from mitsuba_ext.composition.promise import Promise
 from mitsuba_ext.images.coarse_film import CoarseFilm
 from mitsuba_ext.rendering.pass_images import FEWEST_PASSES, PassImages
 from mitsuba_ext.transport.walk import Walk
