@@ -206,7 +206,8 @@ def choices(
 
 def gain(result: dict[str, Any], name: str, key: str = "error") -> float:
     """The efficiency of an integrator in units of that of the first one."""
-    first, other = (result["integrators"][which] for which in ("path", name))
+    made = result["integrators"]
+    first, other = next(iter(made.values())), made[name]
     clock = "cpu" if result["cpu"] else "time"
     return first[key] * first[clock] / max(other[key] * other[clock], 1e-300)
 
