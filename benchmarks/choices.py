@@ -13,7 +13,9 @@ included.
 
 With ``--references``, scenes of ours whose reference ``references.py`` has rendered have the size
 and ``max_depth`` of that reference. Their errors are squared differences to it, so that one seed is
-enough: a render of fewer samples comes before it, and compiles.
+enough: a render of fewer samples comes before it, and compiles. The error of ``path`` over all
+pixels is the expected one, where ``references.py --integrator path`` has measured its variance: the
+brightest samples of a single render would decide about it.
 
 ``--choices 10`` renders no images: it shows what ten seeds choose for renders of that time.
 
@@ -40,7 +42,7 @@ import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
 
-from mitsuba_ext.compare.references import load_reference  # isort: skip
+from mitsuba_ext.compare.references import Reference, load_reference  # isort: skip
 from mitsuba_ext.inputs.scenes import load_scene, scene_name  # isort: skip
 
 #: The first one is that to which the others are compared.
@@ -111,6 +113,15 @@ def errors_to(truth: np.ndarray, images: dict[str, list[np.ndarray]]) -> dict[st
     }
 
 
+def expected_error(truth: np.ndarray, of_path: Reference, spp: int) -> float:
+    """The relative squared error of all pixels that a render of ``path`` is expected to have: its
+    variance, and what it cannot find."""
+    variance = np.nan_to_num(of_path.variance)
+    missed = np.square(of_path.mean - truth) - variance
+    scale = truth**2 + 0.01 * truth.mean() ** 2
+    return float(((variance * of_path.spp / spp + missed) / scale).mean())
+
+
 def _samples_of_path(
     scene: mi.Scene, seconds: float, cpu: bool = True, max_depth: int = _MAX_DEPTH
 ) -> int:
@@ -135,6 +146,7 @@ def compare(
     if reference is not None:
         truth = load_reference(reference)
         size, truth = truth.size, truth.mean.astype(float)
+    of_path = stored(scene_name(file), "path") if reference is not None else None
     loaded = load_scene(file, size)
     scene = loaded.scene
     if truth is not None:
@@ -170,6 +182,9 @@ def compare(
             "error": error[: int(0.999 * len(error))].mean(), "error_of_all": error.mean(),
             "effects": effects[name],
         }  # fmt: skip
+    if of_path is not None:
+        expected = expected_error(truth, load_reference(of_path), spp)
+        result["path"]["error_of_all"] = expected
     return {"spp": spp, "seconds": seconds, "cpu": cpu, "integrators": result, "refused": refused}
 
 
@@ -191,7 +206,8 @@ def choices(
 
 def gain(result: dict[str, Any], name: str, key: str = "error") -> float:
     """The efficiency of an integrator in units of that of the first one."""
-    first, other = (result["integrators"][which] for which in ("path", name))
+    made = result["integrators"]
+    first, other = next(iter(made.values())), made[name]
     clock = "cpu" if result["cpu"] else "time"
     return first[key] * first[clock] / max(other[key] * other[clock], 1e-300)
 

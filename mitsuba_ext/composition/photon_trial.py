@@ -200,10 +200,10 @@ class PhotonTrial(Learner):
 
     @property
     def effect(self) -> Effect:
-        about = {"rival": round(self.rival, 4)} if self.variance is not None else {}
+        about = {"rival": self.rival} if self.variance is not None else {}
         about |= asdict(PHOTONS)
         if self._measured is not None:
-            about["measured_variance"] = round(self._measured, 4)
+            about["measured_variance"] = self._measured
         is_kept = self._choice.techniques == PHOTONS
         return Effect(is_kept, self.variance, self.time, about)
 
