@@ -88,8 +88,8 @@ class PhotonTrial(Learner):
         leaves_out: If photons pay, these slots decide as ``path``.
         can_be_guided: Are camera paths guided beside photons?
         variance, time: Those of photons, relative to ``path``, once the choice has been made.
-        promise: Tests the choice of camera paths; ``None`` if photons were chosen: the short passes
-            of pilots do not tell their variance later, when more samples share them.
+        promise: Tests the choice of camera paths; ``None`` if photons were chosen, since there are
+            no pilots after that.
     """
 
     leaves_out = *OF_CAMERA_PATHS, "next_event"
