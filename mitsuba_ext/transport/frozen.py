@@ -8,13 +8,13 @@ attributes, the parameters of the scene that are not arrays, the number of threa
 used again only where all of this is the same.
 
 Nothing is recorded in spectral variants, whose colour tables are not arguments of any function;
-with a ``thinlens``, which does not tell Dr.Jit of all its arrays; with a ``batch`` of sensors, which
-loads a table of them whenever it is traced; and where kernels call plugins that are written in
-Python: while these are traced, they may read arrays, or free memory of NumPy. At that, and at such
-a table, Dr.Jit ends the process. A function with an argument that cannot be described (a sampler in
-Python) is not frozen either. The log says why (level ``Debug``). If Dr.Jit cannot record a
-function, the render begins anew, nothing more is recorded in that scene, and the log says so (level
-``Info``).
+with a ``thinlens``, which does not tell Dr.Jit of all its arrays; with a ``batch`` of sensors,
+which loads a table of them whenever it is traced; and where kernels call plugins that are written
+in Python: while these are traced, they may read arrays, or free memory of NumPy. At that, and at
+such a table, Dr.Jit ends the process. A function with an argument that cannot be described (a
+sampler in Python) is not frozen either. The log says why (level ``Debug``). If Dr.Jit cannot record
+a function, the render begins anew, nothing more is recorded in that scene, and the log says so
+(level ``Info``).
 
 Rules for a frozen function:
 
