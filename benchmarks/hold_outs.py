@@ -340,14 +340,6 @@ def cove(folder: Path) -> Node:
 
 
 @scene
-def aquarium(folder: Path) -> Node:
-    water = {"type": "dielectric", "int_ior": 1.33}
-    pebble = ball(0.2, 0.8, 0.2, {"type": "conductor", "material": "Au"}, z=0.25)
-    tank = block(0, 0.8, 0.5, [0.9, 0.5, 0.48], water)
-    return hall({"tank": tank, "pebble": pebble, "lamp": panel(0, 1, 2.8, 0.5, 12)})
-
-
-@scene
 def white_hall(folder: Path) -> Node:
     return hall({"lamp": panel(0, 1, 2.99, 0.8, 2), **furniture(diffuse(0.9))}, wall=diffuse(0.9))
 
