@@ -129,7 +129,7 @@ def test_the_variance_of_fewer_techniques_is_predicted(parameters: dict[str, flo
     integrator = _auto(max_depth=4, pilot_spp=64)
     mi.render(scene, integrator=integrator, spp=256)
     learner = integrator.learners["light_paths"]
-    candidate = Candidate(parameters.get("light_paths", 1.0), "connections" not in parameters)
+    candidate = Candidate(parameters.get("light_paths", 1.0), parameters.get("connections", 1))
     predicted = learner.estimate.variances[learner.candidates.index(candidate)].mean()
     seeds = batches(scene, bdpt(4, **parameters), 16, range(24))
     measured = 16 * seeds.mean(axis=-1).var(axis=0, ddof=1).mean()

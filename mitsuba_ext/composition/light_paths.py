@@ -224,8 +224,8 @@ class LightPathTrial(Learner):
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightPathChoice:
         self._moments = None
-        count, connects, merges = state["light_paths"]
-        self._choice = LightPathChoice(Candidate(float(count), bool(connects), bool(merges)))
+        count, connections, merges = state["light_paths"]
+        self._choice = LightPathChoice(Candidate(float(count), int(connections), bool(merges)))
         return self._choice
 
     @property
@@ -293,8 +293,7 @@ def cost(techniques: Candidate, counts: Counts) -> float:
         return rays
     rays += _SUMS * counts.camera_rays
     rays += techniques.light_paths * (_LIGHT_RAY * counts.light_rays + _SPLAT * counts.splatted)
-    if techniques.connects:
-        rays += _CONNECTION * counts.connected
+    rays += techniques.connections * _CONNECTION * counts.connected
     if techniques.merges:
         rays += _GRID * techniques.light_paths * counts.light_rays + _LOOK * counts.looked
     return rays
