@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import add_own, channel_mean, from_numpy
-from ..images.box_filter import box_means
+from ..images.box_filter import box_means, squares_by_neighbours
 from ..images.coarse_film import CoarseFilm
 from ..transport.estimator import CameraRays, Sample
 from ..transport.mis import power_heuristic
@@ -320,7 +320,7 @@ class PathMoments(TechniqueObserver):
         products = everything - moments[1] / n + brought[1] ** 2
         ratios = [x / np.maximum(brought[1], 1e-30) for x in brought]
         # Products of connections of the same vertex
-        of_first = self._smooth(joined / n) ** 2
+        of_first = squares_by_neighbours((joined / n).reshape(-1, self._width)).ravel()
         pairs = [max(0, 1 - 1 / max(c.connections, 1)) for c in self.candidates]
         variances = [
             m / n + (products + share * of_first) * ratio**2 - x**2
