@@ -18,9 +18,14 @@ class CandidateMoments:
     of the light image.
 
     Let a candidate find a path of contribution f with the densities qᵢ. With the power heuristic,
-    its second moment is the integral of f² Σ cᵢ qᵢ³ / (Σ qᵢ²)², where cᵢ is 1 but for merging. Of
-    techniques of one kind, only the sum of the squared densities is known: the sum of their cubes
-    is as if one of them had all of it.
+    its second moment is the integral of f² Σ cᵢ qᵢ³ / (Σ qᵢ²)², where cᵢ is 1 but for merging. The
+    densities contain the number of samples: with twice the connections, theirs are twice as large.
+
+    Any technique that finds the path tells the terms of hits, next event estimation, the light
+    image and merging. Of merging at different vertices, only the sum of the squared densities is
+    known: the sum of their cubes is as if one of them had all of it. Several connections often find
+    the same path (corridor: up to four, whose cubes would be overestimated by half), so that only
+    the connection which found it tells its own term.
 
     Parameters:
         candidates: The candidates. That without light paths has the techniques of ``path`` alone.
@@ -112,10 +117,11 @@ def _split(
     inverse = dr.select(largest > 0, dr.rcp(largest), 0)
     shares = [square * inverse for square in squares]
     cubes = [share * dr.sqrt(share) for share in shares]
+    # Connections: that which found the path, whose own MIS weight is left out of the estimate
     cubes[3] = mi.Float(0)
     if is_joined:
-        scaled = factors.y * inverse
-        cubes[3] = scaled * dr.sqrt(scaled) * total
+        own = factors.y * inverse
+        cubes[3] = own * dr.sqrt(own) * total
     cubes[-1] *= factors.w
     whole = dr.maximum(_sum(shares), 1)
     found = _sum(cubes) / dr.square(whole) * dr.sqrt(inverse)

@@ -12,6 +12,8 @@ from .merging_radius import MergingRadius
 #: although 1.2 to 1.5 was predicted.
 _COUNTS, _MERGING_COUNTS = (1 / 16, 1 / 4, 1.0, 4.0), (1.0,)
 
+#: The numbers of connections. More than one were not measured beside merging, or beside four light
+#: paths, and are not tried there.
 _CONNECTIONS = (1, 0, 2, 4)
 
 
@@ -79,8 +81,9 @@ def candidates(available: Available) -> list[Candidate]:
                 candidate = Candidate(count, connections, merges)
                 # Light paths without any technique are of no use
                 is_useful = connections or available.has_image or merges
+                # Several vertices of one light path would depend on each other
                 is_possible = available.are_shared or (count == 1 and connections <= 1)
-                is_possible &= connections <= 1 or (not merges and count <= 1)
-                if is_useful and is_possible and candidate != everything:
+                is_tried = connections <= 1 or (not merges and count <= 1)
+                if is_useful and is_possible and is_tried and candidate != everything:
                     found.append(candidate)
     return found

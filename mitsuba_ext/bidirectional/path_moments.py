@@ -115,6 +115,13 @@ class PathMoments(TechniqueObserver):
     bring more of the light: their squared mean, and products of their contributions, grow as the
     square of that.
 
+    Several connections of a vertex are independent given the camera path. The mean of their
+    products is the square of what one is expected to bring to that vertex. Single connections do
+    not show it; it is estimated as the squared mean of a pixel's first vertices, which is too
+    little: it leaves out later vertices, and the contrast within a pixel. (Of the true value: 0.65
+    to 0.95 in veach-bidir, many_lamps, glass_lamp, kitchen, cornell_box, rooms, and 0.1 in corridor
+    and keyhole, where products are a hundredth of the squares.)
+
     Source: P. Grittmann, I. Georgiev, P. Slusallek, *Efficiency-Aware Multiple Importance Sampling
     for Bidirectional Rendering Algorithms*, ACM TOG 41(4), 2022 (second moments of one set of
     techniques from samples of another).
@@ -319,9 +326,9 @@ class PathMoments(TechniqueObserver):
         brought = [self._smooth(mean - image / n) for image in images]
         products = everything - moments[1] / n + brought[1] ** 2
         ratios = [x / np.maximum(brought[1], 1e-30) for x in brought]
-        # Products of connections of the same vertex
+        # Products of two connections of the same vertex, and their share of the square of a mean
         of_first = squares_by_neighbours((joined / n).reshape(-1, self._width)).ravel()
-        pairs = [max(0, 1 - 1 / max(c.connections, 1)) for c in self.candidates]
+        pairs = [1 - 1 / max(c.connections, 1) for c in self.candidates]
         variances = [
             m / n + (products + share * of_first) * ratio**2 - x**2
             for m, x, ratio, share in zip(moments, brought, ratios, pairs)
