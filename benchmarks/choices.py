@@ -11,6 +11,12 @@ are means over all pixels but the 0.1 % with the largest ones, and in brackets o
 median over the seeds but the first, which compiles; learning, and what other seeds compile,
 included.
 
+With ``--references``, scenes of ours whose reference ``references.py`` has rendered have the size
+and ``max_depth`` of that reference. Their errors are squared differences to it, so that one seed is
+enough: a render of fewer samples comes before it, and compiles. The error of ``path`` over all
+pixels is the expected one, where ``references.py --integrator path`` has measured its variance: the
+brightest samples of a single render would decide about it.
+
 ``--choices 10`` renders no images: it shows what ten seeds choose for renders of that time.
 
 ``--cpu`` measures the time of all cores instead of the wall clock, for machines that do other work.
@@ -28,6 +34,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from references import stored
 
 import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before mitsuba)
 
@@ -35,11 +42,16 @@ import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
 
+from mitsuba_ext.compare.references import Reference, load_reference  # isort: skip
+from mitsuba_ext.inputs.scenes import load_scene, scene_name  # isort: skip
+
 #: The first one is that to which the others are compared.
 INTEGRATORS = ("path", "auto_path", "bdpt", "vcm", "auto")
 
 #: Integrators whose mean is trusted: they find the light that camera paths miss.
 TRUSTED = ("bdpt", "vcm", "auto")
+
+_MAX_DEPTH = 6
 
 
 def _render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int):
@@ -93,29 +105,58 @@ def errors(images: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     return found
 
 
-def _load(file: Path, size: tuple[int, int]) -> mi.Scene:
-    scene = mi.load_file(str(file))
-    sensor = mi.traverse(scene.sensors()[0])
-    sensor["film.size"] = sensor["film.crop_size"] = list(size)
-    sensor.update()
-    return scene
+def errors_to(truth: np.ndarray, images: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
+    """As :func:`errors`, by the difference to a reference."""
+    scale = truth**2 + 0.01 * truth.mean() ** 2
+    return {
+        name: np.sort((np.mean(np.square(some - truth), axis=0) / scale).mean(axis=2), axis=None)
+        for name, some in images.items()
+    }
 
 
-def _samples_of_path(scene: mi.Scene, seconds: float, cpu: bool = True) -> int:
+def expected_error(truth: np.ndarray, of_path: Reference, spp: int) -> float:
+    """The relative squared error of all pixels that a render of ``path`` is expected to have: its
+    variance, and what it cannot find."""
+    variance = np.nan_to_num(of_path.variance)
+    missed = np.square(of_path.mean - truth) - variance
+    scale = truth**2 + 0.01 * truth.mean() ** 2
+    return float(((variance * of_path.spp / spp + missed) / scale).mean())
+
+
+def _samples_of_path(
+    scene: mi.Scene, seconds: float, cpu: bool = True, max_depth: int = _MAX_DEPTH
+) -> int:
     """How many samples of each pixel ``path`` takes in the given time."""
-    path = mi.load_dict({"type": "path", "max_depth": 6})
+    path = mi.load_dict({"type": "path", "max_depth": max_depth})
     for _ in range(3):
         wall, busy = _render(scene, path, 16, 1)[1]
     return max(8, round(16 * seconds / (busy / dr.thread_count() if cpu else wall)))
 
 
 def compare(
-    file: Path, seconds: float, seeds: int, size: tuple[int, int], names: tuple[str, ...], cpu: bool
+    file: Path,
+    seconds: float,
+    seeds: int,
+    size: tuple[int, int],
+    names: tuple[str, ...],
+    cpu: bool,
+    reference: Path | None = None,
 ) -> dict[str, Any]:
     """The result for one scene: times, errors, choices."""
-    scene = _load(file, size)
-    made = {name: mi.load_dict({"type": name, "max_depth": 6}) for name in names}
-    spp = _samples_of_path(scene, seconds, cpu)
+    max_depth, truth = _MAX_DEPTH, None
+    if reference is not None:
+        truth = load_reference(reference)
+        size, truth = truth.size, truth.mean.astype(float)
+    of_path = stored(scene_name(file), "path") if reference is not None else None
+    loaded = load_scene(file, size)
+    scene = loaded.scene
+    if truth is not None:
+        max_depth = loaded.settings["max_depth"]
+    made = {name: mi.load_dict({"type": name, "max_depth": max_depth}) for name in names}
+    spp = _samples_of_path(scene, seconds, cpu, max_depth)
+    if truth is not None:
+        for integrator in made.values():
+            _render(scene, integrator, max(20, spp // 8), 1)
     images, times = {name: [] for name in made}, {name: [] for name in made}
     effects: dict[str, list[dict[str, Any]]] = {name: [] for name in made}
     refused = {}
@@ -131,15 +172,20 @@ def compare(
             times[name].append(taken)
             effects[name].append(integrator.statistics.effects if name != "path" else {})
     images = {name: some for name, some in images.items() if len(some) == seeds}
-    found = errors(images)
+    found = errors(images) if truth is None else errors_to(truth, images)
+    # The first one compiles
+    first = 1 if truth is None else 0
     result = {}
     for name, error in found.items():
         result[name] = {
-            "time": statistics.median(wall for wall, _ in times[name][1:]),
-            "cpu": statistics.median(busy for _, busy in times[name][1:]),
+            "time": statistics.median(wall for wall, _ in times[name][first:]),
+            "cpu": statistics.median(busy for _, busy in times[name][first:]),
             "error": error[: int(0.999 * len(error))].mean(), "error_of_all": error.mean(),
             "effects": effects[name],
         }  # fmt: skip
+    if of_path is not None:
+        expected = expected_error(truth, load_reference(of_path), spp)
+        result["path"]["error_of_all"] = expected
     return {"spp": spp, "seconds": seconds, "cpu": cpu, "integrators": result, "refused": refused}
 
 
@@ -148,9 +194,9 @@ def choices(
 ) -> collections.Counter[str]:
     """What ``seeds`` seeds choose, in renders of as many samples as ``path`` takes in the given
     time. They end when all has been learned."""
-    scene = _load(file, size)
+    scene = load_scene(file, size).scene
     spp = _samples_of_path(scene, seconds)
-    integrator = mi.load_dict({"type": name, "max_depth": 6})
+    integrator = mi.load_dict({"type": name, "max_depth": _MAX_DEPTH})
     found = collections.Counter()
     for seed in range(seeds):
         integrator.progress = lambda _done: integrator.statistics.learned and integrator.cancel()
@@ -161,7 +207,8 @@ def choices(
 
 def gain(result: dict[str, Any], name: str, key: str = "error") -> float:
     """The efficiency of an integrator in units of that of the first one."""
-    first, other = (result["integrators"][which] for which in ("path", name))
+    made = result["integrators"]
+    first, other = next(iter(made.values())), made[name]
     clock = "cpu" if result["cpu"] else "time"
     return first[key] * first[clock] / max(other[key] * other[clock], 1e-300)
 
@@ -214,6 +261,7 @@ def table(folder: Path, name: str = "auto") -> None:
 @click.option("--size", default=(320, 180), type=(int, int), show_default=True)
 @click.option("--integrator", "names", multiple=True, default=INTEGRATORS, help="The first: path.")
 @click.option("--cpu", is_flag=True, help="Measure the time of all cores.")
+@click.option("--references", is_flag=True, help="Measure errors by stored references.")
 @click.option("--choices", "chosen", default=0, help="Show what so many seeds choose.")
 @click.option("--out", default="out/choices", type=click.Path(path_type=Path), show_default=True)
 @click.option("--table", "only_table", is_flag=True, help="Print the table of the results in OUT.")
@@ -224,6 +272,7 @@ def main(
     size: tuple[int, int],
     names: tuple[str, ...],
     cpu: bool,
+    references: bool,
     chosen: int,
     out: Path,
     only_table: bool,
@@ -235,12 +284,13 @@ def main(
     mi.set_variant("llvm_ad_rgb")
     out.mkdir(parents=True, exist_ok=True)
     for file in files:
-        scene = file.parent.name if file.stem == "scene" else file.stem
+        scene = scene_name(file)
         if chosen:
             found = choices(file, seconds, chosen, size).most_common()
             print(f"{scene}: {', '.join(f'{n} x {what}' for what, n in found)}", flush=True)
             continue
-        result = compare(file, seconds, seeds, size, names, cpu)
+        reference = stored(scene) if references else None
+        result = compare(file, seconds, seeds, size, names, cpu, reference)
         (out / f"{scene}.json").write_text(json.dumps(result))
         print(line(scene, result), flush=True)
         for name in result["integrators"]:

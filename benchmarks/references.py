@@ -3,6 +3,10 @@
 
     python benchmarks/references.py --variant cuda_ad_rgb --spp 16384   # on a GPU
     python benchmarks/references.py rooms pool                          # these, on the CPU
+    python benchmarks/references.py --integrator path                   # the errors of path
+
+The last one renders with ``path`` into ``out/references/path``, for ``choices.py``: these files
+hold the variance of ``path``, and their means lack what it cannot find.
 
 Scenes that are there are not rendered again.
 """
@@ -44,9 +48,10 @@ def integrator_of(name: str, variant: str) -> str:
     return "composed_path" if is_plain else integrator
 
 
-def stored(name: str) -> Path | None:
-    """The file of the reference of a scene, if there is one: that with the most samples."""
-    found = FOLDER.glob(f"{name}_{WIDTHS.get(name, 320)}x180_*spp.exr")
+def stored(name: str, integrator: str = "") -> Path | None:
+    """The file of the reference of a scene, if there is one: that with the most samples. Of those
+    that ``integrator`` has rendered, if it is given."""
+    found = (FOLDER / integrator).glob(f"{name}_{WIDTHS.get(name, 320)}x180_*spp.exr")
     return max(found, key=lambda path: load_reference(path).spp or 0, default=None)
 
 
@@ -54,20 +59,22 @@ def stored(name: str) -> Path | None:
 @click.argument("names", nargs=-1)
 @click.option("--variant", default="llvm_ad_rgb", show_default=True)
 @click.option("--spp", default=1024, show_default=True, help="For light paths, a quarter on a GPU.")
+@click.option("--integrator", "other", default="", help="Render with this one.")
 @click.option("--limit", default=1e9, help="Begin none after so many seconds.")
-def main(names: tuple[str, ...], variant: str, spp: int, limit: float) -> None:
+def main(names: tuple[str, ...], variant: str, spp: int, other: str, limit: float) -> None:
     """Renders the references of the scenes NAMES (all, if none is given)."""
-    FOLDER.mkdir(parents=True, exist_ok=True)
+    folder = FOLDER / other
+    folder.mkdir(parents=True, exist_ok=True)
     begin = time.perf_counter()
     for name in names or PICTURES:
-        if stored(name) is not None or time.perf_counter() - begin > limit:
+        if stored(name, other) is not None or time.perf_counter() - begin > limit:
             continue
         mi.set_variant(variant.replace("rgb", "spectral") if name in SPECTRAL else variant)
         scene = load_scene(ROOT / "scenes" / f"{name}.xml", (WIDTHS.get(name, 320), 180))
-        integrator = integrator_of(name, variant)
+        integrator = other or integrator_of(name, variant)
         samples = spp // 4 if "cuda" in variant and integrator in _LIGHT_PATHS else spp
         try:
-            reference = render_reference(scene, samples, FOLDER, integrator)
+            reference = render_reference(scene, samples, folder, integrator)
         except InputError as error:
             print(f"{name}: {error}", flush=True)
             continue

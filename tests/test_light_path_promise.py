@@ -13,6 +13,7 @@ from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
 from mitsuba_ext.composition.light_path_promise import LightPathPromise
 from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
 from mitsuba_ext.images.coarse_film import CoarseFilm
+from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
 from mitsuba_ext.rendering.pass_images import FEWEST_PASSES, PassImages
 from mitsuba_ext.transport.walk import Walk
 
@@ -73,6 +74,15 @@ def test_a_broken_promise_is_seen(efficiency: float) -> None:
     assert is_broken == (efficiency < 0.9)
 
 
+def test_lights_gain_little_where_rare_paths_make_the_variance() -> None:
+    """The pilots hold none of these paths: they show the trial's variance of ``path`` only."""
+    learner = LightMapLearner("contribution", 0, 1 << 20, 1 << 10, _SIZE)
+    learner.removed, learner._is_kept = 3.0, True
+    learner.set_variance(variance=297.0, trimmed=1.0)
+    effect = learner.effect.as_dict()
+    assert (effect["variance"], effect["trimmed_variance"]) == (0.99, 0.25)
+
+
 def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = []
 
@@ -95,6 +105,7 @@ def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.isfinite(image).all()
     effect = integrator.statistics.effects["light_paths"]
     assert not effect["is_kept"] and effect["measured_variance"] == 5.0
+    assert effect["variance"] == 5.0 and 0 < effect["predicted_variance"] < 1
     learned = integrator.statistics.learned
     assert "light paths do not pay" in learned and "guide" in learned
     assert counts and counts[0] >= FEWEST_PASSES - 1

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 
 from ..learning.directions.guide_learner import GuideLearner
+from ..learning.next_event.light_map_learner import LightMapLearner
 from ..rendering.camera_samples import CameraSamples
 from ..rendering.stages import Stage
 from .learned_slots import CAMERA_NUMBERS, OF_CAMERA_PATHS
@@ -117,6 +118,9 @@ class LightPathSchedule:
             # Only the summary may be new
             return self._inner.stage_again() if stage.learned else stage
         self._take_up_again = self._inner.leave_out(self._trial.leaves_out)
+        lights = self._inner.learners.get("next_event")
+        if isinstance(lights, LightMapLearner) and lights.removed is not None:
+            lights.set_variance(*self._trial.predicted.of_image)
         # Going back needs no margin
         self._trial.rival /= self._margin
         if is_guided and self._trial.can_be_guided and not self._inner.is_at_end:

@@ -235,18 +235,17 @@ class LightPathTrial(Learner):
         if self.estimate is None:
             return Effect(is_kept, about=asdict(techniques))
         index, predicted = self._shown, self.predicted
-        figures = {
-            "trimmed_variance": predicted.trimmed, "long_run_variance": predicted.long_run,
-            "missed": predicted.missed,
-        }  # fmt: skip
+        variance = promised = predicted.variances[index]
         about = {
-            "rival": round(self.rival, 4), **asdict(self.candidates[index]),
-            **{name: round(float(values[index]), 4) for name, values in figures.items()},
-            "missed_by_path": round(float(predicted.missed[0]), 4),
+            "rival": self.rival, **asdict(self.candidates[index]),
+            "missed": predicted.missed[index], "missed_by_path": predicted.missed[0],
+            "predicted_variance": promised,
         }  # fmt: skip
         if self._measured is not None:
-            about["measured_variance"] = round(self._measured, 4)
-        return Effect(is_kept, float(predicted.variances[index]), float(self.costs[index]), about)
+            about["measured_variance"] = variance = self._measured
+        figures = {"trimmed_variance": predicted.trimmed, "long_run_variance": predicted.long_run}
+        about |= {name: x[index] * variance / promised for name, x in figures.items()}
+        return Effect(is_kept, float(variance), float(self.costs[index]), about)
 
     @property
     def _measured(self) -> float | None:

@@ -38,6 +38,8 @@ class PredictedErrors:
         uncertainty: The standard error of the logarithm of ``variances``.
         of_path: The squared error of each pixel with ``path``, for one sample: that of the render,
             times the number of samples.
+        of_image: The mean of that over the image, relative to the squared radiance of the pixels;
+            and the same without the brightest contributions.
     """
 
     variances: np.ndarray
@@ -46,6 +48,7 @@ class PredictedErrors:
     missed: np.ndarray
     uncertainty: np.ndarray
     of_path: np.ndarray
+    of_image: tuple[float, float]
 
     @classmethod
     def of(cls, estimate: Estimate, width: int, spp: int, pixel_count: int) -> PredictedErrors:
@@ -60,6 +63,7 @@ class PredictedErrors:
         scale = relative_scale(estimate.mean.reshape(-1, width), 1).ravel()
         shares = _LEAST / pixel_count, _LEFT_OUT
         (whole, missed), (trimmed, _) = estimate.errors_of_render(scale, spp, shares)
+        of_image = tuple(float((x[0] * scale**2).mean()) for x in (whole, trimmed))
         variances, uncertainty = _relative_to_all(whole, scale)
         trimmed, _ = _relative_to_all(trimmed, scale)
         long_run, _ = _relative_to_all(estimate.variances, scale)
@@ -69,7 +73,7 @@ class PredictedErrors:
         else:
             long_run = np.where(misses, np.inf, long_run / long_run[0])
         variances, trimmed = variances / variances[0], trimmed / trimmed[0]
-        return cls(variances, trimmed, long_run, missed, uncertainty, whole[0])
+        return cls(variances, trimmed, long_run, missed, uncertainty, whole[0], of_image)
 
 
 def _relative_to_all(

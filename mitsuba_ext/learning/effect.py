@@ -25,6 +25,11 @@ class Effect:
     def as_dict(self) -> dict[str, Any]:
         """All that is known, as numbers, Booleans and texts."""
         figures = {"variance": self.variance, "time": self.time}
-        known = {key: round(float(x), 4) for key, x in figures.items() if x is not None}
-        about = {key: x.item() if hasattr(x, "item") else x for key, x in self.about.items()}
-        return {"is_kept": self.is_kept, **known, **about}
+        known = {key: x for key, x in figures.items() if x is not None} | self.about
+        return {"is_kept": self.is_kept, **{key: _plain(x) for key, x in known.items()}}
+
+
+def _plain(x: Any) -> Any:
+    """A number of NumPy's as one of Python's; those that are not whole, with four digits."""
+    x = x.item() if hasattr(x, "item") else x
+    return float(f"{x:.4g}") if isinstance(x, float) else x

@@ -151,6 +151,12 @@ class ConnectionRecords(Observer):
         return gain_of(self._batches)
 
     @property
+    def removed(self) -> float:
+        """By how much the variance of a path would be larger with Mitsuba's choice, weighted by
+        pixel."""
+        return float(self._batches[1].sum()) / max(self._paths, 1)
+
+    @property
     def cost(self) -> float:
         """The time of a path with the choice of the last pilot, relative to Mitsuba's choice."""
         return self._cost(self._rays[1])

@@ -69,6 +69,8 @@ class LightMapLearner(Learner):
 
     Attributes:
         map (LightMap): What has been learned so far; ``None`` if there is no map.
+        removed (float): The variance of a sample that the map has removed in the last pilot, in
+            units of the squared radiance of its pixel; ``None`` if it was not measured.
     """
 
     def __init__(
@@ -95,6 +97,8 @@ class LightMapLearner(Learner):
         self._records: ConnectionRecords | None = None
         self._summary, self._effect = "", "not measured"
         self._efficiency, self._measured = 1.0, (None, None)
+        self.removed: float | None = None
+        self._about: dict[str, float] = {}
         self._is_kept: bool | None = None
         self._is_tested = False
         # Makes a finer map than that of the first pilot
@@ -246,6 +250,7 @@ class LightMapLearner(Learner):
         if self._is_tested:
             # The samples were drawn from the table, and it was not learned from them
             (gain, error), cost = records.measured, records.cost
+            self.removed = records.removed
         else:
             # The prediction is too optimistic, as the table was learned from the same samples, but
             # too pessimistic where each entry has few of them. The pilot itself chose by unoccluded
@@ -255,8 +260,10 @@ class LightMapLearner(Learner):
             gain = max(predicted, records.measured[0])
             is_trial, cost = not is_last, records.least_cost
         efficiency = self._efficiency = 1 / (max(1 - gain, 1e-3) * cost)
-        self._measured = 1 - gain, cost
-        self._effect = f"about {max(0.0, gain):.0%} less variance in {cost:.2f} x the time"
+        if not self._about:
+            self._measured = 1 - gain, cost
+        left, time = self._measured
+        self._effect = f"about {max(0.0, 1 - left):.0%} less variance in {time:.2f} x the time"
         # A trial need not be certain
         least, error = (_TRIAL_EFFICIENCY, 0.0) if is_trial else (_LEAST_EFFICIENCY, error)
         if not is_worth(efficiency, error, least):
@@ -281,9 +288,18 @@ class LightMapLearner(Learner):
     def _selection(self, probabilities: mi.Float) -> LightTable:
         return LightTable(self.map.rows, self.map.cells, probabilities)
 
+    def set_variance(self, variance: float, trimmed: float) -> None:
+        """Sets the variance of a sample of ``path`` with the map, in the units of :attr:`removed`,
+        for :attr:`effect`: pilots of ``path`` hold few of the rare paths that make most of it.
+        ``trimmed`` is that without the brightest contributions."""
+        left, trimmed = (x / max(x + self.removed, 1e-30) for x in (variance, trimmed))
+        self._measured, self._about = (left, self._measured[1]), {"trimmed_variance": trimmed}
+
     @property
     def effect(self) -> Effect | None:
-        return None if self._is_kept is None else Effect(self._is_kept, *self._measured)
+        if self._is_kept is None:
+            return None
+        return Effect(self._is_kept, *self._measured, self._about)
 
     def __str__(self) -> str:
         return self._summary
