@@ -105,22 +105,26 @@ def errors(images: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     return found
 
 
-def errors_to(truth: np.ndarray, images: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
-    """As :func:`errors`, by the difference to a reference."""
-    scale = truth**2 + 0.01 * truth.mean() ** 2
-    return {
-        name: np.sort((np.mean(np.square(some - truth), axis=0) / scale).mean(axis=2), axis=None)
-        for name, some in images.items()
-    }
+def errors_to(
+    reference: Reference, images: dict[str, list[np.ndarray]]
+) -> dict[str, np.ndarray]:
+    """As :func:`errors`, by the difference to a reference, corrected for its noise."""
+    squares = {name: np.square(some - reference.mean).mean(axis=0) for name, some in images.items()}
+    return {name: np.sort(_relative(x, reference), axis=None) for name, x in squares.items()}
 
 
-def expected_error(truth: np.ndarray, of_path: Reference, spp: int) -> float:
+def _relative(squared_errors: np.ndarray, reference: Reference) -> np.ndarray:
+    noise = 0 if reference.variance is None else np.nan_to_num(reference.variance)
+    scale = reference.mean**2 + 0.01 * reference.mean.mean() ** 2
+    return ((squared_errors - noise) / scale).mean(axis=2)
+
+
+def expected_error(reference: Reference, of_path: Reference, spp: int) -> float:
     """The relative squared error of all pixels that a render of ``path`` is expected to have: its
     variance, and what it cannot find."""
     variance = np.nan_to_num(of_path.variance)
-    missed = np.square(of_path.mean - truth) - variance
-    scale = truth**2 + 0.01 * truth.mean() ** 2
-    return float(((variance * of_path.spp / spp + missed) / scale).mean())
+    missed = np.square(of_path.mean - reference.mean) - variance
+    return float(_relative(variance * of_path.spp / spp + missed, reference).mean())
 
 
 def _samples_of_path(
@@ -140,21 +144,17 @@ def compare(
     size: tuple[int, int],
     names: tuple[str, ...],
     cpu: bool,
-    reference: Path | None = None,
+    stored_file: Path | None = None,
 ) -> dict[str, Any]:
     """The result for one scene: times, errors, choices."""
-    max_depth, truth = _MAX_DEPTH, None
-    if reference is not None:
-        truth = load_reference(reference)
-        size, truth = truth.size, truth.mean.astype(float)
-    of_path = stored(scene_name(file), "path") if reference is not None else None
-    loaded = load_scene(file, size)
+    max_depth, reference = _MAX_DEPTH, load_reference(stored_file) if stored_file else None
+    loaded = load_scene(file, reference.size if reference else size)
     scene = loaded.scene
-    if truth is not None:
+    if reference is not None:
         max_depth = loaded.settings["max_depth"]
     made = {name: mi.load_dict({"type": name, "max_depth": max_depth}) for name in names}
     spp = _samples_of_path(scene, seconds, cpu, max_depth)
-    if truth is not None:
+    if reference is not None:
         for integrator in made.values():
             _render(scene, integrator, max(20, spp // 8), 1)
     images, times = {name: [] for name in made}, {name: [] for name in made}
@@ -172,9 +172,9 @@ def compare(
             times[name].append(taken)
             effects[name].append(integrator.statistics.effects if name != "path" else {})
     images = {name: some for name, some in images.items() if len(some) == seeds}
-    found = errors(images) if truth is None else errors_to(truth, images)
-    # The first one compiles
-    first = 1 if truth is None else 0
+    found = errors_to(reference, images) if reference else errors(images)
+    # Without a reference, the first one compiles
+    first = 0 if reference else 1
     result = {}
     for name, error in found.items():
         result[name] = {
@@ -183,8 +183,9 @@ def compare(
             "error": error[: int(0.999 * len(error))].mean(), "error_of_all": error.mean(),
             "effects": effects[name],
         }  # fmt: skip
-    if of_path is not None:
-        expected = expected_error(truth, load_reference(of_path), spp)
+    of_path = stored(scene_name(file), "path")
+    if reference is not None and of_path is not None and "path" in result:
+        expected = expected_error(reference, load_reference(of_path), spp)
         result["path"]["error_of_all"] = expected
     return {"spp": spp, "seconds": seconds, "cpu": cpu, "integrators": result, "refused": refused}
 
@@ -289,8 +290,8 @@ def main(
             found = choices(file, seconds, chosen, size).most_common()
             print(f"{scene}: {', '.join(f'{n} x {what}' for what, n in found)}", flush=True)
             continue
-        reference = stored(scene) if references else None
-        result = compare(file, seconds, seeds, size, names, cpu, reference)
+        stored_file = stored(scene) if references else None
+        result = compare(file, seconds, seeds, size, names, cpu, stored_file)
         (out / f"{scene}.json").write_text(json.dumps(result))
         print(line(scene, result), flush=True)
         for name in result["integrators"]:

@@ -36,7 +36,11 @@ _LIGHT_PATHS = ("bdpt", "vcm", "erpt", "sppm")
 _EXCEPTIONS = {
     "fog": "volpath", "volume_caustic": "sppm", "keyhole": "bdpt",
     "paperweight": "bdpt",  # its spot lights shine through glass: no camera path finds them
-}
+    "spotlights": "bdpt",
+    # Caustics that are seen in mirrors, or through glass or water
+    "burning_glass": "vcm", "caustic": "vcm", "mirrored_lamp": "vcm", "pool": "vcm", "ring": "vcm",
+    "water_glass": "vcm",
+}  # fmt: skip
 
 
 def integrator_of(name: str, variant: str) -> str:
