@@ -101,7 +101,9 @@ class Auto(LightPathIntegrator):
     In scenes with participating media, there is one choice besides camera paths: photons, as
     :class:`sppm` renders them. Renders of two million samples or more try them on a coarse film,
     beside camera paths. The photons also tell how rarely camera paths find the light of lamps in or
-    behind glass, to which they cannot be connected. The choice is not tested later.
+    behind glass, to which they cannot be connected. Where camera paths are kept, the later pilots
+    show what variance they really have, with all that was learned for them. If photons would be
+    better, they render the last stage. A choice of photons is not tested later.
 
     Light paths are not tried in films of more than two million pixels, and where a light cannot
     emit them: there, the integrator is :class:`auto_path`. In spectral variants and with moving

@@ -76,6 +76,24 @@ def test_a_render_with_a_thin_lens_begins_once(monkeypatch, known: bool, renders
     _assert_same(*images)
 
 
+def test_a_batch_of_sensors_is_not_recorded() -> None:
+    """It loads a table of its sensors while it is traced, at which Dr.Jit ends the process."""
+    film = {"type": "hdrfilm", "width": 64, "height": 36}
+    views = {f"view_{i}": sensor(film={**film, "width": 32}, fov=30.0 + i) for i in range(2)}
+    scene = _scene(camera={"type": "batch", "film": film, **views})
+    integrator = mi.load_dict({"type": "auto_path", "max_depth": 3, "pilot_spp": 8})
+    _assert_same(_image(scene, integrator, spp=32), _traced(scene, integrator, spp=32))
+    assert not frozen._scenes
+
+
+def test_parameters_without_a_value_are_no_error() -> None:
+    """``sigma_a`` of hair is ``None`` where the pigments are given, and Mitsuba raises."""
+    scene = _scene(hair={"type": "sphere", "radius": 0.3, "bsdf": {"type": "hair"}})
+    integrator = mi.load_dict({"type": "composed_path", "max_depth": 3})
+    for seed in (1, 2):
+        _assert_same(_image(scene, integrator, seed), _traced(scene, integrator, seed))
+
+
 def test_a_second_render_traces_nothing(monkeypatch) -> None:
     calls = []
     trace = Walk._trace

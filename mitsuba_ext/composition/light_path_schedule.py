@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -46,7 +47,8 @@ class LightPathSchedule:
     """Adds a stage to a schedule in which light paths are tried, with the lights that were learned
     until then. If they pay, more than guided directions do, the stages after it use them; and where
     guides paid before, they are learned again from these stages, unless vertices are merged. Before
-    the last stage, it goes back on that if the pilots after the trial show less than was promised.
+    the last stage, the trial reconsiders what it has chosen, as the pilots after it show the real
+    variance of that.
 
     Parameters:
         inner: Makes the other stages.
@@ -77,9 +79,9 @@ class LightPathSchedule:
         if self._next is not None:
             return self._stage_after_trial()
         stage = self._inner.next_stage()
-        if self._take_up_again is not None:
+        if self._is_over:
             return self._measured_stage(stage)
-        if self._is_over or stage.is_scout:
+        if stage.is_scout:
             return stage
         if self._place > 0:
             self._place -= 1
@@ -115,8 +117,7 @@ class LightPathSchedule:
                 self._trial.rival /= max(effect.variance, 1e-3)
         choice = self._trial.learn(self._scene, is_last=True)
         if choice is None or choice.techniques.light_paths == 0:
-            # Only the summary may be new
-            return self._inner.stage_again() if stage.learned else stage
+            return self._measured_stage(stage)
         self._take_up_again = self._inner.leave_out(self._trial.leaves_out)
         lights = self._inner.learners.get("next_event")
         if isinstance(lights, LightMapLearner) and lights.removed is not None:
@@ -134,15 +135,25 @@ class LightPathSchedule:
         return replace(stage, forgets=self._trial.chosen_variance < _FAR_LESS)
 
     def _measured_stage(self, stage: Stage) -> Stage:
-        """A stage with light paths; or, if it is the last one, and those before it show that light
-        paths do not pay, what it would have been without them."""
+        """A stage after the trial, whose variance is measured; or, if it is the last one, that with
+        what the trial chooses now."""
         promise = self._trial.promise
-        if promise is None:
-            return stage
         if not self._inner.is_at_end:
-            return replace(stage, images=promise.images)
-        if self._trial.goes_back():
+            return stage if promise is None else replace(stage, images=promise.images)
+        choice, forgets = self._trial.reconsider(self._time_of_camera_paths(), self._margin), False
+        if choice is not None and self._take_up_again is not None:
             del self._inner.decisions["light_paths"]
             self._take_up_again()
-        return self._inner.stage_again()
+        elif choice is not None:
+            self._inner.leave_out(self._trial.leaves_out)
+            self._inner.decisions["light_paths"] = choice
+            forgets = self._trial.chosen_variance < _FAR_LESS
+        return replace(self._inner.stage_again(), forgets=forgets)
 
+    def _time_of_camera_paths(self) -> float:
+        """The time of a camera path with what was learned for it, in units of that of ``path``."""
+        effects = [
+            learner.effect for slot, learner in self._inner.learners.items()
+            if slot in OF_CAMERA_PATHS
+        ]  # fmt: skip
+        return math.prod(x.time for x in effects if x is not None and x.is_kept and x.time)

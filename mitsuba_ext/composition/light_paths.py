@@ -22,8 +22,8 @@ from ..rendering.camera import film_extent, first_pixel
 from ..scene.movers import movers
 from .decision_parameters import DecisionParameters, Setting, Slots
 from .learned_slots import OF_CAMERA_PATHS
-from .light_path_promise import LightPathPromise
 from .predicted_errors import PredictedErrors
+from .promise import Promise
 
 #: The time of what a sample does, in units of that of a ray of ``path``: camera paths carry partial
 #: sums; rays of light paths; shadow rays to the sensor; a light path's vertex that is put into the
@@ -163,7 +163,7 @@ class LightPathTrial(Learner):
         self.candidates: list[Candidate] = []
         self.predicted: PredictedErrors | None = None
         self.costs = np.zeros(0)
-        self.promise: LightPathPromise | None = None
+        self.promise: Promise | None = None
 
     @property
     def chosen_variance(self) -> float:
@@ -209,17 +209,17 @@ class LightPathTrial(Learner):
         self._best_with_light_paths = 1 + int(np.argmax(gains[1:]))
         self._choice = LightPathChoice(moments.candidates[self._best])
         if self._best > 0:
-            self.promise = LightPathPromise(self._film, self._coarse, predicted.of_path)
+            self.promise = Promise(self._film, self._coarse, predicted.of_path)
         return self._choice
 
-    def goes_back(self) -> bool:
-        """Has a choice not kept its promise? It is then replaced by ``path``."""
-        if self.promise is None:
-            return False
-        if self.promise.is_broken(self.chosen_cost, self.rival):
-            self._choice = LightPathChoice(Candidate(0.0))
-            return True
-        return False
+    def reconsider(self, time: float, margin: float) -> LightPathChoice | None:
+        """What is chosen instead of light paths if these have not kept their promise: ``path``, for
+        which :attr:`rival` says what matters, and which needs no margin. See :class:`PhotonTrial`.
+        """
+        if self.promise is None or not self.promise.is_broken(self.chosen_cost, self.rival):
+            return None
+        self._choice = LightPathChoice(Candidate(0.0))
+        return self._choice
 
     def state(self) -> dict[str, np.ndarray]:
         return {"light_paths": np.array(astuple(self._choice.techniques), float)}

@@ -29,6 +29,7 @@ from ..transport.numbers import Numbers, schedule_state
 from ..transport.walk import Walk
 from .learned_slots import OF_CAMERA_PATHS
 from .light_paths import cost
+from .promise import Promise
 
 #: The least number of samples of a render that has a trial, the camera samples of each of its
 #: passes, and its passes of photons and of ``path``. (The trial takes about as long as half a
@@ -87,25 +88,26 @@ class PhotonTrial(Learner):
         leaves_out: If photons pay, these slots decide as ``path``.
         can_be_guided: Are camera paths guided beside photons?
         variance, time: Those of photons, relative to ``path``, once the choice has been made.
-        promise: ``None``: the short passes of pilots do not tell the variance of photons later,
-            when more samples share them.
+        promise: Tests the choice of camera paths; ``None`` if photons were chosen, since there are
+            no pilots after that.
     """
 
-    leaves_out, promise = (*OF_CAMERA_PATHS, "next_event"), None
+    leaves_out = *OF_CAMERA_PATHS, "next_event"
     can_be_guided = False
 
     def __init__(self, film: mi.Film, spp: int) -> None:
         width, height = film_extent(film)
         coarse = CoarseFilm.of(width, height, _SAMPLES)
-        self._width, self._spp, self._film_pixels = coarse.width, spp, coarse.pixel_count
+        self._film, self._coarse, self._spp = film, coarse, spp
         pixels = coarse.width * coarse.height
         self._photons: _Samples | None = _Samples(pixels)
         self._path: _Samples | None = _Samples(pixels)
-        self._choice, self._pixel_width = PhotonChoice(), coarse.pixel_width
+        self._choice = PhotonChoice()
         self._mapper: PhotonMapper | None = None
         self.samples, self.rival = coarse.samples, 1.0
         self.variance: float | None = None
         self.time: float | None = None
+        self.promise: Promise | None = None
 
     @staticmethod
     def is_possible(pixel_count: int, spp: int) -> bool:
@@ -114,14 +116,16 @@ class PhotonTrial(Learner):
 
     @property
     def chosen_variance(self) -> float:
-        """The variance of what was chosen, relative to ``path``."""
-        return self.variance if self._choice.techniques == PHOTONS else 1.0
+        """The variance of what was chosen, relative to that of the samples before."""
+        if self._choice.techniques != PHOTONS:
+            return 1.0
+        return self.variance if self.promise is None else 1 / self.promise.variance
 
     def estimator(self, walk: Walk, mapper: PhotonMapper) -> TrialPasses:
         """Takes the samples: ``walk`` those of camera paths, ``mapper`` those of photons, for the
         whole film."""
         self._mapper = mapper
-        coarse = mapper.of_coarse_film(self._pixel_width)
+        coarse = mapper.of_coarse_film(self._coarse.pixel_width)
         light_walk = replace(coarse.light_walk, sums=HiddenLight())
         coarse = replace(coarse, light_walk=light_walk, observer=self._photons)
         return TrialPasses(walk, coarse, self._path)
@@ -131,7 +135,7 @@ class PhotonTrial(Learner):
 
     def learn(self, scene: mi.Scene, is_last: bool) -> PhotonChoice:
         photons, path = np.array(self._photons.passes), np.concatenate(self._path.passes)
-        image = photons.mean(axis=(0, 1)).reshape(-1, self._width)
+        image = photons.mean(axis=(0, 1)).reshape(-1, self._coarse.width)
         weight = relative_scale(image).ravel() ** 2
         of_photons = self._of_photons(photons) * weight + _SQUARED_BIAS * np.sqrt(self._spp)
         found = np.var(path, axis=0, ddof=1) * weight
@@ -145,8 +149,25 @@ class PhotonTrial(Learner):
         ratio, error = _ratio(of_photons, np.maximum(found / self.rival, hidden))
         pays = is_worth(1 / (ratio * self.time), error, 1.0)
         self._choice = PhotonChoice(PHOTONS if pays else NO_PHOTONS)
+        if not pays:
+            # Pilots may hold none of the rare hits of hidden lights
+            of_photons /= weight
+            self.promise = Promise(self._film, self._coarse, of_photons, self._hidden(), weight)
         # Frees what it holds
         self._mapper, self._photons, self._path = None, None, None
+        return self._choice
+
+    def reconsider(self, time: float, margin: float) -> PhotonChoice | None:
+        """Photons, if camera paths with all that was learned for them have so much variance that
+        these are better; ``None`` if nothing changes.
+
+        Parameters:
+            time: The time of a camera path, in units of that of ``path``.
+            margin: The efficiency that photons must have, in units of that of camera paths.
+        """
+        if self.promise is None or not self.promise.is_broken(time / self.time, 1 / margin):
+            return None
+        self._choice = PhotonChoice(PHOTONS)
         return self._choice
 
     def _of_photons(self, values: np.ndarray) -> np.ndarray:
@@ -154,7 +175,7 @@ class PhotonTrial(Learner):
         samples = values.shape[1]
         own = values.var(axis=1, ddof=1).mean(axis=0)
         of_photons = values.mean(axis=1).var(axis=0, ddof=1) - own / samples
-        mapper, film = self._mapper, self._film_pixels
+        mapper, film = self._mapper, self._coarse.pixel_count
         in_pass = min(self._spp, max(1, mapper.most_lanes // film))
         shared = max(
             radius.samples_per_vertex(mapper.light_paths, in_pass)
@@ -166,7 +187,7 @@ class PhotonTrial(Learner):
         """The variance of camera paths, in each pixel, due to light that connections do not find.
         """
         moment, lost = np.mean(self._photons.hidden, axis=(0, 2))
-        lost = box_means(lost.reshape(-1, self._width)).ravel()
+        lost = box_means(lost.reshape(-1, self._coarse.width)).ravel()
         return moment + self._spp * lost**2
 
     def state(self) -> dict[str, np.ndarray]:
@@ -179,8 +200,10 @@ class PhotonTrial(Learner):
 
     @property
     def effect(self) -> Effect:
-        about = {"rival": round(self.rival, 4)} if self.variance is not None else {}
+        about = {"rival": self.rival} if self.variance is not None else {}
         about |= asdict(PHOTONS)
+        if self._measured is not None:
+            about["measured_variance"] = self._measured
         is_kept = self._choice.techniques == PHOTONS
         return Effect(is_kept, self.variance, self.time, about)
 
@@ -188,7 +211,16 @@ class PhotonTrial(Learner):
         kept = "photons pay" if self._choice.techniques == PHOTONS else "photons do not pay"
         if self.variance is None:
             return kept
-        return f"{kept} ({self.variance:.2g} of the variance, {self.time:.1f} x the time)"
+        measured = "" if self._measured is None else f", {self._measured:.2g} without them"
+        return f"{kept} ({self.variance:.2g} of the variance{measured}, {self.time:.1f} x the time)"
+
+    @property
+    def _measured(self) -> float | None:
+        """The variance of the pilots after the trial, relative to ``path``, if they had no photons.
+        """
+        if self.promise is None or self.promise.variance is None:
+            return None
+        return self.promise.variance * self.variance
 
 
 class _Samples(TechniqueObserver):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..scene.parameter_values import values_of
 from ..startup import registry
 
 if TYPE_CHECKING:
@@ -105,10 +106,9 @@ def _feed(digest: Any, value: object) -> None:
         digest.update(np.array(value).tobytes())
     elif isinstance(value, mi.Object):
         digest.update(str(value).encode())
-        traversed = mi.traverse(value)
-        for key in sorted(traversed.keys()):
+        for key, item in sorted(values_of(mi.traverse(value)), key=lambda pair: pair[0]):
             digest.update(key.encode())
-            _feed(digest, traversed[key])
+            _feed(digest, item)
     elif hasattr(value, "matrix"):  # a transformation
         digest.update(np.array(value.matrix).tobytes())
     elif isinstance(value, (str, bool, int, float)) or value is None:

@@ -19,9 +19,12 @@ class LightCells:
         scene: A scene with at least one emitter.
         voxel: The three edges of a box. Emitters that are longer are divided into cells, an
             environment into bins. With ``None``, each emitter is one cell.
+        bins: The bins of the environment, if other cells of this scene have them: making them
+            takes a tenth of a second.
 
     Attributes:
         count (int): Number of cells.
+        bins (EnvironmentBins | None): The bins of the environment; ``None`` if it is not divided.
         emitter_index (numpy.ndarray): The number of each cell's emitter; shape [count].
         share (numpy.ndarray): The share of each cell in the area of its emitter, or in the emitted
             brightness of the environment; shape [count].
@@ -29,15 +32,17 @@ class LightCells:
             Mitsuba's own sampling of such a mesh has a wrong density.
     """
 
-    def __init__(self, scene: mi.Scene, voxel: mi.Vector3f | None) -> None:
+    def __init__(
+        self, scene: mi.Scene, voxel: mi.Vector3f | None, bins: EnvironmentBins | None = None
+    ) -> None:
         environment = scene.environment() if voxel is not None else None
         emitters = scene.emitters()
         others = [
             i for i, e in enumerate(emitters) if environment is None or e.ptr != environment.ptr
         ]
         self._emitters = EmitterCells(scene, others, voxel) if others else None
-        self._bins = EnvironmentBins(scene) if environment is not None else None
-        parts = [part for part in (self._emitters, self._bins) if part is not None]
+        self.bins = None if environment is None else bins or EnvironmentBins(scene)
+        parts = [part for part in (self._emitters, self.bins) if part is not None]
         self.count = sum(part.count for part in parts)
         self.share = np.concatenate([part.share for part in parts])
         self.emitter_index = np.full(self.count, -1)
@@ -45,8 +50,8 @@ class LightCells:
         self.has_smooth_meshes = self._emitters is not None and self._emitters.has_smooth_meshes
         if self._emitters is not None:
             self.emitter_index[: self._emitters.count] = self._emitters.emitter_index
-        if self._bins is not None:
-            self._first_bin -= self._bins.count
+        if self.bins is not None:
+            self._first_bin -= self.bins.count
             index = next(i for i, e in enumerate(emitters) if e.ptr == environment.ptr)
             self.emitter_index[self._first_bin :] = index
 
@@ -59,13 +64,13 @@ class LightCells:
             The direction sample, whose ``pdf`` is conditional on the cell, and its radiance / pdf,
             before any visibility test.
         """
-        if self._bins is None:
+        if self.bins is None:
             return self._emitters.sample(cell, ref, sample, active)
         if self._emitters is None:
-            return self._bins.sample(cell, ref, sample, active)
+            return self.bins.sample(cell, ref, sample, active)
         in_bin = cell >= self._first_bin
         a, a_weight = self._emitters.sample(cell, ref, sample, active & ~in_bin)
-        b, b_weight = self._bins.sample(cell - self._first_bin, ref, sample, active & in_bin)
+        b, b_weight = self.bins.sample(cell - self._first_bin, ref, sample, active & in_bin)
         return dr.select(in_bin, b, a), dr.select(in_bin, b_weight, a_weight)
 
     def pdf(
@@ -77,10 +82,10 @@ class LightCells:
     ) -> tuple[mi.UInt32, mi.Float]:
         """The cell that a ray from ``ref`` hit at ``si``, and the density, conditional on the cell,
         with which :meth:`sample` would sample the ray's direction."""
-        if self._bins is None:
+        if self.bins is None:
             return self._emitters.pdf(ref, si, ds, active)
-        escaped = active & (ds.emitter == self._bins.pointer)
-        bin, bin_pdf = self._bins.pdf(ds.d, escaped)
+        escaped = active & (ds.emitter == self.bins.pointer)
+        bin, bin_pdf = self.bins.pdf(ds.d, escaped)
         if self._emitters is None:
             return bin, bin_pdf
         cell, pdf = self._emitters.pdf(ref, si, ds, active & ~escaped)

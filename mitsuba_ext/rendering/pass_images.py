@@ -7,8 +7,7 @@ import numpy as np
 
 from .filter_weights import mean_weights, share_of_squares, shares_of_pixels
 
-#: A stage whose images are wanted has so many passes or more: the first one only tells what was in
-#: the film before, and a variance needs two images.
+#: A stage whose images are wanted has so many passes or more. A variance needs two images.
 FEWEST_PASSES = 3
 
 
@@ -34,19 +33,25 @@ class PassImages:
         """The number of images."""
         return len(self._images)
 
-    def add(self, block: mi.ImageBlock, splats: mi.ImageBlock | None, spp: int) -> None:
-        """Called after each pass, with the sums of all samples until then, and their number for
-        each pixel. The first call only says where the sums begin."""
+    def begin(self, block: mi.ImageBlock, splats: mi.ImageBlock | None, spp: int) -> None:
+        """Called before the first pass of a stage, with the sums of all samples until then, and
+        their number for each pixel."""
         if self._is_special:
             return
         sums = _contents(block)
         splatted = np.zeros_like(sums) if splats is None else _contents(splats)
-        if self._before is not None:
-            before, splatted_before, spp_before = self._before
-            image = self._image(sums - before, splatted - splatted_before, spp - spp_before)
-            self._images.append(np.where(np.isfinite(image), image, 0))
-            self._spp.append(spp - spp_before)
         self._before = sums, splatted, spp
+
+    def add(self, block: mi.ImageBlock, splats: mi.ImageBlock | None, spp: int) -> None:
+        """Called after each pass, as :meth:`begin`."""
+        if self._is_special:
+            return
+        before, splatted_before, spp_before = self._before
+        self.begin(block, splats, spp)
+        sums, splatted, _ = self._before
+        image = self._image(sums - before, splatted - splatted_before, spp - spp_before)
+        self._images.append(np.where(np.isfinite(image), image, 0))
+        self._spp.append(spp - spp_before)
 
     def _image(self, sums: np.ndarray, splatted: np.ndarray, spp: int) -> np.ndarray:
         weight = sums[..., 4 if mi.has_flag(self._film.flags(), mi.FilmFlags.Alpha) else 3]

@@ -221,6 +221,8 @@ class Job:
                 forgets, self.forgotten = False, before
                 self.block.clear()
                 self.splats = None
+            if stage.images is not None and done == 0:
+                stage.images.begin(self.block, self.splats, before)
             compiled = self._run_pass(stage, spp)
             done += spp
             if stage.images is not None:

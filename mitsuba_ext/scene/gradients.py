@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .parameter_values import values_of
+
 #: Parameters of shapes and sensors that move what rays hit.
 _GEOMETRY = ("vertex_positions", "vertex_normals", "to_world", "x_fov", "principal_point_offset_x",
              "principal_point_offset_y")  # fmt: skip
@@ -61,13 +63,14 @@ class Optimized:
 
 
 def _is_optimized(thing: Any) -> bool:
-    return any(dr.grad_enabled(value) for _key, value in mi.traverse(thing))
+    return any(dr.grad_enabled(value) for _key, value in values_of(mi.traverse(thing)))
 
 
 def _has_optimized_colours(shape: mi.Shape) -> bool:
     """Has a mesh attributes with gradients, which its BSDF may use?"""
     # Those of its BSDF and its light have the names of these before a dot
-    return any("." not in key and dr.grad_enabled(value) for key, value in mi.traverse(shape))
+    values = values_of(mi.traverse(shape))
+    return any("." not in key and dr.grad_enabled(value) for key, value in values)
 
 
 def _index(pointer: mi.BSDFPtr | mi.EmitterPtr) -> int:

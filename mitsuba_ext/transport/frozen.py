@@ -8,12 +8,13 @@ attributes, the parameters of the scene that are not arrays, the number of threa
 used again only where all of this is the same.
 
 Nothing is recorded in spectral variants, whose colour tables are not arguments of any function;
-with a ``thinlens``, which does not tell Dr.Jit of all its arrays; and where kernels call plugins
-that are written in Python: while these are traced, they may read arrays, or free memory of NumPy,
-at which Dr.Jit ends the process. A function with an argument that cannot be described (a sampler in
-Python) is not frozen either. The log says why (level ``Debug``). If Dr.Jit cannot record a
-function, the render begins anew, nothing more is recorded in that scene, and the log says so (level
-``Info``).
+with a ``thinlens``, which does not tell Dr.Jit of all its arrays; with a ``batch`` of sensors,
+which loads a table of them whenever it is traced; and where kernels call plugins that are written
+in Python: while these are traced, they may read arrays, or free memory of NumPy. At that, and at
+such a table, Dr.Jit ends the process. A function with an argument that cannot be described (a
+sampler in Python) is not frozen either. The log says why (level ``Debug``). If Dr.Jit cannot record
+a function, the render begins anew, nothing more is recorded in that scene, and the log says so
+(level ``Info``).
 
 Rules for a frozen function:
 
@@ -45,14 +46,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..scene.parameter_values import values_of
 from ..startup import registry
 from ..startup.garbage import garbage_left_alone
 
 #: The largest number of scenes whose recordings are kept, and of recordings of each.
 _MOST_SCENES, _MOST_RECORDINGS = 8, 256
 
-#: Sensors of Mitsuba 3.9.1 that hold an array of which Dr.Jit is not told.
-_UNKNOWN = frozenset({"ThinLensCamera"})
+#: Sensors of Mitsuba 3.9.1 that cannot be recorded: they hold an array of which Dr.Jit is not told,
+#: or load one while they are traced.
+_UNKNOWN = frozenset({"ThinLensCamera", "BatchSensor"})
 
 #: Dr.Jit's words where it cannot record (the second ones on a GPU, where memory is copied).
 _OF_RECORDING = "frozen function", "record(): "
@@ -176,7 +179,7 @@ def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
         mi.Log(mi.LogLevel.Debug, "nothing is recorded: there are plugins in Python")
         return None
     is_on_gpu = dr.backend_v(mi.Float) == dr.JitBackend.CUDA
-    if is_on_gpu and any(dr.is_tensor_v(value) for _, value in parameters.items()):
+    if is_on_gpu and any(dr.is_tensor_v(value) for _, value in values_of(parameters)):
         # Dr.Jit 1.5.0 ends the process: "jit_var(r0): unknown variable"
         mi.Log(mi.LogLevel.Debug, "nothing is recorded: there are textures of a GPU")
         return None
@@ -209,7 +212,7 @@ def _values(parameters: mi.SceneParameters) -> tuple:
     """The parameters that are not arrays: kernels contain them, and users may change them."""
     return tuple(
         (key, value if isinstance(value, _VALUES) else str(value))
-        for key, value in parameters.items()
+        for key, value in values_of(parameters)
         if not _holds_arrays(value)
     )
 

@@ -206,7 +206,7 @@ class GuideLearner(Learner):
             share, bounces, gain, efficiency = self.guidance
             if is_trial:
                 bounces = self.bounces
-            effect = f"about {gain:.0%} less variance"
+            effect = f"about {max(gain, 0):.0%} less variance"
             if not (self.always or is_worth(efficiency, error, least)):
                 self.guide, self._records, self.roulette = None, None, Roulette()
                 self._summary = f"no guide: with {self._regions}, {effect}"

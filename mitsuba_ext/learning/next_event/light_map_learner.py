@@ -164,7 +164,7 @@ class LightMapLearner(Learner):
             grid = max(1, int(0.8 * grid))
         rows = SurfaceRows(bbox, grid, p, n)
         if grid != (self.grid or _GRID):
-            cells = LightCells(scene, voxel_edges(bbox, grid))
+            cells = LightCells(scene, voxel_edges(bbox, grid), cells.bins)
         if self.grid > grid:
             mi.Log(
                 mi.LogLevel.Warn,

@@ -10,8 +10,8 @@ import pytest
 from statistical import load
 
 from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
-from mitsuba_ext.composition.light_path_promise import LightPathPromise
 from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
+from mitsuba_ext.composition.promise import Promise
 from mitsuba_ext.images.coarse_film import CoarseFilm
 from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
 from mitsuba_ext.rendering.pass_images import FEWEST_PASSES, PassImages
@@ -35,6 +35,7 @@ def fill(images: PassImages, film: mi.Film, passes: int) -> None:
     rng = np.random.default_rng(1)
     y, x = np.mgrid[:_SIZE, :_SIZE].reshape(2, -1).repeat(_SPP, axis=1)
     alpha = block.channel_count() - 4
+    images.begin(block, splats, 0)
     for number in range(1, passes + 1):
         value = mi.Float(rng.random(x.size))
         position = mi.Point2f(x + rng.random(x.size), y + rng.random(x.size))
@@ -52,26 +53,49 @@ def test_passes_show_mean_and_variance(rfilter: str, pixel_format: str) -> None:
     images = PassImages(film)
     fill(images, film, 5)
     inner = np.s_[3:-3, 3:-3]
-    assert images.count == 4
+    assert images.count == 5
     assert images.mean()[inner].mean() == pytest.approx(1.5, rel=0.01)
     # The splats of a pixel are Poisson distributed: half a splat of 2 for each sample
     expected = 1 / 12 + 0.5 * 2**2
     assert images.variance()[inner].mean() == pytest.approx(expected, rel=0.08)
 
 
-@pytest.mark.parametrize("efficiency", [0.8, 0.99, 1.25])
+@pytest.mark.parametrize("efficiency", [0.8, 1.02, 1.25])
 def test_a_broken_promise_is_seen(efficiency: float) -> None:
     film = film_of("gaussian", sample_border=True)
     border = 2 * film.rfilter().border_size()
     coarse = CoarseFilm.of(_SIZE + border, _SIZE + border, 512)
     of_path = np.full(coarse.width * coarse.height, 1 / 12 + 0.5 * 2**2)
-    promise = LightPathPromise(film, coarse, of_path)
+    promise = Promise(film, coarse, of_path)
     assert not promise.is_broken(time=9.0, rival=9.0)
     fill(promise.images, film, FEWEST_PASSES)
     # The variance is that of ``path``
     is_broken = promise.is_broken(time=2 / efficiency, rival=0.5)
     assert promise.variance == pytest.approx(1, rel=0.05)
     assert is_broken == (efficiency < 0.9)
+
+
+def test_a_given_weight_lets_rare_bright_samples_count() -> None:
+    film, coarse = film_of("box"), CoarseFilm.whole(_SIZE, _SIZE)
+    film.prepare([])
+    y, x = np.mgrid[:_SIZE, :_SIZE].reshape(2, -1) + 0.5
+    bright = np.ones(_SIZE * _SIZE)
+    # The brighter one is left out
+    bright[[500, 1500]] = 1000, 2000
+    variances = {}
+    for weight in (None, np.ones(_SIZE * _SIZE)):
+        promise = Promise(film, coarse, np.ones(_SIZE * _SIZE), weight=weight)
+        block = film.create_block()
+        promise.images.begin(block, None, 0)
+        for number in range(FEWEST_PASSES):
+            value = mi.Float(bright if number == 0 else np.ones(_SIZE * _SIZE))
+            block.put(mi.Point2f(x, y), [value, value, value, mi.Float(1)])
+            promise.images.add(block, None, number + 1)
+        promise.is_broken(1.0, 1.0)
+        variances[weight is None] = promise.variance
+    expected = 999**2 / 3 / (_SIZE**2 - 1)
+    assert variances[False] == pytest.approx(expected, rel=0.01)
+    assert variances[True] < 0.1 * expected
 
 
 def test_lights_gain_little_where_rare_paths_make_the_variance() -> None:
@@ -86,7 +110,7 @@ def test_lights_gain_little_where_rare_paths_make_the_variance() -> None:
 def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = []
 
-    def is_broken(promise: LightPathPromise, time: float, rival: float) -> bool:
+    def is_broken(promise: Promise, time: float, rival: float) -> bool:
         counts.append(promise.images.count)
         promise.variance = 5.0
         return True
@@ -97,7 +121,7 @@ def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
         stages.append(next_stage(schedule))
         return stages[-1]
 
-    monkeypatch.setattr(LightPathPromise, "is_broken", is_broken)
+    monkeypatch.setattr(Promise, "is_broken", is_broken)
     monkeypatch.setattr(LightPathSchedule, "next_stage", remembered)
     integrator = mi.load_dict({"type": "auto", "max_depth": 6})
     scene = load("caustic", width=96, height=54)
@@ -108,6 +132,6 @@ def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
     assert effect["variance"] == 5.0 and 0 < effect["predicted_variance"] < 1
     learned = integrator.statistics.learned
     assert "light paths do not pay" in learned and "guide" in learned
-    assert counts and counts[0] >= FEWEST_PASSES - 1
+    assert counts and counts[0] >= FEWEST_PASSES
     kinds = [type(stage.estimator) for stage in stages if not stage.is_scout]
     assert kinds[-2:] == [BidirectionalPathTracer, Walk]

@@ -1,0 +1,18 @@
+"""The parameters of a scene that have a value."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+
+def values_of(parameters: mi.SceneParameters) -> Iterator[tuple[str, Any]]:
+    """Keys and values, without parameters that are ``None``, for which Mitsuba 3.9.1 raises a
+    ``TypeError``: ``sigma_a`` of ``hair``, where the pigments are given."""
+    for key in parameters.keys():
+        value, kind, *_ = parameters.properties[key]
+        if value is not None or kind is not None:
+            yield key, parameters[key]
