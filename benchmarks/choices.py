@@ -68,7 +68,8 @@ def _choice(effects: dict[str, dict[str, Any]]) -> str:
         if not effect["is_kept"]:
             continue
         if slot == "light_paths":
-            connects = "" if effect["connects"] else ", no connections"
+            number = effect["connections"]
+            connects = "" if number == 1 else f", {number or 'no'} connections"
             merges = ", merging" if effect["merges"] else ""
             words.append(f"{effect['light_paths']:g} light paths{connects}{merges}")
         else:

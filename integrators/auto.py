@@ -72,12 +72,13 @@ class Auto(LightPathIntegrator):
     The first two pilots are those of :class:`auto_path`. After these comes a short stage with one
     light path for each camera path, all techniques, and the lights learned until then. Its samples
     tell the variance of each choice of techniques (no light paths; 1/16, 1/4, 1 or 4 of them for
-    each camera path; with and without connections to their vertices, and merging); numbers of rays
-    tell its time. The best choice is made, if it is better than guided directions and maps. Maps
-    are then left out; guided directions that paid before are learned again, from samples with light
-    paths, unless vertices are merged. This stage has 16384 samples, spread over the film, which are
-    not part of the image; in renders of less than a million samples, it has as few as 4096. Where
-    light paths have less than 0.4 of the variance, the samples before are left out of the image.
+    each camera path; 0, 1, 2 or 4 connections of each vertex of a camera path to their vertices;
+    with merging, and without); numbers of rays tell its time. The best choice is made, if it is
+    better than guided directions and maps. Maps are then left out; guided directions that paid
+    before are learned again, from samples with light paths, unless vertices are merged. This stage
+    has 16384 samples, spread over the film, which are not part of the image; in renders of less
+    than a million samples, it has as few as 4096. Where light paths have less than 0.4 of the
+    variance, the samples before are left out of the image.
 
     Renders of less than 262144 samples are those of :monosp:`path`, unless they save what they
     learn: they would take longer to learn, and to compile the kernels of learning, than for all

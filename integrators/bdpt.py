@@ -36,8 +36,9 @@ class BidirectionalPathTracing(BidirectionalIntegrator):
        - |float| or |string|
        - Number of light paths for each camera path, from 0 (camera paths alone) to 64; or
          :monosp:`always`, which is 1; or :monosp:`auto`: pilot samples measure whether 0, 1/16,
-         1/4, 1 or 4 are most efficient in a render of this length, with connections to their
-         vertices or without. Light that only light paths find may be missing in a short render.
+         1/4, 1 or 4 are most efficient in a render of this length, with ``connections``, two or
+         four times as many, or without any. Light that only light paths find may be missing in a
+         short render.
          (Default: always)
      * - sample_direct
        - |bool|

@@ -14,7 +14,8 @@ from test_bdpt import assert_image_of_path, bdpt
 from test_light_tracer import EMITTERS, MANY_SEEDS, T, _balls, below_the_lamp
 
 from mitsuba_ext.bidirectional import path_tracer
-from mitsuba_ext.bidirectional.candidates import Candidate
+from mitsuba_ext.bidirectional.candidates import Available, Candidate, candidates
+from mitsuba_ext.bidirectional.merging_radius import MergingRadius
 from mitsuba_ext.bidirectional.path_moments import PathMoments
 from mitsuba_ext.bidirectional.vertex_choice import Chosen, VertexChoice
 from mitsuba_ext.composition import light_paths
@@ -120,16 +121,17 @@ def test_the_variance_of_path_is_predicted_whatever_weights_connections_have(
 
 
 @pytest.mark.parametrize("parameters", [
-    {"light_paths": 0.25}, {"light_paths": 4.0}, {"connections": 0},
+    {"light_paths": 0.25}, {"light_paths": 4.0}, {"connections": 0}, {"connections": 4},
     pytest.param({"light_paths": 0.25, "connections": 0}, marks=pytest.mark.slow),
+    pytest.param({"light_paths": 0.25, "connections": 2}, marks=pytest.mark.slow),
 ])  # fmt: skip
-def test_the_variance_of_fewer_techniques_is_predicted(parameters: dict[str, float]) -> None:
+def test_the_variance_of_other_techniques_is_predicted(parameters: dict[str, float]) -> None:
     """From the samples of all of them, with one light path for each camera path."""
     scene = mi.load_dict(_below_a_ceiling(diffuse()), optimize=False)
     integrator = _auto(max_depth=4, pilot_spp=64)
     mi.render(scene, integrator=integrator, spp=256)
     learner = integrator.learners["light_paths"]
-    candidate = Candidate(parameters.get("light_paths", 1.0), "connections" not in parameters)
+    candidate = Candidate(parameters.get("light_paths", 1.0), parameters.get("connections", 1))
     predicted = learner.estimate.variances[learner.candidates.index(candidate)].mean()
     seeds = batches(scene, bdpt(4, **parameters), 16, range(24))
     measured = 16 * seeds.mean(axis=-1).var(axis=0, ddof=1).mean()
@@ -145,6 +147,16 @@ def test_the_variance_of_fewer_techniques_is_predicted(parameters: dict[str, flo
 def test_the_number_of_light_paths_does_not_change_the_mean(parameters: dict[str, Any]) -> None:
     camera = {**below_the_lamp(), "type": "thinlens", "aperture_radius": 0.1, "focus_distance": 3}
     assert_image_of_path(stage(camera=camera), **parameters)
+
+
+def test_several_connections_are_tried_where_light_paths_are_shared_and_not_merged() -> None:
+    radius = MergingRadius(0.1, 0.75, 100, 0.01)
+    shared = candidates(Available(True, True, radius, are_shared=True))
+    several = [c for c in shared if c.connections > 1]
+    assert {c.connections for c in several} == {2, 4}
+    assert not any(c.merges for c in several)
+    own = candidates(Available(True, True, None, are_shared=False))
+    assert {c.connections for c in own} == {0, 1}
 
 
 @pytest.mark.slow

@@ -12,6 +12,10 @@ from .merging_radius import MergingRadius
 #: although 1.2 to 1.5 was predicted.
 _COUNTS, _MERGING_COUNTS = (1 / 16, 1 / 4, 1.0, 4.0), (1.0,)
 
+#: The numbers of connections. More than one were not measured beside merging, or beside four light
+#: paths, and are not tried there.
+_CONNECTIONS = (1, 0, 2, 4)
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -20,17 +24,19 @@ class Candidate:
     Attributes:
         light_paths: Number of light paths for each camera path. With 0, there are the techniques of
             ``path`` alone.
-        connects: Are vertices of camera paths and of light paths connected (s, t ≥ 2)?
+        connections: Number of connections of each vertex of a camera path to vertices of light
+            paths (s, t ≥ 2), in units of that which the integrator has otherwise.
         merges: Are they merged?
     """
 
     light_paths: float
-    connects: bool = True
+    connections: int = 1
     merges: bool = False
 
     def __str__(self) -> str:
         parts = [f"{self.light_paths:g} for each camera path"]
-        parts += [] if self.connects else ["no connections"]
+        if self.connections != 1:
+            parts.append(f"{self.connections or 'no'} connections")
         parts += ["merging"] if self.merges else []
         return ", ".join(parts)
 
@@ -67,15 +73,17 @@ class Available:
 def candidates(available: Available) -> list[Candidate]:
     """The candidates of a render; the first one is ``path``, the second one has all techniques."""
     can_merge = available.radius is not None
-    everything = Candidate(1.0, available.connects, can_merge)
+    everything = Candidate(1.0, int(available.connects), can_merge)
     found = [Candidate(0.0), everything]
     for merges in (False, True) if can_merge else (False,):
         for count in _MERGING_COUNTS if merges else _COUNTS:
-            for connects in (True, False) if available.connects else (False,):
-                candidate = Candidate(count, connects, merges)
+            for connections in _CONNECTIONS if available.connects else (0,):
+                candidate = Candidate(count, connections, merges)
                 # Light paths without any technique are of no use
-                is_useful = connects or available.has_image or merges
-                is_possible = available.are_shared or count == 1
-                if is_useful and is_possible and candidate != everything:
+                is_useful = connections or available.has_image or merges
+                # Several vertices of one light path would depend on each other
+                is_possible = available.are_shared or (count == 1 and connections <= 1)
+                is_tried = connections <= 1 or (not merges and count <= 1)
+                if is_useful and is_possible and is_tried and candidate != everything:
                     found.append(candidate)
     return found

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..images.box_filter import box_sums
+from ..images.box_filter import squares_by_neighbours
 
 #: Values of contributions are counted by powers of four, from 4⁻¹⁶ on; the last bin holds what is
 #: never found.
@@ -67,11 +67,8 @@ def rare(
         rare_light, rare_moment = (
             np.bincount(place[first], x[first], len(found)) for x in (light, moment)
         )
-        # The product with the light of other pixels, whose noise is independent
-        image = rare_light.reshape(-1, width)
-        neighbours = box_sums(np.ones_like(image), 1) - 1
-        others = (box_sums(image, 1) - image) / np.maximum(neighbours, 1)
-        result.append(Rare(rare_light, rare_moment, (image * others).ravel()))
+        squares = squares_by_neighbours(rare_light.reshape(-1, width)).ravel()
+        result.append(Rare(rare_light, rare_moment, squares))
     return result
 
 

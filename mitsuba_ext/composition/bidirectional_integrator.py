@@ -139,7 +139,7 @@ class LightPathIntegrator(WalkIntegrator):
         if radius is not None and choice.pixel_width > 1:
             radius = radius.of_coarse_film(choice.pixel_width)
         return BidirectionalPathTracer(
-            walk, side.emission, side.sensor, self.connections if techniques.connects else 0,
+            walk, side.emission, side.sensor, self.connections * techniques.connections,
             selection, choice.observer, radius=radius,
             merges_all=self.merges_all, light_paths=techniques.light_paths,
             most_lanes=_most_lanes(techniques.light_paths),

@@ -26,12 +26,14 @@ from .predicted_errors import PredictedErrors
 from .promise import Promise
 
 #: The time of what a sample does, in units of that of a ray of ``path``: camera paths carry partial
-#: sums; rays of light paths; shadow rays to the sensor; connections; a light path's vertex that is
-#: put into the grid; vertices and cells of the grid that are looked at. They are constants, because
-#: with measured times two renders of the same seed could choose differently (a fit to ten sets of
-#: techniques in cornell_box, caustic, glass_lamp, pool, water_glass and mirrored_lamp: nine of ten
-#: times within a fifth, all within 0.72 to 1.24).
-_SUMS, _LIGHT_RAY, _SPLAT, _CONNECTION, _GRID, _LOOK = 0.2, 2.2, 2.8, 3.2, 0.3, 0.2
+#: sums; rays of light paths; shadow rays to the sensor; a light path's vertex that is put into the
+#: grid; vertices and cells of the grid that are looked at; connections, the first one of a vertex
+#: and further ones. They are constants, because with measured times two renders of the same seed
+#: could choose differently (a fit to ten sets of techniques in cornell_box, caustic, glass_lamp,
+#: pool, water_glass and mirrored_lamp: nine of ten times within a fifth, all within 0.72 to 1.24;
+#: further connections: corridor, cornell_box, veach-bidir, many_lamps and kitchen).
+_SUMS, _LIGHT_RAY, _SPLAT, _GRID, _LOOK = 0.2, 2.2, 2.8, 0.3, 0.2
+_CONNECTION, _FURTHER = 3.2, 2.5
 
 #: Number of samples from which the choice is made, unless the pilots have fewer.
 _ENOUGH = 1 << 15
@@ -224,8 +226,8 @@ class LightPathTrial(Learner):
 
     def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightPathChoice:
         self._moments = None
-        count, connects, merges = state["light_paths"]
-        self._choice = LightPathChoice(Candidate(float(count), bool(connects), bool(merges)))
+        count, connections, merges = state["light_paths"]
+        self._choice = LightPathChoice(Candidate(float(count), int(connections), bool(merges)))
         return self._choice
 
     @property
@@ -292,8 +294,9 @@ def cost(techniques: Candidate, counts: Counts) -> float:
         return rays
     rays += _SUMS * counts.camera_rays
     rays += techniques.light_paths * (_LIGHT_RAY * counts.light_rays + _SPLAT * counts.splatted)
-    if techniques.connects:
-        rays += _CONNECTION * counts.connected
+    if techniques.connections:
+        further = _FURTHER * (techniques.connections - 1)
+        rays += (_CONNECTION + further) * counts.connected
     if techniques.merges:
         rays += _GRID * techniques.light_paths * counts.light_rays + _LOOK * counts.looked
     return rays

@@ -40,7 +40,7 @@ _LEAST, _SAMPLES, _PHOTON_PASSES, _PATH_PASSES = 1 << 21, 1 << 13, 2, 16
 #: the number of samples. (After 64, it was 0.012 in volume_caustic, and 0 to 0.001 in four others.)
 _SQUARED_BIAS = 0.03
 
-PHOTONS, NO_PHOTONS = Candidate(1.0, connects=False, merges=True), Candidate(0.0)
+PHOTONS, NO_PHOTONS = Candidate(1.0, connections=0, merges=True), Candidate(0.0)
 
 
 @dataclass(frozen=True)
