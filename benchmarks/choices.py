@@ -13,7 +13,7 @@ included.
 
 With ``--references``, scenes of ours whose reference ``references.py`` has rendered have the size
 and ``max_depth`` of that reference. Their errors are squared differences to it, so that one seed is
-enough: a render of fewer samples comes before it, and compiles. The error of ``path`` over all
+enough: a render of fewer samples comes before it, and compiles most kernels. The error of ``path`` over all
 pixels is the expected one, where ``references.py --integrator path`` has measured its variance: the
 brightest samples of a single render would decide about it.
 
@@ -173,8 +173,8 @@ def compare(
             effects[name].append(integrator.statistics.effects if name != "path" else {})
     images = {name: some for name, some in images.items() if len(some) == seeds}
     found = errors_to(reference, images) if reference else errors(images)
-    # Without a reference, the first one compiles
-    first = 0 if reference else 1
+    # The first one compiles
+    first = min(1, seeds - 1)
     result = {}
     for name, error in found.items():
         result[name] = {
