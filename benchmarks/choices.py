@@ -13,9 +13,9 @@ included.
 
 With ``--references``, scenes of ours whose reference ``references.py`` has rendered have the size
 and ``max_depth`` of that reference. Their errors are squared differences to it, so that one seed is
-enough: a render of fewer samples comes before it, and compiles most kernels. The error of ``path`` over all
-pixels is the expected one, where ``references.py --integrator path`` has measured its variance: the
-brightest samples of a single render would decide about it.
+enough: a render of fewer samples comes before it, and compiles most kernels. The error of ``path``
+over all pixels is the expected one, where ``references.py --integrator path`` has measured its
+variance: the brightest samples of a single render would decide about it.
 
 ``--choices 10`` renders no images: it shows what ten seeds choose for renders of that time.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import mitsuba as mi
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 from statistical import load
 
+from mitsuba_ext.bidirectional.candidates import Candidate
 from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
 from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
+from mitsuba_ext.composition.light_paths import LightPathChoice, LightPathTrial
 from mitsuba_ext.composition.promise import Promise
 from mitsuba_ext.images.coarse_film import CoarseFilm
 from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
@@ -105,6 +108,17 @@ def test_lights_gain_little_where_rare_paths_make_the_variance() -> None:
     learner.set_variance(variance=297.0, trimmed=1.0)
     effect = learner.effect.as_dict()
     assert (effect["variance"], effect["trimmed_variance"]) == (0.99, 0.25)
+
+
+@pytest.mark.parametrize(("merges", "expected"), [(False, 4.0), (True, 8.0)])
+def test_guides_help_light_paths_too_but_not_merging(merges: bool, expected: float) -> None:
+    trial = LightPathTrial(film_of("box"), _SPP)
+    trial.rival, trial.guide_efficiency, trial.costs, trial._best = 8.0, 4.0, [1.0, 2.0], 1
+    trial._choice = LightPathChoice(Candidate(0.25, merges=merges))
+    seen = []
+    trial.promise = SimpleNamespace(is_broken=lambda *arguments: seen.append(arguments))
+    assert trial.reconsider(time=1.0, margin=1.1) is None
+    assert seen == [(2.0, expected)]
 
 
 def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:

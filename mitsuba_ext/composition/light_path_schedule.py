@@ -110,7 +110,8 @@ class LightPathSchedule:
         is_guided = isinstance(guide, GuideLearner) and guide.guide and guide.guidance
         self._trial.rival = self._margin
         if is_guided:
-            self._trial.rival *= guide.guidance.efficiency * _GROWS
+            self._trial.guide_efficiency = guide.guidance.efficiency * _GROWS
+            self._trial.rival *= self._trial.guide_efficiency
         for slot in CAMERA_NUMBERS:
             learner = self._inner.learners.get(slot)
             if learner is not None and (effect := learner.effect).is_kept:

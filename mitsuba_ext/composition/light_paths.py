@@ -44,6 +44,10 @@ _ENOUGH = 1 << 15
 #: ``path``. (Trials of all sizes kept the same techniques in twelve scenes.)
 _SPARSE, _LEAST_SPARSE, _MOST = 1 << 14, 1 << 12, 1 / 64
 
+#: Guided directions are expected to keep this power of their efficiency beside light paths. (The
+#: first pilots with both have guides of few samples, and show less.)
+_KEPT = 0.5
+
 #: The least share of missing light of which a render tells.
 _WORTH_A_WORD = 1e-3
 
@@ -136,6 +140,7 @@ class LightPathTrial(Learner):
     Attributes:
         samples: A pixel for each sample, of these only.
         rival: The efficiency of ``path`` with what else was learned for it, relative to ``path``.
+        guide_efficiency: That of guided directions, of which :attr:`rival` is a multiple.
         estimate: Estimate of the image and its variance, once the choice has been made.
         candidates: What was compared, once the choice has been made.
         predicted, costs: Errors and time of each candidate, relative to ``path``.
@@ -158,7 +163,7 @@ class LightPathTrial(Learner):
             observer=self._moments, pixel_width=coarse.pixel_width
         )
         self.samples, self._spp, self._pixel_count = coarse.samples, spp, coarse.pixel_count
-        self.rival = 1.0
+        self.rival = self.guide_efficiency = 1.0
         self.estimate: Estimate | None = None
         self.candidates: list[Candidate] = []
         self.predicted: PredictedErrors | None = None
@@ -205,8 +210,9 @@ class LightPathTrial(Learner):
         efficiencies /= efficiencies[1]
         efficiencies[0] *= self.rival
         gains = [expected_gain(*x) for x in zip(efficiencies, predicted.uncertainty)]
-        self._best = int(np.argmax(gains))
-        self._best_with_light_paths = 1 + int(np.argmax(gains[1:]))
+        best = self._best_with_light_paths = 1 + int(np.argmax(gains[1:]))
+        gains[best] += math.log(self._of_guide(moments.candidates[best]))
+        self._best = best if gains[best] > gains[0] else 0
         self._choice = LightPathChoice(moments.candidates[self._best])
         if self._best > 0:
             self.promise = Promise(self._film, self._coarse, predicted.of_path)
@@ -216,10 +222,16 @@ class LightPathTrial(Learner):
         """What is chosen instead of light paths if these have not kept their promise: ``path``, for
         which :attr:`rival` says what matters, and which needs no margin. See :class:`PhotonTrial`.
         """
-        if self.promise is None or not self.promise.is_broken(self.chosen_cost, self.rival):
+        rival = self.rival / self._of_guide(self._choice.techniques)
+        if self.promise is None or not self.promise.is_broken(self.chosen_cost, rival):
             return None
         self._choice = LightPathChoice(Candidate(0.0))
         return self._choice
+
+    def _of_guide(self, techniques: Candidate) -> float:
+        """The efficiency that guided directions are expected to have beside light paths; 1 with
+        merging, where there are none."""
+        return 1.0 if techniques.merges else self.guide_efficiency**_KEPT
 
     def state(self) -> dict[str, np.ndarray]:
         return {"light_paths": np.array(astuple(self._choice.techniques), float)}
