@@ -75,10 +75,11 @@ class Auto(LightPathIntegrator):
     each camera path; 0, 1, 2 or 4 connections of each vertex of a camera path to their vertices;
     with merging, and without); numbers of rays tell its time. The best choice is made, if it is
     better than guided directions and maps. Maps are then left out; guided directions that paid
-    before are learned again, from samples with light paths, unless vertices are merged. This stage
-    has 16384 samples, spread over the film, which are not part of the image; in renders of less
-    than a million samples, it has as few as 4096. Where light paths have less than 0.4 of the
-    variance, the samples before are left out of the image.
+    before are learned again, from samples with light paths, unless vertices are merged: they are
+    expected to keep the square root of their efficiency. This stage has 16384 samples, spread over
+    the film, which are not part of the image; in renders of less than a million samples, it has as
+    few as 4096. Where light paths have less than 0.4 of the variance, the samples before are left
+    out of the image.
 
     Renders of less than 262144 samples are those of :monosp:`path`, unless they save what they
     learn: they would take longer to learn, and to compile the kernels of learning, than for all
