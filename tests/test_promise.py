@@ -12,8 +12,10 @@ from statistical import load
 
 from mitsuba_ext.bidirectional.candidates import Candidate
 from mitsuba_ext.bidirectional.path_tracer import BidirectionalPathTracer
+from mitsuba_ext.composition import light_paths
 from mitsuba_ext.composition.light_path_schedule import LightPathSchedule
 from mitsuba_ext.composition.light_paths import LightPathChoice, LightPathTrial
+from mitsuba_ext.composition.predicted_errors import PredictedErrors
 from mitsuba_ext.composition.promise import Promise
 from mitsuba_ext.images.coarse_film import CoarseFilm
 from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
@@ -119,6 +121,26 @@ def test_guides_help_light_paths_too_but_not_merging(merges: bool, expected: flo
     trial.promise = SimpleNamespace(is_broken=lambda *arguments: seen.append(arguments))
     assert trial.reconsider(time=1.0, margin=1.1) is None
     assert seen == [(2.0, expected)]
+
+
+@pytest.mark.parametrize("merges", [False, True])
+def test_light_paths_that_can_be_guided_are_chosen_instead_of_guides(
+    monkeypatch: pytest.MonkeyPatch, merges: bool
+) -> None:
+    """Twice the efficiency of ``path``, where guides have three times that."""
+    predicted = SimpleNamespace(
+        variances=np.array([1.0, 0.25]), uncertainty=np.zeros(2), of_path=np.ones(_SIZE**2)
+    )
+    monkeypatch.setattr(PredictedErrors, "of", lambda *_: predicted)
+    monkeypatch.setattr(light_paths, "cost", lambda techniques, _: 1 + techniques.light_paths)
+    trial = LightPathTrial(film_of("box"), _SPP)
+    trial._moments = SimpleNamespace(
+        samples=1 << 20, candidates=[Candidate(0.0), Candidate(1.0, merges=merges)], counts=None,
+        estimate=lambda: None,
+    )  # fmt: skip
+    trial.rival = trial.guide_efficiency = 3.0
+    choice = trial.learn(None, is_last=True)
+    assert choice.techniques.light_paths == (0 if merges else 1)
 
 
 def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:
