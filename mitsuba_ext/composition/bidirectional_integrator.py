@@ -33,9 +33,9 @@ from .walk_integrator import WalkIntegrator
 #: The decisions that a scene can replace, of camera paths and of light paths.
 _SLOTS = ("directions", "next_event", "roulette", "shadow_test", *BIDIRECTIONAL_SLOTS)
 
-#: Bytes for what a pass stores; and bytes, about, that a path takes besides the vertices that are
-#: stored at a time.
-_PASS_BYTES, _PATH_BYTES = 1 << 29, 640
+#: Bytes for what a pass stores; and bytes, about, that a light path takes besides the vertices that
+#: are stored at a time, and that a camera path takes.
+_PASS_BYTES, _LIGHT_BYTES, _CAMERA_BYTES = 1 << 29, 512, 128
 
 
 class LightPathIntegrator(WalkIntegrator):
@@ -222,5 +222,5 @@ class Once:
 def _most_lanes(light_paths: float) -> int:
     """The most camera paths in a pass, with so many light paths for each."""
     layout = Layout(len(mi.Spectrum()), 5, True)
-    bytes_per_path = STRIDE * bytes_per_vertex(layout) + _PATH_BYTES
-    return int(_PASS_BYTES / max(1.0, light_paths)) // bytes_per_path
+    bytes_per_path = STRIDE * bytes_per_vertex(layout) + _LIGHT_BYTES
+    return int(_PASS_BYTES / (light_paths * bytes_per_path + _CAMERA_BYTES))
