@@ -76,6 +76,19 @@ def test_a_render_with_a_thin_lens_begins_once(monkeypatch, known: bool, renders
     _assert_same(*images)
 
 
+def test_light_paths_with_learned_lights_begin_once(monkeypatch) -> None:
+    """Also where some lights are points, whose probabilities only light paths ask for."""
+    jobs, start = [], Job.run
+    monkeypatch.setattr(Job, "run", lambda job, *more: jobs.append(job) or start(job, *more))
+    intensity = {"type": "rgb", "value": 2.0}
+    bulb = {"type": "point", "position": [-1.0, -1.0, 1.5], "intensity": intensity}
+    scene = _scene(bulb=bulb)
+    for seed in range(2):
+        integrator = {"type": "bdpt", "max_depth": 3, "next_event": {"type": "learned_lights"}}
+        _image(scene, mi.load_dict(integrator), seed, 32)
+    assert len(jobs) == 2
+
+
 def test_a_batch_of_sensors_is_not_recorded() -> None:
     """It loads a table of its sensors while it is traced, at which Dr.Jit ends the process."""
     film = {"type": "hdrfilm", "width": 64, "height": 36}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...arrays import from_numpy
 from ...discrete_sampling import alias_tables
 from ...lights.choice import Choice
 from ...lights.light_cells import LightCells
@@ -57,6 +57,11 @@ class LightTable(EmitterSampling):
         self._table = alias_rows(weights, rows.count, cells.count)
         # Opaque: scenes that differ in it only share their kernels
         self._count = dr.opaque(mi.UInt32, cells.count)
+        # The first cell of each emitter. Made here: arrays must exist before kernels are recorded
+        index = cells.emitter_index
+        first = np.zeros(index.max(initial=0) + 1, dtype=np.uint32)
+        first[index[::-1]] = np.arange(len(index))[::-1]
+        self._cell_of = from_numpy(mi.UInt32, first)
 
     def begin(self, sampler, ray, pixel=None) -> mi.UInt32:
         return mi.UInt32(0)
@@ -85,14 +90,6 @@ class LightTable(EmitterSampling):
         # Points and directions are cells of their own
         entry = state * self._count + dr.gather(mi.UInt32, self._cell_of, emitter, active)
         return dr.gather(mi.Float, self._table, 4 * entry + 2, active)
-
-    @functools.cached_property
-    def _cell_of(self) -> mi.UInt32:
-        """The first cell of each emitter."""
-        index = self.cells.emitter_index
-        first = np.zeros(index.max(initial=0) + 1, dtype=np.uint32)
-        first[index[::-1]] = np.arange(len(index))[::-1]
-        return mi.UInt32(first)
 
     def _density(self, row, ref, si, ds, active) -> mi.Float:
         cell, pdf = self.cells.pdf(ref, si, ds, active)
