@@ -33,14 +33,13 @@ class Counts:
     Attributes:
         camera_rays, light_rays: Rays that go on with camera paths and with light paths.
         tested: Shadow rays to lights, of camera paths.
-        splatted, connected: Shadow rays to the sensor, and between vertices of both paths.
+        connected: Shadow rays between vertices of both paths.
         looked: Vertices, and rows of cells, that were looked at for merging.
     """
 
     camera_rays: int = 0
     tested: int = 0
     light_rays: int = 0
-    splatted: int = 0
     connected: int = 0
     looked: int = 0
 
@@ -301,7 +300,6 @@ class PathMoments(TechniqueObserver):
         tested, scattered = _total(self._shadow_count), _total(camera.scatter_count)
         self.counts.add(
             lanes + scattered, tested, lanes + _total(whole.scatter_count) - scattered,
-            _total(whole.shadow_count) - _total(camera.shadow_count),
             _total(camera.shadow_count) - tested, _total(self._looked),
         )  # fmt: skip
 

@@ -15,7 +15,7 @@ from ..bidirectional.candidates import Candidate
 from ..bidirectional.path_moments import Counts, Estimate, PathMoments
 from ..bidirectional.technique_observer import TechniqueObserver
 from ..images.coarse_film import CoarseFilm
-from ..learning.benefit import expected_gain
+from ..learning.benefit import SEGMENT, SHADOW, expected_gain
 from ..learning.effect import Effect
 from ..learning.learner import Learner
 from ..rendering.camera import film_extent, first_pixel
@@ -25,15 +25,13 @@ from .learned_slots import OF_CAMERA_PATHS
 from .predicted_errors import PredictedErrors
 from .promise import Promise
 
-#: The time of what a sample does, in units of that of a ray of ``path``: camera paths carry partial
-#: sums; rays of light paths; shadow rays to the sensor; a light path's vertex that is put into the
-#: grid; vertices and cells of the grid that are looked at; connections, the first one of a vertex
-#: and further ones. They are constants, because with measured times two renders of the same seed
-#: could choose differently (a fit to ten sets of techniques in cornell_box, caustic, glass_lamp,
-#: pool, water_glass and mirrored_lamp: nine of ten times within a fifth, all within 0.72 to 1.24;
-#: further connections: corridor, cornell_box, veach-bidir, many_lamps and kitchen).
-_SUMS, _LIGHT_RAY, _SPLAT, _GRID, _LOOK = 0.2, 2.2, 2.8, 0.3, 0.2
-_CONNECTION, _FURTHER = 3.2, 2.5
+#: The time of what a sample does, in the units of :data:`SEGMENT`: partial sums along a segment of
+#: a camera path; a segment of a light path. A connection of each vertex, and its shadow ray. With
+#: merging: a vertex that is put into the grid; vertices and cells that are looked at. They are
+#: constants, because with measured times two renders of the same seed could choose differently. (A
+#: fit to seven sets of techniques without merging in 14 scenes, and to three, two of them with
+#: merging, in seven: 0.91 of the times within 1.2. spotlights takes 1.1 to 1.6 times as long.)
+_SUMS, _LIGHT_SEGMENT, _CONNECTION, _CONNECTED, _GRID, _LOOK = 0.17, 3.1, 0.3, 1.3, 0.7, 0.1
 
 #: Number of samples from which the choice is made, unless the pilots have fewer.
 _ENOUGH = 1 << 15
@@ -298,17 +296,15 @@ def _trial_samples(samples: int) -> int:
 
 
 def cost(techniques: Candidate, counts: Counts) -> float:
-    """The time of the samples of a pilot, had they only these techniques, in units of that of a ray
-    of ``path``. ``counts`` are those of all techniques, with one light path for each camera path.
-    """
-    rays = counts.camera_rays + counts.tested
+    """The time of the samples of a pilot, had they only these techniques, in the units of
+    :data:`SEGMENT`. ``counts`` are those of all techniques, with one light path for each camera
+    path."""
+    time = SEGMENT * counts.camera_rays + SHADOW * counts.tested
     if techniques.light_paths == 0:
-        return rays
-    rays += _SUMS * counts.camera_rays
-    rays += techniques.light_paths * (_LIGHT_RAY * counts.light_rays + _SPLAT * counts.splatted)
-    if techniques.connections:
-        further = _FURTHER * (techniques.connections - 1)
-        rays += (_CONNECTION + further) * counts.connected
+        return time
+    time += _SUMS * counts.camera_rays + techniques.light_paths * _LIGHT_SEGMENT * counts.light_rays
+    of_connection = _CONNECTION * counts.camera_rays + _CONNECTED * counts.connected
+    time += techniques.connections * of_connection
     if techniques.merges:
-        rays += _GRID * techniques.light_paths * counts.light_rays + _LOOK * counts.looked
-    return rays
+        time += _GRID * techniques.light_paths * counts.light_rays + _LOOK * counts.looked
+    return time

@@ -273,7 +273,7 @@ class _Samples(TechniqueObserver):
         lanes, scattered = values.size, _total(camera.scatter_count)
         self.counts.add(
             lanes + scattered, _total(camera.shadow_count),
-            lanes + _total(whole.scatter_count) - scattered, 0, 0, _total(self._looked),
+            lanes + _total(whole.scatter_count) - scattered, 0, _total(self._looked),
         )  # fmt: skip
 
 

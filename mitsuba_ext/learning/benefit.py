@@ -7,8 +7,8 @@ without. Variance and time are estimated from pilots:
   the decision of ``path``. The paths are divided into batches, from which the uncertainty of the
   ratio is estimated. The brightest paths, one in 32768 and one in each pass at least, are left out:
   they would dominate the estimate.
-- Time: rays are counted, and the additional cost of a decision is a constant in units of the time
-  of a ray. A clock would be more accurate on an idle machine, but renders with equal seeds could
+- Time: segments of paths and shadow rays are counted, and the additional cost of a decision is a
+  constant. A clock would be more accurate on an idle machine, but renders with equal seeds could
   choose differently, above all on a busy machine.
 
 The prior is that efficiency does not change. It weighs more, the less certain an estimate is.
@@ -18,10 +18,15 @@ from __future__ import annotations
 
 import numpy as np
 
-#: The cost of decisions, in units of the time of a ray: of choosing a light from a table
-#: (medians over 15 scenes: 0.1 to 0.4), of guiding the first direction of a path (0.3 to 1), and of
-#: each further one. ``benchmarks/decision_costs.py`` measures them.
-TABLE, FIRST_GUIDED, GUIDED = 0.2, 0.7, 0.25
+#: The time of a segment of a path (its ray, its BSDF, the choice of a light), of the shadow ray,
+#: and of choosing the light from a table, in arbitrary units. (A fit to light paths, see
+#: ``light_paths.py``, and to ten scenes with a table: predictions within 0.06 of the measured time,
+#: but in showroom, where paths with the table take 0.88 of the time.)
+SEGMENT, SHADOW, TABLE = 1.35, 0.5, 0.05
+
+#: The cost of guiding the first direction of a path, and each further one, in units of the time of
+#: a ray (medians over 15 scenes; the first: 0.3 to 1).
+FIRST_GUIDED, GUIDED = 0.7, 0.25
 
 #: The number of batches of paths; one path in ``TRIM`` is left out.
 BATCHES, TRIM = 32, 1 << 15

@@ -10,7 +10,7 @@ from ...arrays import add_own
 from ...lights.choice import Choice
 from ...transport.mis import power_heuristic
 from ...transport.observer import Observer
-from ..benefit import BATCHES, TABLE, gain_of, trimmed_batches
+from ..benefit import BATCHES, SEGMENT, SHADOW, TABLE, gain_of, trimmed_batches
 from ..pixel_estimates import PixelEstimates, brightness
 
 #: The number of first vertices of a path whose connections are recorded, and about the most paths
@@ -169,10 +169,10 @@ class ConnectionRecords(Observer):
     def _cost(self, shadow: float) -> float:
         connections, _, as_path = self._rays
         if connections == 0:
-            return 1 + TABLE
-        # One ray led to each vertex, and one away from the last one
-        others = self._paths + connections
-        return (others + shadow + TABLE * connections) / (others + as_path)
+            return 1.0
+        # One segment led to each vertex, and one away from the last one
+        segments = SEGMENT * (self._paths + connections)
+        return (segments + SHADOW * shadow + TABLE * connections) / (segments + SHADOW * as_path)
 
     def predicted_gain(self, ratio: mi.Float) -> float:
         """The relative reduction of variance by a choice with which the mean squares of the
