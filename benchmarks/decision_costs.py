@@ -3,7 +3,8 @@ units of that of ``path``, and for each event in units of a ray.
 
     python benchmarks/decision_costs.py scenes/rooms.xml …
 
-The constants of ``mitsuba_ext/learning/benefit.py`` are medians of what this prints.
+The constants of guided directions in ``mitsuba_ext/learning/benefit.py`` are medians of what this
+prints.
 """
 
 from __future__ import annotations
