@@ -10,7 +10,7 @@ from lights import ball
 from maps import connect, floor, lamp, learner_of, map_of, observe, row_of, surface, vertex_at
 
 from mitsuba_ext.decisions.next_event.light_table import LightTable, OneRow
-from mitsuba_ext.learning.benefit import TABLE
+from mitsuba_ext.learning.benefit import SEGMENT, SHADOW, TABLE
 from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
 from mitsuba_ext.learning.shadow_test.light_map_roulette_learner import LightMapRouletteLearner
 from mitsuba_ext.lights import weights as lights_weights
@@ -49,7 +49,7 @@ class _Cells:
     """Cells of which only the number matters."""
 
     def __init__(self, count: int) -> None:
-        self.count = count
+        self.count, self.emitter_index = count, np.zeros(count, dtype=np.uint32)
 
     def sample(self, cell, si, x, active):
         return dr.zeros(mi.DirectionSample3f, dr.width(cell)), mi.Color3f(1)
@@ -187,12 +187,13 @@ def test_learning_that_does_not_pay_ends_with_the_choice_of_path_unless_needed(
     assert ("as path" in str(learner)) == ends and (learner.map is None) == ends
 
 
-def test_cost_of_a_choice_is_that_of_its_rays_and_of_the_table():
+def test_cost_of_a_choice_is_that_of_its_segments_shadow_rays_and_of_the_table():
     records = learner_of(floor(a=lamp(-0.1, 0, 50), b=lamp(0.1, 0, 50)))._records
     # Of 10 paths: connections, shadow rays, and shadow rays with Mitsuba's choice
     records._paths, records._rays = 10, np.array([40.0, 30.0, 20.0])
-    assert records.cost == pytest.approx((10 + 40 + 30 + TABLE * 40) / (10 + 40 + 20))
-    assert records.least_cost == pytest.approx((10 + 40 + 20 + TABLE * 40) / (10 + 40 + 20))
+    as_path, table = SEGMENT * (10 + 40) + SHADOW * 20, TABLE * 40
+    assert records.cost == pytest.approx((as_path + SHADOW * 10 + table) / as_path)
+    assert records.least_cost == pytest.approx((as_path + table) / as_path)
 
 
 def test_learning_goes_on_where_lights_were_chosen_better_than_by_path():

@@ -18,8 +18,10 @@ from mitsuba_ext.composition.light_paths import LightPathChoice, LightPathTrial
 from mitsuba_ext.composition.predicted_errors import PredictedErrors
 from mitsuba_ext.composition.promise import Promise
 from mitsuba_ext.images.coarse_film import CoarseFilm
+from mitsuba_ext.learning.directions.guide_learner import GuideLearner
 from mitsuba_ext.learning.next_event.light_map_learner import LightMapLearner
 from mitsuba_ext.rendering.pass_images import FEWEST_PASSES, PassImages
+from mitsuba_ext.rendering.stages import Stage
 from mitsuba_ext.transport.walk import Walk
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -141,6 +143,29 @@ def test_light_paths_that_can_be_guided_are_chosen_instead_of_guides(
     trial.rival = trial.guide_efficiency = 3.0
     choice = trial.learn(None, is_last=True)
     assert choice.techniques.light_paths == (0 if merges else 1)
+
+
+def test_going_back_brings_back_the_guide_as_it_is() -> None:
+    """Not as it would be with the samples of all pilots, nor with the margin of the choice."""
+    guide = GuideLearner.__new__(GuideLearner)
+    guide.guide, guide.guidance = True, SimpleNamespace(efficiency=2.0)
+    rivals = []
+
+    def learn(scene: Any, is_last: bool) -> LightPathChoice:
+        rivals.append(trial.rival)
+        return LightPathChoice(Candidate(1.0, merges=True))
+
+    trial = SimpleNamespace(
+        learn=learn, leaves_out=(), promise=None, can_be_guided=False, chosen_variance=0.1
+    )
+    inner = SimpleNamespace(
+        learners={"directions": guide}, beside={}, decisions={}, is_at_end=False,
+        leave_out=lambda slots: None, stage_again=lambda: Stage(None),
+    )  # fmt: skip
+    schedule = LightPathSchedule(inner, None, 2, trial, 1 << 30)
+    schedule._next = Stage(None)
+    assert schedule.next_stage().forgets
+    assert rivals[0] > 2.5 and trial.rival == pytest.approx(2.0)
 
 
 def test_auto_goes_back_to_what_it_had(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,14 +123,12 @@ class LightPathSchedule:
         lights = self._inner.learners.get("next_event")
         if isinstance(lights, LightMapLearner) and lights.removed is not None:
             lights.set_variance(*self._trial.predicted.of_image)
-        # Going back needs no margin
-        self._trial.rival /= self._margin
+        # Going back needs no margin, and brings back guides that have not become better
+        self._trial.rival /= self._margin * (_GROWS if is_guided else 1.0)
         if is_guided and self._trial.can_be_guided and not self._inner.is_at_end:
             # MIS weights are those of unguided paths, which light paths may have as well
             self._inner.learners["directions"] = guide.beside_light_paths(self._trial.chosen_cost)
             self._inner.decisions["directions"] = guide.guide
-            # These guides become better too
-            self._trial.rival /= _GROWS
         self._inner.decisions["light_paths"] = choice
         stage = self._measured_stage(self._inner.stage_again())
         return replace(stage, forgets=self._trial.chosen_variance < _FAR_LESS)

@@ -169,7 +169,7 @@ class ConnectionRecords(Observer):
     def _cost(self, shadow: float) -> float:
         connections, _, as_path = self._rays
         if connections == 0:
-            return 1.0
+            return 1 + TABLE / SEGMENT
         # One segment led to each vertex, and one away from the last one
         segments = SEGMENT * (self._paths + connections)
         return (segments + SHADOW * shadow + TABLE * connections) / (segments + SHADOW * as_path)
