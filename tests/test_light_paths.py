@@ -16,7 +16,7 @@ from test_light_tracer import EMITTERS, MANY_SEEDS, T, _balls, below_the_lamp
 from mitsuba_ext.bidirectional import path_tracer
 from mitsuba_ext.bidirectional.candidates import Available, Candidate, candidates
 from mitsuba_ext.bidirectional.merging_radius import MergingRadius
-from mitsuba_ext.bidirectional.path_moments import PathMoments
+from mitsuba_ext.bidirectional.path_moments import Counts, PathMoments
 from mitsuba_ext.bidirectional.vertex_choice import Chosen, VertexChoice
 from mitsuba_ext.composition import light_paths
 
@@ -31,6 +31,26 @@ def test_light_paths_are_kept_where_they_find_caustics() -> None:
     integrator = _auto()
     mi.render(load("caustic", width=48, height=27), integrator=integrator, spp=64)
     assert integrator.statistics.learned.startswith("light paths pay")
+
+
+def test_passes_are_longer_with_few_light_paths() -> None:
+    """Camera paths take little memory."""
+    few, one = (bdpt(light_paths=count).most_lanes for count in (1 / 16, 1.0))
+    assert 5 * one < few < 16 * one
+
+
+def test_path_takes_nearly_as_long_where_it_traces_no_shadow_rays() -> None:
+    """Light paths with many connections are then no more expensive, relative to ``path``, than the
+    vertices of its paths say."""
+    many = Candidate(1 / 16, connections=4)
+    times = {}
+    for tested in (0, 1000):
+        counts = Counts(camera_rays=1000, tested=tested, light_rays=800, connected=240)
+        of_path = light_paths.cost(Candidate(0.0), counts)
+        times[tested] = of_path, light_paths.cost(many, counts) / of_path
+    assert times[1000][0] < 1.5 * times[0][0]
+    # keyhole, which has no tested shadow rays: 2.7 was measured
+    assert times[0][1] == pytest.approx(2.7, rel=0.2)
 
 
 @pytest.mark.parametrize("ball", [{"type": "diffuse"}, {"type": "conductor"}])
