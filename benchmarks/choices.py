@@ -11,8 +11,9 @@ are means over all pixels but the 0.1 % with the largest ones, and in brackets o
 median over the seeds but the first, which compiles; learning, and what other seeds compile,
 included.
 
-With ``--references``, scenes of ours whose reference ``references.py`` has rendered have the size
-and ``max_depth`` of that reference. Their errors are squared differences to it, so that one seed is
+With ``--references``, scenes of ours whose reference ``references.py`` has rendered, and scenes
+with a reference by ``path`` beside them, have the size and
+``max_depth`` of that reference. Their errors are squared differences to it, so that one seed is
 enough: a render of fewer samples comes before it, and compiles most kernels. The error of ``path``
 over all pixels is the expected one, where ``references.py --integrator path`` has measured its
 variance: the brightest samples of a single render would decide about it.
@@ -52,6 +53,9 @@ INTEGRATORS = ("path", "auto_path", "bdpt", "vcm", "auto")
 TRUSTED = ("bdpt", "vcm", "auto")
 
 _MAX_DEPTH = 6
+
+#: References that lie beside the files of scenes.
+_BESIDE = "reference_path_*.exr"
 
 
 def _render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int):
@@ -151,7 +155,7 @@ def compare(
     loaded = load_scene(file, reference.size if reference else size)
     scene = loaded.scene
     if reference is not None:
-        max_depth = loaded.settings["max_depth"]
+        max_depth = reference.metadata.get("max_depth", loaded.settings["max_depth"])
     made = {name: mi.load_dict({"type": name, "max_depth": max_depth}) for name in names}
     spp = _samples_of_path(scene, seconds, cpu, max_depth)
     if reference is not None:
@@ -188,6 +192,11 @@ def compare(
         expected = expected_error(reference, load_reference(of_path), spp)
         result["path"]["error_of_all"] = expected
     return {"spp": spp, "seconds": seconds, "cpu": cpu, "integrators": result, "refused": refused}
+
+
+def _reference_of(file: Path) -> Path | None:
+    """The file of the reference of a scene, if there is one."""
+    return stored(scene_name(file)) or next(file.parent.glob(_BESIDE), None)
 
 
 def choices(
@@ -290,7 +299,7 @@ def main(
             found = choices(file, seconds, chosen, size).most_common()
             print(f"{scene}: {', '.join(f'{n} x {what}' for what, n in found)}", flush=True)
             continue
-        stored_file = stored(scene) if references else None
+        stored_file = _reference_of(file) if references else None
         result = compare(file, seconds, seeds, size, names, cpu, stored_file)
         (out / f"{scene}.json").write_text(json.dumps(result))
         print(line(scene, result), flush=True)

@@ -3,7 +3,7 @@
 Tracing a walk takes longer than running it for a few ten thousand samples: Dr.Jit traces each call
 of a BSDF once for each BSDF of the scene. ``dr.freeze`` records the kernels of a function instead.
 It handles arrays, and objects of Mitsuba that hold arrays. All else that a function depends on is
-described here (:class:`_Description`): the classes of our objects and the values of their
+described (:class:`CallDescription`): the classes of our objects and the values of their
 attributes, the parameters of the scene that are not arrays, the number of threads. A recording is
 used again only where all of this is the same.
 
@@ -34,7 +34,6 @@ Rules for a frozen function:
 
 from __future__ import annotations
 
-import enum
 import functools
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
@@ -44,11 +43,11 @@ from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..scene.parameter_values import values_of
 from ..startup import registry
 from ..startup.garbage import garbage_left_alone
+from .call_description import VALUES, CallDescription, UndescribedError, address
 
 #: The largest number of scenes whose recordings are kept, and of recordings of each.
 _MOST_SCENES, _MOST_RECORDINGS = 8, 256
@@ -60,16 +59,9 @@ _UNKNOWN = frozenset({"ThinLensCamera", "BatchSensor"})
 #: Dr.Jit's words where it cannot record (the second ones on a GPU, where memory is copied).
 _OF_RECORDING = "frozen function", "record(): "
 
-#: Values that are their own description.
-_VALUES = (int, float, str, bytes, bool, type(None), enum.Enum, range)
-
 
 class NotRecordableError(RuntimeError):
     """Dr.Jit cannot record a function, which may already have changed its arguments."""
-
-
-class _UndescribedError(Exception):
-    """An argument cannot be compared with that of an earlier call; the message names it."""
 
 
 @dataclass
@@ -193,12 +185,12 @@ def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
     if kept.cannot_be_recorded:
         return None
     sensors = scene.sensors()
-    own = frozenset(_address(o) for o in (*sensors, *scene.emitters(), *scene.shapes()))
+    own = frozenset(address(o) for o in (*sensors, *scene.emitters(), *scene.shapes()))
     # Kernels whose threads accumulate separately have memory for this number of threads
     threads = dr.thread_count()
-    values = threads, _address(sensor), _values(parameters), _values(mi.traverse(sensor))
-    if _address(sensor) not in own:
-        kept.held[_address(sensor)] = sensor
+    values = threads, address(sensor), _values(parameters), _values(mi.traverse(sensor))
+    if address(sensor) not in own:
+        kept.held[address(sensor)] = sensor
     return _Current(kept, scene, values, own)
 
 
@@ -211,7 +203,7 @@ def _is_foreign(thing: mi.Object) -> bool:
 def _values(parameters: mi.SceneParameters) -> tuple:
     """The parameters that are not arrays: kernels contain them, and users may change them."""
     return tuple(
-        (key, value if isinstance(value, _VALUES) else str(value))
+        (key, value if isinstance(value, VALUES) else str(value))
         for key, value in values_of(parameters)
         if not _holds_arrays(value)
     )
@@ -223,16 +215,12 @@ def _holds_arrays(value: Any) -> bool:
     return dr.is_jit_v(value) or any(_holds_arrays(getattr(value, name)) for name in names)
 
 
-def _address(thing: mi.Object) -> int:
-    return thing.ptr
-
-
 def _call(current: _Current, function: Callable, args: tuple, any_width: bool) -> Any:
     kept = current.kept
-    description = _Description(current, any_width)
+    description = CallDescription(current.scene, current.own, any_width)
     try:
         key = (function, current.values, description.of(args))
-    except _UndescribedError as reason:
+    except UndescribedError as reason:
         if function not in kept.refused:
             mi.Log(mi.LogLevel.Debug, f"{function.__qualname__} is not frozen: {reason}")
             kept.refused.add(function)
@@ -260,7 +248,7 @@ def _call(current: _Current, function: Callable, args: tuple, any_width: bool) -
         kept.recordings.pop(key, None)
         raise
     if is_new:
-        again = _Description(current, any_width)
+        again = CallDescription(current.scene, current.own, any_width)
         if again.of(args) != key[-1] or any(
             a is not b for a, b in zip(again.arrays, description.arrays)
         ):
@@ -279,7 +267,7 @@ def _check_result(function: Callable, result: Any) -> None:
         TypeError: There is such an object in a result.
     """
     kind = type(result)
-    if isinstance(result, _VALUES) or dr.is_array_v(kind) or hasattr(kind, "DRJIT_STRUCT"):
+    if isinstance(result, VALUES) or dr.is_array_v(kind) or hasattr(kind, "DRJIT_STRUCT"):
         return
     if isinstance(result, dict):
         parts = list(result.values())
@@ -317,107 +305,3 @@ class _Recording:
             raise cause from None
         finally:
             self._args = ()
-
-
-class _Description:
-    """All that the kernels of a function depend on, except the contents of arrays.
-
-    Parameters:
-        current: The render.
-        any_width: Are the widths of arrays left out?
-
-    Attributes:
-        arrays: The arrays, and objects that hold arrays, in the order in which they were met.
-        held: Objects outside of the scene that are named by their address.
-    """
-
-    def __init__(self, current: _Current, any_width: bool) -> None:
-        self._current, self._any_width = current, any_width
-        self._met: dict[int, int] = {}
-        # Keeps objects alive, so that no new one gets the id of an earlier one
-        self._kept_alive: list[Any] = []
-        self.arrays: list[Any] = []
-        self.held: dict[int, Any] = {}
-
-    def of(self, thing: Any) -> Any:
-        """The description of one thing: a value that can be compared and hashed."""
-        if isinstance(thing, _VALUES):
-            # True is 1, and 1 is 1.0
-            return type(thing), thing
-        if id(thing) in self._met:
-            return "met", self._met[id(thing)]
-        self._met[id(thing)] = len(self._met)
-        self._kept_alive.append(thing)
-        kind = type(thing)
-        if dr.is_jit_v(kind) and dr.is_array_v(kind):
-            if dr.width(thing) == 0:
-                return kind, "empty"
-            self.arrays.append(thing)
-            return kind, self._widths(thing)
-        if isinstance(thing, (list, tuple)):
-            return kind, tuple(self.of(part) for part in thing)
-        if isinstance(thing, dict):
-            return kind, tuple((self.of(key), self.of(value)) for key, value in thing.items())
-        if isinstance(thing, (set, frozenset)) and all(isinstance(x, _VALUES) for x in thing):
-            return kind, frozenset(thing)
-        if isinstance(thing, np.ndarray):
-            return thing.shape, thing.dtype.str, thing.tobytes()
-        if isinstance(thing, (np.number, np.bool_)):
-            return kind, thing.item()
-        if isinstance(thing, type):
-            return thing
-        if isinstance(thing, functools.partial):
-            return kind, self.of(thing.func), self.of(thing.args), self.of(thing.keywords)
-        if callable(thing) and hasattr(thing, "__code__"):
-            return self._function(thing)
-        if isinstance(thing, mi.Object):
-            return self._object(thing)
-        if hasattr(kind, "DRJIT_STRUCT"):
-            self.arrays.append(thing)
-            parts = (self._widths(getattr(thing, name)) for name in kind.DRJIT_STRUCT)
-            return kind, tuple(parts)
-        if kind.__module__.partition(".")[0] in ("mitsuba", "drjit") and not hasattr(
-            thing, "__dict__"
-        ):
-            return kind, str(thing)
-        if hasattr(kind, "kernel_state"):
-            return kind, self.of(thing.kernel_state())
-        if isinstance(thing, slice):
-            return kind, thing.start, thing.stop, thing.step
-        if hasattr(thing, "__dict__"):
-            return kind, tuple((key, self.of(value)) for key, value in vars(thing).items())
-        raise _UndescribedError(f'a "{kind.__module__}.{kind.__qualname__}"')
-
-    def _widths(self, thing: Any) -> Any:
-        if self._any_width:
-            # Scalars stay scalars
-            return dr.width(thing) == 1
-        if dr.is_tensor_v(thing):
-            return dr.shape(thing)
-        return dr.width(thing)
-
-    def _function(self, function: Callable) -> Any:
-        owner = getattr(function, "__self__", None)
-        cells = [cell.cell_contents for cell in function.__closure__ or ()]
-        defaults = function.__defaults__
-        return function.__code__, self.of(owner), self.of(cells), self.of(defaults)
-
-    def _object(self, thing: mi.Object) -> Any:
-        if type(thing).__module__.partition(".")[0] != "mitsuba":
-            raise _UndescribedError(f'a "{type(thing).__name__}", which is written in Python')
-        self.arrays.append(thing)
-        if thing is self._current.scene:
-            return "scene"
-        if isinstance(thing, mi.Sampler):
-            return type(thing), thing.class_name(), thing.wavefront_size()
-        if isinstance(thing, mi.ImageBlock):
-            return (
-                type(thing), tuple(thing.size()), tuple(thing.offset()), thing.channel_count(),
-                thing.coalesce(), thing.normalize(), thing.border_size(),
-                _address(thing.rfilter()) if thing.rfilter() is not None else None,
-                thing.warn_negative(), thing.warn_invalid(),
-            )  # fmt: skip
-        address = _address(thing)
-        if address not in self._current.own:
-            self.held[address] = thing
-        return type(thing), address

@@ -1,0 +1,129 @@
+"""All that the kernels of a frozen function (``frozen.py``) depend on."""
+
+from __future__ import annotations
+
+import enum
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Values that are their own description.
+VALUES = (int, float, str, bytes, bool, type(None), enum.Enum, range)
+
+
+class UndescribedError(Exception):
+    """An argument cannot be compared with that of an earlier call; the message names it."""
+
+
+def address(thing: mi.Object) -> int:
+    """Names an object of Mitsuba while it lives."""
+    return thing.ptr
+
+
+class CallDescription:
+    """Describes arguments by all that matters to kernels, except the contents of arrays.
+
+    Parameters:
+        scene: The scene that is rendered.
+        own: Addresses of its objects.
+        any_width: Are the widths of arrays left out?
+
+    Attributes:
+        arrays: The arrays, and objects that hold arrays, in the order in which they were met.
+        held: Objects outside of the scene that are named by their address.
+    """
+
+    def __init__(self, scene: mi.Scene, own: frozenset[int], any_width: bool) -> None:
+        self._scene, self._own, self._any_width = scene, own, any_width
+        self._met: dict[int, int] = {}
+        # Keeps objects alive, so that no new one gets the id of an earlier one
+        self._kept_alive: list[Any] = []
+        self.arrays: list[Any] = []
+        self.held: dict[int, Any] = {}
+
+    def of(self, thing: Any) -> Any:
+        """The description of one thing: a value that can be compared and hashed."""
+        if isinstance(thing, VALUES):
+            # True is 1, and 1 is 1.0
+            return type(thing), thing
+        if id(thing) in self._met:
+            return "met", self._met[id(thing)]
+        self._met[id(thing)] = len(self._met)
+        self._kept_alive.append(thing)
+        kind = type(thing)
+        if dr.is_jit_v(kind) and dr.is_array_v(kind):
+            if dr.width(thing) == 0:
+                return kind, "empty"
+            self.arrays.append(thing)
+            return kind, self._widths(thing)
+        if isinstance(thing, (list, tuple)):
+            return kind, tuple(self.of(part) for part in thing)
+        if isinstance(thing, dict):
+            return kind, tuple((self.of(key), self.of(value)) for key, value in thing.items())
+        if isinstance(thing, (set, frozenset)) and all(isinstance(x, VALUES) for x in thing):
+            return kind, frozenset(thing)
+        if isinstance(thing, np.ndarray):
+            return thing.shape, thing.dtype.str, thing.tobytes()
+        if isinstance(thing, (np.number, np.bool_)):
+            return kind, thing.item()
+        if isinstance(thing, type):
+            return thing
+        if isinstance(thing, functools.partial):
+            return kind, self.of(thing.func), self.of(thing.args), self.of(thing.keywords)
+        if callable(thing) and hasattr(thing, "__code__"):
+            return self._function(thing)
+        if isinstance(thing, mi.Object):
+            return self._object(thing)
+        if hasattr(kind, "DRJIT_STRUCT"):
+            self.arrays.append(thing)
+            parts = (self._widths(getattr(thing, name)) for name in kind.DRJIT_STRUCT)
+            return kind, tuple(parts)
+        if kind.__module__.partition(".")[0] in ("mitsuba", "drjit") and not hasattr(
+            thing, "__dict__"
+        ):
+            return kind, str(thing)
+        if hasattr(kind, "kernel_state"):
+            return kind, self.of(thing.kernel_state())
+        if isinstance(thing, slice):
+            return kind, thing.start, thing.stop, thing.step
+        if hasattr(thing, "__dict__"):
+            return kind, tuple((key, self.of(value)) for key, value in vars(thing).items())
+        raise UndescribedError(f'a "{kind.__module__}.{kind.__qualname__}"')
+
+    def _widths(self, thing: Any) -> Any:
+        if self._any_width:
+            # Scalars stay scalars
+            return dr.width(thing) == 1
+        if dr.is_tensor_v(thing):
+            return dr.shape(thing)
+        return dr.width(thing)
+
+    def _function(self, function: Callable) -> Any:
+        owner = getattr(function, "__self__", None)
+        cells = [cell.cell_contents for cell in function.__closure__ or ()]
+        defaults = function.__defaults__
+        return function.__code__, self.of(owner), self.of(cells), self.of(defaults)
+
+    def _object(self, thing: mi.Object) -> Any:
+        if type(thing).__module__.partition(".")[0] != "mitsuba":
+            raise UndescribedError(f'a "{type(thing).__name__}", which is written in Python')
+        self.arrays.append(thing)
+        if thing is self._scene:
+            return "scene"
+        if isinstance(thing, mi.Sampler):
+            return type(thing), thing.class_name(), thing.wavefront_size()
+        if isinstance(thing, mi.ImageBlock):
+            return (
+                type(thing), tuple(thing.size()), tuple(thing.offset()), thing.channel_count(),
+                thing.coalesce(), thing.normalize(), thing.border_size(),
+                address(thing.rfilter()) if thing.rfilter() is not None else None,
+                thing.warn_negative(), thing.warn_invalid(),
+            )  # fmt: skip
+        name = address(thing)
+        if name not in self._own:
+            self.held[name] = thing
+        return type(thing), name
