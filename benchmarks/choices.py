@@ -6,17 +6,18 @@ given time?
 All integrators take the same number of samples: as many as ``path`` takes in the given time. Error
 of a pixel: the variance between the seeds, plus the squared difference of their mean to that of the
 integrators that have light paths (without the integrator itself, and corrected for noise), over
-(mean² + 0.01 · (mean of the image)²). The difference shows what light an integrator misses. Errors
+(median² + 0.01 · (mean of the image)²). The difference shows what light an integrator misses. The
+median is that of all seeds of these integrators, and should be one of three images or more. Errors
 are means over all pixels but the 0.1 % with the largest ones, and in brackets over all. Time: the
 median over the seeds but the first, which compiles; learning, and what other seeds compile,
 included.
 
 With ``--references``, scenes of ours whose reference ``references.py`` has rendered, and scenes
-with a reference by ``path`` beside them, have the size and
-``max_depth`` of that reference. Their errors are squared differences to it, so that one seed is
-enough: a render of fewer samples comes before it, and compiles most kernels. The error of ``path``
-over all pixels is the expected one, where ``references.py --integrator path`` has measured its
-variance: the brightest samples of a single render would decide about it.
+with a reference of ``path`` beside them, have the size and ``max_depth`` of that reference. Their
+errors are squared differences to it, so that one seed is enough: a render of fewer samples comes
+before it, and compiles most kernels. The error of ``path`` over all pixels is the expected one,
+where ``references.py --integrator path`` has measured its variance: the brightest samples of a
+single render would decide about it.
 
 ``--choices 10`` renders no images: it shows what ten seeds choose for renders of that time.
 
@@ -94,7 +95,8 @@ def errors(images: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     mean = {name: np.mean(some, axis=0) for name, some in images.items()}
     noise = {name: np.var(some, axis=0, ddof=1) for name, some in images.items()}
     trusted = [name for name in TRUSTED if name in images] or list(images)
-    image = np.mean([mean[name] for name in trusted], axis=0)
+    # In a mean, sparks would make their own pixels bright, whose errors then count less
+    image = np.median(np.concatenate([images[name] for name in trusted]), axis=0)
     scale = image**2 + 0.01 * image.mean() ** 2
     found = {}
     for name, some in images.items():
