@@ -4,13 +4,13 @@ given time?
     python benchmarks/choices.py scenes/window.xml scenes/open.xml --seconds 5 --out out/choices
 
 All integrators take the same number of samples: as many as ``path`` takes in the given time. Error
-of a pixel: the variance between the seeds, plus the squared difference of their mean to that of the
-integrators that have light paths (without the integrator itself, and corrected for noise), over
-(median² + 0.01 · (mean of the image)²). The difference shows what light an integrator misses. The
-median is that of all seeds of these integrators, and should be one of three images or more. Errors
-are means over all pixels but the 0.1 % with the largest ones, and in brackets over all. Time: the
-median over the seeds but the first, which compiles; learning, and what other seeds compile,
-included.
+of a pixel: the variance between the seeds, over (median² + 0.01 · (mean of the image)²). The median
+is that of all seeds of the integrators that have light paths, and should be one of three images or
+more. To the errors of the others, the squared difference of their mean to that of these integrators
+is added, corrected for noise: it shows what light they miss. (The bias of merging is not shown, nor
+is light that only some of those with light paths find.) Errors are means over all pixels but the
+0.1 % with the largest ones, and in brackets over all. Time: the median over the seeds but the
+first, which compiles; learning, and what other seeds compile, included.
 
 With ``--references``, scenes of ours whose reference ``references.py`` has rendered, and scenes
 with a reference of ``path`` beside them, have the size and ``max_depth`` of that reference. Their
@@ -98,13 +98,12 @@ def errors(images: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     # In a mean, sparks would make their own pixels bright, whose errors then count less
     image = np.median(np.concatenate([images[name] for name in trusted]), axis=0)
     scale = image**2 + 0.01 * image.mean() ** 2
+    truth = np.mean([mean[name] for name in trusted], axis=0)
+    noise_of_truth = np.sum([noise[name] for name in trusted], axis=0) / len(trusted) ** 2
     found = {}
     for name, some in images.items():
-        others = [other for other in trusted if other != name]
         error = noise[name]
-        if others:
-            truth = np.mean([mean[other] for other in others], axis=0)
-            noise_of_truth = np.sum([noise[other] for other in others], axis=0) / len(others) ** 2
+        if name not in trusted:
             missed = (mean[name] - truth) ** 2 - (noise[name] + noise_of_truth) / len(some)
             error = error + missed
         found[name] = np.sort((error / scale).mean(axis=2), axis=None)
