@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+import quick_kernels  # noqa: F401  isort: skip  (before drjit)
 from noisy import Clock
 
 import mitsuba_ext  # noqa: F401  (chooses an LLVM library that works: before drjit and mitsuba)
