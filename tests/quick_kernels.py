@@ -1,25 +1,21 @@
 """Kernels that compile quickly, for tests that compile more than they render.
 
 With few samples on small films, a test spends most of its time in LLVM's optimisation passes. LLVM
-skips these if this module is imported before Dr.Jit; kernels are then up to twice as slow. Long
-statistics (``pytest -m slow``) compile as users do.
+skips these if this module is imported before Dr.Jit; kernels are then up to twice as slow. With
+``MITSUBA_EXT_TEST_KERNELS=optimised``, tests compile as users do; so do the processes that tests
+start, and the tutorials of ``make docs``.
 """
 
 from __future__ import annotations
 
 import ctypes
 import os
-import sys
 from pathlib import Path
 
 from mitsuba_ext.startup import llvm
 
 #: Run no pass that is optional, and say nothing about it.
 _OPTIONS = (b"-opt-bisect-limit=0", b"-opt-bisect-verbose=0")
-
-#: "quick" or "optimised": the process that begins decides, and its workers inherit it.
-_VARIABLE = "MITSUBA_EXT_TEST_KERNELS"
-
 
 #: Where quick kernels are stored, also by processes that tests start. The renders of a user must
 #: not find kernels that are slow.
@@ -36,5 +32,5 @@ def _compile_quickly() -> None:
     ctypes.CDLL(library.path).LLVMParseCommandLineOptions(len(arguments), arguments, None)
 
 
-if os.environ.setdefault(_VARIABLE, "optimised" if "slow" in sys.argv else "quick") == "quick":
+if os.environ.get("MITSUBA_EXT_TEST_KERNELS", "quick") == "quick":
     _compile_quickly()
