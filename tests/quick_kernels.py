@@ -12,7 +12,7 @@ import ctypes
 import os
 from pathlib import Path
 
-from mitsuba_ext.startup import llvm
+from mitsuba_ext.startup import llvm, runtime
 
 #: Run no pass that is optional, and say nothing about it.
 _OPTIONS = (b"-opt-bisect-limit=0", b"-opt-bisect-verbose=0")
@@ -23,6 +23,7 @@ _FOLDER = Path(__file__).parents[1] / ".pytest_cache" / "kernels"
 
 
 def _compile_quickly() -> None:
+    runtime.choose_llvm()
     library = llvm.default_library()
     if library is None or not library.path:
         return
