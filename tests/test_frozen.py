@@ -60,20 +60,50 @@ def test_images_are_those_of_traced_kernels(name: str) -> None:
         _assert_same(_image(scene, integrator, seed), _traced(scene, integrator, seed))
 
 
-@pytest.mark.parametrize(("known", "renders"), [(True, [1, 2]), (False, [2, 3])])
-def test_a_render_with_a_thin_lens_begins_once(monkeypatch, known: bool, renders: list) -> None:
-    """And where it is not known before that nothing can be recorded, only the first one twice."""
+_THIN_LENS = {"plugin": "thinlens", "aperture_radius": 0.1, "focus_distance": 3.0}
+
+
+@pytest.mark.parametrize(
+    ("camera", "known", "renders"),
+    [
+        (_THIN_LENS, True, [1, 2]),
+        (_THIN_LENS, False, [2, 3]),
+        ({"plugin": "orthographic"}, True, [1, 2]),
+    ],
+)
+def test_sensors_with_hidden_arrays(monkeypatch, camera: dict, known: bool, renders: list) -> None:
+    """The render begins once. Where it is not known before that nothing can be recorded, only the
+    first one begins twice."""
     if not known:
         monkeypatch.setattr(frozen, "_UNKNOWN", frozenset())
     jobs, start = [], Job.run
     monkeypatch.setattr(Job, "run", lambda job, *more: jobs.append(job) or start(job, *more))
-    scene = _scene(camera=sensor("thinlens", aperture_radius=0.1, focus_distance=3.0))
+    scene = _scene(camera=sensor(**camera))
     images, counts = [], []
     for _ in renders:
         images.append(_image(scene, mi.load_dict({"type": "composed_path", "max_depth": 3})))
         counts.append(len(jobs))
     assert counts == renders
     _assert_same(*images)
+
+
+def test_a_trial_of_light_paths_is_recorded() -> None:
+    """It finds the same: what its observer remembers of a pass is that of this pass."""
+    scene = _scene(ball={"type": "sphere", "radius": 0.3, "bsdf": {"type": "dielectric"}})
+    integrator = mi.load_dict({"type": "vcm", "max_depth": 4, "light_paths": "auto"})
+
+    def effect(image: Callable, seed: int) -> dict[str, Any]:
+        image(scene, integrator, seed, 32)
+        return integrator.statistics.effects["light_paths"]
+
+    found = [effect(_image, seed) for seed in (1, 2)]
+    recorded = {key[0].__qualname__ for kept in frozen._scenes.values() for key in kept.recordings}
+    assert {"_walked", "LightImage._connect"} <= recorded
+    expected = [effect(_traced, seed) for seed in (1, 2)]
+    assert [e["light_paths"] for e in found] == [e["light_paths"] for e in expected]
+    for e, other in zip(found, expected):
+        assert e["variance"] == pytest.approx(other["variance"], rel=1e-3)
+        assert e["time"] == pytest.approx(other["time"], rel=1e-3)
 
 
 def test_light_paths_with_learned_lights_begin_once(monkeypatch) -> None:

@@ -218,16 +218,15 @@ def test_larger_regions_contain_the_smaller_ones(surfaces: SurfaceRegions) -> No
     labels, side = _labels(surfaces, p, n), np.where(n[2] > 0, 1, -1)
     extents, inside = [], []
     for level in range(len(surfaces._regions.levels)):
-        numbers = surfaces._numbers(level)[labels]
-        size = surfaces._regions.levels[level].stop - surfaces._regions.levels[level].start
-        members = [numbers == number for number in range(size)]
+        around, regions = surfaces._around(level)[labels], surfaces._regions.levels[level]
+        members = [around == region for region in range(regions.start, regions.stop)]
         assert all(LEAST <= chosen.sum() for chosen in members)
         extents.append(max(np.ptp(p[:, chosen], axis=1).max() for chosen in members))
-        inside.append(np.mean(numbers < size))
+        inside.append(np.mean((around >= regions.start) & (around < regions.stop)))
         if level > 0:
             assert all(np.ptp(side[chosen]) == 0 for chosen in members)
             # Each lies in one of the level before
-            before = surfaces._numbers(level - 1)[labels]
+            before = surfaces._around(level - 1)[labels]
             assert all(len(set(before[chosen])) == 1 for chosen in members)
     assert inside[0] == 1 and (np.diff(inside) <= 0).all() and inside[-1] < inside[1]
     expected = 1.05 / np.array([1, 4, 8, 16, 32])

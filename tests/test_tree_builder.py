@@ -203,12 +203,12 @@ def test_merged_samples_give_the_same_trees():
     rng, u = np.random.default_rng(4), _uniform(count)
     region = mi.UInt32(rng.integers(0, regions, count).astype(np.uint32))
     samples = _samples(u, FUNCTIONS["edge"](*u), rng.uniform(0.2, 5, count))
-    merged, merged_region = samples.merged(region)
+    merged = samples.in_order(region).merged()
     cells = {(int(r), int(c)) for r, c in zip(region.numpy(), samples.code.numpy())}
-    found = zip(merged_region.numpy().tolist(), merged.code.numpy().tolist())
+    found = zip(merged.tree.numpy().tolist(), merged.code.numpy().tolist())
     assert sorted(cells) == list(found)
     results = []
-    for data, tree in ((samples, region), (merged, merged_region)):
+    for data, tree in ((samples, region), (merged, merged.tree)):
         builder = TreeBuilder()
         builder.add(data, tree // 10, regions // 10)
         builder.add(data, tree, regions, 1 + dr.arange(mi.UInt32, regions) // 10)

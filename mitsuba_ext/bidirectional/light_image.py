@@ -77,14 +77,14 @@ class LightImage:
         """The objects and constants that kernels depend on."""
         return (
             self._least_depth, self._scene, self._sensor, self._importance, self._sums,
-            self._query, self._hides_emitters, self._seed, self._share,
+            self._query, self._hides_emitters, self._seed, self._share, self._observer,
         )  # fmt: skip
 
     def add(self, vertices: LightVertices) -> None:
         """Connects these vertices, at least one. It evaluates the result, so that the vertices'
         memory can be freed."""
-        # Observers rebind attributes when they are called, so that the kernel cannot be frozen
-        connect = self._connect_frozen if self._observer is None else self._connect
+        can_be_frozen = self._observer is None or self._observer.can_be_frozen
+        connect = self._connect_frozen if can_be_frozen else self._connect
         found, tested = connect(vertices, *vertices.lanes())
         dr.eval(found, tested)
         self._found.append(found)

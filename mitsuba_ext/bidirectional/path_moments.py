@@ -140,7 +140,7 @@ class PathMoments(TechniqueObserver):
         counts: What takes time (:class:`Counts`).
     """
 
-    compares = True
+    compares = can_be_frozen = True
 
     def __init__(
         self, coarse: CoarseFilm, corner: tuple[int, int], film_width: int, spp: int
@@ -168,6 +168,15 @@ class PathMoments(TechniqueObserver):
         self._by_value = np.zeros((0, self._block_count, BINS, 2))
 
     # ---- Observer ----
+
+    def kernel_state(self) -> tuple:
+        """The attributes on which kernels depend (``frozen.py``). What ``weighed`` remembers is
+        part of the kernel itself."""
+        return (
+            self._pixel, self._importance, self._lane, self._path, self._squares, self._merged,
+            self._joined, self._shadow_count, self._looked, self._splats, self._moments,
+            self._of_pixel, self._corner, self._film_width,
+        )  # fmt: skip
 
     def start(self, rays: CameraRays, available: Available) -> None:
         if not self.candidates:

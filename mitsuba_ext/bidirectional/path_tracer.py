@@ -161,7 +161,7 @@ class BidirectionalPathTracer:
                 )  # fmt: skip
         if isinstance(sampler, BothEnds):
             sampler = sampler.camera
-        sample = self._camera_paths(
+        sample = camera_paths(
             replace(walk, mis=weights, subpaths=subpaths), scene, sampler, rays, active
         )
         # The first lane counts all rays that are not those of the path in a lane
@@ -177,11 +177,6 @@ class BidirectionalPathTracer:
         if observer is not None:
             observer.traced(sample, whole)
         return whole
-
-    def _camera_paths(self, walk, scene, sampler, rays, active) -> Sample:
-        if self.observer is not None:
-            return walk(scene, sampler, rays, active)
-        return camera_paths(walk, scene, sampler, rays, active)
 
 
 def camera_paths(

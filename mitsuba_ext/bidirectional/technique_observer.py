@@ -23,6 +23,7 @@ class TechniqueObserver(Observer):
     """
 
     compares = False
+    can_be_frozen = False
 
     def start(self, rays: CameraRays, available: Available) -> None:
         """A pass begins, with these camera rays, and with all techniques that are available. The

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 #: Pixels on each side, along each axis, over which the radiance of a pixel is averaged, if nothing
@@ -11,14 +13,15 @@ RADIUS = 4
 
 def box_means(image: np.ndarray, radius: int = RADIUS) -> np.ndarray:
     """The mean of each pixel of an image and its neighbours, shape [y, x]."""
-    return box_sums(image, radius) / box_sums(np.ones_like(image), radius)
+    return box_sums(image, radius) / _counts(image.shape, radius)
 
 
 def box_sums(image: np.ndarray, radius: int = RADIUS) -> np.ndarray:
     """Sums over the neighbours of each pixel, itself included, shape [y, x]."""
     for axis in range(2):
         size = image.shape[axis]
-        sums = np.insert(np.cumsum(image, axis), 0, 0, axis)
+        sums = np.cumsum(image, axis)
+        sums = np.concatenate([np.zeros_like(sums.take([0], axis)), sums], axis)
         index = np.arange(size)
         end = np.minimum(index + radius + 1, size)
         image = sums.take(end, axis) - sums.take(np.maximum(index - radius, 0), axis)
@@ -28,5 +31,11 @@ def box_sums(image: np.ndarray, radius: int = RADIUS) -> np.ndarray:
 def squares_by_neighbours(image: np.ndarray) -> np.ndarray:
     """The product of each pixel of an image with the mean of its neighbours, shape [y, x]: an
     estimate of its squared mean that is free of the pixel's noise."""
-    neighbours = box_sums(np.ones_like(image), 1) - 1
-    return image * (box_sums(image, 1) - image) / np.maximum(neighbours, 1)
+    neighbours = np.maximum(_counts(image.shape, 1) - 1, 1)
+    return image * (box_sums(image, 1) - image) / neighbours
+
+
+@functools.lru_cache(maxsize=8)
+def _counts(shape: tuple[int, int], radius: int) -> np.ndarray:
+    """The number of neighbours of each pixel, itself included, shape [y, x]."""
+    return box_sums(np.ones(shape), radius)

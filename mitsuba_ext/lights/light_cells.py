@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .emitter_cells import EmitterCells
 from .environment_bins import EnvironmentBins
+from .tabulated_bins import TabulatedBins
 
 
 class LightCells:
@@ -54,6 +57,15 @@ class LightCells:
             self._first_bin -= self.bins.count
             index = next(i for i, e in enumerate(emitters) if e.ptr == environment.ptr)
             self.emitter_index[self._first_bin :] = index
+
+    def tabulated(self) -> LightCells:
+        """The same cells, for :meth:`sample` only; of an environment, it knows a few directions of
+        each bin (:class:`TabulatedBins`)."""
+        if self.bins is None:
+            return self
+        other = copy.copy(self)
+        other.bins = TabulatedBins(self.bins)
+        return other
 
     def sample(
         self, cell: mi.UInt32, ref: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool

@@ -95,13 +95,14 @@ def spatial_weights(scene: mi.Scene, rows: VoxelRows, cells: LightCells) -> mi.F
 def unoccluded_weights(scene: mi.Scene, rows: SurfaceRows, cells: LightCells) -> mi.Float:
     """The root mean square of the contribution of each cell to a white diffuse surface of each row
     without occlusion; shape [rows · cells]."""
+    lights = cells.tabulated()
 
     def squared_contribution(row: mi.UInt32, cell: mi.UInt32, sampler: mi.Sampler) -> mi.Float64:
         size = dr.gather(mi.UInt32, rows.size, row)
         index = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(size)), size - 1)
         index += dr.gather(mi.UInt32, rows.first, row)
         # Moving lights are evaluated at time 0; pilots see the other times
-        value, d = _light(cells, cell, dr.gather(mi.Point3f, rows.p, index), mi.Float(0), sampler)
+        value, d = _light(lights, cell, dr.gather(mi.Point3f, rows.p, index), mi.Float(0), sampler)
         cosine = dr.maximum(dr.dot(d, dr.gather(mi.Normal3f, rows.n, index)), 0) + _LEAST_COSINE
         # In double precision: the square of a bright light may exceed the range of single precision
         return dr.square(mi.Float64(value * cosine))

@@ -8,13 +8,13 @@ attributes, the parameters of the scene that are not arrays, the number of threa
 used again only where all of this is the same.
 
 Nothing is recorded in spectral variants, whose colour tables are not arguments of any function;
-with a ``thinlens``, which does not tell Dr.Jit of all its arrays; with a ``batch`` of sensors,
-which loads a table of them whenever it is traced; and where kernels call plugins that are written
-in Python: while these are traced, they may read arrays, or free memory of NumPy. At that, and at
-such a table, Dr.Jit ends the process. A function with an argument that cannot be described (a
-sampler in Python) is not frozen either. The log says why (level ``Debug``). If Dr.Jit cannot record
-a function, the render begins anew, nothing more is recorded in that scene, and the log says so
-(level ``Info``).
+with a ``thinlens`` or an ``orthographic`` sensor, which do not tell Dr.Jit of all their arrays;
+with a ``batch`` of sensors, which loads a table of them whenever it is traced; and where kernels
+call plugins that are written in Python: while these are traced, they may read arrays, or free
+memory of NumPy. At that, and at such a table, Dr.Jit ends the process. A function with an argument
+that cannot be described (a sampler in Python) is not frozen either. The log says why (level
+``Debug``). If Dr.Jit cannot record a function, the render begins anew, nothing more is recorded in
+that scene, and the log says so (level ``Info``).
 
 Rules for a frozen function:
 
@@ -52,9 +52,9 @@ from .call_description import VALUES, CallDescription, UndescribedError, address
 #: The largest number of scenes whose recordings are kept, and of recordings of each.
 _MOST_SCENES, _MOST_RECORDINGS = 8, 256
 
-#: Sensors of Mitsuba 3.9.1 that cannot be recorded: they hold an array of which Dr.Jit is not told,
+#: Sensors of Mitsuba 3.9.1 that cannot be recorded: they hold arrays of which Dr.Jit is not told,
 #: or load one while they are traced.
-_UNKNOWN = frozenset({"ThinLensCamera", "BatchSensor"})
+_UNKNOWN = frozenset({"ThinLensCamera", "OrthographicCamera", "BatchSensor"})
 
 #: Dr.Jit's words where it cannot record (the second ones on a GPU, where memory is copied).
 _OF_RECORDING = "frozen function", "record(): "

@@ -77,17 +77,23 @@ class SurfaceRegions:
             The builder, the root of each region's tree, and ``None``: leaves do not lead to other
             trees. The tree of the surrounding region is the prior of a region's tree.
         """
-        samples = Samples(records.code, records.value, records.weight)
-        samples, region = samples.merged(records.region)
+        levels = list(enumerate(self._regions.levels))
+        samples, of_level = Samples(records.code, records.value, records.weight), []
+        region = records.region
+        for level, _regions in reversed(levels):
+            # Coarser levels merge what finer ones have merged
+            around = dr.gather(mi.UInt32, mi.UInt32(self._around(level)), region)
+            samples = samples.in_order(around).merged()
+            region = samples.tree
+            of_level.insert(0, samples)
         builder = TreeBuilder()
         roots = np.full(self.count + 1, UNIFORM, np.uint32)
-        for level, regions in enumerate(self._regions.levels):
+        for (level, regions), samples in zip(levels, of_level):
             size = regions.stop - regions.start
             if size == 0:
                 continue
-            tree = dr.gather(mi.UInt32, mi.UInt32(self._numbers(level)), region)
             expected = mi.UInt32(roots[self._regions.parent[regions]]) if level > 0 else None
-            first = builder.add(samples, tree, size, expected)
+            first = builder.add_sorted(samples, regions.start, size, expected)
             roots[regions] = first + np.arange(size)
         return builder, mi.UInt32(roots), None
 
@@ -114,15 +120,12 @@ class SurfaceRegions:
             )
         return from_numpy(mi.Float, np.minimum(radiance, 1e30))
 
-    def _numbers(self, level: int) -> np.ndarray:
-        """For each region, the number of the region of a level in which it lies; a number too large
-        if there is none."""
-        numbers = np.full(self.count + 1, self.count, np.uint32)
-        regions = self._regions.levels[level]
-        numbers[regions] = np.arange(regions.stop - regions.start)
+    def _around(self, level: int) -> np.ndarray:
+        """For each region, the region of a level in which it lies; itself if there is none."""
+        around = np.arange(self.count + 1, dtype=np.uint32)
         for smaller in self._regions.levels[level + 1 :]:
-            numbers[smaller] = numbers[self._regions.parent[smaller]]
-        return numbers
+            around[smaller] = around[self._regions.parent[smaller]]
+        return around
 
     def __str__(self) -> str:
         return f"{self.count} regions of surfaces"

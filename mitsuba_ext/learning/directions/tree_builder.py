@@ -59,29 +59,13 @@ class Samples:
         mean = dr.sum(mi.Float64(value)) / dr.opaque(mi.Float64, len(value))
         self._scale = dr.rcp(dr.maximum(mean, 1e-30))
 
-    def in_order(self, key: mi.UInt32) -> tuple[mi.UInt32, list[mi.UInt64]]:
-        """``key`` in ascending order, and the running sums of values, squares and weights in that
-        order, in units."""
+    def in_order(self, tree: mi.UInt32) -> SortedSamples:
+        """The samples in the order of their trees, and of their cells in a tree."""
+        key = (tree << DEPTH) | self.code
         order = dr.argsort(key)
         key = dr.gather(mi.UInt32, key, order)
         # One after the other: these are the largest arrays
-        running = [dr.cumsum(x) for x in self._fixed(order)]
-        return key, running
-
-    def merged(self, region: mi.UInt32) -> tuple[Samples, mi.UInt32]:
-        """Merges all samples of the same cell and region; returns the merged samples, and the
-        region of each."""
-        key, running = self.in_order((region << DEPTH) | self.code)
-        index = dr.arange(mi.UInt32, len(key))
-        begin = dr.compress((index == 0) | (key != dr.gather(mi.UInt32, key, index - 1, index > 0)))
-        index = dr.arange(mi.UInt32, len(begin))
-        is_last = index == dr.opaque(mi.UInt32, len(begin) - 1)
-        end = dr.gather(mi.UInt32, begin, index + 1, ~is_last)
-        end = dr.select(is_last, dr.opaque(mi.UInt32, len(key)), end)
-        key = dr.gather(mi.UInt32, key, begin)
-        code, region, values = key & ((1 << DEPTH) - 1), key >> DEPTH, sums(running, begin, end)
-        dr.eval(code, region, values)
-        return _MergedSamples(code, values), region
+        return SortedSamples(key, [dr.cumsum(x) for x in self._fixed(order)])
 
     def _fixed(self, order: mi.UInt32) -> Iterator[mi.UInt64]:
         """Values, squares and weights in units, in another order."""
@@ -93,19 +77,31 @@ class Samples:
             yield mi.UInt64(x * unit)
 
 
-class _MergedSamples(Samples):
-    """Sums of samples.
+class SortedSamples(Samples):
+    """Samples in the order of :attr:`key`.
 
     Parameters:
-        code: Their cells.
-        values: Sums of values, squares and weights, in units.
+        key: The number of the tree of each sample, followed by the bits of its cell.
+        running: Running sums of values, squares and weights, in units.
     """
 
-    def __init__(self, code: mi.UInt32, values: list[mi.UInt64]) -> None:
-        self.code, self._values = code, values
+    def __init__(self, key: mi.UInt32, running: list[mi.UInt64]) -> None:
+        self.key, self.running = key, running
+        self.tree, self.code = key >> DEPTH, key & ((1 << DEPTH) - 1)
+
+    def merged(self) -> SortedSamples:
+        """One sample instead of all those of the same tree and cell."""
+        index, count = dr.arange(mi.UInt32, len(self.key)), dr.opaque(mi.UInt32, len(self.key))
+        following = dr.gather(mi.UInt32, self.key, index + 1, index + 1 < count)
+        last = dr.compress((index + 1 == count) | (self.key != following))
+        key, running = dr.gather(mi.UInt32, self.key, last), [
+            dr.gather(mi.UInt64, x, last) for x in self.running
+        ]
+        dr.eval(key, running)
+        return SortedSamples(key, running)
 
     def _fixed(self, order):
-        return (dr.gather(mi.UInt64, x, order) for x in self._values)
+        return (sums([x], order, order + 1)[0] for x in self.running)
 
 
 def sums(running: list[mi.UInt64], begin: mi.UInt32, end: mi.UInt32) -> list[mi.UInt64]:
@@ -169,11 +165,20 @@ class TreeBuilder:
         Returns:
             The node of the first tree; those of the others follow.
         """
-        first_node = self.node_count
-        key = (dr.minimum(tree, dr.opaque(mi.UInt32, tree_count)) << DEPTH) | samples.code
-        self._sorted = samples.in_order(key)
+        most = dr.opaque(mi.UInt32, tree_count)
+        return self.add_sorted(samples.in_order(dr.minimum(tree, most)), 0, tree_count, expected)
 
-        tree = dr.arange(mi.UInt32, tree_count)
+    def add_sorted(
+        self,
+        samples: SortedSamples,
+        first: int,
+        tree_count: int,
+        expected: mi.UInt32 | None = None,
+    ) -> int:
+        """As :meth:`add`, for samples that have been sorted. The trees are those of the numbers
+        from ``first`` on."""
+        first_node, self._sorted = self.node_count, samples
+        tree = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, tree_count)
         begin, end = self._lower_bound(tree << DEPTH), self._lower_bound((tree + 1) << DEPTH)
         twin = dr.full(mi.UInt32, UNIFORM, tree_count) if expected is None else expected
         value, square, _weight = self._sums(begin, end)
@@ -233,7 +238,7 @@ class TreeBuilder:
 
     def _lower_bound(self, code, first=None, last=None) -> mi.UInt32:
         """The first sample whose code is not below ``code``."""
-        key = self._sorted[0]
+        key = self._sorted.key
         if first is None:
             first, last = mi.UInt32(0), dr.opaque(mi.UInt32, len(key))
         # Few numbers of steps, so that fewer kernels are compiled
@@ -242,7 +247,7 @@ class TreeBuilder:
 
     def _sums(self, begin: mi.UInt32, end: mi.UInt32) -> list[mi.Float]:
         """The sums of values, squares and weights of the samples [begin, end)."""
-        found = sums(self._sorted[1], begin, end)
+        found = sums(self._sorted.running, begin, end)
         return [mi.Float(mi.Float64(x) / unit) for x, unit in zip(found, _UNITS)]
 
     def _append(self, levels: list[_Level]) -> None:

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...decisions.next_event.light_table import LightTable
+from ...lights.environment_bins import EnvironmentBins
 from ...lights.light_cells import LightCells
 from ...lights.weights import uniform_weights
 from ...maps import light_map_file
@@ -34,10 +35,10 @@ _DEFENSIVE = 0.1
 #: the pilots (with about three connections each).
 _GRID, _ENTRIES_PER_SAMPLE = 16, 16.0
 
-#: The most entries of the first pilot's map per sample of the render: an entry takes a third of the
-#: time of a sample, all stages together. And the efficiency that the first pilot must predict for a
-#: finer map to follow.
-_TRIAL_ENTRIES, _FINER_EFFICIENCY = 0.15, 1.2
+#: The most entries of the first pilot's map, and of a finer one, per sample of the render: an entry
+#: takes a third of the time of a sample, all stages together. And the efficiency that the first
+#: pilot must predict for a finer map to follow.
+_TRIAL_ENTRIES, _MOST_ENTRIES, _FINER_EFFICIENCY = 0.15, 1.0, 1.2
 
 #: So many entries may the first pilot's map have in any render: they take about 20 ms.
 _FEW_ENTRIES = 1 << 17
@@ -101,15 +102,16 @@ class LightMapLearner(Learner):
         self._about: dict[str, float] = {}
         self._is_kept: bool | None = None
         self._is_tested = False
-        # Makes a finer map than that of the first pilot
+        # Makes a finer map than that of the first pilot, with the same bins of the environment
         self._finer_map: Callable[[], LightMap] | None = None
+        self._bins: EnvironmentBins | None = None
 
     def keep_map(self) -> None:
         """Keeps the map even where it does not pay for the choice of lights."""
         self._is_needed, self._records = True, None
 
     def start(self, scene: mi.Scene, p: mi.Point3f, n: mi.Normal3f) -> EmitterSampling | None:
-        self.map, self._records = None, None
+        self.map, self._records, self._bins = None, None, None
         self._summary = "lights: no path scatters"
         if self.load is not None:
             self.map = light_map_file.load(
@@ -143,6 +145,7 @@ class LightMapLearner(Learner):
         trial = max(_FEW_ENTRIES, self.render_samples * _TRIAL_ENTRIES)
         trial = math.inf if self._is_needed else trial
         light_map = self._new_map(scene, p, n, min(limit, trial))
+        limit = min(limit, max(_FEW_ENTRIES, self.render_samples * _MOST_ENTRIES))
         if trial < limit and light_map.rows.resolution < _GRID:
             self._finer_map = lambda: self._new_map(scene, p, n, limit)
         return light_map
@@ -151,7 +154,8 @@ class LightMapLearner(Learner):
         """The finest map of at most ``limit`` entries."""
         bbox = region(p)
         grid = self.grid or _GRID
-        cells = LightCells(scene, voxel_edges(bbox, grid))
+        cells = LightCells(scene, voxel_edges(bbox, grid), self._bins)
+        self._bins = cells.bins
         counts = RowCounts(bbox, p, n)
 
         def fits(grid: int) -> bool:
@@ -235,7 +239,7 @@ class LightMapLearner(Learner):
         return self._selection(self._probabilities(self.map.weights(self.target)))
 
     def finish(self) -> None:
-        self.map = self._scene = self._finer_map = None
+        self.map = self._scene = self._finer_map = self._bins = None
 
     def _set_as_path(self, scene: mi.Scene) -> None:
         cells = self.map.cells
