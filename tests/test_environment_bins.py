@@ -15,6 +15,7 @@ from mitsuba_ext.lights.environment_bins import BINS, EnvironmentBins
 from mitsuba_ext.lights.light_cells import LightCells
 from mitsuba_ext.lights.spectra import brightness, comparison_wavelengths
 from mitsuba_ext.lights.sun import SunDisk
+from mitsuba_ext.lights.tabulated_bins import TabulatedBins
 
 LANES = 1 << 18
 
@@ -260,6 +261,21 @@ def test_samples_lie_behind_the_scene_and_lanes_without_one_are_zero(name):
         d.d = mi.Vector3f([0, dr.nan, 1], 0, 0)
         pdf = cells.pdf(ref, bad, d, mi.Bool(False))[1]
         assert bool(dr.all(pdf == 0))
+
+
+@pytest.mark.parametrize("name", ["turned", "sky"])
+def test_a_few_directions_stand_for_a_bin(name):
+    """Light and mean direction of each bin are those of many samples."""
+    bins, each = EnvironmentBins(_scene(name)), 1 << 10
+    index = dr.arange(mi.UInt32, bins.count * each) // each
+    numbers, ref = mi.PCG32(size=len(index)), dr.zeros(mi.Interaction3f, len(index))
+    found = []
+    for source in (bins, TabulatedBins(bins)):
+        ds, weight = source.sample(index, ref, _square(numbers), mi.Bool(True))
+        value = brightness(weight)
+        columns = value, value * ds.d.x, value * ds.d.y, value * ds.d.z
+        found.append(np.array([dr.block_sum(x, each).numpy() for x in columns]) / each)
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=0.03 * found[0][0])
 
 
 @pytest.mark.parametrize(
