@@ -8,13 +8,14 @@ import mitsuba as mi
 from .environment_bins import EnvironmentBins
 from .spectra import brightness, comparison_wavelengths
 
-#: Directions along each of the two axes of a bin. (Three samples in a row of a bin then differ.)
+#: Directions along each of the two axes of a bin.
 _SIDE = 8
 
 
 class TabulatedBins:
     """Samples bins as :class:`EnvironmentBins`, but only directions of a table: what an environment
-    emits depends on no place, and to evaluate a sky at each place takes long.
+    emits depends on no place, and to evaluate a sky at each place takes long. A bin at the horizon that
+    is nearly black may have no light in the table: do not exclude it for that.
 
     Parameters:
         bins: The bins.
