@@ -14,8 +14,8 @@ _SIDE = 8
 
 class TabulatedBins:
     """Samples bins as :class:`EnvironmentBins`, but only directions of a table: what an environment
-    emits depends on no place, and to evaluate a sky at each place takes long. A bin at the horizon that
-    is nearly black may have no light in the table: do not exclude it for that.
+    emits depends on no place, and to evaluate a sky at each place takes long. A bin at the horizon
+    that is nearly black may have no light in the table, and must not be excluded for that.
 
     Parameters:
         bins: The bins.
