@@ -14,7 +14,7 @@ import pytest
 from stage import area, sensor, stage
 
 from mitsuba_ext.rendering.render import Job
-from mitsuba_ext.transport import frozen
+from mitsuba_ext.transport import call_description, frozen
 from mitsuba_ext.transport.walk import Walk
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -72,10 +72,10 @@ _THIN_LENS = {"plugin": "thinlens", "aperture_radius": 0.1, "focus_distance": 3.
     ],
 )
 def test_sensors_with_hidden_arrays(monkeypatch, camera: dict, known: bool, renders: list) -> None:
-    """The render begins once. Where it is not known before that nothing can be recorded, only the
-    first one begins twice."""
+    """Camera rays are traced, and what follows is recorded. Where these sensors are not known, the
+    first render begins twice, and nothing is recorded after that."""
     if not known:
-        monkeypatch.setattr(frozen, "_UNKNOWN", frozenset())
+        monkeypatch.setattr(call_description, "SENSORS_WITH_HIDDEN_ARRAYS", frozenset())
     jobs, start = [], Job.run
     monkeypatch.setattr(Job, "run", lambda job, *more: jobs.append(job) or start(job, *more))
     scene = _scene(camera=sensor(**camera))
@@ -85,6 +85,29 @@ def test_sensors_with_hidden_arrays(monkeypatch, camera: dict, known: bool, rend
         counts.append(len(jobs))
     assert counts == renders
     _assert_same(*images)
+    _assert_same(images[0], _traced(scene, mi.load_dict({"type": "composed_path", "max_depth": 3})))
+    recorded = [key[0].__qualname__ for k in frozen._scenes.values() for key in k.recordings]
+    assert recorded == (["_estimated"] if known else [])
+
+
+@pytest.mark.parametrize("name", ["auto_path", "bdpt", "pssmlt"])
+def test_images_by_a_thin_lens_are_those_of_traced_kernels(name: str) -> None:
+    """Light paths and chains use the sensor, and are not recorded."""
+    parameters = {"type": name, "max_depth": 4, **_CHAINS.get(name, {})}
+    scene, integrator = _scene(camera=sensor(**_THIN_LENS)), mi.load_dict(parameters)
+    for seed in (1, 2):
+        _assert_same(_image(scene, integrator, seed, 32), _traced(scene, integrator, seed, 32))
+
+
+@pytest.mark.parametrize("camera", [{}, _THIN_LENS])
+def test_gradients_are_refused_before_anything_is_learned(camera: dict) -> None:
+    scene = _scene(camera=sensor(**camera))
+    parameters = mi.traverse(scene)
+    dr.enable_grad(parameters["light.emitter.radiance.value"])
+    parameters.update()
+    integrator = mi.load_dict({"type": "auto_path", "max_depth": 3, "pilot_spp": 8})
+    with pytest.raises(NotImplementedError, match='"auto_path" does not compute gradients'):
+        integrator.render(scene, scene.sensors()[0], seed=1, spp=32)
 
 
 def test_a_trial_of_light_paths_is_recorded() -> None:

@@ -160,8 +160,7 @@ class LayeredJob(Job):
         chosen = dr.gather(mi.UInt32, pixels, place)
         pixel, is_hidden = chosen & (_HIDDEN - 1), chosen >= _HIDDEN
         lanes = self._lanes_with_margin(pixel, lane - place * dr.opaque(mi.UInt32, count))
-        numbers = camera.draw_numbers(self.sensor, sampler, lanes, stage.camera)
-        rays = camera.camera_rays(self.sensor, lanes, numbers, self.plan.spp)
+        rays = self._rays(stage, sampler, lanes)
         surface, active, behind = self._surface(rays, pixel, is_hidden)
         sample = stage.estimator(self.scene, sampler, rays, active)
         self._put(rays, sample, surface, mi.Float(rays.weight) * self._weight, active, behind)

@@ -43,8 +43,6 @@ def put_samples(
         GradientsError: The radiance has gradients.
     """
     rays, sample = _sampled(estimator, samples, scene, sensor, sampler, lanes, spp)
-    if dr.grad_enabled(sample.L):
-        raise GradientsError
     camera.put(sensor.film(), block, rays, sample, sample.aovs, weight)
     count_rays(tally, sample)
 
@@ -60,7 +58,7 @@ def look(
     spp: int,
 ) -> mi.Spectrum:
     """The radiance of samples from which observers learn. They are not added to the film. The
-    parameters are those of :func:`put_samples`."""
+    parameters, and what is raised, are those of :func:`put_samples`."""
     return _sampled(estimator, samples, scene, sensor, sampler, lanes, spp)[1].L
 
 
@@ -76,7 +74,22 @@ def _sampled(
     taken = lanes.lanes(sensor.film())
     numbers = camera.draw_numbers(sensor, sampler, taken, samples)
     rays = camera.camera_rays(sensor, taken, numbers, spp)
-    return rays, estimator(scene, sampler, rays, mi.Bool(True))
+    return rays, _estimated(estimator, scene, sampler, rays)
+
+
+@frozen(any_width=True)
+def _estimated(
+    estimator: Estimator, scene: mi.Scene, sampler: mi.Sampler, rays: CameraRays
+) -> Sample:
+    """The samples of these rays. It is recorded alone where the sensor cannot be recorded.
+
+    Raises:
+        GradientsError: The radiance has gradients.
+    """
+    sample = estimator(scene, sampler, rays, mi.Bool(True))
+    if dr.grad_enabled(sample.L):
+        raise GradientsError
+    return sample
 
 
 def count_rays(tally: mi.UInt64, sample: Sample) -> None:

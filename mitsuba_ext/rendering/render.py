@@ -83,7 +83,8 @@ def render(
     Raises:
         ValueError: There is no such sensor, ``spp`` is out of range, the film has more pixels than
             a wavefront can hold, or ``spp`` is too large for this number of pixels.
-        NotImplementedError: The integrator has AOVs, and the film is a special one.
+        NotImplementedError: The integrator has AOVs, and the film is a special one; or parameters
+            of the scene have gradients.
         KeyboardInterrupt: Ctrl-C; the film then holds the image of the finished passes.
     """
     sensor = camera.find_sensor(scene, sensor)
@@ -93,6 +94,8 @@ def render(
         try:
             with deferred_interrupt() as interrupt:
                 made.run(interrupt)
+        except GradientsError:
+            raise integrator.no_gradients() from None
         finally:
             # Also after an exception, the film holds the passes that were finished
             made.fill_film()
@@ -287,10 +290,14 @@ class Job:
         else:
             lanes = camera.PixelLanes(from_numpy(mi.UInt32, pixels))
         self._begin(stage, lanes)
-        take = look if self._is_frozen(stage) else look.__wrapped__
-        radiance = take(
-            stage.estimator, stage.camera, self.scene, self.sensor, sampler, lanes, self.plan.spp
-        )
+        if self._is_frozen(stage):
+            radiance = look(
+                stage.estimator, stage.camera, self.scene, self.sensor, sampler, lanes,
+                self.plan.spp,
+            )  # fmt: skip
+        else:
+            rays = self._rays(stage, sampler, lanes.lanes(self.film))
+            radiance = stage.estimator(self.scene, sampler, rays, mi.Bool(True)).L
         dr.eval(radiance)
 
     def _begin(self, stage: Stage, lanes: camera.PassLanes) -> None:
@@ -323,13 +330,10 @@ class Job:
             return
         self._begin(stage, lanes)
         weight = 1.0 if stage.weight == 1 else dr.opaque(mi.Float, stage.weight)
-        try:
-            put_samples(
-                stage.estimator, stage.camera, self.scene, self.sensor, sampler, lanes,
-                self.plan.spp, weight, self.block, self.tally,
-            )  # fmt: skip
-        except GradientsError:
-            raise self.integrator.no_gradients() from None
+        put_samples(
+            stage.estimator, stage.camera, self.scene, self.sensor, sampler, lanes,
+            self.plan.spp, weight, self.block, self.tally,
+        )  # fmt: skip
         self._finish_take(sampler)
 
     def _is_frozen(self, stage: Stage) -> bool:
@@ -344,8 +348,7 @@ class Job:
 
     def _take(self, stage: Stage, sampler: mi.Sampler, lanes: camera.Lanes) -> None:
         """Puts the samples of these lanes into the block."""
-        numbers = camera.draw_numbers(self.sensor, sampler, lanes, stage.camera)
-        rays = camera.camera_rays(self.sensor, lanes, numbers, self.plan.spp)
+        rays = self._rays(stage, sampler, lanes)
         count = stage.weight if stage.weight == 1 else dr.opaque(mi.Float, stage.weight)
         sample = self._sample(stage, sampler, rays, count)
         for splats in sample.splats:
@@ -354,6 +357,10 @@ class Job:
                 self.splats.set_coalesce(False)
             camera.put_splats(self.film, self.splats, splats)
         self._finish_take(sampler)
+
+    def _rays(self, stage: Stage, sampler: mi.Sampler, lanes: camera.Lanes) -> CameraRays:
+        numbers = camera.draw_numbers(self.sensor, sampler, lanes, stage.camera)
+        return camera.camera_rays(self.sensor, lanes, numbers, self.plan.spp)
 
     def _finish_take(self, sampler: mi.Sampler) -> None:
         if self.plan.structured:
@@ -369,7 +376,7 @@ class Job:
             stage.observer.begin(dr.width(rays.ray), rays.pixel)
         sample = stage.estimator(self.scene, sampler, rays, mi.Bool(True))
         if dr.grad_enabled(sample.L):
-            raise self.integrator.no_gradients()
+            raise GradientsError
         aovs = [*sample.aovs, *self.integrator.sample_aovs(self.scene, sampler, rays.ray)]
         camera.put(self.film, self.block, rays, sample, aovs, count)
         count_rays(self.tally, sample)

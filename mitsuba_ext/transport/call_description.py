@@ -14,6 +14,9 @@ import numpy as np
 #: Values that are their own description.
 VALUES = (int, float, str, bytes, bool, type(None), enum.Enum, range)
 
+#: Sensors of Mitsuba 3.9.1 that hold arrays of which Dr.Jit is not told.
+SENSORS_WITH_HIDDEN_ARRAYS = frozenset({"ThinLensCamera", "OrthographicCamera"})
+
 
 class UndescribedError(Exception):
     """An argument cannot be compared with that of an earlier call; the message names it."""
@@ -111,6 +114,8 @@ class CallDescription:
     def _object(self, thing: mi.Object) -> Any:
         if type(thing).__module__.partition(".")[0] != "mitsuba":
             raise UndescribedError(f'a "{type(thing).__name__}", which is written in Python')
+        if thing.class_name() in SENSORS_WITH_HIDDEN_ARRAYS:
+            raise UndescribedError(f'a "{thing.class_name()}", whose arrays are not all known')
         self.arrays.append(thing)
         if thing is self._scene:
             return "scene"

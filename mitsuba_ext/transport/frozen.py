@@ -8,13 +8,14 @@ attributes, the parameters of the scene that are not arrays, the number of threa
 used again only where all of this is the same.
 
 Nothing is recorded in spectral variants, whose colour tables are not arguments of any function;
-with a ``thinlens`` or an ``orthographic`` sensor, which do not tell Dr.Jit of all their arrays;
 with a ``batch`` of sensors, which loads a table of them whenever it is traced; and where kernels
 call plugins that are written in Python: while these are traced, they may read arrays, or free
 memory of NumPy. At that, and at such a table, Dr.Jit ends the process. A function with an argument
-that cannot be described (a sampler in Python) is not frozen either. The log says why (level
-``Debug``). If Dr.Jit cannot record a function, the render begins anew, nothing more is recorded in
-that scene, and the log says so (level ``Info``).
+that cannot be described is not frozen either: a sampler in Python, or a ``thinlens`` or an
+``orthographic`` sensor, which do not tell Dr.Jit of all their arrays. (With these, camera rays are
+traced in each pass, and what follows is recorded.) The log says why (level ``Debug``). If Dr.Jit
+cannot record a function, the render begins anew, nothing more is recorded in that scene, and the
+log says so (level ``Info``).
 
 Rules for a frozen function:
 
@@ -51,10 +52,6 @@ from .call_description import VALUES, CallDescription, UndescribedError, address
 
 #: The largest number of scenes whose recordings are kept, and of recordings of each.
 _MOST_SCENES, _MOST_RECORDINGS = 8, 256
-
-#: Sensors of Mitsuba 3.9.1 that cannot be recorded: they hold arrays of which Dr.Jit is not told,
-#: or load one while they are traced.
-_UNKNOWN = frozenset({"ThinLensCamera", "OrthographicCamera", "BatchSensor"})
 
 #: Dr.Jit's words where it cannot record (the second ones on a GPU, where memory is copied).
 _OF_RECORDING = "frozen function", "record(): "
@@ -162,8 +159,8 @@ def _can_freeze() -> bool:
 
 
 def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
-    if sensor.class_name() in _UNKNOWN:
-        mi.Log(mi.LogLevel.Debug, f"nothing is recorded: the sensor is a {sensor.class_name()}")
+    if sensor.class_name() == "BatchSensor":
+        mi.Log(mi.LogLevel.Debug, "nothing is recorded: the sensor is a batch of sensors")
         return None
     parameters = mi.traverse(scene)
     nodes = (*parameters.hierarchy, *mi.traverse(sensor).hierarchy)
