@@ -375,14 +375,14 @@ def test_processes_divide_a_render_and_one_of_them_is_killed(make_scene, tmp_pat
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_a_render_that_is_killed_fifty_times_loses_no_interval(make_scene, tmp_path):
+def test_a_render_that_is_killed_many_times_loses_no_interval(make_scene, tmp_path):
     scene, kept = make_scene(), CheckpointFolder(tmp_path / "kept")
     command = [sys.executable, "-m", "mitsuba_ext", *map(str, (
         "render", scene, "-o", tmp_path / "a.exr", "--spp", 1 << 20, "--size", "64x64",
         "--checkpoint", kept.path, "--every", "16spp",
     ))]  # fmt: skip
     before, rng = 0, random.Random(1)
-    for _ in range(50):
+    for _ in range(20):
         process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         deadline = time.monotonic() + 60
         while kept.load().spp <= before and time.monotonic() < deadline:
