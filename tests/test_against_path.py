@@ -28,13 +28,14 @@ pytestmark = pytest.mark.usefixtures("variant")
 WIDTH, HEIGHT = 32, 18
 
 #: The relative standard error of the image mean that z-tests reach, at most: quickly, and over many
-#: seeds. The paper's law is noisy.
+#: seeds. The estimate of that error has a standard deviation of an eighth, and renders that learn
+#: differ between machines: the limits are 1.4 times what was measured. The paper's law is noisy.
 PRECISION = {
     "cornell_box": (0.004, 0.002),
     "door_ajar": (0.03, 0.012),
-    "rooms": (0.03, 0.01),
+    "rooms": (0.03, 0.014),
     "mirrors_and_glass": (0.03, 0.012),
-    "sunny_gloss": (0.02, 0.008),
+    "sunny_gloss": (0.02, 0.012),
     "window": (0.025, 0.012),
 }
 
