@@ -32,6 +32,7 @@ import collections
 import json
 import statistics
 import time
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,9 @@ def _choice(effects: dict[str, dict[str, Any]]) -> str:
             number = effect["connections"]
             connects = "" if number == 1 else f", {number or 'no'} connections"
             merges = ", merging" if effect["merges"] else ""
-            words.append(f"{effect['light_paths']:g} light paths{connects}{merges}")
+            count = Fraction(effect["light_paths"])
+            paths = "light path" if count == 1 else "light paths"
+            words.append(f"{count} {paths}{connects}{merges}")
         else:
             words.append({"next_event": "lights", "directions": "guide"}.get(slot, slot))
     return " + ".join(words) or "path"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 
 from .merging_radius import MergingRadius
 
@@ -34,7 +35,7 @@ class Candidate:
     merges: bool = False
 
     def __str__(self) -> str:
-        parts = [f"{self.light_paths:g} for each camera path"]
+        parts = [f"{Fraction(self.light_paths).limit_denominator(64)} for each camera path"]
         if self.connections != 1:
             parts.append(f"{self.connections or 'no'} connections")
         parts += ["merging"] if self.merges else []
