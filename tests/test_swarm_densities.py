@@ -158,6 +158,31 @@ def test_smaller_tiles_go_on_with_what_larger_ones_have_counted() -> None:
     assert counts.sums()[0].numpy().sum() > after.sum()
 
 
+def test_rare_bright_samples_count_in_gains() -> None:
+    """A map that suits the frequent contributions makes more noise of the rare ones, which make
+    most of the variance: each must not make its own tile bright, so that its error hardly
+    counts."""
+    density = np.array([2.5, 0.5, 0.5, 0.5])
+    frequent, rare, chance = 4.0, 300.0, 1 / 2000
+    # Frequent: in the first cell. Rare: in any
+    before, after = frequent**2 / 4, frequent**2 / 4 / density[0]
+    rare_square = rare**2 * chance
+    variance = before + rare_square - (frequent / 4 + rare * chance) ** 2
+    exact = (before - after + rare_square * (1 - np.mean(1 / density))) / variance
+    tiles = FilmTiles(64, 64, 2)
+    counts = TileCounts(tiles, 1, 4)
+    counts.begin_stage([lambda table, cell: dr.gather(mi.Float, mi.Float(density), cell)])
+    rng = np.random.default_rng(3)
+    pixel = np.repeat(np.arange(64 * 64), 16)
+    cell = rng.integers(0, 4, len(pixel))
+    value = frequent * (cell == 0) + rare * (rng.random(len(pixel)) < chance)
+    radiance = mi.Float(value)
+    choices = Choices(mi.UInt32(0), mi.UInt32(cell), mi.Float(1), radiance, mi.Bool(True))
+    counts.add(mi.UInt32(pixel), radiance, choices)
+    assert exact < -0.4
+    np.testing.assert_allclose(counts.gains(), [exact], atol=0.2)
+
+
 def test_noise_stays_nearly_uniform() -> None:
     rng = np.random.default_rng(2)
     counts = rng.multinomial(20, np.full(64, 1 / 64), size=(30, 40, 1)).astype(float)

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...arrays import from_numpy
+from ...images.box_filter import RADIUS, box_means
 from ...maps.swarm.film_tiles import FilmTiles
 
 #: Fixed point of counts and of their squares, of radiance, and of squared radiance.
@@ -153,7 +154,7 @@ class TileCounts:
         samples = np.maximum(samples, 1)
         first, second = first / samples / _ONE_X, second / samples / _ONE_X2
         floor = _FLOOR * np.average(first, weights=samples) ** 2
-        scale, brightness = second + floor, np.square(first) + floor
+        scale, brightness = second + floor, np.square(self._smooth(first)) + floor
         weight = np.repeat(scale / brightness, self._maps)
         if choices.lane is not None:
             tile = dr.gather(mi.UInt32, tile, choices.lane)
@@ -167,6 +168,13 @@ class TileCounts:
         total = float((samples * variance).sum())
         self._variance += total
         self._stage_variance += total
+
+    def _smooth(self, means: np.ndarray) -> np.ndarray:
+        """The mean radiance of each tile and its neighbours, as that of pixels in
+        :mod:`..pixel_estimates`. A rare bright sample would make its own tile bright, so that its
+        error would hardly count."""
+        image = means.reshape(self._tiles.rows, self._tiles.columns)
+        return box_means(image, RADIUS // self._tiles.edge).ravel()
 
     def _add_choices(self, tile, choices: Choices, value, later, weight: np.ndarray) -> None:
         """``value`` and ``later`` are relative to the root mean square contribution of samples of
