@@ -29,7 +29,8 @@ WIDTH, HEIGHT = 32, 18
 
 #: The relative standard error of the image mean that z-tests reach, at most: quickly, and over many
 #: seeds. The estimate of that error has a standard deviation of an eighth, and renders that learn
-#: differ between machines: the limits are 1.4 times what was measured. The paper's law is noisy.
+#: differ between machines: the limits are 1.4 times what was measured, or more. The paper's law is
+#: noisy.
 PRECISION = {
     "cornell_box": (0.004, 0.002),
     "door_ajar": (0.03, 0.012),
