@@ -238,11 +238,12 @@ def line(scene: str, result: dict[str, Any]) -> str:
 
 def table(folder: Path, name: str = "auto") -> None:
     """Prints a table of all results in a folder for one integrator: the best of the others, its own
-    efficiency, what it chose, and what it predicted; and a summary."""
+    efficiency, what it chose, and what it predicted; these figures with all pixels; a summary."""
     results = {file.stem: json.loads(file.read_text()) for file in folder.glob("*.json")}
     results = dict(sorted(results.items(), key=lambda item: -gain(item[1], name)))
-    print("| scene | samples | `auto` chose | its efficiency | predicted | best other |")
+    print("| scene | samples | `auto` chose | efficiency | predicted | best other |")
     print("|---" * 6 + "|")
+    all_pixels = ["| scene | efficiency | all pixels | predicted | all pixels |", "|---" * 5 + "|"]
     of_path, of_best, honest = [], [], []
     for scene, result in results.items():
         others = {n: gain(result, n) for n in result["integrators"] if n not in (name, "path")}
@@ -253,19 +254,27 @@ def table(folder: Path, name: str = "auto") -> None:
         of_whole = statistics.median(_predicted(e, "variance") for e in effects)
         chosen = " / ".join(dict.fromkeys(map(_choice, effects)))
         cells = [
-            scene, result["spp"], chosen, f"{own:.3g} ({of_all:.3g})",
-            f"{predicted:.3g} ({of_whole:.3g})", f"{others[best]:.3g} (`{best}`)",
+            scene, result["spp"], chosen, _digits(own), _digits(predicted),
+            f"{_digits(others[best])} (`{best}`)",
         ]  # fmt: skip
         print(f"| {' | '.join(map(str, cells))} |")
+        pairs = (own, of_all, predicted, of_whole)
+        all_pixels.append(f"| {scene} | {' | '.join(map(_digits, pairs))} |")
         of_path.append(own)
         of_best.append(own / max(1, others[best]))
         honest.append(own / predicted)
+    print("\n".join(["", *all_pixels, ""]))
     print(
         f"{len(results)} scenes; of path: least {min(of_path):.2f}, geometric mean "
         f"{np.exp(np.mean(np.log(of_path))):.2f}; of the best: least {min(of_best):.2f}, median "
         f"{statistics.median(of_best):.2f}; measured / predicted within 0.7 to 1.4 in "
         f"{sum(0.7 <= ratio <= 1.4 for ratio in honest)}"
     )
+
+
+def _digits(x: float) -> str:
+    """Three digits, without an exponent."""
+    return f"{x:.0f}" if x >= 100 else f"{x:.3g}"
 
 
 @click.command()

@@ -99,8 +99,8 @@ def main(names: tuple[str, ...], seconds: float, seeds: int) -> None:
             f"[the scene](../../scenes/{name}.xml)\n"
         )
     head = (
-        "# Gallery\n\nOur scenes, rendered by `path` (in fog `volpath`, with things that move "
-        "`composed_path`), the best of our other integrators, and `auto`, at equal time: "
+        "# Reports on all scenes\n\nOur scenes, rendered by `path` (in fog `volpath`, with things "
+        "that move `composed_path`), the best of our other integrators, and `auto`, at equal time: "
         f"{seconds:g} s, {seeds} seeds. The pictures here are clean previews; each report "
         "has the renders. `benchmarks/gallery.py` makes this page.\n\n"
     )

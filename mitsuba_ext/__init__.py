@@ -6,7 +6,8 @@ selected later. Scenes then name the plugins as they name Mitsuba's own::
     import mitsuba as mi
     import mitsuba_ext
     mi.set_variant("llvm_ad_rgb")
-    image = mi.render(mi.load_file("scenes/door_ajar.xml", integrator="neepp"))
+    scene = mi.load_file("scene.xml")
+    image = mi.render(scene, integrator=mi.load_dict({"type": "auto"}))
 """
 
 from pathlib import Path

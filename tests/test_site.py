@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -40,7 +41,8 @@ def site(plugins: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
     app = Sphinx(
         ROOT, None, folder / "html", folder / "pages", "html", status=None, warning=warnings,
         confoverrides={
-            "extensions": ["sphinx_tabs.tabs", "plugins", "offline"], "html_theme": "basic",
+            "extensions": ["sphinx_tabs.tabs", "plugins", "offline", "offline_search"],
+            "html_theme": "basic",
             "include_patterns": plugins.files(), "root_doc": "integrators/auto",
             "primary_domain": None, "nitpicky": True, "html_copy_source": False,
             "html_math_renderer": "mathml",
@@ -100,6 +102,15 @@ def test_papers_of_a_page_are_in_the_bibliography(name: str) -> None:
         for title in titles
         if not any(f"*{title}" in entry and f"[`{name}`]" in entry for entry in entries)
     ]
+
+
+def test_search_knows_the_text_of_each_page(site: tuple[Path, str]) -> None:
+    script = (site[0] / "_static" / "page_texts.js").read_text(encoding="utf-8")
+    texts = json.loads(re.search(r"^const pageTexts = (.*);$", script, re.MULTILINE)[1])
+    assert len(texts) >= len(FILES)
+    text = texts["integrators/bdpt.html"]
+    assert "Bidirectional path tracer" in text and '<section id="' in text
+    assert "page_texts.js" in (site[0] / "search.html").read_text(encoding="utf-8")
 
 
 def test_check_finds_links_to_nothing_and_requests(tmp_path: Path, plugins: Any) -> None:

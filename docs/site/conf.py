@@ -24,7 +24,10 @@ author = "the authors of mitsuba_ext"
 release = version = __version__
 language = "en"
 
-extensions = ["myst_nb", "sphinx_tabs.tabs", "plugins", "offline"]
+extensions = [
+    "myst_nb", "sphinx_tabs.tabs", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "plugins",
+    "offline", "offline_search",
+]  # fmt: skip
 root_doc = "README"
 include_patterns = [
     "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**.md", "*/README.md", *plugins.files(),
@@ -37,8 +40,16 @@ exclude_patterns = [
 # Roles without a domain are ours, not those of Python
 primary_domain = None
 nitpicky = True
+# Types in the docstrings of the Python API: not all of them have a page here
+nitpick_ignore_regex = [("py:.*", ".*")]
 
-myst_enable_extensions = ["dollarmath", "colon_fence"]
+# Docstrings of the Python API
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_preserve_defaults = True
+napoleon_use_ivar = True
+
+myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 4
 
 # Tutorials are executed. Their results are kept until their code changes
@@ -65,8 +76,6 @@ html_css_files = ["style.css"]
 html_extra_path = ["index.html"]
 html_math_renderer = "mathml"
 html_copy_source = False
-# The search would fetch each page that it finds, which browsers refuse in a folder
-html_show_search_summary = False
 html_show_sphinx = False
 html_show_copyright = False
 pygments_style = "friendly"

@@ -2,7 +2,8 @@
 
 The docstrings have the form of Mitsuba's. This extension knows what they use: the directive
 ``pluginparameters``, the roles ``monosp`` and ``class``, and names of types such as ``|int|``. Base
-classes with parameters of their own have pages, too. ``{plugins} KIND`` lists the pages of a kind.
+classes with parameters of their own have pages, too. ``{plugins} KIND`` lists the pages of a kind,
+and ``{gallery}`` shows the pictures of all of them.
 """
 
 from __future__ import annotations
@@ -189,13 +190,19 @@ class ClassRole(SphinxRole):
     """``:class:`name```: the page of a plugin or of a base class."""
 
     def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
-        name = nodes.literal(text=self.text)
         target = _pages_by_name().get(self.text)
         if target is None:
             _log.warning("no plugin or base class %r", self.text, location=self.get_location())
-            return [name], []
-        attributes = {"refdomain": "std", "reftype": "doc", "reftarget": f"/{target}"}
-        return [addnodes.pending_xref("", name, refexplicit=True, refwarn=True, **attributes)], []
+            return [nodes.literal(text=self.text)], []
+        return [_link(target, self.text)], []
+
+
+def _link(page: str, text: str) -> addnodes.pending_xref:
+    """A link to a page of the site, such as :func:`docname` names it."""
+    target = {"refdomain": "std", "reftype": "doc", "reftarget": f"/{page}"}
+    return addnodes.pending_xref(
+        "", nodes.literal(text=text), refexplicit=True, refwarn=True, **target
+    )
 
 
 class PluginList(SphinxDirective):
@@ -211,11 +218,7 @@ class PluginList(SphinxDirective):
             self.env.note_dependency(str(file))
             page = pages.read_page(file)
             name = file.stem if page.title else _class_name(file)
-            target = {"refdomain": "std", "reftype": "doc", "reftarget": f"/{docname(file)}"}
-            link = addnodes.pending_xref(
-                "", nodes.literal(text=name), refexplicit=True, refwarn=True, **target
-            )
-            term = nodes.term("", "", link)
+            term = nodes.term("", "", _link(docname(file), name))
             if page.title:
                 term += nodes.Text(f" {_title(file)}")
             sentence = re.match(r".*?\.(?= |$)", page.summary)
@@ -232,11 +235,26 @@ class PluginList(SphinxDirective):
         return [listed, nodes.compound("", toctree, classes=["toctree-wrapper"])]
 
 
+class Gallery(SphinxDirective):
+    """The pictures of all plugins, each under the plugin's name."""
+
+    def run(self) -> list[nodes.Node]:
+        shown: list[nodes.Node] = []
+        for kind in ("integrators", "decisions", "samplers", "emitters", "shapes"):
+            for file in kinds()[kind]:
+                picture = _picture(file, self.state.document)
+                if picture:
+                    heading = _link(docname(file), file.stem)
+                    shown += [nodes.paragraph("", "", heading, classes=["rubric"]), *picture]
+        return shown
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     app.add_source_suffix(".py", "plugin")
     app.add_source_parser(PluginParser)
     app.add_directive("pluginparameters", ParameterList)
     app.add_directive("plugins", PluginList)
+    app.add_directive("gallery", Gallery)
     app.add_generic_role("monosp", nodes.literal)
     app.add_generic_role("meth", nodes.literal)
     app.add_role("class", ClassRole())
