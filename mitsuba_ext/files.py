@@ -7,8 +7,10 @@ import os
 import platform
 import re
 import tempfile
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TextIO
 
 from .errors import InputError
 
@@ -62,22 +64,44 @@ def _is_alive(process: int) -> bool:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a temporary path to write to; the finished file then replaces ``path`` in one step.
+    """Yields the path of an empty temporary file to write to; the finished file then replaces
+    ``path`` in one step.
 
     After an exception, ``path`` is unchanged. Removes temporary files for ``path`` of processes on
-    this machine that were killed while they wrote.
+    this machine that were killed while they wrote. If ``path`` is a link, the link is replaced, and
+    not its target; nor can somebody else put a link in the place of the temporary file, because its
+    name cannot be guessed.
+
+    Raises:
+        OSError: The file cannot be written; the error names it.
     """
     before, after = f".{path.stem}.{_HOST}-", path.suffix
-    temporary = path.with_name(f"{before}{os.getpid()}{after}")
-    for name in os.listdir(path.parent):
-        if name.startswith(before) and name.endswith(after):
-            process = name[len(before) : len(name) - len(after)]
-            if process.isdecimal() and not _is_alive(int(process)):
-                with contextlib.suppress(OSError):
-                    path.with_name(name).unlink()
+    temporary = path.with_name(f"{before}{os.getpid()}-{uuid.uuid4().hex[:8]}{after}")
     try:
+        for name in os.listdir(path.parent):
+            if name.startswith(before) and name.endswith(after):
+                process = name[len(before) : len(name) - len(after)].partition("-")[0]
+                if process.isdecimal() and not _is_alive(int(process)):
+                    with contextlib.suppress(OSError):
+                        path.with_name(name).unlink()
+        new_file(temporary).close()
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is not None and error.filename != str(temporary):
+            raise
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def new_file(path: Path) -> TextIO:
+    """Opens a text file that does not exist yet. A link counts as existing.
+
+    Raises:
+        OSError: There is such a file, or it cannot be made.
+    """
+    return path.open("x", encoding="utf-8")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import stat
 import uuid
 import zlib
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import TextIO
 
 from .errors import InputError
-from .files import make_folder
+from .files import make_folder, new_file
 
 try:
     import fcntl
@@ -63,7 +64,9 @@ def marked(mark: Path) -> Iterator[None]:
     if has_crashed(mark):
         raise RuntimeError(mark.with_suffix(_CRASHED).read_text(encoding="utf-8"))
     mark.parent.mkdir(parents=True, exist_ok=True)
-    mark.write_text(str(os.getpid()), encoding="utf-8")
+    mark.unlink(missing_ok=True)  # a link, or the mark of a process that died
+    with new_file(mark) as file:
+        file.write(str(os.getpid()))
     try:
         yield
     finally:
@@ -108,17 +111,19 @@ def blame(folder: Path, process: int, message: str) -> set[Path]:
 
 
 def forgive(folder: Path) -> None:
-    """Removes all marks, so that integrators that crashed are tried again."""
+    """Removes all marks, so that integrators that crashed are tried again. Other files are left
+    alone, whatever their suffix."""
     for suffix in (_RUNNING, _CRASHED):
         for mark in folder.glob(f"*/*{suffix}"):
-            mark.unlink()
+            if re.search(r"_[0-9a-f]{8}$", mark.stem):
+                mark.unlink()
 
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """Locks ``folder`` against other comparisons, as they would slow each other down; makes it if
-    it is missing. The lock ends with the process, in whichever way that ends. Marks of earlier
-    processes are removed. In a worker, this does nothing, because its supervisor holds the lock.
+    """Locks ``folder`` against other comparisons, as they would slow each other down
+    (:func:`locked`). Marks of earlier processes are removed. In a worker, this does nothing,
+    because its supervisor holds the lock.
 
     Raises:
         InputError: Another comparison is running there, or the folder cannot be made.
@@ -126,11 +131,23 @@ def in_use(folder: Path) -> Iterator[None]:
     if SESSION_VARIABLE in os.environ:
         yield
         return
+    with locked(folder):
+        forgive(folder)
+        yield
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Locks ``folder`` against other processes; makes it if it is missing. The lock ends with the
+    process, in whichever way that ends.
+
+    Raises:
+        InputError: Another process uses the folder, or it cannot be made or locked.
+    """
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     make_folder(folder)
     file = _lock(folder)
     try:
-        forgive(folder)
         yield
     finally:
         if file is not None:
@@ -147,7 +164,7 @@ def _lock(folder: Path) -> TextIO | None:
         return None
     path = folder / _LOCK
     while True:
-        file = path.open("a+", encoding="utf-8")
+        file = _opened(path)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -165,7 +182,33 @@ def _lock(folder: Path) -> TextIO | None:
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 break
         file.close()  # the process that held the lock has removed the file since it was opened
-    file.truncate(0)
-    file.write(str(os.getpid()))
-    file.flush()
+    try:
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # closing it writes what is left
+            file.close()
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    return file
+
+
+def _opened(path: Path) -> TextIO:
+    """Opens a lock, or makes it.
+
+    Raises:
+        InputError: It cannot be made, or is no lock but something of the user's.
+    """
+    try:
+        # A link might lead to any file of the user
+        flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+        file = os.fdopen(os.open(path, flags, 0o666), "a+", encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be used as a lock ({error.strerror})") from None
+    file.seek(0)
+    is_regular = stat.S_ISREG(os.fstat(file.fileno()).st_mode)
+    if not is_regular or not re.fullmatch(r"\d{0,20}", file.read(32)):
+        file.close()
+        raise InputError(f"{path}: is no lock of this program: remove it, or name another folder")
     return file

@@ -18,6 +18,7 @@ from mitsuba_ext.metropolis.chains.numbers import generator
 from mitsuba_ext.metropolis.chains.path_chains import PathChains
 from mitsuba_ext.metropolis.chains.stored import arrays_of, value_of
 from mitsuba_ext.metropolis.chains.target import Contribution
+from mitsuba_ext.stored.arrays import StoredArrays
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -46,7 +47,9 @@ def test_arrays_are_put_together_as_they_were() -> None:
     place, colour = mi.Point2f([1, 2], [3, 4]), mi.Color3f([1, 2], [3, 4], [5, 6])
     found = Contribution(place, colour, mi.Float(7, 8))
     tree = [rng, [found, mi.UInt32(1, 2)]]
-    (again, (other, numbers)) = value_of(arrays_of(tree, "all"), "all")
+    stored, kinds = StoredArrays.of(arrays_of(tree, "all")), [mi.PCG32, [Contribution]]
+    again, (other,) = value_of(stored, "all", kinds, None, {})
+    numbers = value_of(stored, "all/1/1", mi.UInt32, 2, {"1": (1, 2)})
     np.testing.assert_array_equal(again.next_float32().numpy(), rng.next_float32().numpy())
     np.testing.assert_array_equal(numbers.numpy(), [1, 2])
     for key, value in vars(found).items():

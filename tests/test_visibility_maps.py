@@ -19,6 +19,7 @@ from mitsuba_ext.decisions.next_event.two_stage import TwoStage
 from mitsuba_ext.learning.next_event.environment_visibility_learner import VisibilityLearner
 from mitsuba_ext.maps.environment_visibility import PrimaryVisibility, Tile, VisibilityCounts
 from mitsuba_ext.rendering.render import kernel_cache_misses
+from mitsuba_ext.stored.arrays import StoredArrays
 from mitsuba_ext.transport.path_decisions import LightNumbers
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -59,10 +60,10 @@ def test_pixels_lie_in_tiles_and_a_large_film_has_larger_ones() -> None:
 def test_visibility_is_a_probability_and_follows_the_counts() -> None:
     counts = VisibilityCounts(WIDTH, HEIGHT, 16, 16)
     for kind in KINDS:
-        counts.counts = _counts(kind, (16, 16))
+        counts.restore(StoredArrays.of({"counts": _counts(kind, (16, 16))}))
         visibility = counts.visibility()
         assert visibility.min() > 0 and visibility.max() <= 1
-    counts.counts = _counts("one cell", (16, 16))
+    counts.restore(StoredArrays.of({"counts": _counts("one cell", (16, 16))}))
     visibility = counts.visibility()[4]
     assert visibility[5, 8] > 0.9 and np.delete(visibility.ravel(), 5 * 16 + 8).max() < 1e-3
 
@@ -71,7 +72,7 @@ def test_visibility_is_a_probability_and_follows_the_counts() -> None:
 def test_random_numbers_are_distributed_by_their_density(kind: str) -> None:
     """Of one tile: chi² over cells, the density is found again, and no cell is starved."""
     counts = VisibilityCounts(WIDTH, HEIGHT, 16, 16)
-    counts.counts = _counts(kind, (16, 16))
+    counts.restore(StoredArrays.of({"counts": _counts(kind, (16, 16))}))
     maps, numbers = PrimaryVisibility(counts, 0.8), mi.PCG32(size=LANES)
     tile, active = Tile(mi.UInt32(4), mi.Bool(True)), mi.Bool(True)
     point, density = maps.sample(tile, _square(numbers), active)
@@ -98,7 +99,7 @@ def test_random_numbers_are_distributed_by_their_density(kind: str) -> None:
 def _learned(scene: mi.Scene, space: str, kind: str) -> TwoStage:
     learner = VisibilityLearner(space, 8, False, 0.9, WIDTH, HEIGHT)
     shape = (16, 16) if space == "primary" else (32, 16)
-    return learner.restore(scene, {"counts": _counts(kind, shape)})
+    return learner.restore(scene, StoredArrays.of({"counts": _counts(kind, shape)}))
 
 
 _CASES = [

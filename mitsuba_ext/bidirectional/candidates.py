@@ -17,6 +17,9 @@ _COUNTS, _MERGING_COUNTS = (1 / 16, 1 / 4, 1.0, 4.0), (1.0,)
 #: paths, and are not tried there.
 _CONNECTIONS = (1, 0, 2, 4)
 
+#: The largest of all these numbers.
+MOST_TRIED = max(*_COUNTS, *_MERGING_COUNTS, *_CONNECTIONS)
+
 
 @dataclass(frozen=True)
 class Candidate:

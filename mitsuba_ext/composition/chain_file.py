@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from ..stored.arrays import StoredArrays
 from . import learned_file
 
 #: The only part of these files.
@@ -37,7 +38,7 @@ class ChainFile:
         }  # fmt: skip
         self._made_by = ", ".join(f"{k} = {' '.join(str(v).split())}" for k, v in described.items())
 
-    def load(self) -> dict[str, np.ndarray] | None:
+    def load(self) -> StoredArrays | None:
         """The saved state; ``None`` if the file does not exist.
 
         Raises:
@@ -45,7 +46,8 @@ class ChainFile:
         """
         if not self._path.exists():
             return None
-        return learned_file.load(self._path, self._scene, self._made_by, self._where)[_PART]
+        parts = learned_file.load(self._path, self._scene, self._made_by, self._where)
+        return parts.get(_PART) or StoredArrays.of({})
 
     def save(self, arrays: dict[str, np.ndarray]) -> None:
         """Writes or replaces the file."""

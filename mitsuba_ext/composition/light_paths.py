@@ -11,7 +11,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ..bidirectional.candidates import Candidate
+from ..bidirectional.candidates import MOST_TRIED, Candidate
 from ..bidirectional.path_moments import Counts, Estimate, PathMoments
 from ..bidirectional.technique_observer import TechniqueObserver
 from ..images.coarse_film import CoarseFilm
@@ -20,6 +20,7 @@ from ..learning.effect import Effect
 from ..learning.learner import Learner
 from ..rendering.camera import film_extent, first_pixel
 from ..scene.movers import movers
+from ..stored.arrays import StoredArrays
 from .decision_parameters import DecisionParameters, Setting, Slots
 from .learned_slots import OF_CAMERA_PATHS
 from .predicted_errors import PredictedErrors
@@ -234,9 +235,9 @@ class LightPathTrial(Learner):
     def state(self) -> dict[str, np.ndarray]:
         return {"light_paths": np.array(astuple(self._choice.techniques), float)}
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightPathChoice:
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> LightPathChoice:
         self._moments = None
-        count, connections, merges = state["light_paths"]
+        count, connections, merges = state.take("light_paths", "f", (3,), 0, MOST_TRIED)
         self._choice = LightPathChoice(Candidate(float(count), int(connections), bool(merges)))
         return self._choice
 

@@ -24,6 +24,7 @@ from ..learning.effect import Effect
 from ..learning.learner import Learner
 from ..learning.pixel_estimates import relative_scale
 from ..rendering.camera import film_extent
+from ..stored.arrays import StoredArrays
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.numbers import Numbers, schedule_state
 from ..transport.walk import Walk
@@ -193,8 +194,8 @@ class PhotonTrial(Learner):
     def state(self) -> dict[str, np.ndarray]:
         return {"light_paths": np.array(astuple(self._choice.techniques), float)}
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> PhotonChoice:
-        is_kept = state["light_paths"][0] > 0
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> PhotonChoice:
+        is_kept = state.take("light_paths", "f", (3,), 0)[0] > 0
         self._choice = PhotonChoice(PHOTONS if is_kept else NO_PHOTONS)
         return self._choice
 

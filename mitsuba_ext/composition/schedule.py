@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from ..learning.learner import Learner
 from ..learning.scout import SCOUT_DEPTH, Scout
@@ -108,7 +109,7 @@ class Schedule:
         estimator: Callable[..., Estimator],
         query: Any,
         restored: States | None = None,
-        learned: Callable[[States], None] | None = None,
+        learned: Callable[[Mapping[str, Mapping[str, np.ndarray]]], None] | None = None,
     ) -> None:
         self._setting, self._pilot_count, self.estimator = setting, len(stages) - 1, estimator
         self._stages = list(stages)
@@ -132,7 +133,7 @@ class Schedule:
         #: For each stage, the weight of its samples relative to those of the last stage
         self._weights = stage_weights(stages) if self._learns_maps else [1.0] * len(stages)
         self._restored, self._learned = restored, learned
-        self._states: States = {}
+        self._states: dict[str, dict[str, np.ndarray]] = {}
         self._scout: Scout | None = None
         self._finished_stages = -1
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..stored.arrays import StoredArrays
 from .hemisphere import Irradiance
 
 #: Of how many neighbours a record's radius is clamped, and how often: a small radius spreads from
@@ -16,6 +17,10 @@ _NEIGHBOURS, _ROUNDS = 12, 8
 #: Two records disagree if they differ by so many standard errors more than the accuracy allows. A
 #: record then reaches this share of the way between them.
 _NOISE, _SHORTER = 2.0, 0.7
+
+
+#: The most records of a file.
+_MOST = 1 << 22
 
 
 @dataclass
@@ -79,9 +84,26 @@ class Records:
         return dict(vars(self))
 
     @classmethod
-    def of_arrays(cls, arrays: dict[str, np.ndarray]) -> Records:
-        """The records from :meth:`arrays`."""
-        return cls(**arrays)
+    def of_arrays(cls, arrays: StoredArrays, channels: int) -> Records:
+        """The records from :meth:`arrays`.
+
+        Raises:
+            DamagedError: They are no records of so many channels.
+        """
+        p = arrays.take("p", "f", (None, 3), longest=3 * _MOST)
+        count, least = len(p), np.finfo(np.float32).tiny
+        shapes = {
+            "n": (count, 3), "irradiance": (count, channels), "rotation": (count, channels, 3),
+            "translation": (count, channels, 3), "reach": (count,), "least": (count,),
+            "deviation": (count,),
+        }  # fmt: skip
+        ranges = {"n": (-2, 2), "irradiance": (0, None), "reach": (least, None),
+                  "least": (0, None), "deviation": (0, None)}  # fmt: skip
+        others = {
+            name: arrays.take(name, "f", shape, *ranges.get(name, (None, None)), 9 * _MOST)
+            for name, shape in shapes.items()
+        }
+        return cls(p, **others)
 
     def joined(self, other: Records) -> Records:
         """These records and others."""

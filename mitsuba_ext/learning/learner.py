@@ -7,6 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from ..stored.arrays import StoredArrays
 from ..transport.observer import Observer
 from .effect import Effect
 
@@ -32,7 +33,7 @@ class Learner(Observer):
         where it is that of Mitsuba's ``path``."""
         return {}
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> Any | None:
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> Any | None:
         """The decision of the last stage, from a :meth:`state` that is not empty, for the same
         scene. A restored learner does not learn: only :meth:`finish` and its summary are used."""
         raise NotImplementedError

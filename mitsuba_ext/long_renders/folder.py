@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .. import marks
 from ..errors import InputError
 from ..files import make_folder, replacing
+from ..stored import archives
+from ..stored.arrays import DamagedError
 from .state import RenderState
 
 #: Files: the description of what is rendered; the state; the state before it.
@@ -22,8 +22,11 @@ _DESCRIPTION, _STATE, _BEFORE = "render.json", "state.npz", "state.before.npz"
 #: name the file that has changed, as names can differ between machines.
 _FILES = "scene files"
 
-#: Version of the format of these files.
-_FORMAT = 2
+#: What a state is, and the version of its format.
+_FORM = "mitsuba_ext render 3"
+
+#: The most bytes of a description.
+_MOST_BYTES = 1 << 26
 
 
 class CheckpointFolder:
@@ -47,7 +50,7 @@ class CheckpointFolder:
     def in_use(self):
         """A context in which no other process can use the folder."""
         make_folder(self.path)
-        return marks.in_use(self.path)
+        return marks.locked(self.path)
 
     def describe(self, description: Mapping[str, Any]) -> None:
         """Stores the description of what is rendered, or compares it with the stored one.
@@ -75,9 +78,12 @@ class CheckpointFolder:
         if not file.exists():
             raise InputError(f"{self.path}: has no {_DESCRIPTION}: no render is kept here")
         try:
-            return json.loads(file.read_text())
-        except (OSError, ValueError) as error:
+            description = json.loads(archives.read_bytes(file, _MOST_BYTES))
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{file}: cannot be read ({error})") from None
+        if not isinstance(description, dict):
+            raise InputError(f"{file}: is no description of a render")
+        return description
 
     def load(self) -> RenderState:
         """The newest state that is not damaged; an empty one if there is none.
@@ -88,12 +94,19 @@ class CheckpointFolder:
         found = [self.path / name for name in (_STATE, _BEFORE)]
         found = [file for file in found if file.exists()]
         for file in found:
-            arrays = _read(file)
-            if arrays is not None:
-                self.damaged = None if file == found[0] else found[0]
-                return RenderState.from_arrays(arrays)
+            try:
+                arrays = archives.read(file, _FORM, f"{file}", "delete it")
+                # States are not compressed, so that they are not larger than their files
+                state = RenderState.from_arrays(arrays, file.stat().st_size)
+            except (DamagedError, OSError):
+                continue
+            self.damaged = None if file == found[0] else found[0]
+            return state
         if found:
-            raise InputError(f"{found[0]}: is damaged: delete {self.path}, and begin again")
+            raise InputError(
+                f"{found[0]}: is damaged, or was written by another version: delete {self.path}, "
+                f"and begin again"
+            )
         return RenderState()
 
     def save(self, state: RenderState) -> None:
@@ -103,19 +116,15 @@ class CheckpointFolder:
             OSError: It cannot be written; the state before it is still there.
         """
         file = self.path / _STATE
-        temporary = self.path / f".{_STATE}"
-        try:
+        with replacing(file) as temporary:
             with temporary.open("wb") as stream:
-                np.savez(stream, format=np.array(_FORMAT), **state.arrays())
+                archives.write_to(stream, _FORM, state.arrays(), is_compressed=False)
                 stream.flush()
                 os.fsync(stream.fileno())
             # A damaged state must not replace the one before it, which is not damaged
             if file.exists() and self.damaged is None:
                 os.replace(file, self.path / _BEFORE)
-            os.replace(temporary, file)
-            self.damaged = None
-        finally:
-            temporary.unlink(missing_ok=True)
+        self.damaged = None
 
 
 def check_same(
@@ -144,7 +153,9 @@ def difference(before: Mapping[str, Any], now: Mapping[str, Any], free: Sequence
         there, here = before.get(key), now.get(key)
         change = f"{there} there, {here} here"
         if key == f"{_FILES} hash":
-            key, change = _FILES, _changed_files(before.get(_FILES, {}), now.get(_FILES, {}))
+            files = (d.get(_FILES) for d in (before, now))
+            files = (f if isinstance(f, Mapping) else {} for f in files)
+            key, change = _FILES, _changed_files(*files)
         elif key.endswith("hash"):  # its value would not help the user
             key = key.removesuffix("hash").strip()
             change = "its code has changed" if key == "integrator" else "it has changed"
@@ -161,16 +172,6 @@ def _changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     are = "has" if len(names) == 1 else "have"
     return f"{', '.join(names[:3])}{more} {are} changed" if names else "their order has changed"
-
-
-def _read(file: Path) -> dict[str, np.ndarray] | None:
-    """The arrays of a file; ``None`` if it is damaged."""
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        return arrays if int(arrays.pop("format")) == _FORMAT else None
-    except Exception:  # NumPy, zipfile (which verifies checksums) and zlib raise many kinds
-        return None
 
 
 def _flush(path: Path) -> None:

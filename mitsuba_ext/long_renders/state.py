@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import mitsuba as mi
@@ -13,6 +12,7 @@ from ..errors import InputError
 from ..rendering.batches import Batches
 from ..rendering.film_sums import FilmSums
 from ..rendering.totals import RenderTotals
+from ..stored.arrays import StoredArrays
 
 
 class Batch(NamedTuple):
@@ -136,21 +136,35 @@ class RenderState:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> RenderState:
-        """
+    def from_arrays(cls, arrays: StoredArrays, most_bytes: int) -> RenderState:
+        """The inverse of :meth:`arrays`.
+
+        Args:
+            most_bytes: The most bytes of one of the arrays.
+
         Raises:
-            KeyError: An array is missing.
+            DamagedError: They are no state.
         """
-        state = cls()
-        state.done = [Batch(*row) for row in arrays["done"].tolist()]
-        state.film.contents = arrays["contents"]
-        state.film.has_weights, state.film.spp = bool(arrays["has_weights"]), int(arrays["spp"])
-        state.aov_names = tuple(arrays["aov_names"].tolist())
+        state, anything = cls(), (-np.inf, np.inf)
+        done = arrays.take("done", "u", (None, 3), 0, 0xFFFFFFFF, most_bytes)
+        state.done = [Batch(*row) for row in done.tolist()]
+        indices = {(seed, index) for seed, index, _spp in state.done}
+        arrays.require(len(indices) == len(done), "a batch is there twice")
+        spp = int(done[:, 2].sum(dtype=np.uint64))
+        arrays.number("spp", "iu", spp, spp)
+        state.totals = RenderTotals.of_known(arrays.text("totals", most_bytes), arrays)
+        state.aov_names = arrays.texts("aov_names")
         if "learned" in arrays:
-            state.learned = arrays["learned"].tobytes()
-        state.totals = RenderTotals(**json.loads(str(arrays.get("totals", "{}"))))
-        if state.done:
-            prefix = "images."
-            parts = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
-            state.images = Batches.from_arrays(parts)
+            state.learned = arrays.take("learned", "u", (None,), 0, 0xFF, most_bytes).tobytes()
+        if not state.done:
+            return state
+        state.images = Batches.from_arrays(arrays.part("images."), most_bytes)
+        arrays.require(
+            state.images.count == len(done) and state.images.spp == spp,
+            f"images of {state.images.count} batches, and {len(done)} batches",
+        )
+        shape = (*state.images.mean.shape[:2], None)
+        state.film.contents = arrays.take("contents", "f", shape, *anything, most_bytes)
+        state.film.has_weights = bool(arrays.take("has_weights", "b"))
+        state.film.spp = spp
         return state

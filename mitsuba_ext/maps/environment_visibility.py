@@ -15,6 +15,7 @@ import numpy as np
 
 from ..arrays import from_numpy
 from ..discrete_sampling import ONE_MINUS_EPSILON
+from ..stored.arrays import StoredArrays
 from ..transport.observer import Observer
 
 #: The least edge of a tile in pixels, and the most tiles of a film.
@@ -96,9 +97,16 @@ class VisibilityCounts(Observer):
     def counts(self) -> np.ndarray:
         return self._counts.numpy()
 
-    @counts.setter
-    def counts(self, values: np.ndarray) -> None:
-        self._counts = from_numpy(mi.UInt64, values)
+    def restore(self, state: StoredArrays) -> None:
+        """Sets the counts to the array ``counts``, those of a film of the same size.
+
+        Raises:
+            DamagedError: They are no such counts.
+        """
+        counts = state.take("counts", "u", (len(self._counts),))
+        is_sound = (counts >> 32) <= (counts & 0xFFFFFFFF)
+        state.require(bool(is_sound.all()), 'there are more successes than tests in "counts"')
+        self._counts = from_numpy(mi.UInt64, counts)
 
     def release(self) -> None:
         """Frees the counts."""

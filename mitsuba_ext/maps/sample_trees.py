@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import from_numpy
+from ..stored.arrays import StoredArrays
 
 #: The value that marks a leaf, in place of a probability.
 LEAF = -1.0
@@ -19,6 +20,10 @@ _BITS = 9
 _ONE = 1 << _BITS
 
 _ALMOST_ONE = 1 - 2.0**-24
+
+#: Of stored trees: the most words of all nodes (256 MiB), and the most packed nodes from a root to
+#: a leaf.
+_MOST_WORDS, _DEEPEST = 1 << 26, 64
 
 
 class SampleTrees:
@@ -92,24 +97,39 @@ class SampleTrees:
         }
 
     @classmethod
-    def of_state(cls, state: dict[str, np.ndarray]) -> SampleTrees:
-        """The trees from the arrays of :meth:`state`."""
+    def of_state(cls, state: StoredArrays) -> SampleTrees:
+        """The trees from the arrays of :meth:`state`.
+
+        Raises:
+            DamagedError: They are no trees: a child is missing, or leads back to its parent.
+        """
+        nodes = state.take("nodes", "u", (None,), most=0xFFFFFFFF, longest=_MOST_WORDS)
+        slots = len(nodes) // 2
+        share = state.take("share", "f", (None,), 0, 1, slots)
+        has_values = "values" in state and state.shape("values") != (0,)
+        values = state.take("values", "u", (slots if has_values else 0,), most=len(share) - 1)
+        state.require(_end_in_leaves(nodes.reshape(-1, 2)), '"nodes" are no trees')
+        return cls._of(nodes, values, share)
+
+    @classmethod
+    def _of(cls, nodes: np.ndarray, values: np.ndarray, share: np.ndarray) -> SampleTrees:
         trees = cls.__new__(cls)
         # As integers: bit patterns of nodes may be those of NaNs
-        trees._nodes = dr.reinterpret_array(mi.Float, from_numpy(mi.UInt32, state["nodes"]))
-        trees._values = from_numpy(mi.UInt32, state["values"])
-        trees.share = from_numpy(mi.Float, state["share"])
+        trees._nodes = dr.reinterpret_array(mi.Float, from_numpy(mi.UInt32, nodes))
+        trees._values, trees.share = from_numpy(mi.UInt32, values), from_numpy(mi.Float, share)
         dr.eval(trees._nodes, trees._values, trees.share)
         return trees
 
     @classmethod
     def uniform(cls, count: int) -> SampleTrees:
         """So many trees without splits."""
-        return cls.of_state({
-            "nodes": np.zeros(2 * count, np.uint32),
-            "values": np.zeros(0, np.uint32),
-            "share": np.zeros(count, np.float32),
-        })  # fmt: skip
+        nodes, values = np.zeros(2 * count, np.uint32), np.zeros(0, np.uint32)
+        return cls._of(nodes, values, np.zeros(count, np.float32))
+
+    @property
+    def count(self) -> int:
+        """Number of trees."""
+        return len(self.share)
 
     @property
     def bytes(self) -> int:
@@ -178,6 +198,21 @@ class SampleTrees:
         x, y = dr.minimum(x, last), dr.minimum(y, last)
         point = mi.Point2f((mi.Float(column) + x) * edge, (mi.Float(row) + y) * edge)
         return point, density, node
+
+
+def _end_in_leaves(nodes: np.ndarray) -> bool:
+    """Do all ways down packed nodes end in a leaf?"""
+    side = np.arange(4, dtype=np.uint32)
+    is_leaf = (nodes[:, :1] >> (3 * _BITS + side)) & 1 == 1
+    child = np.where(is_leaf, 0, nodes[:, 1:].astype(np.int64) + side)
+    if not len(nodes) or child.max() >= len(nodes):
+        return False
+    ends = is_leaf.all(axis=1)
+    for _level in range(_DEEPEST):
+        if ends.all():
+            return True
+        ends = (is_leaf | ends[child]).all(axis=1)
+    return False
 
 
 def _choose(x: mi.Float, bits: mi.UInt32, by_tree: mi.Bool) -> tuple[mi.Float, mi.Bool, mi.Float]:

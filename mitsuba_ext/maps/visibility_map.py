@@ -12,6 +12,7 @@ import numpy as np
 
 from ..arrays import from_numpy
 from ..regions.voxel_grid import VoxelGrid
+from ..stored.arrays import StoredArrays
 
 #: Two counters, and two numbers of the roulette's table in the worst case (lights in all voxels).
 _BYTES_PER_ENTRY = 16
@@ -73,10 +74,20 @@ class VisibilityMap:
             "holds_light": self._holds_light.numpy(),
         }
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Sets the counters to those of a map of the same scene and grid."""
+    def restore(self, state: StoredArrays) -> None:
+        """Sets the counters to those of a map of the same scene and grid.
+
+        Raises:
+            DamagedError: They are no such counters.
+        """
+        entries, most = (len(self.tests),), 0xFFFFFFFF
+        tests, successes = (
+            state.take(key, "u", entries, 0, most, *entries) for key in ("tests", "successes")
+        )
+        state.require(bool((successes <= tests).all()), 'there are more "successes" than "tests"')
+        holds_light = state.take("holds_light", "u", (len(self._holds_light),), most=1)
         self.tests, self.successes, self._holds_light = (
-            from_numpy(mi.UInt32, state[key]) for key in ("tests", "successes", "holds_light")
+            from_numpy(mi.UInt32, x) for x in (tests, successes, holds_light)
         )
 
     def _entry_count(self) -> int:

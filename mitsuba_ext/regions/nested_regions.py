@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import from_numpy
+from ..stored.arrays import StoredArrays
 from .surface_sides import region
 from .voxel_sides import SIDES, VoxelSides, voxel_coordinates
 
@@ -79,14 +80,22 @@ class NestedRegions:
         }
 
     @classmethod
-    def of_state(cls, state: dict[str, np.ndarray]) -> NestedRegions:
-        """Regions from a :meth:`state`, with only :meth:`number` and ``count``."""
-        regions = cls.__new__(cls)
-        regions._origin, regions._scale = state["origin"], state["scale"]
+    def of_state(cls, state: StoredArrays) -> NestedRegions:
+        """Regions from a :meth:`state`, with only :meth:`number` and ``count``.
+
+        Raises:
+            DamagedError: The state is that of no regions.
+        """
+        regions, pairs = cls.__new__(cls), _GRIDS[-1] ** 3 * SIDES
+        regions._origin = state.take("origin", "f", (3,))
+        regions._scale = state.take("scale", "f", (3,), least=0)
+        # At most a region for each pair of each grid, and the whole scene
+        regions.count = state.number("count", "iu", 1, 1 + sum(n**3 * SIDES for n in _GRIDS))
+        table = state.take("table", "u", (pairs,), most=regions.count - 1)
         regions._pairs = VoxelSides(
             mi.Point3f(regions._origin), mi.Vector3f(regions._scale), _GRIDS[-1]
         )
-        regions._table, regions.count = from_numpy(mi.UInt32, state["table"]), int(state["count"])
+        regions._table = from_numpy(mi.UInt32, table)
         dr.eval(regions._table)
         return regions
 

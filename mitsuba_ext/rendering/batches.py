@@ -7,7 +7,7 @@ through ``sample()`` (light tracing, Metropolis) or whose samples depend on each
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -16,6 +16,7 @@ import numpy as np
 
 from ..scene.unseen import check_all_is_seen
 from ..startup.garbage import garbage_left_alone
+from ..stored.arrays import StoredArrays
 from .camera import film_told, find_sensor
 
 
@@ -75,17 +76,26 @@ class Batches:
         }  # fmt: skip
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Batches:
+    def from_arrays(cls, arrays: StoredArrays, most_bytes: int = 1 << 40) -> Batches:
         """The inverse of :meth:`arrays`.
 
+        Args:
+            most_bytes: The most bytes of one of the arrays.
+
         Raises:
-            KeyError: An array is missing.
+            DamagedError: They are no batches.
         """
-        batches = cls(arrays["channels"].tolist(), int(arrays["image_channel_count"]))
-        batches._state = (
-            int(arrays["count"]), int(arrays["samples"]), arrays["mean"],
-            arrays["weighted_squares"],
-        )  # fmt: skip
+        channels = arrays.texts("channels")
+        arrays.require(bool(channels), "no channels")
+        batches = cls(channels, arrays.number("image_channel_count", "iu", 1, len(channels)))
+        count, samples = (arrays.number(key, "iu", 0, 1 << 62) for key in ("count", "samples"))
+        mean, squares = np.float64(0), np.float64(0)
+        if count:
+            # Pixels may be infinite, or NaN
+            shape, limits = (None, None, len(channels)), (-np.inf, np.inf)
+            mean = arrays.take("mean", "f", shape, *limits, most_bytes)
+            squares = arrays.take("weighted_squares", "f", mean.shape, *limits, most_bytes)
+        batches._state = count, samples, mean, squares
         return batches
 
     def save(self, path: Path) -> None:
@@ -101,7 +111,7 @@ class Batches:
             OSError, ValueError, KeyError, zipfile.BadZipFile: The file is missing or damaged.
         """
         with np.load(path) as stored:
-            return cls.from_arrays(stored)
+            return cls.from_arrays(StoredArrays.of(dict(stored)))
 
     @property
     def spp(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -10,8 +11,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..stored.arrays import StoredArrays
 from .camera import film_extent
 from .statistics import RenderStatistics
+
+#: The kinds of rays that are counted.
+_KINDS = ("camera", "scatter", "shadow")
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,21 @@ class RenderTotals:
             own.memory, own.learned, own.effects,
         )  # fmt: skip
 
+    @classmethod
+    def of_known(cls, text: str, arrays: StoredArrays) -> RenderTotals:
+        """The inverse of :meth:`known`, from its JSON in ``arrays``.
+
+        Raises:
+            DamagedError: It is none.
+        """
+        try:
+            known = json.loads(text)
+        except (ValueError, RecursionError):
+            known = None
+        is_sound = isinstance(known, dict) and all(_is_cost(*cost) for cost in known.items())
+        arrays.require(is_sound, 'the text "totals" holds no costs')
+        return cls(**known)
+
     def plus(self, later: RenderTotals) -> RenderTotals:
         """The cost of both."""
         kinds = dict.fromkeys([*self.rays, *later.rays])
@@ -76,6 +96,23 @@ class RenderTotals:
     def known(self) -> dict[str, Any]:
         """The attributes that are not 0 or empty."""
         return {key: value for key, value in asdict(self).items() if value}
+
+
+def _is_cost(key: str, value: Any) -> bool:
+    """Can an attribute of :class:`RenderTotals` have this value?"""
+    if key == "rays":
+        return isinstance(value, dict) and all(
+            kind in _KINDS and _is_number(count) for kind, count in value.items()
+        )
+    if key == "effects":
+        return isinstance(value, dict) and all(isinstance(x, dict) for x in value.values())
+    if key == "learned":
+        return isinstance(value, str)
+    return key in RenderTotals.__dataclass_fields__ and _is_number(value)
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and 0 <= value < math.inf
 
 
 def forget_memory_peak() -> None:

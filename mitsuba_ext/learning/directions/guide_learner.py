@@ -12,6 +12,7 @@ import numpy as np
 from ...decisions.directions.guided_directions import GuidedDirections, Regions
 from ...decisions.roulette.adjoint_roulette import AdjointRoulette
 from ...maps.sample_trees import SampleTrees
+from ...stored.arrays import StoredArrays
 from ...transport.observer import Observer
 from ...transport.path_decisions import DirectionSamples, Roulette
 from ..benefit import BATCHES, FIRST_GUIDED, GUIDED, gain_of, is_worth
@@ -99,7 +100,7 @@ class GuideLearner(Learner):
         self.roulette, self.trial = Roulette(), None
         self._rr_depth: int | None = None
         self._film_size, self._pixels = film_size, PixelEstimates(film_size[0])
-        self._pixel_count = film_size[0] * film_size[1]
+        self.pixel_count = film_size[0] * film_size[1]
         #: The time of a sample, in units of that of ``path`` without guides
         self._time = 1.0
         self.sample_count = 0
@@ -121,7 +122,7 @@ class GuideLearner(Learner):
         count = self._regions.count + 1
         if self._rr_depth is not None:
             self.roulette = AdjointRoulette.by_throughput(
-                self._regions, count, self._pixel_count
+                self._regions, count, self.pixel_count
             )
         return GuidedDirections(SampleTrees.uniform(count), self._regions, self.bounces)
 
@@ -241,11 +242,14 @@ class GuideLearner(Learner):
         arrays = {**self.guide.trees.state(), **self.guide.regions.state()}
         return {**arrays, "bounces": np.array(self.guide.bounces)}
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> GuidedDirections:
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> GuidedDirections:
         # Any vertex: these regions are replaced
         regions = self.make_regions(mi.Point3f(0, 0, 0), mi.Normal3f(0, 0, 1))
         regions.restore(state)
-        trees, bounces = SampleTrees.of_state(state), int(state["bounces"])
+        trees, bounces = SampleTrees.of_state(state), state.number("bounces", "iu", 1, 1 << 20)
+        state.require(
+            trees.count >= regions.tree_count, f"{trees.count} trees for {regions.tree_count} roots"
+        )
         self.guide = GuidedDirections(trees, regions, bounces)
         self._summary = f"guide: {regions}, for {bounces} bounces"
         return self.guide

@@ -7,6 +7,7 @@ import numpy as np
 
 from ...arrays import from_numpy
 from ...decisions.roulette.adjoint_roulette import AdjointRoulette
+from ...stored.arrays import StoredArrays
 from ...transport.path_decisions import Roulette
 from ..learner import Learner
 from .guide_learner import GuideLearner
@@ -35,9 +36,13 @@ class RouletteLearner(Learner):
         roulette = self._guide.roulette
         return roulette.state() if isinstance(roulette, AdjointRoulette) else {}
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> Roulette:
-        radiance, scale = (from_numpy(mi.Float, state[key]) for key in ("radiance", "scale"))
-        self._guide.roulette = AdjointRoulette(self._guide.guide.regions, radiance, scale)
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> Roulette:
+        regions = self._guide.guide.regions
+        radiance = state.take("radiance", "f", (regions.tree_count,), -1)
+        scale = state.take("scale", "f", (self._guide.pixel_count,), 0)
+        self._guide.roulette = AdjointRoulette(
+            regions, from_numpy(mi.Float, radiance), from_numpy(mi.Float, scale)
+        )
         return self._guide.roulette
 
     def __str__(self) -> str:

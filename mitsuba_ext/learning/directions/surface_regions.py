@@ -10,6 +10,7 @@ from ...arrays import from_numpy
 from ...maps.sample_trees import SampleTrees
 from ...regions.nested_regions import NestedRegions
 from ...regions.surface_sides import lit_normal
+from ...stored.arrays import StoredArrays
 from .path_records import PathRecords
 from .tree_builder import UNIFORM, Samples, TreeBuilder
 
@@ -42,9 +43,14 @@ class SurfaceRegions:
         """What the walk needs of the regions, as arrays."""
         return self._regions.state()
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
+    def restore(self, state: StoredArrays) -> None:
         """Restores the regions from the arrays of :meth:`state`."""
         self._set(NestedRegions.of_state(state))
+
+    @property
+    def tree_count(self) -> int:
+        """Number of trees: one more than there are regions, for mirrors and glass."""
+        return self.count + 1
 
     # ---- During the walk ----
 

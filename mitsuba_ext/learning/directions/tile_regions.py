@@ -12,6 +12,7 @@ import numpy as np
 
 from ...arrays import joined
 from ...maps.sample_trees import SampleTrees
+from ...stored.arrays import StoredArrays
 from .path_records import PathRecords
 from .tree_builder import DEPTH, UNIFORM, Samples, TreeBuilder
 
@@ -46,8 +47,13 @@ class TileRegions:
         """The arrays that depend on the pilots: none."""
         return {}
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
+    def restore(self, state: StoredArrays) -> None:
         """Restores the result of :meth:`state`: nothing to do."""
+
+    @property
+    def tree_count(self) -> int:
+        """Number of trees of first bounces."""
+        return self.count
 
     # ---- During the walk ----
 

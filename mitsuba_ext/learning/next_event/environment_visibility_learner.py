@@ -11,6 +11,7 @@ from ...decisions.next_event.two_stage import TwoStage
 from ...lights.environment_texels import EnvironmentTexels
 from ...lights.texel_sums import TexelSums
 from ...maps.environment_visibility import PrimaryVisibility, VisibilityCounts, WorldVisibility
+from ...stored.arrays import StoredArrays
 from ..learner import Learner
 
 #: Cells of a tile in each space: columns and rows, powers of two.
@@ -53,9 +54,9 @@ class VisibilityLearner(Learner):
     def state(self) -> dict[str, np.ndarray]:
         return self._state
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> TwoStage:
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> TwoStage:
         self._sums = TexelSums(EnvironmentTexels(scene))
-        self._counts.counts = state["counts"]
+        self._counts.restore(state)
         self._summary = str(self._counts)
         return self._learned(scene)
 

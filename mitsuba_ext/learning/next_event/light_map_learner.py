@@ -18,6 +18,7 @@ from ...maps import light_map_file
 from ...maps.light_map import BYTES_PER_ENTRY, LightMap
 from ...regions.surface_rows import BYTES_PER_VOXEL, RowCounts, SurfaceRows, voxel_edges
 from ...regions.surface_sides import region
+from ...stored.arrays import StoredArrays
 from ...transport.observer import Observer
 from ...transport.path_decisions import EmitterSampling
 from ..benefit import is_worth
@@ -231,8 +232,8 @@ class LightMapLearner(Learner):
     def state(self) -> dict[str, np.ndarray]:
         return {} if self.map is None else light_map_file.arrays_of(self._scene, self.map)
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> LightTable:
-        self.map = light_map_file.of_arrays(state, scene)
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> LightTable:
+        self.map = light_map_file.of_arrays(state, scene, self.max_memory)
         self._set_as_path(scene)
         self.map.evaluate()
         self._is_kept, self._summary = True, str(self.map)

@@ -7,6 +7,7 @@ import numpy as np
 
 from ...decisions.shadow_test.light_map_roulette import LightMapRoulette
 from ...decisions.shadow_test.rejection_law import WORTHWHILE
+from ...stored.arrays import StoredArrays
 from ...transport.path_decisions import ShadowTest
 from ..learner import Learner
 from ..next_event.light_map_learner import LightMapLearner
@@ -37,7 +38,7 @@ class LightMapRouletteLearner(Learner):
         # Everything else is in the light map
         return {} if self._lights.map is None else {"law": np.array(self._law["law"])}
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> ShadowTest | None:
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> ShadowTest | None:
         return self._make_roulette()
 
     def _make_roulette(self) -> ShadowTest | None:

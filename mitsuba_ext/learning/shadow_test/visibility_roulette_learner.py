@@ -12,6 +12,7 @@ import numpy as np
 from ...decisions.shadow_test.rejection_law import WORTHWHILE
 from ...decisions.shadow_test.visibility_roulette import VisibilityRoulette
 from ...maps.visibility_map import VisibilityMap
+from ...stored.arrays import StoredArrays
 from ...transport.path_decisions import ShadowTest
 from ..learner import Learner
 
@@ -59,7 +60,7 @@ class VisibilityRouletteLearner(Learner):
     def state(self) -> dict[str, np.ndarray]:
         return self._map.state()
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> ShadowTest | None:
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> ShadowTest | None:
         self._map = VisibilityMap(scene, self._grid, self._max_memory)
         self._map.restore(state)
         return self._make_roulette()

@@ -12,6 +12,7 @@ import numpy as np
 from ...arrays import joined
 from ...decisions.subpaths.region_table import RegionTable
 from ...regions.nested_regions import NestedRegions
+from ...stored.arrays import StoredArrays
 from ...transport.path_decisions import SubpathSelection
 from ..learner import Learner
 from ..pixel_estimates import PixelEstimates
@@ -191,11 +192,13 @@ class RegionLearner(Learner):
             "power": self._power,
         }
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> RegionTable:
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> RegionTable:
         self._regions = NestedRegions.of_state(state)
-        self._probability, self._vertices = state["probability"], state["vertices"]
-        # Files of version 0.2.0 have no powers: all vertices are then alike
-        self._power = state.get("power", self._vertices)
+        count, least = self._regions.count, np.finfo(np.float32).tiny
+        state.require(count <= _MOST_REGIONS, f"{count} regions")
+        self._probability = state.take("probability", "f", (count, count), least, 1)
+        self._vertices = state.take("vertices", "f", (count,), least)
+        self._power = state.take("power", "f", (count,), 0)
         self._summary = f"{self._regions.count} regions of light vertices"
         return self._table()
 

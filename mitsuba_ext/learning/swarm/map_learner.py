@@ -11,6 +11,7 @@ import numpy as np
 from ...arrays import from_numpy
 from ...maps.swarm.cells import CellDensities, Cells
 from ...maps.swarm.film_tiles import FilmTiles
+from ...stored.arrays import StoredArrays
 from ...transport.colour import to_rgb
 from ...transport.estimator import CameraRays
 from ..effect import Effect
@@ -229,11 +230,16 @@ class MapLearner(Learner):
         edge = np.array(self.decision.tiles.edge)
         return {"cumulative": maps.cumulative.numpy(), "edge": edge}
 
-    def restore(self, scene: mi.Scene, state: dict[str, np.ndarray]) -> Any:
-        maps = CellDensities(self.cells, self._widths)
-        maps.cumulative = from_numpy(mi.UInt32, state["cumulative"])
-        self.decision.maps = maps
-        self.decision.tiles = FilmTiles(*self._extent, int(state["edge"]))
+    def restore(self, scene: mi.Scene, state: StoredArrays) -> Any:
+        maps, cells = CellDensities(self.cells, self._widths), self.cells.count
+        tiles = FilmTiles(*self._extent, state.number("edge", "iu", 1, 1 << 16))
+        size = tiles.count * self.maps * cells
+        cumulative = state.take("cumulative", "u", (size,), 0, 0xFFFFFFFF, longest=size)
+        rows = cumulative.reshape(-1, cells)
+        is_rising = (rows[:, 1:] >= rows[:, :-1]).all() and (rows[:, -1] > 0).all()
+        state.require(bool(is_rising), '"cumulative" is not rising')
+        maps.cumulative = from_numpy(mi.UInt32, cumulative)
+        self.decision.maps, self.decision.tiles = maps, tiles
         return self.decision
 
     def finish(self) -> None:

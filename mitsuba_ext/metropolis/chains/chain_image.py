@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
 
 from ...rendering.filter_weights import put_splats
+from ...stored.arrays import StoredArrays
 from .target import Contribution, Found
 
 
@@ -53,6 +55,19 @@ class ChainImage:
         for block, tensor in zip(self._blocks, tensors):
             block.put_block(mi.ImageBlock(tensor, offset=block.offset()))
         dr.eval(self.tensors())
+
+    def restore(self, stored: StoredArrays, names: Sequence[str]) -> None:
+        """Adds the tensors of an image of this film from a file.
+
+        Raises:
+            DamagedError: They have another size.
+        """
+        shapes = [tensor.shape for tensor in self.tensors()]
+        arrays = (
+            stored.take(name, "f", shape, longest=math.prod(shape))
+            for name, shape in zip(names, shapes)
+        )
+        self.add_tensors([mi.TensorXf(array) for array in arrays])
 
     def tensors(self) -> list[mi.TensorXf]:
         """The pixels of each block. A launch evaluates them."""

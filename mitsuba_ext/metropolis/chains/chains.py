@@ -9,12 +9,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...stored.arrays import StoredArrays
 from ...transport.frozen import frozen
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
 from .numbers import generator, stream
 from .small_steps import SmallSteps
-from .stored import Arrays, arrays_of, value_of
+from .stored import Arrays, Ranges, arrays_of, value_of
 from .target import ImageTarget
 
 #: Random numbers of a state that a chain stores, for the camera's end of its path and for the
@@ -26,6 +27,9 @@ MOST_NUMBERS, MOST_LIGHT_NUMBERS = 128, 96
 #: cores), and least number for each chain. States are read and written, and the clock is checked,
 #: between launches.
 _LAUNCH, _LEAST_LAUNCH = 1 << 21, 16
+
+#: The most chains that a file may have.
+_MOST_CHAINS = 1 << 20
 
 #: Streams of random numbers, different from those of the bootstrap.
 CAMERA, LIGHT = 3, 4
@@ -121,9 +125,6 @@ class Chains:
         done: Number of mutations of each chain.
     """
 
-    #: Names of the attributes that make up the state of all chains.
-    _parts_of_state: tuple[str, ...]
-
     def __init__(
         self,
         target: ImageTarget,
@@ -133,11 +134,11 @@ class Chains:
         winners: mi.UInt32 | None,
         seed: int,
         energy: float = 1.0,
-        stored: Arrays | None = None,
+        stored: StoredArrays | None = None,
     ) -> None:
         self._target, self._image, self.rules = target, image, rules
         self._seed = seed
-        count = int(stored["count"]) if stored else len(winners)
+        count = stored.number("count", "iu", 1, _MOST_CHAINS) if stored else len(winners)
         self._large_step = dr.opaque(mi.Float, rules.large_step)
         self._uses_uniform = rules.large_step > 0 and rules.uniform_weight > 0
         self._uniform_weight = dr.opaque(mi.Float, rules.uniform_weight)
@@ -151,9 +152,10 @@ class Chains:
         if not stored:
             self._begin(bootstrap, winners)
             return
-        self.done = int(stored["done"])
-        for name in self._parts_of_state:
-            setattr(self, name, value_of(stored, name))
+        self.done = stored.number("done", "iu", 1, 0xFFFFFFFF)
+        for name, (kind, width) in self._state_kinds().items():
+            setattr(self, name, value_of(stored, name, kind, width, self._ranges()))
+        self._check(stored)
 
     @property
     def launch(self) -> int:
@@ -163,9 +165,27 @@ class Chains:
 
     def stored(self) -> Arrays:
         """The state of the chains between two launches."""
-        parts = (arrays_of(getattr(self, name), name) for name in self._parts_of_state)
+        parts = (arrays_of(getattr(self, name), name) for name in self._state_kinds())
         own = {"count": np.array(self.count), "done": np.array(self.done)}
         return {key: array for part in (own, *parts) for key, array in part.items()}
+
+    def _state_kinds(self) -> dict[str, tuple[Any, int | None]]:
+        """The attributes that make up the state of all chains: the type of each, and its lanes."""
+        rngs = [mi.PCG32] * len(self._rngs)
+        return {"_rngs": (rngs, self.count), "_weight": (mi.Float, self.count)}
+
+    def _ranges(self) -> Ranges:
+        """The least and the largest value of each attribute, and of the fields of structures."""
+        return {"target": (0, None), "_weight": (0, None)}
+
+    def _check(self, stored: StoredArrays) -> None:
+        """Checks what was restored beyond the range of each number.
+
+        Raises:
+            DamagedError: It is no state.
+        """
+        for rng in self._rngs:
+            stored.require(bool(dr.all(rng.inc & 1 == 1)), "an increment is even")
 
     def _begin(self, bootstrap: Bootstrap, winners: mi.UInt32) -> None:
         """Makes these samples the states of the chains."""

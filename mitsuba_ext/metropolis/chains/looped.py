@@ -14,8 +14,6 @@ class LoopedChains(Chains):
     """All mutations of a launch are one traced loop around the estimator. A sample of the estimator
     must contribute to one film position only: there are no splats. See :class:`Chains`."""
 
-    _parts_of_state = ("_rngs", "_state", "_known", "_values", "_weight", "_earlier")
-
     def _begin(self, bootstrap, winners):
         record = RecordedNumbers(
             dr.zeros(mi.Float, MOST_NUMBERS * self.count), self.count, self.rules.steps
@@ -27,6 +25,16 @@ class LoopedChains(Chains):
         self._earlier = dr.opaque(mi.Float, 0, self.count)
         # Evaluated now, so that the first launch has the same kernel as the others
         dr.eval(self._state, self._known, self._values, self._rngs)
+
+    def _state_kinds(self):
+        numbers, count = MOST_NUMBERS * self.count, self.count
+        own = {"_state": (Contribution, count), "_known": (mi.UInt32, count)}
+        others = {"_values": (mi.Float, numbers), "_earlier": (mi.Float, count)}
+        return {**super()._state_kinds(), **own, **others}
+
+    def _ranges(self):
+        own = {"_known": (0, MOST_NUMBERS), "_values": (0, 1), "_earlier": (0, None)}
+        return {**super()._ranges(), **own}
 
     def kernel_state(self) -> tuple:
         """The objects and constants that kernels depend on, without the states."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ...transport.frozen import frozen
 from ...transport.numbers import Numbers, copied
@@ -22,8 +23,6 @@ class PathChains(Chains):
     """Chains of paths. All mutations of a launch are one traced loop. In each step, all chains make
     the same kind of mutation if their paths allow it, so that neighbouring lanes execute the same
     code. See :class:`Chains`."""
-
-    _parts_of_state = ("_rngs", "_state", "_places", "_logs", "_weight")
 
     def _begin(self, bootstrap, winners):
         self._state, self._places, self._logs = self._first(bootstrap.numbers(winners))
@@ -45,6 +44,28 @@ class PathChains(Chains):
             self._target, self._image, self.rules.large_step > 0, self.rules.steps, self.count,
             self._large_step, self._uses_uniform, self._uniform_weight, self._energy,
         )  # fmt: skip
+
+    def _state_kinds(self):
+        vertices = self.count * stride(self._target.most)
+        own = {"_state": (PathState, self.count), "_places": (Place, vertices)}
+        return {**super()._state_kinds(), **own, "_logs": (Logs, vertices)}
+
+    def _ranges(self):
+        # Kernels cope with any real numbers of vertices; the others choose places in memory
+        most, anything = self._target.most, (-np.inf, np.inf)
+        return {
+            **super()._ranges(),
+            **dict.fromkeys([*vars(dr.zeros(Logs)), "p", "d", "density"], anything),
+            "at": (0, stride(most)), "length": (1, most), "film": (0, 1), "aperture": (0, 1),
+            "time": (0, 1), "wavelength": (0, 1), "lobe": (0, 1), "is_discrete": (0, 1),
+            "emitter": (0, max(0, len(self._target.scene.emitters()) - 1)),
+        }  # fmt: skip
+
+    def _check(self, stored):
+        super()._check(stored)
+        at = self._state.head.at
+        is_place = bool(dr.all((at == 0) | (at == stride(self._target.most))))
+        stored.require(is_place, "a path begins elsewhere")
 
     def _as_state(self, proposal) -> PathState:
         return PathState(proposal.head, self._target.contribution(proposal), proposal.log_density)

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...stored.arrays import StoredArrays
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
 from .chains import ChainRules, Chains
@@ -130,10 +131,13 @@ class RedistributionRender(ChainRender):
         tensors = {f"image{n}": np.array(tensor) for n, tensor in enumerate(image.tensors())}
         return {**tensors, **{key: np.array(getattr(self, f"_{key}")) for key in _SUMS}}
 
-    def _restore(self, stored: Arrays, image: ChainImage) -> None:
-        image.add_tensors([mi.TensorXf(stored[f"image{n}"]) for n in range(len(image.tensors()))])
+    def _restore(self, stored: StoredArrays, image: ChainImage) -> None:
+        image.restore(stored, [f"image{n}" for n in range(len(image.tensors()))])
         for key in _SUMS:
-            setattr(self, f"_{key}", stored[key].item())
+            is_count = isinstance(getattr(self, f"_{key}"), int)
+            least, most = (1, 1 << 62) if is_count else (0, np.finfo(float).max)
+            number = stored.number(key, "iu" if is_count else "f", least, most)
+            setattr(self, f"_{key}", number)
 
     def _image(self) -> ChainImage:
         filters = self._settings.filters

@@ -23,8 +23,6 @@ class SteppedChains(Chains):
     #: Random numbers that are stored, for each end of a path.
     _most = (MOST_NUMBERS, MOST_LIGHT_NUMBERS)
 
-    _parts_of_state = ("_rngs", "_state", "_parts", "_lanes", "_known", "_values", "_weight")
-
     def _begin(self, bootstrap, winners):
         empty = [dr.opaque(mi.Float, 0, most * self.count) for most in self._most]
         records = self._records(empty)
@@ -36,6 +34,28 @@ class SteppedChains(Chains):
         self._state = found.target
         self._parts, self._lanes = _wanted(found.parts, found.lanes, self._everywhere())
         dr.eval(self._values, self._known, self._state)
+
+    def _state_kinds(self):
+        return {
+            **super()._state_kinds(),
+            "_state": (mi.Float, self.count),
+            "_known": ([mi.UInt32] * len(self._rngs), self.count),
+            "_values": ([mi.Float] * len(self._rngs), None),
+            "_parts": (Contribution, None),
+            "_lanes": (mi.UInt32, None),
+        }
+
+    def _ranges(self):
+        own = {"_state": (0, None), "_lanes": (0, self.count - 1)}
+        known = {str(end): (0, most) for end, most in enumerate(self._most)}
+        return {**super()._ranges(), **own, **known}
+
+    def _check(self, stored):
+        super()._check(stored)
+        for values, most in zip(self._values, self._most):
+            stored.require(len(values) == most * self.count, f"{len(values)} numbers of states")
+        lanes, parts = len(self._lanes), dr.width(self._parts)
+        stored.require(lanes == parts > 0, f"{parts} contributions, and {lanes} lanes")
 
     def advance(self, steps):
         counts = Counts.none(self.count)

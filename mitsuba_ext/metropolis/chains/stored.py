@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import drjit as dr
@@ -9,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...arrays import from_numpy
+from ...stored.arrays import StoredArrays
 from ..path_space.memory import Head, Logs, Place
 from .path_target import PathState
 from .target import Contribution
@@ -16,11 +19,17 @@ from .target import Contribution
 #: Arrays by name.
 Arrays = dict[str, np.ndarray]
 
+#: The most numbers of an array whose length the reader does not know.
+_MOST_NUMBERS = 1 << 27
+
+#: The least and the largest value of a field, by its name.
+Ranges = Mapping[str, tuple[Any, Any]]
+
 
 class StateFile(Protocol):
     """A file that holds the state of a render."""
 
-    def load(self) -> Arrays | None:
+    def load(self) -> StoredArrays | None:
         """The saved state; ``None`` if none was saved yet."""
 
     def save(self, arrays: Arrays) -> None:
@@ -43,23 +52,41 @@ def arrays_of(value: Any, name: str) -> Arrays:
     return {key: array for arrays in found for key, array in arrays.items()}
 
 
-def value_of(arrays: Arrays, name: str) -> Any:
-    """The inverse of :func:`arrays_of`."""
-    if name in arrays:
-        return _array(arrays[name])
-    prefix = f"{name}/"
-    keys = {k.removeprefix(prefix).partition("/")[0] for k in arrays if k.startswith(prefix)}
-    parts = {key: value_of(arrays, f"{name}/{key}") for key in keys}
-    kind, _, is_structure = next(iter(parts)).partition(".")
-    if not is_structure:
-        return [parts[key] for key in sorted(parts, key=int)]
-    made = dr.zeros(_kinds()[kind])
-    for key, part in parts.items():
-        field = key.partition(".")[2]
-        # An array alone does not tell if it is a point or a colour
-        wanted = type(getattr(made, field))
-        setattr(made, field, part if isinstance(part, wanted) else wanted(part))
+def value_of(
+    stored: StoredArrays, name: str, kind: type | list, width: int | None, ranges: Ranges
+) -> Any:
+    """The inverse of :func:`arrays_of`.
+
+    Parameters:
+        stored: The arrays of the file.
+        name: The name that was given to :func:`arrays_of`.
+        kind: What it was: a type, or a list of these.
+        width: The number of lanes; ``None`` for any.
+        ranges: The least and the largest value of the fields of structures, by their names. Other
+            real numbers are finite.
+
+    Raises:
+        DamagedError: The file has no such value.
+    """
+    if isinstance(kind, list):
+        parts = (f"{name}/{index}" for index in range(len(kind)))
+        return [value_of(stored, part, k, width, ranges) for part, k in zip(parts, kind)]
+    names = {made: name for name, made in _kinds().items()}
+    if kind not in names:
+        return _array(stored, name, kind, width, *ranges.get(_field(name), (None, None)))
+    made = dr.zeros(kind)
+    fields = {"state": mi.UInt64, "inc": mi.UInt64} if kind is mi.PCG32 else {
+        key: type(value) for key, value in vars(made).items()
+    }  # fmt: skip
+    for key, its_kind in fields.items():
+        part = f"{name}/{names[kind]}.{key}"
+        setattr(made, key, value_of(stored, part, its_kind, width, ranges))
     return made
+
+
+def _field(name: str) -> str:
+    """The last part of a name: the field of a structure, or the number in a list."""
+    return name.rpartition("/")[2].rpartition(".")[2]
 
 
 def _kinds() -> dict[str, type]:
@@ -70,8 +97,12 @@ def _kinds() -> dict[str, type]:
     }  # fmt: skip
 
 
-def _array(array: np.ndarray) -> Any:
-    if array.ndim == 2:
-        return {2: mi.Point2f, 3: mi.Color3f}[len(array)](array)
-    kinds = {"float32": mi.Float, "uint32": mi.UInt32, "uint64": mi.UInt64}
-    return from_numpy(kinds[array.dtype.name], array)
+def _array(
+    stored: StoredArrays, name: str, kind: type, width: int | None, least: float | None,
+    most: float | None,
+) -> Any:  # fmt: skip
+    letter = {dr.VarType.Float32: "f", dr.VarType.Float64: "f"}.get(dr.type_v(kind), "u")
+    size = () if dr.depth_v(kind) == 1 else (dr.size_v(kind),)
+    longest = _MOST_NUMBERS if width is None else width * math.prod(size)
+    array = stored.take(name, letter, (*size, width), least, most, longest)
+    return kind(array) if size else from_numpy(kind, array)

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...stored.arrays import StoredArrays
 from .bootstrap import Bootstrap
 from .chain_image import ChainImage
 from .chains import ChainRules, Chains
@@ -168,19 +169,24 @@ class MetropolisRender(ChainRender):
         winners = bootstrap.choose(count)
         return self._kind(self._target, image, rules, bootstrap, winners, self._seed), start
 
-    def _restored(self, stored: Arrays, image: ChainImage) -> tuple[Chains, Start]:
+    def _restored(self, stored: StoredArrays, image: ChainImage) -> tuple[Chains, Start]:
         """The stored chains and their start; the stored image is added to ``image``."""
         settings = self._settings
         if settings.is_even:
             self._first_stage()
         else:
             self._target.learn(stream(self._seed, FIRST_STAGE))
-        image.add_tensors([mi.TensorXf(stored[name]) for name in ("visits", "uniform")])
-        rules = ChainRules(settings.large_step, settings.steps, float(stored["uniform_weight"]))
+        image.restore(stored, ("visits", "uniform"))
+        limit = float(np.finfo(np.float32).max)
+        uniform_weight = stored.number("uniform_weight", "f", 0, limit)
+        rules = ChainRules(settings.large_step, settings.steps, uniform_weight)
         chains = self._kind(
             self._target, image, rules, None, None, self._seed, stored=stored
         )
-        start = Start(float(stored["mean"]), int(stored["samples"]), float(stored["error"]))
+        start = Start(
+            stored.number("mean", "f", 0, limit), stored.number("samples", "iu", 1, 1 << 62),
+            stored.number("error", "f", 0, np.inf),
+        )  # fmt: skip
         return chains, start
 
     def _stored(self, chains: Chains, image: ChainImage, start: Start) -> Arrays:
