@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import importlib
 import json
 import os
 import signal
@@ -122,6 +123,23 @@ def test_modules_beside_the_user_are_found(run, make_scene, tmp_path, monkeypatc
     output = tmp_path / "a.exr"
     *_, err = run("render", make_scene(), "-o", output, "--plugin", "my_plugin_beside")
     assert 'the plugin "my_plugin_beside": found' in err
+
+
+def test_a_plugin_does_not_let_files_beside_the_user_run(run, make_scene, tmp_path, monkeypatch):
+    """Neither while it is imported, nor later."""
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    monkeypatch.chdir(tmp_path)
+    for name in ("OpenEXR", "colorsys"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        (tmp_path / f"{name}.py").write_text(f"open('{name} ran', 'w').close()")
+    (tmp_path / "only_here.py").write_text("import colorsys")
+    (tmp_path / "later.py").write_text("")
+    before = list(sys.path)
+    arguments = ("-o", tmp_path / "a.exr", "--plugin", "only_here", "--until", "1")
+    assert run("render", make_scene(), *arguments)[0] == 0
+    assert sys.path == before and not list(tmp_path.glob("* ran"))
+    with pytest.raises(ImportError):
+        importlib.import_module("later")
 
 
 def test_render_replaces_an_integrator_that_does_not_exist_here(run, make_scene, tmp_path):

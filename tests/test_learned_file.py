@@ -7,6 +7,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from stage import film, sensor, stage
 from statistical import load, one_thread, some
 
 from mitsuba_ext.inputs.plugin_text import parse_plugin
@@ -116,3 +117,21 @@ def test_files_of_other_scenes_and_parameters_are_refused(tmp_path: Path) -> Non
 def test_to_load_and_to_save_at_once_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match='leave "save_learned" out'):
         _integrator("neepp", save_learned=str(tmp_path / "a"), load_learned=str(tmp_path / "b"))
+
+
+@pytest.mark.parametrize(("plugin", "key", "suffix"), [
+    ("neepp", "save_learned", ".npz"), ("neepp", "save_map", ".npz"),
+    ("irradiance_cache", "cache_file", ".npz"), ("mlt", "chain_file", ".npz"),
+    ("bdpt", "technique_images", ".exr"),
+])  # fmt: skip
+def test_files_of_other_kinds_are_not_replaced(tmp_path: Path, plugin, key, suffix) -> None:
+    """A scene names the file, and may be somebody else's."""
+    file, link = tmp_path / f"mine{suffix}", tmp_path / f"link{suffix}"
+    file.write_text("my text")
+    link.symlink_to(file)
+    scene = mi.load_dict(stage(camera=sensor(film=film(8, 8))))
+    for target in (file, link):
+        integrator = mi.load_dict({"type": plugin, "max_depth": 3, key: str(target)})
+        with pytest.raises(ValueError, match="another file, which is not replaced|damaged"):
+            integrator.render(scene, spp=16)
+    assert file.read_text() == "my text" and link.is_symlink()

@@ -130,7 +130,7 @@ def test_a_full_disk_costs_an_interval_at_most(run, make_scene, tmp_path, monkey
     monkeypatch.setattr(CheckpointFolder, "save", watched)
     code, out, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
                          "--checkpoint", kept, "--every", "16spp")  # fmt: skip
-    assert code == 0 and err.count("No space left") == 3 and "64 spp" in out
+    assert code == 2 and err.count("No space left") == 3 and "64 spp" in out
     assert spps == [16, 16, 16, 64, 64] and not list(kept.glob(".state*"))
     assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64
 
@@ -151,7 +151,8 @@ def test_a_full_file_system_keeps_the_state_before(run, make_scene, tmp_path):
                    "--checkpoint", kept.path, "--spp")  # fmt: skip
         assert run(*command, 16)[0] == 0 and kept.load().spp == 16
         code, _, err = run(*command, 32)
-        assert code == 0 and "could not be kept: [Errno 28] No space left on device" in err
+        assert code == 2 and "could not be kept: [Errno 28] No space left on device: " in err
+        assert str(kept.path / "state.npz") in err
         assert read_exr(tmp_path / "a.exr")[1]["spp"] == 32 and kept.load().spp == 16
         subprocess.run(["mount", "-o", "remount,size=5m", str(full)], check=True)
         assert run(*command, 32)[0] == 0 and kept.load().spp == 32
@@ -170,7 +171,7 @@ def test_a_folder_that_is_deleted_costs_the_folder_only(run, make_scene, tmp_pat
     monkeypatch.setattr(BatchRenderer, "render", deleted)
     code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--spp", 64,
                        "--checkpoint", kept, "--every", "16spp")  # fmt: skip
-    assert code == 0 and "the render could not be kept: [Errno 2] No such file" in err
+    assert code == 2 and "the render could not be kept: [Errno 2] No such file" in err
     assert read_exr(tmp_path / "a.exr")[1]["spp"] == 64 and not kept.exists()
 
 

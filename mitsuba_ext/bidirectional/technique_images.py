@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import channel_mean
+from ..images.image_files import write_exr
 from ..transport.estimator import CameraRays
 from .candidates import Available
 from .technique_observer import TechniqueObserver
@@ -121,4 +122,4 @@ class TechniqueImages(TechniqueObserver):
         if not channels:
             names, channels = list("RGB"), [np.zeros((self._height, self._width, 3))]
         pixels = np.ascontiguousarray(np.concatenate(channels, axis=2), dtype=np.float32)
-        mi.Bitmap(pixels, channel_names=names).write(str(file))
+        write_exr(file, pixels, names, {})

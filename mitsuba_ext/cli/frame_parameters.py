@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import InputError
+from ..inputs.variants import import_from_here
 
 
 class FrameParameters(NamedTuple):
@@ -73,11 +72,7 @@ def _as_xml(value: Any) -> str:
 
 def _module(source: str) -> Any:
     if not source.endswith(".py"):
-        sys.path.insert(0, "")  # a command that pip installed does not look in the current folder
-        try:
-            return importlib.import_module(source)
-        finally:
-            sys.path.remove("")
+        return import_from_here(source)
     path = Path(source)
     if not path.is_file():
         raise InputError(f"{source}: no such file")

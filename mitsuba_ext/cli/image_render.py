@@ -207,4 +207,6 @@ def render_image(
     is_slow = kernels_compiled() > compiled and not is_new  # else it was printed above
     remark = " (compiled kernels: the next such render starts faster)" if is_slow else ""
     report.end(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}", costs, **figures)
+    if job.failure:
+        raise job.failure
     return 1 if bad else 0

@@ -60,7 +60,8 @@ class LongJob:
         scene, sensor: What it renders.
         film: The film that holds the image.
         is_interrupted: Did a signal or a failure end the render before its goal was reached?
-        failure: The error that ended the render after its first batch; ``None`` if there was none.
+        failure: The error that ended the render after its first batch, or that kept its last state
+            from being saved; ``None`` if there was none.
         seconds: Wall clock time of the render.
     """
 
@@ -111,7 +112,7 @@ class LongJob:
             try:
                 if self._folder:
                     self._folder.describe(self._renderer.description())
-                    self._state = self._folder.load()
+                    self._state = self._folder.load(self.film)
                     if damaged := self._folder.damaged:
                         report.warn(f"{damaged}: is damaged: going on from the state before it")
                 self._run(spp, seconds, write, report)
@@ -179,7 +180,8 @@ class LongJob:
                 self._folder.save(state)
             except OSError as problem:
                 # Go on: the disk may have room for the image, which is smaller
-                report.warn(f"the render could not be kept: {problem}")
+                problem = InputError(f"the render could not be kept: {problem}")
+                self.failure = self.failure or problem
 
     @contextlib.contextmanager
     def _executor(

@@ -20,6 +20,7 @@ from ..bidirectional.merging_radius import MergingRadius
 from ..bidirectional.partial_sums import PartialSums
 from ..bidirectional.path_tracer import BidirectionalPathTracer
 from ..bidirectional.technique_images import TechniqueImages
+from ..images import image_files
 from ..rendering.camera import film_extent
 from ..scene.movers import movers
 from ..transport.estimator import Estimator
@@ -148,7 +149,8 @@ class LightPathIntegrator(WalkIntegrator):
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         self.techniques = None
         if self.technique_images:
-            self.check_target("technique_images", self.technique_images)
+            check = image_files.check_exr_target
+            self.check_target("technique_images", self.technique_images, check)
         image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
         if self.techniques is not None:
             self.techniques.write(Path(self.technique_images), self.statistics.spp)

@@ -43,6 +43,11 @@ def save(
     archives.write(path, FORM, {**header, **arrays})
 
 
+def check_target(path: Path) -> None:
+    """Raises :class:`InputError` if :func:`save` cannot make or replace a file."""
+    archives.check_target(path, FORM)
+
+
 def load(path: Path, scene: mi.Scene, made_by: str, parameter: str) -> States:
     """Reads what :func:`save` has written.
 

@@ -17,17 +17,18 @@ from ..decisions.next_event.portal_sampling import PortalSampling
 from ..decisions.next_event.resampled_lights import ResampledLights
 from ..decisions.next_event.two_stage import TwoStage
 from ..errors import InputError
-from ..files import check_target
 from ..learning.learner import Learner
 from ..learning.next_event.environment_visibility_learner import VisibilityLearner
 from ..learning.next_event.light_map_learner import LightMapLearner
 from ..lights.light_cells import LightCells
 from ..lights.shutter_times import ShutterTimes
 from ..lights.weights import VoxelRows, power_weights, spatial_weights
+from ..maps import light_map_file
 from ..regions.voxel_grid import VoxelGrid
 from ..rendering.camera import film_extent
 from ..scene.bounds import scene_bounds
 from ..scene.portals import portals
+from ..stored import archives
 from .decision_parameters import DecisionParameters, ParameterReader, Setting, Slots
 
 #: Number of candidates that take about as long as a path.
@@ -141,7 +142,7 @@ class LearnedLights(DecisionParameters):
         """
         if self.save_map:
             try:
-                check_target(Path(self.save_map))
+                archives.check_target(Path(self.save_map), light_map_file.FORM)
             except InputError as error:
                 raise ValueError(f'"{self._plugin}": "save_map": {error}') from None
         scene = setting.scene

@@ -16,7 +16,6 @@ import mitsuba as mi
 from ..decisions.query.aovs import output_variables
 from ..decisions.query.scene import scene_query
 from ..errors import InputError
-from ..files import check_target
 from ..learning.learner import Learner
 from ..rendering.aovs import check_aovs
 from ..rendering.camera import film_extent
@@ -136,13 +135,16 @@ class WalkIntegrator(StagedIntegrator):
         given = {key: value for key, value in learning.items() if value not in (None, "")}
         return {**self._described_slots(), **given}
 
-    def check_target(self, key: str, file: str) -> None:
+    def check_target(
+        self, key: str, file: str, check: Callable[[Path], None] = learned_file.check_target
+    ) -> None:
         """
         Raises:
-            ValueError: The file that the parameter ``key`` names cannot be written.
+            ValueError: The file that the parameter ``key`` names cannot be written, or ``check``
+                finds that there is one of another kind.
         """
         try:
-            check_target(Path(file))
+            check(Path(file))
         except InputError as error:
             raise ValueError(f'"{self.name}": "{key}": {error}') from None
 

@@ -22,6 +22,9 @@ from ..files import replacing
 if TYPE_CHECKING:
     import mitsuba as mi
 
+#: The first bytes of an EXR.
+_MAGIC = b"\x76\x2f\x31\x01"
+
 #: Extensions that ``write_film`` can write.
 EXTENSIONS = (".exr", ".png", ".jpg", ".jpeg", ".hdr", ".pfm")
 
@@ -33,6 +36,24 @@ def check_target(path: Path) -> None:
     if path.suffix.lower() not in EXTENSIONS:
         found = f'the extension "{path.suffix}"' if path.suffix else "a name without extension"
         raise InputError(f"{path}: {found} cannot be written ({' '.join(EXTENSIONS)} can)")
+
+
+def check_exr_target(path: Path) -> None:
+    """Raises :class:`InputError` if no EXR can be made at ``path``, or if there is a file that is
+    none: a scene names it, and must not replace others."""
+    files.check_target(path)
+    if path.suffix.lower() != ".exr":
+        raise InputError(f'{path}: has the extension "{path.suffix}", and not ".exr"')
+    if not path.exists():
+        return
+    is_exr = False
+    if path.is_file():
+        with path.open("rb") as file:
+            is_exr = file.read(4) == _MAGIC
+    if not is_exr:
+        raise InputError(
+            f"{path}: is another file, which is not replaced: delete it, or name another one"
+        )
 
 
 def write_exr(

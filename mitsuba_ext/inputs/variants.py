@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 
 from ..errors import InputError
 
@@ -23,8 +26,6 @@ def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
         mi.set_variant(variant)
     except (ImportError, RuntimeError) as error:
         raise InputError(f'the variant "{variant}" does not start: {one_line(error)}') from error
-    if plugins:
-        sys.path.insert(0, "")  # modules in the current folder, as with python -m
     for name in plugins:
         try:
             _import_module(name)
@@ -32,10 +33,25 @@ def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
             raise InputError(f'the plugin "{name}": {one_line(error)}') from error
 
 
+def import_from_here(name: str) -> ModuleType:
+    """Imports a module, which may lie in the current folder. (A command that pip has installed does
+    not look there.) Installed modules come first, and later imports do not look there: a file of
+    the folder must not take the place of a module that is imported by somebody else."""
+    here = os.getcwd()
+    if here in sys.path:
+        return importlib.import_module(name)
+    sys.path.append(here)
+    try:
+        return importlib.import_module(name)
+    finally:
+        with contextlib.suppress(ValueError):  # the module has removed it
+            sys.path.remove(here)
+
+
 def _import_module(name: str) -> None:
     path = Path(name)
     if path.suffix != ".py":
-        importlib.import_module(name)
+        import_from_here(name)
         return
     spec = importlib.util.spec_from_file_location(path.stem, path)
     module = sys.modules[path.stem] = importlib.util.module_from_spec(spec)

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
+
 from .. import marks
 from ..errors import InputError
 from ..files import make_folder, replacing
@@ -85,8 +87,11 @@ class CheckpointFolder:
             raise InputError(f"{file}: is no description of a render")
         return description
 
-    def load(self) -> RenderState:
+    def load(self, film: mi.Film | None = None) -> RenderState:
         """The newest state that is not damaged; an empty one if there is none.
+
+        Args:
+            film: The film that the images must fit, and which is then filled; ``None`` for any.
 
         Raises:
             InputError: There are states, but all of them are damaged.
@@ -99,6 +104,8 @@ class CheckpointFolder:
                 # States are not compressed, so that they are not larger than their files
                 state = RenderState.from_arrays(arrays, file.stat().st_size)
             except (DamagedError, OSError):
+                continue
+            if film is not None and not state.fits(film):
                 continue
             self.damaged = None if file == found[0] else found[0]
             return state

@@ -17,7 +17,7 @@ from ..rendering.camera import film_extent
 from ..rendering.film_sums import FilmSums
 from ..rendering.seed_passes import can_render, is_independent, pass_length
 from ..rendering.totals import RenderTotals, forget_memory_peak
-from .state import Batch, BatchResult
+from .state import Batch, BatchResult, image_shape
 
 #: Approximate number of samples in a batch of one of our integrators. Batches are this large
 #: because each one traces its kernels anew, and starts its Markov chains anew.
@@ -105,6 +105,20 @@ class IntegratorBatches:
             if learned is None:
                 result = result._replace(learned=file.read_bytes() if file.exists() else b"")
             return result
+
+    def check(self, result: BatchResult) -> None:
+        """Checks the result of a batch that another process has rendered.
+
+        Raises:
+            InputError: It is no image of this film.
+        """
+        size, found = image_shape(self.sensor.film()), result.image.shape
+        shapes = {found[:2], result.contents.shape[:2]}
+        if shapes != {size} or found[2:] != (len(result.channels),) or result.batch.spp < 1:
+            raise InputError(
+                f"a worker returned an image of shape {found}, instead of one of {size[1]}x"
+                f"{size[0]} pixels: does it run the same version?"
+            )
 
     def _rendered(self, batch: Batch) -> BatchResult:
         integrator, film = self._integrator, self.sensor.film()

@@ -65,7 +65,7 @@ class KeptRender:
         sensor.film().prepare(self._integrator.aov_names())
         with self._folder.in_use():
             self._folder.describe(self._description(scene, sensor, seed))
-            state = self._folder.load()
+            state = self._folder.load(sensor.film())
             if damaged := self._folder.damaged:
                 mi.Log(
                     mi.LogLevel.Warn, f"{damaged}: is damaged: going on from the state before it"

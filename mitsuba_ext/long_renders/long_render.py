@@ -96,6 +96,7 @@ class LongRender:
         while not self._is_reached():
             if is_stopped() or (result := next(results, None)) is None:
                 return False
+            self._renderer.check(result)
             self.state.add(result)
             count += 1
             if count == 1:

@@ -54,6 +54,12 @@ class BatchResult(NamedTuple):
     learned: bytes | None = None
 
 
+def image_shape(film: mi.Film) -> tuple[int, int]:
+    """The height and the width of a film's image."""
+    width, height = film.crop_size()
+    return int(height), int(width)
+
+
 class RenderState:
     """Sums over batches. Each batch adds only 12 bytes to the size of the state.
 
@@ -79,6 +85,17 @@ class RenderState:
         return self.film.spp
 
     def add(self, result: BatchResult) -> None:
+        """Adds a batch.
+
+        Raises:
+            InputError: Its image has another size, or other channels, than those before.
+        """
+        before = self.images
+        if before and (before.mean.shape, before.channels) != (result.image.shape, result.channels):
+            raise InputError(
+                f"a batch has an image of shape {result.image.shape} ({' '.join(result.channels)}) "
+                f"instead of {before.mean.shape} ({' '.join(before.channels)})"
+            )
         images = self.images or Batches(result.channels, result.image_channel_count)
         images.add(result.image, result.batch.spp)
         film = FilmSums()
@@ -115,6 +132,18 @@ class RenderState:
     def fill(self, film: mi.Film) -> None:
         """Replaces the contents of a film by the image of all batches."""
         self.film.fill(film, self.aov_names)
+
+    def fits(self, film: mi.Film) -> bool:
+        """Are the images those of a film of this size, with these channels? It is then filled."""
+        if not self.done:
+            return True
+        if self.images.mean.shape[:2] != image_shape(film):
+            return False
+        try:
+            self.fill(film)
+        except (RuntimeError, TypeError):  # the number of channels differs
+            return False
+        return film.base_channels_count() + len(self.aov_names) == len(self.images.channels)
 
     # ---- As arrays ----
 

@@ -14,6 +14,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+from .. import files
+from ..errors import InputError
 from ..files import replacing
 from .arrays import DamagedError, Header, StoredArrays
 
@@ -84,13 +86,24 @@ def read(path: Path, form: str, origin: str, remedy: str) -> StoredArrays:
     return arrays
 
 
-def is_of_kind(path: Path, form: str) -> bool:
-    """Is there a file that :func:`write` has written, of this kind, in any version?"""
+def check_target(path: Path, form: str) -> None:
+    """Checks, before a render, that :func:`write` can make or replace a file. A scene names its
+    files, and must not replace others of the user's.
+
+    Raises:
+        InputError: It cannot be written, or there is a file of another kind.
+    """
+    files.check_target(path)
+    if not os.path.lexists(path):
+        return
     try:
         found = _Archive(path).form()
     except Exception:
-        return False
-    return found.split()[:-1] == form.split()[:-1]
+        found = ""
+    if found.split()[:-1] != form.split()[:-1]:
+        raise InputError(
+            f"{path}: is another file, which is not replaced: delete it, or name another one"
+        )
 
 
 class _Archive:
