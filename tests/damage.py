@@ -42,14 +42,13 @@ def damaged(content: bytes, rng: np.random.Generator) -> bytes:
 
 def contents(file: Path) -> dict[str, np.ndarray]:
     """The arrays of an archive that this package wrote, without its form and its checksum."""
-    with np.load(file) as data:
-        return {key: data[key] for key in data if key not in ("format", "digest")}
+    archive = archives._Archive(file)
+    return {key: archive.read(key) for key in archive.headers if key not in ("format", "digest")}
 
 
 def form(file: Path) -> str:
     """What an archive holds."""
-    with np.load(file) as data:
-        return str(data["format"])
+    return archives._Archive(file).form()
 
 
 def edited(

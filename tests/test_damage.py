@@ -16,6 +16,7 @@ from damage import contents, damaged, damages, edits
 from stage import film, sensor, stage
 
 from mitsuba_ext.errors import InputError
+from mitsuba_ext.learning.subpaths import region_learner
 from mitsuba_ext.long_renders.bundle import Bundle, _digest
 from mitsuba_ext.long_renders.folder import CheckpointFolder
 from mitsuba_ext.long_renders.state import Batch, BatchResult, RenderState
@@ -39,8 +40,8 @@ LEARNED: dict[str, dict[str, Any]] = {
         "directions": {"type": "guided_directions", "regions": "tiles", "always_guide": True},
     },
     "maps": {"type": "swarm_path", "always_use": True},
-    "two stages": {"type": "two_stage"},
-    "light vertices": {"type": "bdpt", "connections": 1, "subpath_selection": "learned"},
+    "two stages": {"type": "two_stage", "visibility": "world"},
+    "light vertices": {"type": "bdpt", "connections": 1, "subpath_selection": "visibility"},
     "light paths": {"type": "bdpt", "light_paths": "auto"},
 }  # fmt: skip
 
@@ -185,7 +186,10 @@ def test_a_damaged_learned_file_is_refused_or_is_the_same(tmp_path: Path, count:
 @pytest.mark.parametrize("name", [
     pytest.param(name, marks=() if name == "regions" else pytest.mark.slow) for name in LEARNED
 ])  # fmt: skip
-def test_edited_learned_files_are_refused_or_render(tmp_path: Path, name: str, count: int) -> None:
+def test_edited_learned_files_are_refused_or_render(
+    tmp_path: Path, name: str, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(region_learner, "_LEAST_GAIN", -np.inf)  # of light vertices
     changes = {"sky": {"type": "constant"}} if name == "two stages" else {}
     scene, file = _scene(**changes), tmp_path / "learned.npz"
     plugin = _saved(name, scene, file)

@@ -209,6 +209,49 @@ def test_the_first_batches_tell_how_many_fit_into_the_time(request_of, monkeypat
 # ---- The folder ----
 
 
+def test_a_checkpoint_leaves_files_of_the_user_alone(request_of, tmp_path):
+    """Also those that links in the folder lead to."""
+    kept, mine = tmp_path / "kept", tmp_path / "mine.txt"
+    files = [kept / "job" / "my.running", kept / "job" / "my.crashed", kept / ".state.npz"]
+    (kept / "job").mkdir(parents=True)
+    mine.write_text("my text")
+    for file in files[:2]:
+        file.write_text("my text")
+    files[2].symlink_to(mine)
+    (kept / "state.npz").symlink_to(mine)
+    folder = CheckpointFolder(kept)
+    with folder.in_use():
+        folder.save(rendered(request_of("path"), spp=16))
+    assert folder.load().spp == 16
+    assert [file.read_text() for file in (*files, mine)] == ["my text"] * 4
+
+
+def test_a_state_of_another_film_is_damaged(request_of, tmp_path):
+    folder, request = CheckpointFolder(tmp_path / "kept"), request_of("path")
+    with folder.in_use():
+        folder.save(rendered(request, spp=16))
+    film = BatchRenderer(request).sensor.film()
+    assert folder.load(film).spp == 16
+    for other in ({"width": 7}, {"pixel_format": "luminance"}):
+        size = dict(zip(("width", "height"), film.size()))
+        with pytest.raises(InputError, match="is damaged, or"):
+            folder.load(mi.load_dict({"type": "hdrfilm", **size, **other}))
+
+
+def test_a_batch_of_another_shape_is_refused(request_of):
+    """As a worker might return it that runs something else."""
+    renderer = BatchRenderer(request_of("path"))
+    result = renderer.render(Batch(0, 0, 16))
+    other = result._replace(image=result.image[:3], contents=result.contents[:3])
+    state = RenderState()
+    with pytest.raises(InputError, match="a worker returned an image of shape"):
+        renderer.check(other)
+    renderer.check(result)
+    state.add(result)
+    with pytest.raises(InputError, match="a batch has an image of shape"):
+        state.add(other)
+
+
 def test_a_damaged_state_is_replaced_by_the_one_before(request_of, tmp_path):
     folder = CheckpointFolder(tmp_path / "kept")
     request = request_of("path")

@@ -21,6 +21,9 @@ INTERRUPTED = 130
 
 MAX_SEED = 2**32 - 1
 
+#: The most threads of a process.
+MOST_THREADS = 1024
+
 #: Width of tables that are written to a file or a pipe.
 _PIPE_WIDTH = 160
 

@@ -14,7 +14,7 @@ from .common import FilledPath, say
     "-o", "--output", type=FilledPath(), metavar="FILE",
     help="Image to write: .exr, .png, .jpg, .hdr or .pfm.  [default: NAME.denoised.EXT]",
 )
-@click.argument("image", type=click.Path(path_type=Path), metavar="IMAGE")
+@click.argument("image", type=FilledPath(), metavar="IMAGE")
 def denoise(image: Path, output: Path | None) -> int:
     """Denoise IMAGE with Open Image Denoise (pip install 'mitsuba_ext[denoise]').
 

@@ -33,8 +33,8 @@ _FIGURES = {
     "-o", "--output", type=FilledPath(), metavar="FILE",
     help="Write the signed difference A − B to this EXR.",
 )
-@click.argument("a", type=click.Path(path_type=Path), metavar="A")
-@click.argument("b", type=click.Path(path_type=Path), metavar="B")
+@click.argument("a", type=FilledPath(), metavar="A")
+@click.argument("b", type=FilledPath(), metavar="B")
 def diff(a: Path, b: Path, as_json: bool, output: Path | None) -> int:
     """Measure how far the image A is from the reference B.
 

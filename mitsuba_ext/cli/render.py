@@ -17,6 +17,7 @@ from ..rendering.interrupts import requests_to_keep
 from . import candidates
 from .common import (
     MAX_SEED,
+    MOST_THREADS,
     Every,
     FilledPath,
     check_executor,
@@ -107,8 +108,8 @@ from .frames import FrameRange, Sensors, pictures
 )
 @click.option(
     # With one thread, Mitsuba 3.9.1 hangs when it reads or writes an EXR file
-    "--threads", type=click.IntRange(min=2), metavar="N",
-    help="Threads of each process, at least 2.  [default: all cores, divided among --workers]",
+    "--threads", type=click.IntRange(2, MOST_THREADS), metavar="N",
+    help="Threads of each process, from 2 to 1024.  [default: all cores, divided among --workers]",
 )
 @scene_options
 @click.argument("scene", type=FilledPath(), shell_complete=candidates.scenes)

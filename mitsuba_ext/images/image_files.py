@@ -7,9 +7,10 @@ warnings to the terminal and returns an empty image.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ import numpy as np
 from .. import files
 from ..errors import InputError, one_line
 from ..files import replacing
+from ..startup.machine import memory_bytes
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -132,8 +134,12 @@ def check_file(path: Path) -> None:
 
 
 def check_film(path: Path, film: mi.Film, aovs: Sequence[str]) -> None:
-    """Raises :class:`InputError` if the image of ``film`` cannot be written to ``path``. Tries it
-    with a black image in the same folder."""
+    """Checks, before a render, that there is memory for an image of ``film``, and that it can be
+    written to ``path``: writes one black pixel in the same folder.
+
+    Raises:
+        InputError: It does not fit, or cannot be written.
+    """
     import mitsuba as mi
 
     is_special = mi.has_flag(film.flags(), mi.FilmFlags.Special)
@@ -142,11 +148,48 @@ def check_film(path: Path, film: mi.Film, aovs: Sequence[str]) -> None:
             f'{path}: the film "{film.class_name()}" has no RGB image: write it to an .exr'
         )
     try:
-        film.prepare(list(aovs))
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            write_film(Path(folder) / path.name, film, {})
+        with _of_one_pixel(film):
+            channels = film.prepare(list(aovs))
+            with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+                write_film(Path(folder) / path.name, film, {})
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be written ({one_line(error)})") from error
+    _check_memory(film, channels)
+
+
+@contextlib.contextmanager
+def _of_one_pixel(film: mi.Film) -> Iterator[None]:
+    """Within it, a film has a crop window of one pixel. Its contents are lost."""
+    import mitsuba as mi
+
+    parameters, keys = mi.traverse(film), ("crop_size", "crop_offset")
+    window = [list(map(int, x)) for x in (film.crop_size(), film.crop_offset())]
+
+    def crop(*window: list[int]) -> None:
+        for key, value in zip(keys, window):
+            parameters[key] = value
+        parameters.update()
+
+    if not all(key in parameters for key in keys):  # a film of somebody else's
+        yield
+        return
+    crop([1, 1], [0, 0])
+    try:
+        yield
+    finally:
+        crop(*window)
+
+
+def _check_memory(film: mi.Film, channels: int) -> None:
+    width, height = film.crop_size()
+    # In the film, in its image, and for the random numbers of a sample
+    needed, memory = int(width) * int(height) * (4 * 2 * channels + 16), memory_bytes()
+    if memory and needed > memory:
+        raise InputError(
+            f"a film of {width}x{height} pixels with {channels} channels needs at least "
+            f"{needed / 2**30:.0f} GiB, and this machine has {memory / 2**30:.0f}: choose a "
+            f"smaller --size, or render crop windows"
+        )
 
 
 def count_non_finite(film: mi.Film) -> tuple[int, int]:

@@ -103,7 +103,7 @@ class VisibilityCounts(Observer):
         Raises:
             DamagedError: They are no such counts.
         """
-        counts = state.take("counts", "u", (len(self._counts),))
+        counts = state.take("counts", "u", (len(self._counts),)).astype(np.uint64)
         is_sound = (counts >> 32) <= (counts & 0xFFFFFFFF)
         state.require(bool(is_sound.all()), 'there are more successes than tests in "counts"')
         self._counts = from_numpy(mi.UInt64, counts)

@@ -104,7 +104,8 @@ class SampleTrees:
             DamagedError: They are no trees: a child is missing, or leads back to its parent.
         """
         nodes = state.take("nodes", "u", (None,), most=0xFFFFFFFF, longest=_MOST_WORDS)
-        slots = len(nodes) // 2
+        slots, odd = divmod(len(nodes), 2)
+        state.require(odd == 0, "half a node")
         share = state.take("share", "f", (None,), 0, 1, slots)
         has_values = "values" in state and state.shape("values") != (0,)
         values = state.take("values", "u", (slots if has_values else 0,), most=len(share) - 1)

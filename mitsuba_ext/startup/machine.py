@@ -33,6 +33,14 @@ def machine() -> dict[str, object]:
     }
 
 
+def memory_bytes() -> int | None:
+    """The memory of this machine; ``None`` if unknown."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return None  # Windows
+
+
 def _core_count() -> int | None:
     try:
         return len(os.sched_getaffinity(0))  # what this process may use

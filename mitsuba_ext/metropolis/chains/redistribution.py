@@ -33,6 +33,9 @@ _SUMS = ("samples", "batches", "redistributed", "energy")
 #: Largest number of chains of a batch.
 _MOST_CHAINS = 1 << 17
 
+#: The most samples, and batches, of a file.
+_MOST = {"samples": 1 << 62, "batches": 1 << 31}
+
 #: Index of the random number stream of the first batch; the next batches use the following ones.
 _BATCHES = 16
 
@@ -135,7 +138,7 @@ class RedistributionRender(ChainRender):
         image.restore(stored, [f"image{n}" for n in range(len(image.tensors()))])
         for key in _SUMS:
             is_count = isinstance(getattr(self, f"_{key}"), int)
-            least, most = (1, 1 << 62) if is_count else (0, np.finfo(float).max)
+            least, most = (1, _MOST[key]) if is_count else (0, np.finfo(float).max)
             number = stored.number(key, "iu" if is_count else "f", least, most)
             setattr(self, f"_{key}", number)
 

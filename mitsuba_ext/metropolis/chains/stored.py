@@ -61,7 +61,7 @@ def value_of(
         stored: The arrays of the file.
         name: The name that was given to :func:`arrays_of`.
         kind: What it was: a type, or a list of these.
-        width: The number of lanes; ``None`` for any.
+        width: The number of lanes; ``None`` for any, which all parts of a structure have.
         ranges: The least and the largest value of the fields of structures, by their names. Other
             real numbers are finite.
 
@@ -80,7 +80,9 @@ def value_of(
     }  # fmt: skip
     for key, its_kind in fields.items():
         part = f"{name}/{names[kind]}.{key}"
-        setattr(made, key, value_of(stored, part, its_kind, width, ranges))
+        value = value_of(stored, part, its_kind, width, ranges)
+        width = dr.width(value) if width is None else width
+        setattr(made, key, value)
     return made
 
 
