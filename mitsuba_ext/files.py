@@ -64,13 +64,24 @@ def _is_alive(process: int) -> bool:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields the path of an empty temporary file to write to; the finished file then replaces
-    ``path`` in one step.
+    """Yields the path of an empty temporary file to write to (:func:`beside`); the finished file
+    then replaces ``path`` in one step. If ``path`` is a link, the link is replaced, and not its
+    target. After an exception, ``path`` is unchanged.
 
-    After an exception, ``path`` is unchanged. Removes temporary files for ``path`` of processes on
-    this machine that were killed while they wrote. If ``path`` is a link, the link is replaced, and
-    not its target; nor can somebody else put a link in the place of the temporary file, because its
-    name cannot be guessed.
+    Raises:
+        OSError: The file cannot be written; the error names it.
+    """
+    with beside(path) as temporary:
+        yield temporary
+        os.replace(temporary, path)
+
+
+@contextlib.contextmanager
+def beside(path: Path) -> Iterator[Path]:
+    """Yields the path of an empty temporary file in the folder of ``path``, which is removed
+    afterwards. Removes temporary files for ``path`` of processes on this machine that were killed
+    while they wrote. Nobody can put a link in the place of the temporary file, because its name
+    cannot be guessed.
 
     Raises:
         OSError: The file cannot be written; the error names it.
@@ -86,7 +97,6 @@ def replacing(path: Path) -> Iterator[Path]:
                         path.with_name(name).unlink()
         new_file(temporary).close()
         yield temporary
-        os.replace(temporary, path)
     except OSError as error:
         if error.filename is not None and error.filename != str(temporary):
             raise

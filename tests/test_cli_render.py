@@ -363,9 +363,9 @@ def test_output_that_cannot_hold_the_film_is_refused_before_rendering(
     assert set(read_exr(tmp_path / "a.exr")[0]) == {"band"}
 
     def full_disk(*_):
-        raise OSError("No space left on device")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(image_files, "write_film", full_disk)
+    monkeypatch.setattr(type(tmp_path), "write_bytes", full_disk)
     code, _, err = run("render", make_scene(), "-o", tmp_path / "b.exr")
     assert code == 2 and "b.exr: cannot be written (No space left on device)" in err
     assert not list(tmp_path.glob("b*"))
@@ -427,3 +427,26 @@ def test_failing_write_leaves_an_older_file_alone(tmp_path, monkeypatch):
         write_exr(path, np.zeros((2, 2, 3)), "RGB", {})
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_film_that_does_not_fit_is_refused_at_once(run, make_scene, tmp_path):
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--size", "200000x200000")
+    assert code == 2 and "a film of 200000x200000 pixels with 4 channels needs at least" in err
+    assert not list(tmp_path.glob("tmp*"))
+
+
+def test_the_check_of_a_film_keeps_its_crop_window(tmp_path):
+    window = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 5, "crop_height": 4}
+    film = mi.load_dict({"type": "hdrfilm", "width": 20, "height": 10, **window})
+    image_files.check_film(tmp_path / "a.exr", film, ["a.R"])
+    assert list(film.crop_size()) == [5, 4] and list(film.crop_offset()) == [3, 2]
+    assert list(film.size()) == [20, 10] and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (("denoise", ""), "expected a path"), (("diff", "", "b"), "expected a path"),
+    (("render", "s.xml", "-o", "a.exr", "--threads", 100000), "not in the range"),
+])  # fmt: skip
+def test_odd_arguments_are_named(run, arguments, words):
+    code, _, err = run(*arguments)
+    assert code == 2 and words in err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -156,6 +157,28 @@ def test_a_full_file_system_keeps_the_state_before(run, make_scene, tmp_path):
         assert read_exr(tmp_path / "a.exr")[1]["spp"] == 32 and kept.load().spp == 16
         subprocess.run(["mount", "-o", "remount,size=5m", str(full)], check=True)
         assert run(*command, 32)[0] == 0 and kept.load().spp == 32
+    finally:
+        subprocess.run(["umount", str(full)], check=True)
+
+
+@pytest.mark.parametrize("arguments", [
+    ("-o", "full/a.exr"), ("-o", "full/a.png"), ("-o", "a.exr", "--checkpoint", "full/kept"),
+], ids=str)  # fmt: skip
+def test_a_full_disk_is_named_before_the_render(run, make_scene, tmp_path, arguments, monkeypatch):
+    """And nothing is left there."""
+    full = tmp_path / "full"
+    full.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(full)]
+    if not shutil.which("mount") or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("no file system can be made here")
+    try:
+        with contextlib.suppress(OSError):
+            (full / "data").write_bytes(bytes(1 << 16))
+        monkeypatch.chdir(tmp_path)
+        code, _, err = run("render", make_scene(), *arguments)
+        name = arguments[-1] if "kept" not in arguments[-1] else "full/kept/.lock"
+        assert code == 2 and f"{name}: cannot be written (No space left on device)" in err
+        assert sorted(f.name for f in full.rglob("*") if f.is_file()) == ["data"]
     finally:
         subprocess.run(["umount", str(full)], check=True)
 

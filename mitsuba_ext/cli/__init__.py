@@ -74,7 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return 1
     except OSError as error:  # a full disk, a deleted folder
-        _complain(str(error))
+        is_named = error.filename is not None and error.strerror
+        _complain(f"{error.filename}: {error.strerror}" if is_named else str(error))
         return 2
     return code if isinstance(code, int) else 0
 

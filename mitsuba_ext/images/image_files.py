@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,6 +28,9 @@ _MAGIC = b"\x76\x2f\x31\x01"
 
 #: Extensions that ``write_film`` can write.
 EXTENSIONS = (".exr", ".png", ".jpg", ".jpeg", ".hdr", ".pfm")
+
+#: Mitsuba's names of their formats.
+_FORMATS = dict(zip(EXTENSIONS, ("OpenEXR", "PNG", "JPEG", "JPEG", "RGBE", "PFM")))
 
 
 def check_target(path: Path) -> None:
@@ -62,6 +64,12 @@ def write_exr(
     path: Path, pixels: np.ndarray, channels: Sequence[str], metadata: Mapping[str, object]
 ) -> None:
     """Writes 32-bit channels; ``pixels`` has the shape (height, width, number of channels)."""
+    _save(_exr(pixels, channels, metadata), path)
+
+
+def _exr(
+    pixels: np.ndarray, channels: Sequence[str], metadata: Mapping[str, object]
+) -> mi.Bitmap:
     import mitsuba as mi
 
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
@@ -70,7 +78,7 @@ def write_exr(
     attributes = bitmap.metadata()
     for key, value in metadata.items():
         attributes[key] = _attribute(value)
-    _save(bitmap, path)
+    return bitmap
 
 
 def write_exr_fast(
@@ -150,10 +158,11 @@ def check_film(path: Path, film: mi.Film, aovs: Sequence[str]) -> None:
     try:
         with _of_one_pixel(film):
             channels = film.prepare(list(aovs))
-            with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-                write_film(Path(folder) / path.name, film, {})
+            with files.beside(path) as temporary:
+                temporary.write_bytes(_encoded(_bitmap(path, film, {}, {}), path))
     except (OSError, RuntimeError) as error:
-        raise InputError(f"{path}: cannot be written ({one_line(error)})") from error
+        reason = getattr(error, "strerror", None) or one_line(error)
+        raise InputError(f"{path}: cannot be written ({reason})") from error
     _check_memory(film, channels)
 
 
@@ -209,23 +218,32 @@ def write_film(
 ) -> None:
     """Writes the image of a film: all channels to an EXR, also ``others``, which are arrays
     (height, width); RGB to HDR and PFM, 8-bit sRGB to the other formats."""
+    if path.suffix.lower() == ".exr" and not is_compressed:
+        write_exr_fast(path, _planes(film, others or {}), metadata)
+    else:
+        _save(_bitmap(path, film, metadata, others or {}), path)
+
+
+def _bitmap(
+    path: Path, film: mi.Film, metadata: Mapping[str, object], others: Mapping[str, np.ndarray]
+) -> mi.Bitmap:
+    """What :func:`write_film` writes."""
     import mitsuba as mi
 
+    if path.suffix.lower() == ".exr":
+        planes = _planes(film, others)
+        return _exr(np.stack(list(planes.values()), axis=2), list(planes), metadata)
     bitmap = film.bitmap()
-    suffix = path.suffix.lower()
-    if suffix == ".exr":
-        # The film's own bitmap may be of half precision
-        pixels = np.moveaxis(np.array(film.develop()), 2, 0)
-        names = [entry.name for entry in bitmap.struct_()]
-        planes = {**dict(zip(names, pixels)), **(others or {})}
-        if is_compressed:
-            write_exr(path, np.stack(list(planes.values()), axis=2), list(planes), metadata)
-        else:
-            write_exr_fast(path, planes, metadata)
-        return
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         bitmap = bitmap.split()[0][1]  # the image without its AOVs
-    _save_converted(bitmap, path)
+    return _converted(bitmap, path)
+
+
+def _planes(film: mi.Film, others: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    # The film's own bitmap may be of half precision
+    pixels = np.moveaxis(np.array(film.develop()), 2, 0)
+    names = [entry.name for entry in film.bitmap().struct_()]
+    return {**dict(zip(names, pixels)), **others}
 
 
 def write_rgb(path: Path, pixels: np.ndarray, metadata: Mapping[str, object]) -> None:
@@ -236,15 +254,16 @@ def write_rgb(path: Path, pixels: np.ndarray, metadata: Mapping[str, object]) ->
         write_exr(path, pixels, "RGB", metadata)
     else:
         pixels = np.ascontiguousarray(pixels, dtype=np.float32)
-        _save_converted(mi.Bitmap(pixels, mi.Bitmap.PixelFormat.RGB), path)
+        _save(_converted(mi.Bitmap(pixels, mi.Bitmap.PixelFormat.RGB), path), path)
 
 
-def _save_converted(bitmap: mi.Bitmap, path: Path) -> None:
+def _converted(bitmap: mi.Bitmap, path: Path) -> mi.Bitmap:
+    """RGB, with the numbers of the format."""
     import mitsuba as mi
 
     eight_bit = path.suffix.lower() not in (".hdr", ".pfm")
     component = mi.Struct.Type.UInt8 if eight_bit else mi.Struct.Type.Float32
-    _save(bitmap.convert(mi.Bitmap.PixelFormat.RGB, component, eight_bit), path)
+    return bitmap.convert(mi.Bitmap.PixelFormat.RGB, component, eight_bit)
 
 
 def to_rgb(image: object, channels: Sequence[str]) -> np.ndarray:
@@ -280,11 +299,22 @@ def film_channels(film: mi.Film) -> list[str]:
 
 
 def _save(bitmap: mi.Bitmap, path: Path) -> None:
+    # By way of memory: on a full disk, Mitsuba 3.9.1 leaves half a file, and raises nothing
+    content = _encoded(bitmap, path)
     with replacing(path) as temporary:
-        try:
-            bitmap.write(str(temporary))
-        except RuntimeError as error:
-            raise OSError(f"{path}: {one_line(error)}") from error
+        temporary.write_bytes(content)
+
+
+def _encoded(bitmap: mi.Bitmap, path: Path) -> bytes:
+    """The contents of a file of the format that ``path`` has."""
+    import mitsuba as mi
+
+    stream, kind = mi.MemoryStream(), _FORMATS.get(path.suffix.lower(), "OpenEXR")
+    try:
+        bitmap.write(stream, getattr(mi.Bitmap.FileFormat, kind))
+    except RuntimeError as error:
+        raise OSError(f"{path}: {one_line(error)}") from error
+    return stream.raw_buffer()
 
 
 def _annotate(bitmap: mi.Bitmap, metadata: Mapping[str, object]) -> None:
