@@ -61,6 +61,12 @@ class Auto(LightPathIntegrator):
        - Files. The render saves all that it has learned to :monosp:`save_learned`. With
          :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
          scene, with the same parameters and film size, has saved. (Default: none)
+     * - keep_learned
+       - |bool|
+       - Keep what is learned for later renders of this process (frames, notebooks)? A render of the
+         same scene, with the same parameters and film size, then takes no pilot samples, also from
+         another camera. It learns again where it would have more pilot samples than the earlier
+         one. An image then depends on the renders before it. (Default: false)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,
@@ -155,10 +161,12 @@ class Auto(LightPathIntegrator):
         # Stages with light paths have limits of their own
         return NO_LIMIT
 
-    def pilots(self, scene, pixel_count, spp, kernels=math.inf):
-        if pixel_count * spp < light_path_schedule.LEAST_SAMPLES and not self.save_learned:
+    def pilots(self, scene, sensor, spp, kernels=math.inf):
+        pixel_count, saves = math.prod(film_extent(sensor.film())), self.save_learned
+        is_short = pixel_count * spp < light_path_schedule.LEAST_SAMPLES
+        if is_short and not (saves or self.keep_learned):
             spp = 0
-        stages = super().pilots(scene, pixel_count, spp, kernels)
+        stages = super().pilots(scene, sensor, spp, kernels)
         self._has_media = may_have_media(scene)
         self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene)
         trial = PhotonTrial if self._has_media else LightPathTrial
@@ -169,7 +177,7 @@ class Auto(LightPathIntegrator):
 
     def schedule(self, scene, sensor, samples, seed) -> Schedule | LightPathSchedule:
         schedule = super().schedule(scene, sensor, samples, seed)
-        if not self._has_light_paths or not (self._has_trial or self.load_learned):
+        if not self._has_light_paths or not (self._has_trial or self.restores):
             return schedule
         if self._has_media:
             trial = PhotonTrial(sensor.film(), sum(samples))
@@ -182,7 +190,7 @@ class Auto(LightPathIntegrator):
         return schedule
 
     def estimators(self, scene, sensor):
-        if not self._has_light_paths or not (self._has_trial or self.load_learned):
+        if not self._has_light_paths or not (self._has_trial or self.restores):
             return self.walk
         if self._has_media:
             mapper = functools.cache(

@@ -76,10 +76,10 @@ class InstantRadiosityIntegrator(WalkIntegrator):
        - Writes the parts of the image, whose sum it is, to the channels :monosp:`direct.R`,
          :monosp:`virtual.R`, :monosp:`compensation.R`, …, and a picture of the virtual lights to
          :monosp:`lights.R`, …: see below. (Default: false)
-     * - pilot_spp, save_learned, load_learned
-       - |int| or |string|
+     * - pilot_spp, save_learned, load_learned, keep_learned
+       - |int|, |string| or |bool|
        - As in :class:`composed_path`; only with the choice :monosp:`learned`. (Default: 16, none,
-         none)
+         none, false)
      * - next_event, shadow_test
        - |string| or decision
        - How lights are chosen for direct light; see :class:`composed_path`.

@@ -76,6 +76,12 @@ class SwarmPath(WalkIntegrator):
        - Files. The render saves all that it has learned to :monosp:`save_learned`. With
          :monosp:`load_learned`, it takes no pilot samples, and uses what a render of the same
          scene, with the same parameters and film size, has saved. (Default: none)
+     * - keep_learned
+       - |bool|
+       - Keep what is learned for later renders of this process (frames, notebooks)? A render of the
+         same scene, with the same parameters and film size, then takes no pilot samples, also from
+         another camera. It learns again where it would have more pilot samples than the earlier
+         one. An image then depends on the renders before it. (Default: false)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs.

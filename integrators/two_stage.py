@@ -56,6 +56,9 @@ class TwoStage(WalkIntegrator):
      * - save_learned, load_learned
        - |string|
        - With visibility maps: as in :class:`composed_path`. (Default: none)
+     * - keep_learned
+       - |bool|
+       - With visibility maps: as in :class:`composed_path`. (Default: false)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,

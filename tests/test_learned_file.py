@@ -10,6 +10,7 @@ import pytest
 from stage import film, sensor, stage
 from statistical import load, one_thread, some
 
+from mitsuba_ext.composition import kept_learning
 from mitsuba_ext.inputs.plugin_text import parse_plugin
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -53,6 +54,62 @@ def test_a_restored_render_draws_what_the_last_stage_would_have_drawn(name, tmp_
     np.testing.assert_array_equal(*images)
     walk = first.schedule(scene, scene.sensors()[0], (8,), 5)
     assert type(again.learners) is type(walk.learners)
+
+
+@pytest.fixture
+def nothing_kept():
+    kept_learning.forget()
+    yield
+    kept_learning.forget()
+
+
+@pytest.mark.usefixtures("nothing_kept")
+def test_a_later_render_of_the_scene_uses_what_was_kept_and_no_other_one_does() -> None:
+    scene, keeping = _small("rooms"), {"max_depth": 6, "keep_learned": True}
+    first = mi.load_dict({"type": "neepp", **keeping})
+    first.render(scene, seed=3, spp=32)
+    assert first.statistics.learning_seconds > 0
+
+    def learns(scene: mi.Scene, spp: int = 32, sensor: mi.Sensor | int = 0, **more) -> bool:
+        """Does another integrator learn, with another seed?"""
+        integrator = mi.load_dict({"type": "neepp", **keeping, **more})
+        integrator.render(scene, sensor, seed=5, spp=spp)
+        assert integrator.statistics.learned
+        return not integrator.restores
+
+    assert not learns(scene) and not learns(_small("rooms"), spp=8)
+    assert learns(scene, grid=4) and learns(scene, sensor=_larger_film())
+    assert learns(scene, spp=64), "its pilots have more samples"
+    other = _small("rooms")
+    parameters = mi.traverse(other)
+    key = next(key for key in parameters.keys() if key.endswith("reflectance.value"))
+    parameters[key] = mi.Color3f(0.1)
+    parameters.update()
+    assert learns(other)
+    assert learns(scene, keep_learned=False)
+
+
+@pytest.mark.usefixtures("nothing_kept")
+@pytest.mark.parametrize("name", ["auto", pytest.param("adaptive", marks=pytest.mark.slow)])
+def test_kept_renders_draw_what_loaded_ones_draw(name, tmp_path: Path) -> None:
+    scene, file = _small("rooms"), str(tmp_path / "learned.npz")
+
+    def make(**parameters) -> mi.Integrator:
+        inner = {"type": "auto_path" if name == "adaptive" else name, "max_depth": 6, **parameters}
+        return mi.load_dict({"type": name, "in": inner} if name == "adaptive" else inner)
+
+    with one_thread():
+        make(keep_learned=True, save_learned=file).render(scene, seed=3, spp=128)
+        kept, loaded = (make(**{key: value}) for key, value in
+                        (("keep_learned", True), ("load_learned", file)))  # fmt: skip
+        images = [np.array(each.render(scene, seed=5, spp=32)) for each in (kept, loaded)]
+    assert getattr(kept, "nested", kept).restores
+    np.testing.assert_array_equal(*images)
+
+
+def test_load_learned_excludes_keep_learned() -> None:
+    with pytest.raises((RuntimeError, ValueError), match='leave "keep_learned" out'):
+        mi.load_dict({"type": "neepp", "load_learned": "some.npz", "keep_learned": True})
 
 
 @pytest.mark.slow

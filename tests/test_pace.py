@@ -54,9 +54,9 @@ def test_the_pilots_are_those_of_a_render_of_the_samples_that_fit(monkeypatch):
     integrator = _integrator("auto_path", timeout=10.0)
     pilots = integrator.pilots
 
-    def remembered(scene, pixel_count, spp, *kernels):
+    def remembered(scene, sensor, spp, *kernels):
         asked.append(spp)
-        return pilots(scene, pixel_count, spp, *kernels)
+        return pilots(scene, sensor, spp, *kernels)
 
     integrator.pilots = remembered
     integrator.render(_scene(), spp=5000)
@@ -149,9 +149,11 @@ def test_the_light_walk_has_one_kernel():
 
 def test_learning_begins_only_where_there_is_time_to_compile():
     integrator, scene = _integrator("auto"), _scene()
-    assert integrator.pilots(scene, 1 << 16, 64, 20) and integrator._has_trial
-    assert integrator.pilots(scene, 1 << 16, 64, 8) and not integrator._has_trial
-    assert not integrator.pilots(scene, 1 << 16, 64, 4)
+    film = {"type": "hdrfilm", "width": 256, "height": 256}
+    sensor = mi.load_dict({"type": "perspective", "film": film})
+    assert integrator.pilots(scene, sensor, 64, 20) and integrator._has_trial
+    assert integrator.pilots(scene, sensor, 64, 8) and not integrator._has_trial
+    assert not integrator.pilots(scene, sensor, 64, 4)
 
 
 @pytest.mark.parametrize("name", ["auto_path", "auto", "pss_guided", "neepp"])

@@ -37,6 +37,7 @@ VALUES = {
     **dict.fromkeys(["connections", "count", "light_samples", "camera_samples", "learn_every"], 3),
     "candidates": 4, "splits": 7, "share": 0.5,
     **dict.fromkeys(["hide_emitters", "rejection", "always_guide", "nee_first_bounce"], True),
+    "keep_learned": True,
     **dict.fromkeys(["timeout", "max_memory", "slope"], 8.0), "floor": 0.5,
     "aovs": "d:depth", "save_map": "map.npz", "load_map": "map.npz", "regions": "surfaces",
     "directions": "guided", "next_event": "power", "shadow_test": "visibility_roulette",
@@ -66,11 +67,11 @@ VALUES = {
 #: What makes a parameter known that is not always.
 CONDITIONS = {
     **{(name, key): {"next_event": "contribution"} for name in ("composed_path", "composed_prb")
-       for key in ("pilot_spp", "save_learned", "load_learned", "learn_every")},
+       for key in ("pilot_spp", "save_learned", "load_learned", "keep_learned", "learn_every")},
     **{("two_stage", key): {"visibility": "primary"}
-       for key in ("reallocated", "pilot_spp", "save_learned", "load_learned")},
+       for key in ("reallocated", "pilot_spp", "save_learned", "load_learned", "keep_learned")},
     **{("instant_radiosity", key): {"choice": "learned"}
-       for key in ("pilot_spp", "save_learned", "load_learned")},
+       for key in ("pilot_spp", "save_learned", "load_learned", "keep_learned")},
     ("two_stage_lights", "reallocated"): {"visibility": "world"},
     ("pss_guided", "tile"): {"regions": "tiles"},
     ("guided_directions", "tile"): {"regions": "tiles"},

@@ -75,7 +75,7 @@ class _TwoStages:
         self.progress, self.is_cancelled = None, False
         self.name, self.sample_cost, self.most_lanes = "two_stages", 1, 2**32 - 1
 
-    def pilots(self, scene, pixel_count, spp):
+    def pilots(self, scene, sensor, spp):
         return [self.pilot_spp]
 
     def samples_per_set(self, spp):

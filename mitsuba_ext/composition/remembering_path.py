@@ -5,6 +5,7 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mitsuba as mi
@@ -39,7 +40,7 @@ class RememberingPath(WalkIntegrator):
                     f'"{self.name}": there are no gradients with the "{self.slots[slot].name}" of '
                     f'the parameter "{slot}": choose another one'
                 )
-        for key in ("aovs", "checkpoint"):
+        for key in ("aovs", "checkpoint", "keep_learned"):
             if getattr(self, key):
                 raise ValueError(f'"{self.name}" has no parameter "{key}": leave it out')
         self.learn_every = 0
@@ -83,13 +84,13 @@ class RememberingPath(WalkIntegrator):
         """Is what it has learned too old?"""
         return 0 < self.learn_every <= self._renders
 
-    def pilots(self, scene, pixel_count, spp):
+    def pilots(self, scene, sensor, spp, kernels=math.inf):
         if self.is_due:
             self.forget()
         if self._knows(scene):
             return []
         # Many renders use what this one learns: pilots have up to three quarters of its samples
-        return super().pilots(scene, pixel_count, 3 * spp)
+        return super().pilots(scene, sensor, 3 * spp, kernels)
 
     def pace_stage(self, scene, sensor, spp):
         # Its pilots are worth their time in later renders

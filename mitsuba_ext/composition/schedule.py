@@ -89,7 +89,7 @@ class Schedule:
         query: How rays are intersected with the scene.
         restored: What an earlier render has learned (``Learner.state``, by slot): there are then
             no pilots. ``None`` to learn.
-        learned: Called with what was learned, before the last stage.
+        savers: Called with what was learned, before the last stage.
 
     Attributes:
         learners: The learners, by slot.
@@ -109,7 +109,7 @@ class Schedule:
         estimator: Callable[..., Estimator],
         query: Any,
         restored: States | None = None,
-        learned: Callable[[Mapping[str, Mapping[str, np.ndarray]]], None] | None = None,
+        savers: Sequence[Callable[[Mapping[str, Mapping[str, np.ndarray]]], None]] = (),
     ) -> None:
         self._setting, self._pilot_count, self.estimator = setting, len(stages) - 1, estimator
         self._stages = list(stages)
@@ -132,7 +132,7 @@ class Schedule:
         self._learns_maps, self._learns_only_maps = any(learns_maps), all(learns_maps)
         #: For each stage, the weight of its samples relative to those of the last stage
         self._weights = stage_weights(stages) if self._learns_maps else [1.0] * len(stages)
-        self._restored, self._learned = restored, learned
+        self._restored, self._savers = restored, savers
         self._states: dict[str, dict[str, np.ndarray]] = {}
         self._scout: Scout | None = None
         self._finished_stages = -1
@@ -208,7 +208,7 @@ class Schedule:
             self.decisions.update(decisions)
             self.learners.update(learners)
             vars(self.camera).update(camera)
-            if self._learned is not None:
+            if self._savers:
                 self._states.update({slot: x.state() for slot, x in learners.items()})
 
         return take_up_again
@@ -226,10 +226,11 @@ class Schedule:
         return {**self.learners, **self.beside}
 
     def _last_stage(self) -> Stage:
-        if self._learned is not None:
+        if self._savers:
             self._states.update({slot: x.state() for slot, x in self.beside.items()})
             known = {s: x for s, x in self._states.items() if x and s in self._everyone}
-            self._learned(known)
+            for save in self._savers:
+                save(known)
         learned = "; ".join(filter(None, map(str, self._everyone.values())))
         estimator = self.estimator(**self.decisions)
         most = getattr(estimator, "most_lanes", 0)
@@ -249,7 +250,7 @@ class Schedule:
         for slot, learner in self.learners.items():
             self._replace(slot, learner.learn(self._setting.scene, is_last))
         if is_last:
-            if self._learned is not None:
+            if self._savers:
                 self._states = {slot: x.state() for slot, x in self.learners.items()}
             for learner in self.learners.values():
                 learner.finish()

@@ -86,7 +86,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
     # ---- What a subclass overrides ----
 
     def pilots(
-        self, scene: mi.Scene, pixel_count: int, spp: int, kernels: float = math.inf
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
     ) -> list[int]:
         """The samples per pixel of each pilot stage, out of ``spp``; empty if nothing learns. See
         :class:`mitsuba_ext.rendering.plan.Planned`."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from ..decisions.query.aovs import output_variables
 from ..decisions.query.scene import scene_query
@@ -22,10 +23,11 @@ from ..rendering.camera import film_extent
 from ..rendering.stages import Stage
 from ..scene.media import refuse_media, refuse_missing_colours, refuse_moving_grids
 from ..scene.unseen import has_unseen_shapes
+from ..stored.arrays import StoredArrays
 from ..transport.estimator import CameraRays, Estimator
 from ..transport.path_decisions import EmitterSampling, SceneQuery
 from ..transport.walk import Walk
-from . import learned_file
+from . import kept_learning, learned_file
 from .camera_numbers import WeightedNumbers, samples_per_set
 from .decision_parameters import DecisionParameters, ParameterReader, Setting
 from .schedule import Schedule, pilot_samples
@@ -64,8 +66,8 @@ class WalkIntegrator(StagedIntegrator):
        - Arbitrary output variables, in the syntax of Mitsuba's :monosp:`aov` integrator, such as
          :monosp:`depth:depth,nn:sh_normal`. (Default: none)
 
-    Where something learns, also ``pilot_spp``, ``save_learned`` and ``load_learned``; see
-    :class:`composed_path`.
+    Where something learns, also ``pilot_spp``, ``save_learned``, ``load_learned`` and
+    ``keep_learned``; see :class:`composed_path`.
 
     Attributes:
         has_light_paths (bool): Does it trace light paths besides camera paths?
@@ -89,6 +91,8 @@ class WalkIntegrator(StagedIntegrator):
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
         self.save_learned = self.load_learned = ""
+        self.keep_learned = False
+        self._kept: kept_learning.Kept | None = None
 
     # ---- What a subclass calls ----
 
@@ -101,7 +105,8 @@ class WalkIntegrator(StagedIntegrator):
 
     def fill(self, props: mi.Properties, **slots: DecisionParameters | None) -> None:
         """Fills slots of the walk; ``None`` leaves a slot to Mitsuba's choice. If a decision
-        learns, reads the common parameters ``pilot_spp``, ``save_learned`` and ``load_learned``.
+        learns, reads the common parameters ``pilot_spp``, ``save_learned``, ``load_learned`` and
+        ``keep_learned``.
 
         Raises:
             TypeError, ValueError: Two decisions exclude each other, or a parameter is wrong.
@@ -120,17 +125,19 @@ class WalkIntegrator(StagedIntegrator):
             self._pilot_spp = self.parameter(props, "pilot_spp", max(wishes), minimum=0)
             self.save_learned = self.parameter(props, "save_learned", "")
             self.load_learned = self.parameter(props, "load_learned", "")
-            if self.save_learned and self.load_learned:
-                raise ValueError(
-                    f'"{self.name}": with "load_learned" nothing is learned: leave "save_learned" '
-                    f"out"
-                )
+            self.keep_learned = self.parameter(props, "keep_learned", False)
+            for key in ("save_learned", "keep_learned"):
+                if self.load_learned and getattr(self, key):
+                    raise ValueError(
+                        f'"{self.name}": with "load_learned" nothing is learned: leave "{key}" out'
+                    )
 
     def parameters(self) -> dict[str, Any]:
         learning = {
             "pilot_spp": self._pilot_spp,
             "save_learned": self.save_learned,
             "load_learned": self.load_learned,
+            "keep_learned": self.keep_learned or "",
         }
         given = {key: value for key, value in learning.items() if value not in (None, "")}
         return {**self._described_slots(), **given}
@@ -155,15 +162,27 @@ class WalkIntegrator(StagedIntegrator):
         """Do ``save_learned`` and ``load_learned`` have an effect?"""
         return bool(self._pilot_spp)
 
+    @property
+    def restores(self) -> bool:
+        """Does the render that :meth:`pilots` has planned use what an earlier one has learned?"""
+        return bool(self.load_learned or self._kept)
+
     def pilots(
-        self, scene: mi.Scene, pixel_count: int, spp: int, kernels: float = math.inf
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
     ) -> list[int]:
-        self.learners = {}
+        self.learners, self._kept = {}, None
         if self.save_learned:
             self.check_target("save_learned", self.save_learned)
-        if self.max_depth < 2 or self.load_learned or kernels < LEARNING_KERNELS:
+        if self.max_depth < 2 or self.load_learned:
             return []
-        return pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
+        pixel_count = math.prod(film_extent(sensor.film()))
+        pilots = pilot_samples(self.slots, scene, pixel_count, spp, self._pilot_spp or 0)
+        if self.keep_learned:
+            kept = kept_learning.find(scene, self._learned_by(sensor))
+            if kept is not None and sum(pilots) <= kept.pilot_spp:
+                self._kept = kept
+                return []
+        return pilots if kernels >= LEARNING_KERNELS else []
 
     def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
         if self.has_light_paths:
@@ -197,28 +216,47 @@ class WalkIntegrator(StagedIntegrator):
     ) -> Schedule:
         *pilots, _rest = samples
         # A loaded state needs no pilots, but learners to restore it: these need a pilot_spp > 0
-        pilot_spp = self._pilot_spp or 0 if self.load_learned else sum(pilots)
+        pilot_spp = self._pilot_spp or 0 if self.restores else sum(pilots)
         setting = Setting(
             scene, sensor, seed, self.max_depth, self.rr_depth, sum(samples), pilot_spp,
             self.timeout > 0,
         )  # fmt: skip
-        slots = [f"{slot} = {text}" for slot, text in self._described_slots().items()]
-        # The tables of some decisions have an entry for each pixel
-        width, height = film_extent(sensor.film())
-        made_by = ", ".join([*slots, f"film = {width}x{height}"])
-        restored, learned = None, None
-        if self.load_learned:
-            where = f'"{self.name}": the parameter "load_learned"'
-            restored = learned_file.load(Path(self.load_learned), scene, made_by, where)
-        if self.save_learned:
-            path = Path(self.save_learned)
-            learned = functools.partial(learned_file.save, path, scene, made_by)
         schedule = Schedule(
             self.name, self.slots, setting, samples, self.estimators(scene, sensor),
-            self.query(scene), restored, learned,
+            self.query(scene), self._restored(scene, sensor),
+            self._savers(scene, sensor, sum(pilots)),
         )  # fmt: skip
         self.learners = schedule.learners
         return schedule
+
+    def _learned_by(self, sensor: mi.Sensor) -> str:
+        """On what, besides the scene, learned states depend."""
+        slots = [f"{slot} = {text}" for slot, text in self._described_slots().items()]
+        # The tables of some decisions have an entry for each pixel
+        width, height = film_extent(sensor.film())
+        return ", ".join([*slots, f"film = {width}x{height}"])
+
+    def _restored(self, scene: mi.Scene, sensor: mi.Sensor) -> learned_file.States | None:
+        """What an earlier render has learned; ``None`` if this one learns."""
+        if self.load_learned:
+            where = f'"{self.name}": the parameter "load_learned"'
+            path = Path(self.load_learned)
+            return learned_file.load(path, scene, self._learned_by(sensor), where)
+        if self._kept is None:
+            return None
+        return {slot: StoredArrays.of(state) for slot, state in self._kept.states.items()}
+
+    def _savers(
+        self, scene: mi.Scene, sensor: mi.Sensor, pilot_spp: int
+    ) -> list[Callable[[Mapping[str, Mapping[str, np.ndarray]]], None]]:
+        """The functions that save what is learned, in a file and for this process."""
+        made_by, savers = self._learned_by(sensor), []
+        if self.save_learned:
+            path = Path(self.save_learned)
+            savers.append(functools.partial(learned_file.save, path, scene, made_by))
+        if self.keep_learned and pilot_spp:
+            savers.append(functools.partial(kept_learning.put, scene, made_by, pilot_spp))
+        return savers
 
     def estimators(self, scene: mi.Scene, sensor: mi.Sensor) -> Callable[..., Estimator]:
         """The function that makes the estimator of a stage from its decisions: :meth:`walk`."""

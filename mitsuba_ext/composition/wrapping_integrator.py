@@ -5,6 +5,8 @@ This file is executed once per variant (see ``registry.py``): its base class is 
 
 from __future__ import annotations
 
+import math
+
 import mitsuba as mi
 
 from ..rendering.stages import OneStage, Schedule
@@ -62,8 +64,10 @@ class WrappingIntegrator(StagedIntegrator):
 
     # ---- What the base class calls ----
 
-    def pilots(self, scene: mi.Scene, pixel_count: int, spp: int) -> list[int]:
-        return self.nested.pilots(scene, pixel_count, spp) if self._is_staged else []
+    def pilots(
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
+    ) -> list[int]:
+        return self.nested.pilots(scene, sensor, spp, kernels) if self._is_staged else []
 
     @property
     def sample_cost(self) -> int:

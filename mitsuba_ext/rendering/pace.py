@@ -47,6 +47,6 @@ def plan_for_timeout(job: Job) -> RenderPlan:
     fits = taken + int(left * budget.short / max(seconds, 1e-6))
     fits = min(plan.spp, max(taken + 1, fits))
     kernels = (LEARNING_SHARE * left - _FIXED) / max(compiling, 1e-6)
-    pilots = integrator.pilots(job.scene, plan.pixel_count, fits - taken, kernels)
+    pilots = integrator.pilots(job.scene, job.sensor, fits - taken, kernels)
     budget.pilot_factor = 1.0
     return replace(plan, stages=(*pilots, fits - taken - sum(pilots)))

@@ -52,11 +52,12 @@ class Planned(Protocol):
         """Largest number of samples that are taken at a time, limited by memory."""
 
     def pilots(
-        self, scene: mi.Scene, pixel_count: int, spp: int, kernels: float = math.inf
+        self, scene: mi.Scene, sensor: mi.Sensor, spp: int, kernels: float = math.inf
     ) -> list[int]:
         """The samples per pixel of each pilot stage, out of ``spp``.
 
         Parameters:
+            scene, sensor: What is rendered.
             kernels: How many kernels as large as that of ``path`` learning may compile.
         """
 
@@ -119,8 +120,9 @@ class RenderPlan:
 
 
 def plan_render(
-    integrator: Planned, scene: mi.Scene, film: mi.Film, sampler: mi.Sampler, seed: int, spp: int
-) -> RenderPlan:
+    integrator: Planned, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler, seed: int,
+    spp: int,
+) -> RenderPlan:  # fmt: skip
     """The plan of ``integrator.render(scene, …)``. Sets the sampler's number of samples.
 
     Raises:
@@ -135,9 +137,8 @@ def plan_render(
     if spp:
         sampler.set_sample_count(spp)
     spp = sampler.sample_count()
-    check_extent(film)
-    width, height = film_extent(film)
-    pixel_count = width * height
+    check_extent(sensor.film())
+    pixel_count = math.prod(film_extent(sensor.film()))
     structured = sampler.class_name() != "IndependentSampler"
     cost = integrator.sample_cost
     limit = _PASS_SAMPLES[dr.backend_v(mi.Float)] // (pixel_count * cost)
@@ -153,7 +154,7 @@ def plan_render(
             f'"{integrator.name}": {spp} samples for each of {pixel_count} pixels '
             f"are too many: give at most {limit * _MOST_PASSES}"
         )
-    pilots = integrator.pilots(scene, pixel_count, spp)
+    pilots = integrator.pilots(scene, sensor, spp)
     # With a timeout, sets of samples are kept whole
     set_size = integrator.samples_per_set(spp) if is_timed else 1
     if structured:

@@ -127,7 +127,7 @@ class Job:
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
         self.sampler = camera.own_sampler(sensor)
         self.plan = plan_render(
-            integrator, scene, self.film, self.sampler, seed & 0xFFFFFFFF, spp
+            integrator, scene, sensor, self.sampler, seed & 0xFFFFFFFF, spp
         )
         self.statistics = integrator.statistics = RenderStatistics()
         self.tally = dr.zeros(mi.UInt64, 4)
