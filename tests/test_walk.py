@@ -9,6 +9,7 @@ import sys
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from mitsuba_ext.transport.estimator import CameraRays
@@ -300,3 +301,61 @@ def test_what_lies_behind_a_hidden_emitter_is_seen_undistorted():
         }
     behind = mi.render(mi.load_dict(scene), integrator=integrator, spp=64).numpy()
     assert behind[..., :3].mean() == pytest.approx(bare[..., :3].mean(), rel=0.02)
+
+
+#: The lamp is not in the picture.
+LAMP = {"type": "rectangle", "emitter": {"type": "area"}}
+SKY = {"type": "constant"}
+
+
+def _masks(*heights: float, opacity: float = 0.4, light: dict = LAMP, bsdf: dict | None = None):
+    """Plates, one below the other, and a light."""
+    T = mi.ScalarTransform4f
+    masked = {"type": "mask", "opacity": opacity, "bsdf": bsdf or {"type": "roughplastic"}}
+    if light is LAMP:
+        light = {**LAMP, "to_world": T().translate([0, 0.5, 2]).rotate([1, 0, 0], 180)}
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgba"}
+    view = {"type": "perspective", "fov": 50, "film": {**film, "rfilter": {"type": "box"}},
+            "to_world": T().look_at([0, -1.5, 1.5], [0, 0, 0], [0, 0, 1])}  # fmt: skip
+    plates = {f"plate_{i}": {"type": "rectangle", "to_world": T().translate([0, 0, z]),
+                             "bsdf": masked} for i, z in enumerate(heights)}  # fmt: skip
+    return mi.load_dict({"type": "scene", "sensor": view, "light": light, **plates})
+
+
+def _image(scene: mi.Scene, **integrator) -> np.ndarray:
+    return mi.render(scene, integrator=mi.load_dict(integrator), spp=512, seed=1).numpy()
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize(
+    "integrator",
+    [
+        *({"type": "composed_path", "mis": mis} for mis in ("power", "light")),
+        {"type": "bdpt"},
+        pytest.param({"type": "composed_path", "mis": "bsdf"}, marks=pytest.mark.slow),
+        *(pytest.param({"type": name}, marks=pytest.mark.slow)
+          for name in ("vcm", "photon_map", "instant_radiosity", "mlt", "pssmlt", "swarm_path")),
+    ],
+    ids=lambda integrator: "-".join(integrator.values()),
+)  # fmt: skip
+def test_light_on_a_mask_before_nothing_is_seen_and_alpha_is_that_of_path(integrator) -> None:
+    """Mitsuba's ``path`` loses the light of paths that only passed through null surfaces."""
+    right = 0.4 * _image(_masks(0, opacity=1.0), type="path", max_depth=2)[..., :3].mean()
+    image = _image(_masks(0), **integrator, max_depth=2)
+    assert image[..., :3].mean() == pytest.approx(right, rel=0.03)
+    alpha = _image(_masks(0), type="path", max_depth=2)[..., 3].mean()
+    assert image[..., 3].mean() == pytest.approx(alpha, rel=0.03)
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize(
+    "name", ["composed_path", "mlt", *(
+        pytest.param(name, marks=pytest.mark.slow) for name in ("bdpt", "vcm", "photon_map"))],
+)  # fmt: skip
+def test_with_the_emitters_the_sky_behind_masks_is_hidden_but_not_its_light_on_them(name) -> None:
+    method = {"max_depth": 3, "hide_emitters": True}
+    black = {"type": "diffuse", "reflectance": 0.0}
+    assert not _image(_masks(0, -1, bsdf=black, light=SKY), type=name, **method)[..., :3].any()
+    right = 0.4 * _image(_masks(0, opacity=1.0, light=SKY), type="path", **method)[..., :3].mean()
+    found = _image(_masks(0, light=SKY), type=name, **method)[..., :3].mean()
+    assert found == pytest.approx(right, rel=0.03)

@@ -100,9 +100,7 @@ class InstantRadiosity:
         if parts is not None:
             # The sums of the parts are complete when the kernel of the samples has run
             dr.eval(sample)
-            values = [
-                dr.select(sample.valid, part * rays.importance, 0) for part in parts.values()
-            ]
+            values = [part * rays.importance for part in parts.values()]
             values.append(self.picture.values(scene, lights, walk, sampler, rays))
             sample = replace(sample, aovs=[channel for value in values for channel in value])
         # The first lane counts the rays of light paths

@@ -61,9 +61,16 @@ class Inside:
 
 
 class NoMedia:
-    """For scenes without media: everything is as in ``path``."""
+    """For scenes without media: everything is as in ``path``.
+
+    Parameters:
+        hide_emitters: Is the environment invisible to rays that nothing has scattered yet?
+    """
 
     exist = False
+
+    def __init__(self, hide_emitters: bool = False) -> None:
+        self._hides = hide_emitters
 
     def begin(self, sampler, rays: CameraRays) -> Any:
         """The state of camera rays."""
@@ -133,13 +140,11 @@ class NoMedia:
         """The state behind the surface ``si``, in the direction ``d``."""
         return inside
 
-    def result(self, L, valid) -> mi.Spectrum:
-        """The radiance of a path; ``valid`` where it has hit something."""
-        return dr.select(valid, L, 0)
-
-    def visible_emission(self, emitted, path: PathState) -> mi.Spectrum:
-        """The emission that a path gains from a light that it hits."""
-        return emitted
+    def visible_emission(self, emitted, path: PathState, si, scattered) -> mi.Spectrum:
+        """The emission that a path gains from the light at ``si`` that it hits, where it has
+        ``scattered`` before, not only passed through null surfaces."""
+        # Area lights that are hidden are not met (``behind``)
+        return dr.select(si.is_valid() | scattered, emitted, 0) if self._hides else emitted
 
 
 # Not a dataclass: Dr.Jit would take one that a loop uses for a part of the loop's state
@@ -155,7 +160,8 @@ class Media(NoMedia):
     exist = True
 
     def __init__(self, hide_emitters: bool, distances: Distances, has_grids: bool = True) -> None:
-        self._hides, self._distances, self._has_grids = hide_emitters, distances, has_grids
+        super().__init__(hide_emitters)
+        self._distances, self._has_grids = distances, has_grids
 
     def begin(self, sampler, rays):
         channel = mi.UInt32(0)
@@ -302,10 +308,7 @@ class Media(NoMedia):
         medium = dr.select(si.is_medium_transition(), si.target_medium(d), inside.medium)
         return replace(inside, medium=medium)
 
-    def result(self, L, valid):
-        return L
-
-    def visible_emission(self, emitted, path):
+    def visible_emission(self, emitted, path, si, scattered):
         if not self._hides:
             return emitted
         return dr.select(path.depth == 0, 0, emitted)
@@ -314,7 +317,7 @@ class Media(NoMedia):
 def media_of(scene: mi.Scene, hide_emitters: bool, distances: Distances) -> NoMedia:
     """The object that handles the media of ``scene``."""
     if not may_have_media(scene):
-        return NoMedia()
+        return NoMedia(hide_emitters)
     return Media(hide_emitters, distances, may_have_grids(scene))
 
 

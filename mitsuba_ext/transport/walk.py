@@ -150,7 +150,7 @@ class Walk:
                     scene, self.query, si, path, self.next_event, next_event_state, self.mis,
                     count,
                 )
-                emitted = media.visible_emission(emitted, path)
+                emitted = media.visible_emission(emitted, path, si, valid)
                 L = dr.fma(path.β, emitted, L)
                 self.observer.emission(
                     path, hit, path.β * emitted, mis, light_pdf, active
@@ -263,9 +263,7 @@ class Walk:
             self.observer.segment(path.arrival.ref.p, ray(pi.t), active & pi.is_valid())
 
         self.observer.end(L)
-        return Sample(
-            media.result(L, valid), valid, scatter_count, shadow_count, connection_count
-        )
+        return Sample(L, valid, scatter_count, shadow_count, connection_count)
 
     def _visit(self, connects: bool, state, scene, si, active):
         """What the next event decision knows of a vertex."""

@@ -90,6 +90,8 @@ def trace_from_camera(
     light_weight = mi.Spectrum(1)
     scatter, shadow = mi.UInt32(0), mi.UInt32(0)
     is_found = mi.Bool(False)
+    # Has the path only passed through null surfaces? If lights are hidden, it does not see the sky
+    is_straight = mi.Bool(True)
     while dr.hint(active, label="path"):
         si = query.interaction(pi, ray)
         place = memory.places[at + index]
@@ -112,6 +114,8 @@ def trace_from_camera(
         found = is_new | space.is_same(si, place.p, dr.minimum(distance, ahead))
         shines = (light != NO_LIGHT) & (light == emitter)
         ends = dr.select(unhittable, ~is_new, shines & (is_infinite | found))
+        if dr.hint(space.hides_emitters, mode="scalar"):
+            ends &= ~(is_infinite & is_straight)
         active &= dr.select(is_end, ends, si.is_valid() & found)
 
         # ----- The densities of the segment that ends here -----
@@ -177,6 +181,8 @@ def trace_from_camera(
         reverse = reverse_density(ctx, bsdf, si, wo, goes_on & ~is_discrete)
         agrees = is_sampled_discrete & (dr.squared_norm(bs.wo - wo) < _MISS)
         goes_on &= ~is_discrete | agrees
+        if dr.hint(space.hides_emitters, mode="scalar"):
+            is_straight &= is_discrete & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         factor = dr.select(is_discrete, weight, smooth)
         through = mi.BSDFSample3f(bs)
         through.wo = wo
