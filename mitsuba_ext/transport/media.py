@@ -68,6 +68,8 @@ class NoMedia:
     """
 
     exist = False
+    #: Are camera rays traced in packets, as in ``path``?
+    coherent = True
 
     def __init__(self, hide_emitters: bool = False) -> None:
         self._hides = hide_emitters
@@ -158,6 +160,9 @@ class Media(NoMedia):
     """
 
     exist = True
+    # Embree's packets miss shared edges of triangles more often than its single rays, which
+    # ``volpath`` traces. A ray that misses the boundary of a medium never sees the medium
+    coherent = False
 
     def __init__(self, hide_emitters: bool, distances: Distances, has_grids: bool = True) -> None:
         super().__init__(hide_emitters)

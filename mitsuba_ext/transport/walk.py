@@ -132,7 +132,7 @@ class Walk:
 
         inside = media.begin(sampler, rays)
         ray, inside = media.launch(inside, sampler, rays, ray, active)
-        pi = self.query.closest(scene, ray, coherent=True, active=active)
+        pi = self.query.closest(scene, ray, coherent=media.coherent, active=active)
         if dr.hint(self.hide_emitters, mode="scalar"):
             ray, pi = media.behind(self.query, scene, ray, pi, active)
 
