@@ -178,7 +178,7 @@ class LightSubpaths(Subpaths):
         # ----- Shadow ray -----
         active &= (dr.max(dr.abs(value)) > 0) & dr.all(dr.isfinite(value))
         ds = dr.zeros(mi.DirectionSample3f, dr.width(active))
-        ds.p, ds.d, ds.dist = far.p, d, distance
+        ds.p, ds.n, ds.d, ds.dist = far.p, far.n, d, distance
         visible = active & ~self._query.occluded(scene, si, ds, active)
         value = dr.select(visible, value, 0)
         if self._techniques is not None:

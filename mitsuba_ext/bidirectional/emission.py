@@ -187,7 +187,8 @@ class LightEmission:
             )  # fmt: skip
         ray.o, ray.d, ray.maxt = start.p, d, dr.largest(mi.Float)
         if self._has_surfaces:
-            above = dr.fma(_OFFSET, self._starts.along(start, d).o - start.p, start.p)
+            share = 1.0 if self._starts.exact else _OFFSET
+            above = dr.fma(share, self._starts.along(start, d).o - start.p, start.p)
             ray.o = dr.select(is_surface, above, ray.o)
         weight /= row.probability * row.density
         sound = active & dr.all(dr.isfinite(weight)) & (row.probability > 0)

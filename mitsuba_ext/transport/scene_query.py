@@ -45,13 +45,18 @@ class SceneQuery:
         active: mi.Bool,
     ) -> mi.Bool:
         """Is the light sample ``ds`` occluded from ``si``?"""
-        return scene.ray_test(self.shadow_ray(scene, si, ds), active=active)
+        ray = self.shadow_ray(scene, si, ds)
+        if self.starts.exact:
+            # Mitsuba tests in single precision whether a sphere occludes: the square of the
+            # distance is rounded. Intersections with spheres are computed in double precision
+            return self.closest(scene, ray, coherent=False, active=active).is_valid()
+        return scene.ray_test(ray, active=active)
 
     def shadow_ray(
         self, scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f
     ) -> mi.Ray3f:
         """The ray from ``si`` to the light sample ``ds``."""
-        ray = self.starts.towards(si, ds.p)
+        ray = self.starts.towards(si, ds.p, ds.n)
         if any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in scene.emitters()):
             # Mitsuba puts ds.p outside of the bounds of the scene, which are wrong where it has
             # merged rectangles (``bounds.py``): its shadow rays may end before a wall

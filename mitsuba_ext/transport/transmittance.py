@@ -36,7 +36,7 @@ def transmittance(
     medium = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
     ray = query.shadow_ray(scene, si, ds)
     # Media attenuate light from infinity up to Mitsuba's ds.p; surfaces block it at any distance
-    left = query.starts.towards(si, ds.p).maxt
+    left = query.starts.towards(si, ds.p, ds.n).maxt
     T = mi.Spectrum(1)
     active = mi.Bool(active)
     while dr.hint(active, label="transmittance"):
