@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import numpy as np
 import pytest
 from hard_cases import film, sensor, stage
 from statistical import batches, one_thread
+
+from mitsuba_ext.composition.slots import SLOTS as WORDS
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -42,6 +45,24 @@ def _refusal(**slots: Any) -> str:
 def test_a_decision_in_a_wrong_slot_is_told_its_own(slot: str, plugin: str, belongs: str) -> None:
     message = _refusal(**{slot: {"type": plugin}})
     assert f'"composed_path": the parameter "{slot}"' in message and belongs in message
+
+
+def test_any_two_words_go_together_or_are_refused_in_a_sentence() -> None:
+    refused = {}
+    for (slot, words), (other, others) in itertools.combinations(WORDS.items(), 2):
+        for word, another in itertools.product(words, others):
+            try:
+                mi.load_dict({"type": "composed_path", slot: word, other: another})
+            except RuntimeError as error:
+                sentence = str(error).strip().splitlines()[-1]
+                named = rf'Error: "composed_path": the parameter "({slot}|{other})" .+'
+                assert re.search(named, sentence)
+                refused[slot, word, other, another] = sentence
+    # In a variant without wavelengths, the maps of these do not go with anything
+    left = {key: sentence for key, sentence in refused.items() if "wavelength" not in key}
+    learned = ("visibility", "contribution", "triple_product")
+    assert set(left) == {("next_event", word, "light_numbers", "swarm") for word in learned}
+    assert all('"next_event" is' in sentence for sentence in left.values())
 
 
 @pytest.mark.parametrize("slot, value", [

@@ -58,8 +58,8 @@ class RejectedShadowRays(DecisionParameters):
     def check_together(self, plugin: str, slots: Slots) -> None:
         if self._given and not self._uses_own_map(slots):
             raise ValueError(
-                f'"{plugin}": the parameter "{self._given[0]}" of "shadow_test" needs lights that '
-                f"are not learned; leave it out"
+                f'"{plugin}": the parameter "{self._given[0]}" of "shadow_test" has no effect '
+                f'where "next_event" learns lights, whose map the shadow test uses: leave it out'
             )
 
     def parameters(self, slots: Slots = MappingProxyType({})) -> dict[str, Any]:

@@ -137,8 +137,9 @@ class LightMapsChoice(Swarm):
         lights = slots.get("next_event")
         if lights is not None and lights.pilot_spp:
             raise ValueError(
-                f'"{plugin}": the parameter "light_numbers" needs lights that are not learned; '
-                f"leave it out"
+                f'"{plugin}": the parameter "light_numbers" is "swarm", which needs lights that '
+                f'are not learned, and "next_event" is "{lights.name}", which learns them: leave '
+                f"one of the two out"
             )
         self._lights = lights
 
