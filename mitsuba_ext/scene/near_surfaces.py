@@ -35,7 +35,8 @@ _EXACT = ("Sphere", "Disk", "Rectangle")
 def has_near_surfaces(scene: mi.Scene, offset: Callable[[float], float]) -> bool:
     """Is another surface closer to that of a small transparent object of ``scene`` than the offset
     of rays? It is false, too, where intersections are not exact enough for a smaller offset: on a
-    GPU, and where there are shapes other than meshes, spheres, disks and rectangles.
+    GPU, and where there are shapes other than meshes, spheres, disks and rectangles. Meshes that
+    Mitsuba has merged count as one object.
 
     Parameters:
         offset: The offset of rays at points whose largest coordinate is given.
@@ -58,8 +59,8 @@ def has_near_surfaces(scene: mi.Scene, offset: Callable[[float], float]) -> bool
 
 def _lets_through(shape: mi.Shape) -> bool:
     """May rays pass through the surface of ``shape``?"""
-    passes = int(mi.BSDFFlags.Transmission) | int(mi.BSDFFlags.Null)
-    return int(shape.bsdf().flags()) & passes != 0
+    passes, bsdf = int(mi.BSDFFlags.Transmission) | int(mi.BSDFFlags.Null), shape.bsdf()
+    return bsdf is not None and int(bsdf.flags()) & passes != 0
 
 
 def _are_near(scene: mi.Scene, small: np.ndarray) -> bool:
@@ -72,8 +73,8 @@ def _are_near(scene: mi.Scene, small: np.ndarray) -> bool:
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     p = low + numbers.random(low.shape) * (high - low)
     o = p - np.linalg.norm(high - low, axis=1, keepdims=True) * d
-    ray = mi.Ray3f(*(type(*(from_numpy(mi.Float, column) for column in values.T))
-                     for type, values in ((mi.Point3f, o), (mi.Vector3f, d))))  # fmt: skip
+    ray = mi.Ray3f(*(kind(*(from_numpy(mi.Float, column) for column in values.T))
+                     for kind, values in ((mi.Point3f, o), (mi.Vector3f, d))))  # fmt: skip
     offset = from_numpy(mi.Float, offset)
     step = _STEP * offset
     near, going = mi.Bool(False), mi.Bool(True)

@@ -64,7 +64,8 @@ class Sample:
 
     Attributes:
         L: Radiance estimate.
-        valid: Did the path hit a surface (or the visible environment)? It becomes alpha.
+        valid: Did the path hit a surface that scattered it (or the visible environment)? It becomes
+            alpha. ``L`` need not be zero elsewhere: a null surface may be lit.
         scatter_count: Rays traced in directions that a BSDF chose.
         shadow_count: Shadow rays traced. Counts are arrays of any width, of which the sum matters.
         connection_count: Connections to a light that were considered: ``path`` traces a shadow ray

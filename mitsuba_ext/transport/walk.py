@@ -2,10 +2,11 @@
 
 The walk is Mitsuba's ``path``: next event estimation, multiple importance sampling with the power
 heuristic, Russian roulette. With the default decisions it draws the same random numbers in the
-same order, so that a render of one pass returns the same image. Where the scene has participating
-media, it is ``volpath`` (``media.py``). A technique replaces one decision
-(``path_decisions.py``); Dr.Jit inlines Python while it traces, so a replaced decision costs only
-its own work and a default one nothing.
+same order, so that a render of one pass returns the same image. It differs where ``path`` loses
+light: on masks before nothing, and between surfaces that are very close (``ray_starts.py``). Where
+the scene has participating media, it is ``volpath`` (``media.py``). A technique replaces one
+decision (``path_decisions.py``); Dr.Jit inlines Python while it traces, so a replaced decision
+costs only its own work and a default one nothing.
 """
 
 from __future__ import annotations
