@@ -22,8 +22,8 @@ _LINES, _SURFACES, _SHARE = 64, 4, 1 / 4
 #: The distance of close surfaces, in offsets, on a line that crosses them at an angle.
 _NEAR = 1.5
 
-#: The most objects that are examined.
-_MOST = 1024
+#: The most objects that are examined, evenly spread over the list of shapes.
+_MOST = 256
 
 #: What is a small part of an offset.
 _STEP = 1 / 32
@@ -54,7 +54,8 @@ def has_near_surfaces(scene: mi.Scene, offset: Callable[[float], float]) -> bool
         distance = offset(float(np.abs([box.min, box.max]).max()))
         if 0 < max(box.extents()) < _SMALL * distance:
             small.append((*box.min, *box.max, distance))
-    return bool(small) and _are_near(scene, np.array(small[:_MOST], dtype=np.float32))
+    small = small[:: -(-len(small) // _MOST) or 1]
+    return bool(small) and _are_near(scene, np.array(small, dtype=np.float32))
 
 
 def _lets_through(shape: mi.Shape) -> bool:
