@@ -10,9 +10,11 @@ import numpy as np
 
 from ..arrays import from_numpy
 from ..scene.bounds import scene_bounds
+from ..scene.bsdfs import bsdf_table
 from ..transport.numbers import Numbers
 from ..transport.ray_starts import ray_starts
 from . import light_pieces as pieces
+from .light_directions import NOT_RECIPROCAL
 from .light_pieces import LightPieces, Piece
 from .stored_interaction import needs_whole_interaction
 
@@ -83,6 +85,7 @@ class LightEmission:
     Attributes:
         needs_whole_interaction (bool): Must stored vertices hold all fields of the interaction
             (``stored_interaction.py``)?
+        not_reciprocal (mi.Bool | None): Which BSDFs are not (``light_directions.py``)?
         probability (numpy.ndarray): Probability of choosing each emitter; shape [emitters].
         has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
         radius (mi.Float): Approximate radius of the scene.
@@ -95,6 +98,7 @@ class LightEmission:
         emitters = scene.emitters()
         # Computed once for a render, since it visits all shapes
         self.needs_whole_interaction = needs_whole_interaction(scene)
+        self.not_reciprocal = bsdf_table(scene, NOT_RECIPROCAL)
         self._pieces = LightPieces(scene)
         self.probability = self._pieces.probability
         self._emitters = scene.emitters_dr()

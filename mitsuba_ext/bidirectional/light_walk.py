@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..startup.garbage import garbage_left_alone
-from ..transport.bsdfs import sample_bsdf
 from ..transport.estimator import CameraRays
 from ..transport.free_flight import Distances
 from ..transport.frozen import frozen
@@ -20,6 +19,7 @@ from ..transport.numbers import Numbers, copied, go_to, reached, schedule_state
 from ..transport.path_decisions import Roulette, SceneQuery
 from ..transport.vertex import Arrival, PathState, Vertex
 from .emission import EmittedRay, LightEmission
+from .light_directions import LightDirections
 from .light_media import medium_at_start
 from .light_vertices import Layout, LightVertices, VertexStore, bytes_per_vertex
 from .partial_sums import PartialSums, Sums
@@ -214,7 +214,7 @@ class LightWalk:
 
     @dr.syntax
     def _trace(self, scene, numbers, paths, store) -> tuple[Numbers, LightPaths]:
-        heroes, media = Heroes(scene), self._media(scene)
+        heroes, media, directions = Heroes(scene), self._media(scene), self._directions()
         ctx = heroes.context()
         ctx.mode = mi.TransportMode.Importance
         place = dr.arange(mi.UInt32, store.lanes) * store.stride
@@ -242,7 +242,7 @@ class LightWalk:
             # ----- Sample the BSDF -----
             active_next = self._goes_on(media, vertex, last_depth, active)
             sample_1, sample_2 = numbers.next_1d(), numbers.next_2d()
-            bs, weight = sample_bsdf(bsdf, ctx, si, sample_1, sample_2, active_next)
+            bs, weight = directions.sample(bsdf, ctx, si, sample_1, sample_2, active_next)
             weight, sums, hero_count, hero_is_alone = self._scatter(
                 heroes, paths, bsdf, si, bs, weight, sums, active_next
             )
@@ -276,6 +276,12 @@ class LightWalk:
             )  # fmt: skip
             active = active_next & (place < end)
         return numbers, paths
+
+    def _directions(self) -> LightDirections:
+        """The object that samples directions."""
+        # MIS weights of camera paths make up for light that the samples of BSDFs do not find
+        weighs = isinstance(self.sums, PartialSums)
+        return LightDirections(None if weighs else self.emission.not_reciprocal)
 
     def _media(self, scene: mi.Scene) -> NoMedia:
         """The object that handles media."""

@@ -58,7 +58,9 @@ class PhotonDirections(Scattering):
         sampled, sampled_pdf = eval_bsdf(vertex.bsdf, ctx, si, bs.wo, guides & ~is_delta)
         photons, sampled_photons = self._densities(vertex, (wo, bs.wo), power, guides)
         mixed = _mixed(sampled_pdf, sampled_photons)
-        sampled *= dr.select(mixed > 0, dr.rcp(mixed), 0)
+        # The BSDF's own sample has failed where its weight is zero
+        is_sampled = follows | (dr.max(dr.abs(mi.unpolarized_spectrum(weight))) > 0)
+        sampled *= dr.select(is_sampled & (mixed > 0), dr.rcp(mixed), 0)
         guided = dr.select(is_delta, weight / (1 - _SHARE), sampled)
         bs.pdf = dr.select(guides, dr.select(is_delta, bs.pdf * (1 - _SHARE), mixed), bs.pdf)
         pdf = dr.select(guides, _mixed(pdf, photons), pdf)

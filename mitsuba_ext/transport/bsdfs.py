@@ -7,6 +7,11 @@ BSDFs that contain others multiply these numbers: in ``blendbsdf``, the weight i
 ``path`` ends such paths, because in Dr.Jit's LLVM and CUDA backends ``NaN != 0`` is false. These
 functions do the same at the source: a sample that is not finite counts as failed, and a value or a
 density that is not finite as zero. Everything else is returned unchanged.
+
+A failed sample has a direction and a density nevertheless: where the microfacet of
+``roughdielectric``, ``principled`` or ``principledthin`` sends light to the wrong side, ``bs.pdf``
+is the density of *successful* samples of that direction, which has another lobe. Only the weight
+tells. Whoever uses the direction without the weight needs :func:`sample_bsdf`.
 """
 
 from __future__ import annotations
@@ -49,7 +54,10 @@ def sample_bsdf(
 ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
     """A direction, and value / density there. Where none is sampled, the weight and ``bs.pdf`` are
     zero, and ``bs.wo`` is an arbitrary direction."""
-    return _finite_sample(*bsdf.sample(ctx, si, sample_1, sample_2, active))
+    bs, weight = _finite_sample(*bsdf.sample(ctx, si, sample_1, sample_2, active))
+    is_sampled = dr.max(dr.abs(mi.unpolarized_spectrum(weight))) > 0
+    bs.pdf = dr.select(is_sampled, bs.pdf, 0)
+    return bs, weight
 
 
 def eval_and_sample_bsdf(

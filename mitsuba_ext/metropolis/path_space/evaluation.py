@@ -151,6 +151,7 @@ def trace_from_camera(
         # All other directions follow from the stored vertices
         is_sampled = goes_on & (walks | was_discrete)
         bs, weight = sample_bsdf(bsdf, ctx, si, lobe, sample, is_sampled)
+        goes_on &= ~walks | (bs.pdf > 0)
         is_sampled_discrete = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         is_discrete = dr.select(walks, is_sampled_discrete, was_discrete)
         next_d = towards(si.p, target, given)
