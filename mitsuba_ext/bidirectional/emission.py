@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import from_numpy
 from ..scene.bounds import scene_bounds
-from ..scene.bsdfs import bsdf_table
+from ..scene.bsdfs import bsdf_table, refuse_clear_curves
 from ..transport.numbers import Numbers
 from ..transport.ray_starts import ray_starts
 from . import light_pieces as pieces
@@ -91,10 +91,12 @@ class LightEmission:
         radius (mi.Float): Approximate radius of the scene.
 
     Raises:
-        NotImplementedError: Paths cannot start from one of the emitters.
+        NotImplementedError: Paths cannot start from one of the emitters, or cannot follow the light
+            of the scene.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
+        refuse_clear_curves(scene)
         emitters = scene.emitters()
         # Computed once for a render, since it visits all shapes
         self.needs_whole_interaction = needs_whole_interaction(scene)

@@ -1,12 +1,15 @@
-"""Finds BSDFs of some classes in scenes, also where others contain them."""
+"""Finds BSDFs in scenes, also where others contain them, and raises errors for those that light
+paths cannot render."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from .movers import all_shapes
 
 #: How many of Dr.Jit's indices of BSDFs are examined in scenes with instances.
 _NUMBERS = 1024
@@ -16,7 +19,7 @@ def bsdf_table(scene: mi.Scene, classes: Collection[str]) -> mi.Bool | None:
     """Which BSDFs of ``scene`` are, or contain, one of the ``classes``: a table over Dr.Jit's
     indices of BSDFs. ``None`` if there is none. The BSDFs of an instance are not accessible: where
     there is one, all BSDFs in memory are examined."""
-    shapes = list(_all(scene.shapes()))
+    shapes = list(all_shapes(scene.shapes()))
     bsdfs = [shape.bsdf() for shape in shapes if shape.bsdf() is not None]
     if any(shape.class_name() == "Instance" for shape in shapes):
         bsdfs += _all_in_memory()
@@ -32,6 +35,26 @@ def is_in_table(table: mi.Bool, bsdf: mi.BSDFPtr) -> mi.Bool:
     """Is ``bsdf`` one of those that :func:`bsdf_table` has found?"""
     index = dr.reinterpret_array(mi.UInt32, bsdf)
     return dr.gather(mi.Bool, table, index, index < dr.width(table))
+
+
+def refuse_clear_curves(scene: mi.Scene) -> None:
+    """Raises an error if light passes through a curve. No ray hits a curve from inside, so that a
+    camera path that enters one leaves it at its own vertex, and the reverse light path meets the
+    other side of the curve instead.
+
+    Raises:
+        NotImplementedError: The BSDF of a curve transmits light.
+    """
+    F = mi.BSDFFlags
+    transmits = int(F.DiffuseTransmission) | int(F.GlossyTransmission) | int(F.DeltaTransmission)
+    for shape in all_shapes(scene.shapes()):
+        is_curve = shape.class_name() in ("BSplineCurve", "LinearCurve")
+        if is_curve and int(shape.bsdf().flags()) & transmits:
+            raise NotImplementedError(
+                'light paths do not pass through a "bsplinecurve" or "linearcurve" whose BSDF '
+                'transmits light, such as "hair"; use an integrator without light paths, such as '
+                '"composed_path", or a mesh instead of the curve'
+            )
 
 
 def _contains(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
@@ -50,13 +73,6 @@ def _contains(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
     nested = Nested()
     bsdf.traverse(nested)
     return nested.is_found
-
-
-def _all(shapes: Iterable[mi.Shape]) -> Iterator[mi.Shape]:
-    """The shapes, and the shapes of which moving ones consist."""
-    for shape in shapes:
-        yield shape
-        yield from _all(getattr(shape, "children", ()))
 
 
 def _all_in_memory() -> Iterator[mi.BSDF]:

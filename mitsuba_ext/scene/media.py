@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 import drjit as dr
 import mitsuba as mi
 
-from .movers import movers
+from .movers import all_shapes, movers
 
 
 def has_media(scene: mi.Scene) -> bool:
@@ -21,12 +21,12 @@ def may_have_media(scene: mi.Scene) -> bool:
     """Like :func:`has_media`, but also true if an instance may contain a medium."""
     if has_media(scene):
         return True
-    return any(s.class_name() == "Instance" for s in _all(scene.shapes())) and _any_is_alive()
+    return any(s.class_name() == "Instance" for s in all_shapes(scene.shapes())) and _any_is_alive()
 
 
 def may_have_grids(scene: mi.Scene) -> bool:
     """May there be a medium in ``scene`` that is not homogeneous?"""
-    is_known = all(s.class_name() != "Instance" for s in _all(scene.shapes()))
+    is_known = all(s.class_name() != "Instance" for s in all_shapes(scene.shapes()))
     return not is_known or any(not medium.is_homogeneous() for medium in _media(scene))
 
 
@@ -97,18 +97,11 @@ def _media(scene: mi.Scene) -> Iterator[mi.Medium]:
 
 
 def _of_shapes(shapes: Iterable[mi.Shape]) -> Iterator[mi.Medium]:
-    for shape in _all(shapes):
+    for shape in all_shapes(shapes):
         if shape.is_medium_transition():
             for medium in (shape.interior_medium(), shape.exterior_medium()):
                 if medium is not None:
                     yield medium
-
-
-def _all(shapes: Iterable[mi.Shape]) -> Iterator[mi.Shape]:
-    """The shapes, and the shapes of which moving ones consist."""
-    for shape in shapes:
-        yield shape
-        yield from _all(getattr(shape, "children", ()))
 
 
 #: How many of Dr.Jit's indices of media are examined.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import drjit as dr
 import mitsuba as mi
 
@@ -12,6 +14,13 @@ def movers(scene: mi.Scene) -> list[mi.Shape]:
     """The shapes of ``scene`` that move. They have the attributes ``motion`` and ``at_rest`` (a
     scene)."""
     return [s for s in scene.shapes() if isinstance(getattr(s, "motion", None), Motion)]
+
+
+def all_shapes(shapes: Iterable[mi.Shape]) -> Iterator[mi.Shape]:
+    """The shapes, and the shapes of which moving ones consist."""
+    for shape in shapes:
+        yield shape
+        yield from all_shapes(getattr(shape, "children", ()))
 
 
 def is_moving_light(emitter: mi.Emitter) -> bool:
