@@ -24,6 +24,7 @@ from mitsuba_ext.composition.staged_integrator import NO_LIMIT
 from mitsuba_ext.composition.walk_integrator import LEARNING_KERNELS
 from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.rendering.stages import Schedule
+from mitsuba_ext.scene.bsdfs import has_clear_curves
 from mitsuba_ext.scene.media import may_have_media
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
@@ -215,6 +216,9 @@ class Auto(LightPathIntegrator):
         if self._has_media and not _can_merge(scene):
             return False
         if not LightPathsWhereTheyPay().can_learn(scene, 1):
+            return False
+        # Nor may light pass through curves: merging would have to find it
+        if self._has_media and has_clear_curves(scene):
             return False
         try:
             LightEmission(scene)

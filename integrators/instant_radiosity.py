@@ -21,6 +21,7 @@ from mitsuba_ext.composition.slots import read_slot
 from mitsuba_ext.composition.subpath_selection import LearnedSubpaths
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera import film_extent
+from mitsuba_ext.scene.bsdfs import refuse_clear_curves
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import Estimator
@@ -200,6 +201,7 @@ class InstantRadiosityIntegrator(WalkIntegrator):
         self._check(scene)
         if not scene.emitters() or self.max_depth < 3:
             return self._walk_alone if self.light_aovs else self.walk
+        refuse_clear_curves(scene, f'"{self.name}"')
         side = LightSide.of(self.name, scene, sensor, has_image=self.light_aovs)
         self._largest = self.bound / scene_diagonal(scene) ** 2
         width, height = film_extent(sensor.film())

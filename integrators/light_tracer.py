@@ -15,6 +15,7 @@ from mitsuba_ext.composition.lens import LENS_SAMPLING, connectable_sensor
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
 from mitsuba_ext.rendering.camera import check_takes_splats
 from mitsuba_ext.rendering.stages import OneStage
+from mitsuba_ext.scene.bsdfs import refuse_clear_curves
 from mitsuba_ext.scene.movers import sensor_at_rest
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.walk import Walk
@@ -143,6 +144,7 @@ class LightTracerIntegrator(WalkIntegrator):
         query = self.query(scene)
         target, walk = ConnectableSensor(sensor), None
         if scene.emitters() and self.max_depth > 1:
+            refuse_clear_curves(scene, f'"{self.name}"')
             self._warn_of_hidden(scene)
             try:
                 emission = LightEmission(scene)

@@ -24,6 +24,7 @@ from mitsuba_ext.bidirectional.photon_phases import (
 )
 from mitsuba_ext.composition.slots import read_slot
 from mitsuba_ext.composition.walk_integrator import WalkIntegrator
+from mitsuba_ext.scene.bsdfs import refuse_clear_curves
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.walk import Walk
@@ -151,6 +152,7 @@ class PhotonMapping(WalkIntegrator):
         self._check(scene)
         if not scene.emitters() or self.max_depth < 2:
             return PhotonMaps()
+        refuse_clear_curves(scene, f'"{self.name}"')
         try:
             emission = LightEmission(scene)
         except NotImplementedError as error:

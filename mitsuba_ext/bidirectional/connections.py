@@ -48,7 +48,7 @@ def joining_weight(
     """The MIS weight of connecting two subpaths. ``expected`` is :meth:`SubpathSelection.expected`,
     if a selection chooses the vertices."""
     inverse = dr.rcp(squared_distance)
-    to_one = other.pdf * geometric_cosine(one.si, one.wo) * inverse
+    to_one = other.pdf * sums.cosine(one.si, one.wo) * inverse
     to_other = one.pdf * geometric_cosine(other.si, other.wo) * inverse
     others = sums.others(to_one, one.sums, one.reverse_pdf)
     others += sums.others(to_other, other.sums, other.reverse_pdf)
@@ -73,7 +73,7 @@ def joining_rivals(
             true number, not that which MIS weights assume.
     """
     inverse = dr.rcp(squared_distance)
-    to_one = other.pdf * geometric_cosine(one.si, one.wo) * inverse
+    to_one = other.pdf * sums.cosine(one.si, one.wo) * inverse
     to_other = one.pdf * geometric_cosine(other.si, other.wo) * inverse
     ends = to_other, other.sums, other.reverse_pdf, is_first[1]
     kinds = sums.by_kind(*ends)
@@ -153,6 +153,7 @@ class LightSubpaths(Subpaths):
         active &= distance > 0
         d /= dr.select(active, distance, 1)
         wo, back = si.to_local(d), far.to_local(-d)
+        active &= self._sums.is_open(far, back)
 
         # ----- Throughput of the connection -----
         value, pdf = eval_bsdf(vertex.bsdf, self._ctx, si, wo, active)

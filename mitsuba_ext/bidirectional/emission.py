@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import from_numpy
 from ..scene.bounds import scene_bounds
-from ..scene.bsdfs import bsdf_table, refuse_clear_curves
+from ..scene.bsdfs import bsdf_table, has_clear_curves
 from ..transport.numbers import Numbers
 from ..transport.ray_starts import ray_starts
 from . import light_pieces as pieces
@@ -86,21 +86,21 @@ class LightEmission:
         needs_whole_interaction (bool): Must stored vertices hold all fields of the interaction
             (``stored_interaction.py``)?
         not_reciprocal (mi.Bool | None): Which BSDFs are not (``light_directions.py``)?
+        has_clear_curves (bool): Does light pass through a curve (``scene/bsdfs.py``)?
         probability (numpy.ndarray): Probability of choosing each emitter; shape [emitters].
         has_smooth_meshes (bool): Is there a light that is a mesh with interpolated normals?
         radius (mi.Float): Approximate radius of the scene.
 
     Raises:
-        NotImplementedError: Paths cannot start from one of the emitters, or cannot follow the light
-            of the scene.
+        NotImplementedError: Paths cannot start from one of the emitters.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
-        refuse_clear_curves(scene)
         emitters = scene.emitters()
         # Computed once for a render, since it visits all shapes
         self.needs_whole_interaction = needs_whole_interaction(scene)
         self.not_reciprocal = bsdf_table(scene, NOT_RECIPROCAL)
+        self.has_clear_curves = has_clear_curves(scene)
         self._pieces = LightPieces(scene)
         self.probability = self._pieces.probability
         self._emitters = scene.emitters_dr()

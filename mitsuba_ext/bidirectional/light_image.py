@@ -123,6 +123,7 @@ class LightImage:
         value *= vertex.β * (importance * self._share)
         mis, rivals = mi.Float(1), ()
         if self._sums is not None:
+            active &= self._sums.is_open(si, to_camera)
             # The density per area with which a camera ray finds the vertex, divided by the density
             # of this point of the aperture
             found = importance * geometric_cosine(si, to_camera)

@@ -280,8 +280,12 @@ class LightWalk:
     def _directions(self) -> LightDirections:
         """The object that samples directions."""
         # MIS weights of camera paths make up for light that the samples of BSDFs do not find
-        weighs = isinstance(self.sums, PartialSums)
-        return LightDirections(None if weighs else self.emission.not_reciprocal)
+        return LightDirections(None if self._is_weighed else self.emission.not_reciprocal)
+
+    @property
+    def _is_weighed(self) -> bool:
+        """Are light paths combined with camera paths by MIS weights?"""
+        return isinstance(self.sums, PartialSums)
 
     def _media(self, scene: mi.Scene) -> NoMedia:
         """The object that handles media."""
@@ -340,6 +344,8 @@ class LightWalk:
         )
         value *= dr.select(bs.pdf > 0, dr.rcp(bs.pdf), 0)
         weight = dr.select(is_delta, weight * delta_correction(si, bs), value)
+        if self._is_weighed:
+            active &= self.sums.is_open(si, bs.wo)
         if self.sums is not None and self.outside is None:
             passes = is_delta | ~self._stores(bsdf)
             cosine = dr.select(passes, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))

@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from ..transport.path_decisions import EmitterSampling, SubpathSelection
 from .both_ends import from_both_ends
+from .scattering import geometric_cosine
 
 if TYPE_CHECKING:
     from .emission import EmittedRay
@@ -91,6 +92,7 @@ class PartialSums:
             arrives from a delta lobe.
         light_paths: Number of light paths for each camera path: so often, on average, a light path
             is connected to the sensor (t = 1).
+        has_clear_curves: Does light pass through a curve (``scene/bsdfs.py``)?
     """
 
     def __init__(
@@ -103,6 +105,7 @@ class PartialSums:
         merging: mi.Float | None = None,
         merges_all: bool = False,
         light_paths: mi.Float | float = 1.0,
+        has_clear_curves: bool = False,
     ) -> None:
         self._next_event, self.exponent, self.selection = next_event, exponent, selection
         self.splits = splits
@@ -113,6 +116,21 @@ class PartialSums:
         #: ``merging``, raised to the exponent.
         self.merging = None if merging is None else self.ratio(merging)
         self.merges_all = merges_all
+        self._has_clear_curves = has_clear_curves
+
+    def cosine(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Float:
+        """The geometric cosine of a local direction; 0 where no light path comes from there, or
+        goes there: into a curve."""
+        return dr.select(self.is_open(si, d), geometric_cosine(si, d), 0)
+
+    def is_open(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
+        """Does a local direction lead anywhere but into a curve, which is left to camera paths?"""
+        if not self._has_clear_curves:
+            return mi.Bool(True)
+        kind = si.shape.shape_type()
+        curves = mi.ShapeType.BSplineCurve, mi.ShapeType.LinearCurve
+        is_curve = (kind == int(curves[0])) | (kind == int(curves[1]))
+        return ~is_curve | (dr.dot(si.n, si.to_world(d)) > 0)
 
     def ratio(self, x: mi.Float) -> mi.Float:
         """A ratio of densities, raised to the exponent."""

@@ -113,6 +113,7 @@ class BidirectionalPathTracer:
             walk.next_event, dr.opaque(mi.Float, count), splits=splits,
             selection=selection, merging=merging, merges_all=self.merges_all,
             light_paths=dr.opaque(mi.Float, per_camera_path),
+            has_clear_curves=self.emission.has_clear_curves,
         )  # fmt: skip
         image = None
         if self.sensor is not None:

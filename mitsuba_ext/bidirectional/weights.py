@@ -98,7 +98,7 @@ class BidirectionalWeights(Weights):
         has_area = ~is_point & ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
         # The density with which a light path samples this segment, in the measure of next event
         # estimation
-        emitted = position * direction * geometric_cosine(si, wo)
+        emitted = position * direction * self.sums.cosine(si, wo)
         emitted *= dr.select(is_point, dr.rcp(dr.square(ds.dist)), 1)
         emitted *= dr.select(has_area, dr.rcp(dr.abs(dr.dot(ds.n, ds.d))), 1)
         inverse = dr.select(active, dr.rcp(pdf), 0)
@@ -118,6 +118,7 @@ class BidirectionalWeights(Weights):
         active = si.is_valid() & ~is_delta
         reverse = reverse_density(self._ctx, vertex.bsdf, si, bs.wo, active)
         cosine = dr.select(is_delta, cosine_of_delta(si, bs), geometric_cosine(si, bs.wo))
+        cosine = dr.select(self.sums.is_open(si, bs.wo), cosine, 0)
         sums = self.sums.leave(
             vertex.path.sums, cosine, bs.pdf, reverse, is_delta, vertex.depth == 0
         )

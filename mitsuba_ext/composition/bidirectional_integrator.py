@@ -98,6 +98,7 @@ class LightPathIntegrator(WalkIntegrator):
         sums = PartialSums(
             next_event or EmitterSampling(), dr.opaque(mi.Float, 1), splits=splits,
             merging=dr.opaque(mi.Float, 1), light_paths=dr.opaque(mi.Float, 1),
+            has_clear_curves=side.emission.has_clear_curves,
         )  # fmt: skip
         light_walk = LightWalk(
             side.emission, self.max_depth, self.rr_depth, sums, query=self.query(scene)

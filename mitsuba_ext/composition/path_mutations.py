@@ -10,6 +10,7 @@ from ..metropolis.chains.path_target import PathTarget
 from ..metropolis.path_space.mutations import Mutations, Switches
 from ..metropolis.path_space.space import PathSpace
 from ..rendering.stages import OneStage
+from ..scene.bsdfs import refuse_clear_curves
 from ..transport.path_decisions import Weights
 from ..transport.without_lengths import WithoutLengths
 from .decision_parameters import Setting
@@ -48,6 +49,7 @@ def path_target(integrator: Any, setting: Setting, switches: Switches) -> PathTa
     least, most = _least(integrator), min(setting.max_depth, MOST)
     if not scene.emitters() or most < least:
         return None
+    refuse_clear_curves(scene, f'"{integrator.name}"')
     side = LightSide.of(integrator.name, scene, sensor)
     space = PathSpace(
         scene, sensor, side.emission, side.sensor, integrator.query(scene), setting.spp,

@@ -10,6 +10,7 @@ from ..bidirectional.emission import LightEmission
 from ..bidirectional.light_media import outer_medium
 from ..bidirectional.light_walk import LightWalk
 from ..bidirectional.photon_mapper import PhotonMapper
+from ..scene.bsdfs import refuse_clear_curves
 from ..scene.media import may_have_media
 from ..transport.path_decisions import NoConnections
 from ..transport.walk import Walk
@@ -34,9 +35,10 @@ def photon_mapper(
         merging, radius_in_media, light_paths: See :class:`sppm`.
 
     Raises:
-        NotImplementedError: A light cannot emit light paths.
+        NotImplementedError: A light cannot emit light paths, or light passes through a curve.
     """
     query = integrator.query(scene)
+    refuse_clear_curves(scene, f'"{integrator.name}"')
     try:
         emission = LightEmission(scene)
     except NotImplementedError as error:

@@ -37,24 +37,36 @@ def is_in_table(table: mi.Bool, bsdf: mi.BSDFPtr) -> mi.Bool:
     return dr.gather(mi.Bool, table, index, index < dr.width(table))
 
 
-def refuse_clear_curves(scene: mi.Scene) -> None:
-    """Raises an error if light passes through a curve. No ray hits a curve from inside, so that a
-    camera path that enters one leaves it at its own vertex, and the reverse light path meets the
-    other side of the curve instead.
+def has_clear_curves(scene: mi.Scene) -> bool:
+    """Does light pass through a curve, such as one with the BSDF ``hair``?
 
-    Raises:
-        NotImplementedError: The BSDF of a curve transmits light.
-    """
+    No ray hits a curve from inside. A camera path that enters a curve leaves it unseen: its vertex
+    is where it enters. The reverse light path meets the other side of the curve instead."""
     F = mi.BSDFFlags
     transmits = int(F.DiffuseTransmission) | int(F.GlossyTransmission) | int(F.DeltaTransmission)
-    for shape in all_shapes(scene.shapes()):
-        is_curve = shape.class_name() in ("BSplineCurve", "LinearCurve")
-        if is_curve and int(shape.bsdf().flags()) & transmits:
-            raise NotImplementedError(
-                'light paths do not pass through a "bsplinecurve" or "linearcurve" whose BSDF '
-                'transmits light, such as "hair"; use an integrator without light paths, such as '
-                '"composed_path", or a mesh instead of the curve'
-            )
+    return any(
+        shape.class_name() in ("BSplineCurve", "LinearCurve")
+        and bool(int(shape.bsdf().flags()) & transmits)
+        for shape in all_shapes(scene.shapes())
+    )
+
+
+def refuse_clear_curves(scene: mi.Scene, what: str) -> None:
+    """Raises an error if light passes through a curve. For methods that need light paths to find
+    it.
+
+    Parameters:
+        what: The beginning of the message: the plugin.
+
+    Raises:
+        NotImplementedError: :func:`has_clear_curves`.
+    """
+    if has_clear_curves(scene):
+        raise NotImplementedError(
+            f'{what}: light paths do not pass through a "bsplinecurve" or "linearcurve" whose BSDF '
+            f'transmits light, such as "hair": use "bdpt" or "composed_path", or a mesh instead of '
+            f"the curve."
+        )
 
 
 def _contains(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
