@@ -134,10 +134,12 @@ class InstantRadiosityIntegrator(WalkIntegrator):
     Virtual lights on glossy surfaces are seen as dim, noisy reflections of lamps. Virtual spherical
     lights were tried, and are worse (docs/results/instant_radiosity.md). Spectral variants, moving
     shapes and lights, and participating media are refused: camera paths of other wavelengths and
-    times cannot share virtual lights. Of lights of the type :monosp:`directionalarea`, which
-    :monosp:`path` does not find, only the indirect light is rendered. As with :class:`bdpt`, images
-    differ from :monosp:`path` in scenes far from the origin. Gradients are not supported (use
-    :class:`composed_prb`), nor nesting in :monosp:`moment` and :monosp:`aov`.
+    times cannot share virtual lights. So are curves whose BSDF transmits light, such as
+    :monosp:`hair`, through which no light paths pass (use :class:`bdpt`). Of lights of the type
+    :monosp:`directionalarea`, which :monosp:`path` does not find, only the indirect light is
+    rendered. As with :class:`bdpt`, images differ from :monosp:`path` in scenes far from the
+    origin. Gradients are not supported (use :class:`composed_prb`), nor nesting in :monosp:`moment`
+    and :monosp:`aov`.
 
     Source: A. Keller, *Instant Radiosity*, SIGGRAPH 1997; T. Kollig, A. Keller, *Illumination in
     the Presence of Weak Singularities*, MCQMC 2004, section 3 (bound and compensation; K for glossy

@@ -83,7 +83,8 @@ class LightTracerIntegrator(WalkIntegrator):
     numbers instead.
 
     Alpha and output variables are those of the camera rays. Participating media are refused (use
-    :monosp:`volpath` or :monosp:`composed_path`). Gradients are not supported (use
+    :monosp:`volpath` or :monosp:`composed_path`), and so are curves whose BSDF transmits light,
+    such as :monosp:`hair` (use :class:`bdpt`). Gradients are not supported (use
     :class:`composed_prb`), nor are scalar and polarized variants, nor nesting in :monosp:`moment`
     and :monosp:`aov`.
 

@@ -78,7 +78,8 @@ class PathMetropolis(ChainIntegrator):
     glass and in mirrors; light through a gap. **Not when** :monosp:`path` or :class:`bdpt` converge
     well, or when noise must look even (see :class:`pssmlt`).
 
-    The statistics contain the acceptance rates. Participating media are refused.
+    The statistics contain the acceptance rates. Participating media are refused, and so
+    are curves whose BSDF transmits light, such as :monosp:`hair` (use :class:`pssmlt`).
 
     Source: E. Veach, L. Guibas, *Metropolis Light Transport*, SIGGRAPH 1997; D. Cline, PhD thesis,
     2007, section 7.12. Parameters: Mitsuba 0.6.

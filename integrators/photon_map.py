@@ -90,8 +90,9 @@ class PhotonMapping(WalkIntegrator):
     glass) scatter camera paths and photons, as mirrors do, so that reflections in them are sharp.
 
     Spectral variants, moving shapes and participating media are refused: photons of other
-    wavelengths and times cannot be merged. Gradients are not supported (use :class:`composed_prb`),
-    nor nesting in :monosp:`moment` and :monosp:`aov`.
+    wavelengths and times cannot be merged. So are curves whose BSDF transmits light, such as
+    :monosp:`hair`, through which no photons pass (use :class:`vcm`). Gradients are not supported
+    (use :class:`composed_prb`), nor nesting in :monosp:`moment` and :monosp:`aov`.
 
     Source: H. W. Jensen et al., *State of the Art in Monte Carlo Global Illumination*, SIGGRAPH
     course, 2004, section 10.5; D. Cline, PhD thesis, 2007, section 7.7.

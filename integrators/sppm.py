@@ -81,8 +81,9 @@ class ProgressivePhotonMapping(WalkIntegrator):
     each photon; outside of all boundaries, that behind the last one that a ray from the sensor
     crosses. In camera rays through homogeneous media, ``sample_emitters`` is ignored.
 
-    Gradients are not supported (use :class:`composed_prb`), nor nesting in :monosp:`moment` and
-    :monosp:`aov`.
+    Curves whose BSDF transmits light, such as :monosp:`hair`, are refused: photons do not pass
+    through them (use :class:`vcm`). Gradients are not supported (use :class:`composed_prb`), nor
+    nesting in :monosp:`moment` and :monosp:`aov`.
 
     Source: T. Hachisuka, H. W. Jensen, *Stochastic Progressive Photon Mapping*, ACM Transactions on
     Graphics 28(5), 2009; C. Knaus, M. Zwicker, *Progressive Photon Mapping: A Probabilistic

@@ -8,8 +8,8 @@ from typing import Any
 
 import mitsuba as mi
 import pytest
-from statistical import MANY_SEEDS, REFERENCE_SEEDS, SEEDS, assert_same_quarters, batches, some
 from stage import diffuse, film, lookat, sensor
+from statistical import MANY_SEEDS, REFERENCE_SEEDS, SEEDS, assert_same_quarters, batches, some
 
 pytestmark = pytest.mark.usefixtures("variant")
 
