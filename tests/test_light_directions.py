@@ -106,6 +106,52 @@ def test_samples_carry_on_all_light_with_little_noise(name: str) -> None:
         assert found.std() < 3 * max(means[1], 0.1), (wi, found.std(), found.max())
 
 
+def test_a_mirror_under_a_normal_map_has_the_weight_that_a_camera_path_finds() -> None:
+    """The map darkens what comes from steep directions: seen from the camera, that is the light."""
+    mirror = {"type": "conductor", "material": "none"}
+    bsdf = mi.load_dict({"type": "normalmap", "normalmap": _tilted(), "mirror": mirror})
+    rng, directions = np.random.default_rng(5), _directions(bsdf)
+    si = _arriving(rng, [0.9, -0.1, 0.4])
+    numbers = mi.Point2f(rng.random((2, _LANES)).astype(np.float32))
+    bs, weight = directions.sample(
+        mi.BSDFPtr(bsdf), mi.BSDFContext(), si, numbers.x, numbers, mi.Bool(True)
+    )
+    n = np.array([0.5, -0.2, 0.7])
+    slope = min((n[0] ** 2 + n[1] ** 2) / n[2] ** 2 / 8, 1)
+    darkening = 2 / (1 + (1 + slope * (0.82 / 0.16)) ** 0.5)
+    assert dr.all(bs.pdf == 1)
+    np.testing.assert_allclose(weight.numpy(), darkening, rtol=1e-3)
+
+
+def _caustic(bsdf: dict[str, Any]) -> mi.Scene:
+    """A floor that a lamp lights by way of a mirror alone."""
+    place = mi.ScalarTransform4f().translate
+    view = lookat([0, -0.9, 0.6], [0, 0.3, 0], [0, 0, 1])
+    black = {"type": "twosided", "bsdf": diffuse(0.0)}
+    return mi.load_dict({
+        "type": "scene", "sensor": sensor(film=film(16, 16), to_world=view, fov=60.0),
+        "floor": rectangle(mi.ScalarTransform4f().scale([3, 3, 1]), bsdf=diffuse(0.8)),
+        "mirror": rectangle(place([0, 1, 1]).rotate([1, 0, 0], 90), bsdf=bsdf),
+        "plate": rectangle(place([0, -1, 1.2]).scale([3, 0.9, 1]), bsdf=black),
+        "lamp": rectangle(place([0, -1.5, 1.5]).rotate([1, 0, 0], -90).scale(0.2),
+                          bsdf=diffuse(0.0), emitter=area(20.0)),
+    }, optimize=False)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bsdf", ["conductor", "plastic"])
+def test_caustics_of_bumps_are_those_of_path(bsdf: str) -> None:
+    """Where the map does not turn towards the viewer: docs/mitsuba_faults.md."""
+    scene = _caustic({"type": "bumpmap", "arbitrary": _bumps(), "flip_invalid_normals": False,
+                      "bsdf": {"type": bsdf}})  # fmt: skip
+    light_tracer, path = (
+        mi.load_dict({"type": x, "max_depth": 3}) for x in ("light_tracer", "path")
+    )
+    images = batches(scene, light_tracer, 2048, SEEDS[:MANY_SEEDS])
+    expected = batches(scene, path, 16384, REFERENCE_SEEDS[:MANY_SEEDS])
+    assert_same_quarters(images, expected, 0.03)
+
+
 def _ball(bsdf: dict[str, Any]) -> mi.Scene:
     lamp = mi.ScalarTransform4f().translate([0.5, -0.3, 2.2]).rotate([1, 0, 0], 180).scale(0.3)
     view = lookat([0, -4, 1.2], [0, 0, 0.3], [0, 0, 1])

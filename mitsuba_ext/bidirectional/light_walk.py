@@ -280,7 +280,7 @@ class LightWalk:
     def _directions(self) -> LightDirections:
         """The object that samples directions."""
         # MIS weights of camera paths make up for light that the samples of BSDFs do not find
-        return LightDirections(None if self._is_weighed else self.emission.not_reciprocal)
+        return LightDirections(self.emission.not_reciprocal, mixes=not self._is_weighed)
 
     @property
     def _is_weighed(self) -> bool:

@@ -46,9 +46,7 @@ def adjoint_value(
 ) -> tuple[mi.Spectrum, mi.Float]:
     """As :func:`evaluate`, but not restricted to the hero wavelength where dispersive interfaces
     refract."""
-    reversed_si = mi.SurfaceInteraction3f(si)
-    reversed_si.wi = to_camera
-    value, pdf = eval_bsdf(bsdf, ctx, reversed_si, si.wi, active)
+    value, pdf = eval_bsdf(bsdf, ctx, reversed_at(si, to_camera), si.wi, active)
     arrives, leaves = geometric_cosine(si, si.wi), geometric_cosine(si, to_camera)
     # The value holds the shading cosine of arrival
     return value * dr.select(arrives > 0, leaves / arrives, 0), pdf
@@ -93,6 +91,11 @@ def reverse_density(
     active: mi.Bool,
 ) -> mi.Float:
     """The density with which a path that arrives from ``wo`` goes on towards ``si.wi``."""
-    reversed_si = mi.SurfaceInteraction3f(si)
-    reversed_si.wi = wo
-    return bsdf_density(bsdf, ctx, reversed_si, si.wi, active)
+    return bsdf_density(bsdf, ctx, reversed_at(si, wo), si.wi, active)
+
+
+def reversed_at(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.SurfaceInteraction3f:
+    """The interaction of a path that arrives from the local direction ``wo``."""
+    si = mi.SurfaceInteraction3f(si)
+    si.wi = wo
+    return si
