@@ -46,6 +46,7 @@ def has_clear_curves(scene: mi.Scene) -> bool:
     transmits = int(F.DiffuseTransmission) | int(F.GlossyTransmission) | int(F.DeltaTransmission)
     return any(
         shape.class_name() in ("BSplineCurve", "LinearCurve")
+        and shape.bsdf() is not None
         and bool(int(shape.bsdf().flags()) & transmits)
         for shape in all_shapes(scene.shapes())
     )
