@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 import re
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import in_subprocess
@@ -15,7 +18,9 @@ from mitsuba_ext import cli
 from mitsuba_ext.cli import supervisor
 from mitsuba_ext.compare import write_exr
 from mitsuba_ext.compare.experiment import Experiment
+from mitsuba_ext.errors import InputError
 from mitsuba_ext.images import denoising, image_files
+from mitsuba_ext.inputs.chosen import LastScene
 from mitsuba_ext.rendering.seed_passes import SeedPasses
 from mitsuba_ext.startup import doctor
 
@@ -73,6 +78,34 @@ def test_render(exits, make_scene, tmp_path, monkeypatch):
         exits("render", (code, (make_scene(), "-o", tmp_path / "a.exr", "--spp", 1 << 16)))
 
 
+def test_a_signal_while_the_scene_is_loaded(exits, make_scene, tmp_path, monkeypatch):
+    """Mitsuba would report what the signal interrupts as an error of a plugin, or not at all."""
+    target, set_variant = ("-o", tmp_path / "a.exr"), mi.set_variant
+    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)):
+
+        def loads(*variants, number=number):
+            try:
+                os.kill(os.getpid(), number)
+                set_variant(*variants)
+            except KeyboardInterrupt as error:
+                raise ImportError("an error while initializing the extension") from error
+
+        def instantiated(*_, number=number, **__):
+            try:
+                os.kill(os.getpid(), number)
+                signal.sigtimedwait([], 0)
+            except KeyboardInterrupt as error:
+                raise InputError("failed to instantiate a plugin") from error
+
+        with monkeypatch.context() as patch:
+            patch.setattr(mi, "set_variant", loads)
+            exits("render", (code, (make_scene(), *target)))
+        with monkeypatch.context() as patch:
+            patch.setattr(LastScene, "choose", instantiated)
+            exits("render", (code, (make_scene(), *target)))
+    assert not (tmp_path / "a.exr").exists()
+
+
 def test_merge(exits, run, make_scene, tmp_path):
     for seed in "12":
         assert run("render", make_scene(), "-o", tmp_path / "a.exr", "--seed", seed, "--spp", 4,
@@ -118,6 +151,17 @@ def test_the_others(exits, image, tmp_path, monkeypatch):
         monkeypatch.setattr(doctor, "main", lambda code=code: code)
         exits("doctor", (code, ()))
     exits("doctor", (2, ("--nothing",)))
+
+
+def test_a_request_to_save_is_ignored_from_the_start():
+    """SIGUSR1 would end the process while Mitsuba is imported."""
+    code = (
+        "import signal, sys; from mitsuba_ext.__main__ import main; sys.argv = ['', '--version']; "
+        "code = main(); assert signal.getsignal(signal.SIGUSR1) is signal.SIG_IGN; "
+        "assert signal.getsignal(signal.SIGINT) is signal.default_int_handler; sys.exit(code)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (result.returncode, result.stderr) == (0, "")
 
 
 @pytest.mark.slow

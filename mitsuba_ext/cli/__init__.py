@@ -59,9 +59,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Only if started from a shell, and not from Python, do comparisons run in worker processes
         obj = SUPERVISED if arguments is None else None
         code = cli.main(arguments, prog_name="mitsuba-ext", standalone_mode=False, obj=obj)
-    except click.Abort:
+    except click.Abort as error:
         say("interrupted")
-        return INTERRUPTED
+        number = getattr(error.__cause__, "number", None)
+        return INTERRUPTED if number is None else 128 + number
     except click.ClickException as error:
         if not list(sys.argv[1:] if arguments is None else arguments):
             error.show()  # the help, because no subcommand was given

@@ -160,9 +160,11 @@ def render_image(
             if order.denoise:
                 guides = render_guides(job.scene, job.sensor, seed)
             job.run(order.spp, order.seconds, show, report)
-        except (KeyboardInterrupt, OSError) as error:
-            # After SIGHUP, showing progress on the closed terminal raises an OSError
-            if isinstance(error, OSError) and not stop.is_asked:
+        except (KeyboardInterrupt, Exception) as error:
+            # After SIGHUP, showing progress on the closed terminal raises an OSError. What a signal
+            # interrupts while the scene is loaded, Mitsuba reports as an error of a plugin
+            is_of_signal = isinstance(error, OSError) or job is None or not job.has_image()
+            if not isinstance(error, KeyboardInterrupt) and not (stop.is_asked and is_of_signal):
                 raise
             if job is None or not job.has_image():
                 say("interrupted before there was an image: nothing written")

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 
 from ..errors import InputError
+from ..startup.signals import signals_wait
 
 
 def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
@@ -23,7 +24,8 @@ def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
     if variant not in mi.variants():
         raise InputError(f'unknown variant "{variant}" (there are: {", ".join(mi.variants())})')
     try:
-        mi.set_variant(variant)
+        with signals_wait():
+            mi.set_variant(variant)
     except (ImportError, RuntimeError) as error:
         raise InputError(f'the variant "{variant}" does not start: {one_line(error)}') from error
     for name in plugins:

@@ -26,6 +26,18 @@ KEEP: int | None = getattr(signal, "SIGUSR1", None)
 TOGETHER = 0.5
 
 
+class Signalled(KeyboardInterrupt):
+    """Raised for a signal.
+
+    Attributes:
+        number: The signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
 class InterruptHandler:
     """A handler for some of :data:`SIGNALS`. The first signal sets :attr:`event`, or raises
     ``KeyboardInterrupt`` if there is none; a second one raises ``KeyboardInterrupt``.
@@ -48,7 +60,7 @@ class InterruptHandler:
         elif now - self._time <= TOGETHER:
             return
         if self.event is None or self.event.is_set():
-            raise KeyboardInterrupt
+            raise Signalled(number)
         self.event.set()
         import mitsuba as mi
 

@@ -16,6 +16,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 from . import runtime
+from .signals import signals_wait
 
 
 def prepare() -> None:
@@ -44,15 +45,16 @@ def _register() -> None:
 def _around_drjit() -> Iterator[None]:
     runtime.check_installed_version()
     runtime.choose_llvm()
-    with runtime.missing_library_is_named():
+    with signals_wait(), runtime.missing_library_is_named():
         yield
 
 
 @contextlib.contextmanager
 def _around_mitsuba() -> Iterator[None]:
     runtime.check_installed_version()
-    yield
-    _register()
+    with signals_wait():
+        yield
+        _register()
 
 
 class _Finder:
