@@ -20,7 +20,7 @@ from mitsuba_ext.long_renders.divided_references import ReferenceWorkers
 from mitsuba_ext.long_renders.long_render import Goal, LongRender
 from mitsuba_ext.long_renders.state import Batch, RenderState
 from mitsuba_ext.long_renders.tasks import Missing, render_batch
-from mitsuba_ext.long_renders.workers import Workers
+from mitsuba_ext.long_renders.workers import WorkerKilledError, Workers
 
 pytestmark = pytest.mark.usefixtures("batches_of_sixteen_samples")
 
@@ -272,11 +272,38 @@ def test_a_process_that_dies_costs_what_it_was_doing_and_one_that_hangs_ends_wit
         found = {future.result(timeout=60)[0] for future in others}
         assert found == {3, 4}
         lost = [future for future in (hanging, dying) if future.done()]
-        assert len(lost) == 1 and isinstance(lost[0].exception(), BrokenProcessPool)
+        assert len(lost) == 1 and isinstance(lost[0].exception(), WorkerKilledError)
+        assert "SIGKILL" in str(lost[0].exception())
+        # A fault of native code is no signal from outside
+        with pytest.raises(BrokenProcessPool):
+            workers.submit(os.kill, workers.submit(os.getpid).result(60), signal.SIGSEGV).result(60)
     finally:
         begin = time.monotonic()
         workers.shutdown(cancel_futures=True)
         assert time.monotonic() - begin < 30
+
+
+@pytest.mark.parametrize(("error", "deaths"), [
+    (WorkerKilledError("killed"), 10), (BrokenProcessPool("died"), 3)
+])  # fmt: skip
+def test_a_batch_ends_the_render_sooner_if_it_is_at_fault(make_scene, error, deaths):
+    """Three deaths of innocent workers do not."""
+    left = [deaths - 1]
+
+    class Dies(Worker):
+        def submit(self, function, *arguments):
+            if arguments[1].index == 2 and left[0] > 0:
+                left[0] -= 1
+                future = Future()
+                future.set_exception(error)
+                return future
+            return super().submit(function, *arguments)
+
+    request = RenderRequest(str(make_scene()))
+    assert rendered(request, 64, Dies()).spp == 64
+    left[0] = deaths
+    with pytest.raises(InputError, match=f"a batch failed {deaths} times: (killed|died)"):
+        rendered(request, 64, Dies())
 
 
 # ---- References of comparisons ----

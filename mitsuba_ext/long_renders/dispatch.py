@@ -18,6 +18,7 @@ from .batch_renderer import BatchRenderer, RenderRequest
 from .bundle import Bundle
 from .state import Batch, BatchResult
 from .tasks import Missing, digest_of, render_batch
+from .workers import WorkerKilledError
 
 #: How many batches are submitted at a time, per worker.
 QUEUE = 2
@@ -25,8 +26,10 @@ QUEUE = 2
 #: Seconds between two checks of the submitted batches.
 _PERIOD = 1.0
 
-#: How often a batch may fail before the render ends with an error.
-_TRIES = 3
+#: How often a batch may fail before the render ends with an error: by itself, and because its
+#: process was killed from outside. That says little about the batch, but the memory that it needs
+#: may be the reason, each time again.
+_TRIES, _KILLS = 3, 10
 
 #: A batch is late after the first number times the median time from submission to result, but not
 #: before the second number of seconds (a new worker loads the scene and compiles kernels). Before
@@ -169,8 +172,8 @@ class Dispatch:
         task.failures += 1
         if is_stopped():  # the workers may have got the same signal
             return None
-        if task.failures >= _TRIES:
-            raise InputError(f"a batch failed {_TRIES} times: {failure}") from failure
+        if task.failures >= (_KILLS if isinstance(failure, WorkerKilledError) else _TRIES):
+            raise InputError(f"a batch failed {task.failures} times: {failure}") from failure
         if not task.futures:
             task.given = time.monotonic()
             self._give(batch, learned)

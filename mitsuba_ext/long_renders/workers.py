@@ -12,17 +12,31 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 from ..rendering import interrupts
 
 _PR_SET_PDEATHSIG = 1
 
+#: Exit codes of processes that somebody, or the system, has killed.
+_FROM_OUTSIDE = [
+    -getattr(signal, name) for name in ("SIGKILL", "SIGTERM") if hasattr(signal, name)
+]
+
+#: Seconds to wait for the exit code of a process that has died.
+_PATIENCE = 5
+
 
 def threads_of_each(count: int) -> int:
     """Threads of each of ``count`` processes that share this machine."""
     # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR file
     return max(2, (os.cpu_count() or 1) // count)
+
+
+class WorkerKilledError(RuntimeError):
+    """A signal from outside has ended the process of a task: of a user, of a batch system, or of
+    the system when memory ran out. (Faults of native code send other signals.)"""
 
 
 class Workers(Executor):
@@ -36,6 +50,7 @@ class Workers(Executor):
     def __init__(self, count: int) -> None:
         self._waiting: queue.SimpleQueue = queue.SimpleQueue()
         self._pools: list[ProcessPoolExecutor | None] = [None] * count
+        self._processes: list[BaseProcess | None] = [None] * count
         self._is_given_up = False
         # A process ends with the thread that started it, so these threads live as long as this
         # object
@@ -75,12 +90,25 @@ class Workers(Executor):
                 continue
             try:
                 result = self._submitted(number, function, arguments, options).result()
+            except BrokenProcessPool as error:
+                future.set_exception(self._killed(number) or error)
             except BaseException as error:
                 future.set_exception(error)
             else:
                 future.set_result(result)
         if pool := self._pools[number]:
             pool.shutdown()
+
+    def _killed(self, number: int) -> WorkerKilledError | None:
+        """What happened to a process that died; ``None`` if nobody has killed it."""
+        process = self._processes[number]
+        process.join(_PATIENCE)
+        if process.exitcode not in _FROM_OUTSIDE:
+            return None
+        name = signal.Signals(-process.exitcode).name
+        return WorkerKilledError(
+            f"its process was killed ({name}), by somebody, or because memory ran out"
+        )
 
     def _submitted(self, number: int, function, arguments, options) -> Future:
         if pool := self._pools[number]:
@@ -90,8 +118,10 @@ class Workers(Executor):
                 pool.shutdown(wait=False)
         # A forked process would share the threads and kernels of this one
         context = multiprocessing.get_context("spawn")
-        self._pools[number] = ProcessPoolExecutor(1, context, _start, (os.getpid(),))
-        return self._pools[number].submit(function, *arguments, **options)
+        self._pools[number] = pool = ProcessPoolExecutor(1, context, _start, (os.getpid(),))
+        future = pool.submit(function, *arguments, **options)
+        (self._processes[number],) = pool._processes.values()
+        return future
 
 
 def _start(parent: int) -> None:
