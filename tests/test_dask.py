@@ -40,8 +40,16 @@ def test_who_renders_is_said_once(run, make_scene, tmp_path):
 # ---- A cluster ----
 
 
+class Processes(list):
+    """The processes of workers, and that of their scheduler."""
+
+    def __init__(self, workers: list[subprocess.Popen], scheduler: subprocess.Popen) -> None:
+        super().__init__(workers)
+        self.scheduler = scheduler
+
+
 @contextlib.contextmanager
-def _cluster(folder: Path, count: int) -> Iterator[tuple[str, list[subprocess.Popen]]]:
+def _cluster(folder: Path, count: int) -> Iterator[tuple[str, Processes]]:
     """A scheduler and workers of one thread; its address, and the processes of the workers."""
     import json
 
@@ -60,13 +68,13 @@ def _cluster(folder: Path, count: int) -> Iterator[tuple[str, list[subprocess.Po
         return process
 
     try:
-        start("scheduler", "--host", "127.0.0.1", "--port", "0")
+        scheduler = start("scheduler", "--host", "127.0.0.1", "--port", "0")
         workers = [start("worker", "--no-nanny", "--nthreads", "1", "--host", "127.0.0.1")
                    for _ in range(count)]  # fmt: skip
         deadline = time.monotonic() + 60
         while not file.exists() and time.monotonic() < deadline:
             time.sleep(0.1)
-        yield json.loads(file.read_text())["address"], workers
+        yield json.loads(file.read_text())["address"], Processes(workers, scheduler)
     finally:
         for process in reversed(processes):
             process.kill()
@@ -162,6 +170,26 @@ def test_a_worker_that_hangs_costs_its_batches_only(make_scene, tmp_path, monkey
     here = _rendered(request, 4096)
     assert hanging and sorted(state.done) == here.done
     np.testing.assert_allclose(state.images.mean, here.images.mean, rtol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_scheduler_that_ends_is_named_in_a_sentence(make_scene, tmp_path, number):
+    """Without tracebacks of Dask; the image so far is written."""
+    preview = tmp_path / "a.png"
+    with _cluster(tmp_path, 1) as (address, workers):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "mitsuba_ext", "render", str(make_scene()), "--spp", "1000000",
+             "-o", str(tmp_path / "a.exr"), "--preview", str(preview), "--dask", address],
+            stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        while process.poll() is None and not preview.exists():
+            time.sleep(0.05)
+        workers.scheduler.send_signal(number)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 2 and "Traceback" not in err and "distributed" not in err
+    assert err.endswith(f"mitsuba-ext: {address}: the Dask scheduler is gone\n")
+    assert (tmp_path / "a.exr").exists()
 
 
 @pytest.mark.slow

@@ -111,8 +111,10 @@ def dask_cluster(address: str) -> Iterator[tuple[DaskWorkers, Callable[[], None]
         if client.status != "running":
             raise InputError(f"{address}: the Dask scheduler is gone")
 
-    for name in ("distributed.client", "distributed.utils"):  # tracebacks of lost connections
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    # Tracebacks of lost connections. Each of its loggers has a level of its own
+    for name in list(logging.Logger.manager.loggerDict):
+        if name.partition(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     with client:
         try:
             client.wait_for_workers(1, timeout=_PATIENCE)
