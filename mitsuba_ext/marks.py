@@ -62,7 +62,7 @@ def marked(mark: Path) -> Iterator[None]:
         RuntimeError: A process died in a render of this integrator before.
     """
     if has_crashed(mark):
-        raise RuntimeError(mark.with_suffix(_CRASHED).read_text(encoding="utf-8"))
+        raise RuntimeError(mark.with_suffix(_CRASHED).read_text(encoding="utf-8", errors="replace"))
     mark.parent.mkdir(parents=True, exist_ok=True)
     mark.unlink(missing_ok=True)  # a link, or the mark of a process that died
     with new_file(mark) as file:
@@ -78,7 +78,7 @@ def running(folder: Path, process: int) -> set[Path]:
     marks = set()
     for mark in folder.glob(f"*/*{_RUNNING}"):
         with contextlib.suppress(FileNotFoundError):  # just finished
-            if mark.read_text(encoding="utf-8") == str(process):
+            if mark.read_text(encoding="utf-8", errors="replace") == str(process):
                 marks.add(mark)
     return marks
 

@@ -19,8 +19,9 @@ _NEIGHBOURS, _ROUNDS = 12, 8
 _NOISE, _SHORTER = 2.0, 0.7
 
 
-#: The most records of a file.
-_MOST = 1 << 22
+#: The most records of a file, and how far from the origin they may lie, in units of their reach:
+#: cells are numbered.
+_MOST, _FARTHEST = 1 << 22, 2.0**40
 
 
 @dataclass
@@ -103,6 +104,8 @@ class Records:
             name: arrays.take(name, "f", shape, *ranges.get(name, (None, None)), 9 * _MOST)
             for name, shape in shapes.items()
         }
+        far = count and float(np.abs(p).max()) > _FARTHEST * float(others["reach"].min())
+        arrays.require(not far, '"p" is too far away')
         return cls(p, **others)
 
     def joined(self, other: Records) -> Records:

@@ -122,6 +122,9 @@ class RenderState:
             return other if self.images is None else self
         if self.images.channels != other.images.channels:
             raise InputError("they have different channels")
+        shapes = {np.shape(state.film.contents) for state in (self, other)}
+        if len(shapes) > 1 or self.images.mean.shape != other.images.mean.shape:
+            raise InputError("they have different sizes")
         total = RenderState()
         total.done = [*self.done, *other.done]
         total.film, total.images = self.film.plus(other.film), self.images.plus(other.images)

@@ -133,7 +133,8 @@ class Batches:
         count, samples, mean, squares = self._state
         if count < 2:
             return np.full_like(mean, np.nan)
-        return squares / (count - 1) / samples
+        with np.errstate(invalid="ignore"):  # pixels may be infinite
+            return squares / (count - 1) / samples
 
 
 def each_batch(
