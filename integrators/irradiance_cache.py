@@ -23,7 +23,6 @@ from mitsuba_ext.irradiance.records import Records
 from mitsuba_ext.rendering.camera import film_extent
 from mitsuba_ext.scene.movers import movers
 from mitsuba_ext.startup import registry
-from mitsuba_ext.stored.arrays import StoredArrays
 from mitsuba_ext.transport.emission import can_be_hit
 from mitsuba_ext.transport.walk import Walk
 
@@ -234,9 +233,8 @@ class IrradianceCache(WalkIntegrator):
         if not self.cache_file or not Path(self.cache_file).exists():
             return Records.none(len(mi.Spectrum()))
         where = f'"{self.name}": the parameter "cache_file"'
-        states = learned_file.load(Path(self.cache_file), scene, self._made_by(), where)
-        records = states.get("records") or StoredArrays.of({})
-        return Records.of_arrays(records, len(mi.Spectrum()))
+        arrays = learned_file.read(Path(self.cache_file), scene, self._made_by(), where)
+        return Records.of_arrays(arrays.part("records/"), len(mi.Spectrum()))
 
     def _made_by(self) -> str:
         """The parameters on which records depend."""

@@ -46,8 +46,8 @@ class ChainFile:
         """
         if not self._path.exists():
             return None
-        parts = learned_file.load(self._path, self._scene, self._made_by, self._where)
-        return parts.get(_PART) or StoredArrays.of({})
+        arrays = learned_file.read(self._path, self._scene, self._made_by, self._where)
+        return arrays.part(f"{_PART}/")
 
     def save(self, arrays: dict[str, np.ndarray]) -> None:
         """Writes or replaces the file."""

@@ -49,7 +49,14 @@ def check_target(path: Path) -> None:
 
 
 def load(path: Path, scene: mi.Scene, made_by: str, parameter: str) -> States:
-    """Reads what :func:`save` has written.
+    """Reads what :func:`save` has written. Parameters and errors are those of :func:`read`."""
+    arrays = read(path, scene, made_by, parameter)
+    slots = {name.partition("/")[0] for name in arrays.names if "/" in name}
+    return {slot: arrays.part(f"{slot}/") for slot in slots}
+
+
+def read(path: Path, scene: mi.Scene, made_by: str, parameter: str) -> StoredArrays:
+    """Reads what :func:`save` has written: arrays with the names ``slot/name``.
 
     Parameters:
         path, scene, made_by: As for :func:`save`.
@@ -75,5 +82,4 @@ def load(path: Path, scene: mi.Scene, made_by: str, parameter: str) -> States:
         raise ValueError(
             f"{origin} was made with other parameters: {found} instead of {made_by}"
         )
-    slots = {name.partition("/")[0] for name in arrays.names if "/" in name}
-    return {slot: arrays.part(f"{slot}/") for slot in slots}
+    return arrays

@@ -182,9 +182,8 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
     Raises:
         OSError: It cannot be read, or is no regular file, or too large.
     """
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | _BINARY)
-    with open(descriptor, "rb") as file:
-        status = os.fstat(descriptor)
+    with open(path, "rb", opener=_open_at_once) as file:
+        status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
             raise OSError(f"{path}: is no regular file")
         if most is not None and status.st_size > most:
@@ -192,7 +191,9 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
         return file.read()
 
 
-_BINARY = getattr(os, "O_BINARY", 0)  # Windows
+def _open_at_once(path: str, flags: int) -> int:
+    """Opens a file; a pipe without waiting for its writer."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def _described(name: str, header: Header) -> bytes:

@@ -7,7 +7,7 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-#: The bits of the largest numbers of arrays.
+#: The most bytes of a number.
 _MOST_BYTES = 8
 
 
