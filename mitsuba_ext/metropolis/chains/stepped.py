@@ -47,8 +47,9 @@ class SteppedChains(Chains):
 
     def _ranges(self):
         own = {"_state": (0, None), "_lanes": (0, self.count - 1)}
-        known = {str(end): (0, most) for end, most in enumerate(self._most)}
-        return {**super()._ranges(), **own, **known}
+        known = {f"_known/{end}": (0, most) for end, most in enumerate(self._most)}
+        values = {f"_values/{end}": (0, 1) for end in range(len(self._most))}
+        return {**super()._ranges(), **own, **known, **values}
 
     def _check(self, stored):
         super()._check(stored)

@@ -22,7 +22,7 @@ Arrays = dict[str, np.ndarray]
 #: The most numbers of an array whose length the reader does not know.
 _MOST_NUMBERS = 1 << 27
 
-#: The least and the largest value of a field, by its name.
+#: The least and the largest value of an array or a field, by its name.
 Ranges = Mapping[str, tuple[Any, Any]]
 
 
@@ -62,8 +62,8 @@ def value_of(
         name: The name that was given to :func:`arrays_of`.
         kind: What it was: a type, or a list of these.
         width: The number of lanes; ``None`` for any, which all parts of a structure have.
-        ranges: The least and the largest value of the fields of structures, by their names. Other
-            real numbers are finite.
+        ranges: The least and the largest value of arrays, and of the fields of structures, by
+            their names. Other real numbers are finite.
 
     Raises:
         DamagedError: The file has no such value.
@@ -73,7 +73,8 @@ def value_of(
         return [value_of(stored, part, k, width, ranges) for part, k in zip(parts, kind)]
     names = {made: name for name, made in _kinds().items()}
     if kind not in names:
-        return _array(stored, name, kind, width, *ranges.get(_field(name), (None, None)))
+        least, most = ranges.get(name) or ranges.get(_field(name)) or (None, None)
+        return _array(stored, name, kind, width, least, most)
     made = dr.zeros(kind)
     fields = {"state": mi.UInt64, "inc": mi.UInt64} if kind is mi.PCG32 else {
         key: type(value) for key, value in vars(made).items()
@@ -87,7 +88,7 @@ def value_of(
 
 
 def _field(name: str) -> str:
-    """The last part of a name: the field of a structure, or the number in a list."""
+    """The last part of a name: the field of a structure."""
     return name.rpartition("/")[2].rpartition(".")[2]
 
 
