@@ -19,8 +19,8 @@ _NEIGHBOURS, _ROUNDS = 12, 8
 _NOISE, _SHORTER = 2.0, 0.7
 
 
-#: The most records of a file, and how far from the origin they may lie, in units of their reach:
-#: cells are numbered.
+#: The most records of a file, and how far from the origin they may lie and reach, in units of the
+#: smallest reach: cells are numbered.
 _MOST, _FARTHEST = 1 << 22, 2.0**40
 
 
@@ -104,8 +104,10 @@ class Records:
             name: arrays.take(name, "f", shape, *ranges.get(name, (None, None)), 9 * _MOST)
             for name, shape in shapes.items()
         }
-        far = count and float(np.abs(p).max()) > _FARTHEST * float(others["reach"].min())
-        arrays.require(not far, '"p" is too far away')
+        if count:
+            farthest = _FARTHEST * float(others["reach"].min())
+            is_near = max(float(np.abs(p).max()), float(others["reach"].max())) < farthest
+            arrays.require(is_near, "places and reaches are too far apart")
         return cls(p, **others)
 
     def joined(self, other: Records) -> Records:
