@@ -106,7 +106,8 @@ class Records:
         }
         if count:
             farthest = _FARTHEST * float(others["reach"].min())
-            is_near = max(float(np.abs(p).max()), float(others["reach"].max())) < farthest
+            lengths = (np.abs(p), others["reach"], others["least"])
+            is_near = all(float(length.max()) < farthest for length in lengths)
             arrays.require(is_near, "places and reaches are too far apart")
         return cls(p, **others)
 
