@@ -80,7 +80,7 @@ def assert_they_add_up(
 SHAPES = ((1, 0), (2, 0), (1, 2))
 
 
-@pytest.mark.parametrize("name", some("rectangle", "constant", of=EMITTERS))
+@pytest.mark.parametrize("name", some("rectangle", "mirrored cube", "constant", of=EMITTERS))
 def test_weights_of_an_emitter_add_up(name: str) -> None:
     scene = mi.load_dict(stage(light=EMITTERS[name]()), optimize=False)
     for light, camera in SHAPES:

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from hard_cases import area, bitmap, diffuse, film, lookat, rectangle, sensor, stage
+from hard_cases import area, bitmap, diffuse, film, lookat, mesh, rectangle, sensor, stage
 from statistical import (
     MANY_SEEDS,
     REFERENCE_SEEDS,
@@ -73,6 +73,18 @@ def _lamp(shape: str, radiance: Any = None, size: float = 0.4, **more: Any) -> d
             **more}  # fmt: skip
 
 
+def _mirrored(shape: str) -> dict[str, Any]:
+    """Its triangles are wound the other way; its vertex normals are not."""
+    return _lamp(shape, to_world=_turned() @ T().scale([-1, 1, 1]))
+
+
+def _wound_both_ways() -> mi.Mesh:
+    """A square whose vertex normals all face down. So does one of its two triangles."""
+    corners = [[-0.7, -0.4, 1.9], [0.1, -0.4, 1.9], [0.1, 0.4, 1.9], [-0.7, 0.4, 1.9]]
+    return mesh(corners, [[0, 1, 2], [0, 3, 2]], 4 * [[0, 0, -1]], bsdf=diffuse(0.0),
+                emitter=area(3.0))  # fmt: skip
+
+
 def _down() -> mi.ScalarTransform4f:
     return lookat([-0.7, -1, 2.5], [0, 0.2, 0], [0, 0, 1])
 
@@ -84,6 +96,10 @@ EMITTERS = {
     "cylinder": lambda: _lamp("cylinder"),
     "cube": lambda: _lamp("cube"),
     "textured rectangle": lambda: _lamp("rectangle", _texture()),
+    "mirrored cube": lambda: _mirrored("cube"),
+    "mirrored rectangle": lambda: _mirrored("rectangle"),
+    "mirrored disk": lambda: _mirrored("disk"),
+    "square wound both ways": _wound_both_ways,
     "point": lambda: {"type": "point", "position": [0.8, -1, 1.5]},
     "spot": lambda: {"type": "spot", "to_world": _down(), "cutoff_angle": 35.0},
     "textured spot": lambda: {"type": "spot", "to_world": _down(), "texture": _texture()},
@@ -97,7 +113,7 @@ EMITTERS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", some("sphere", "envmap", of=EMITTERS))
+@pytest.mark.parametrize("name", some("sphere", "mirrored cube", "envmap", of=EMITTERS))
 def test_an_emitter_sends_out_what_path_sees(name: str) -> None:
     """Turned lamps too. The scene is not optimized: sky and sun would leak in ``path``."""
     scene = mi.load_dict(stage(light=EMITTERS[name]()), optimize=False)

@@ -117,6 +117,7 @@ class LightEmission:
         self._beams = [(int(index), emitters[index]) for index in beams]
         self._has_beams = bool(self._beams)
         self.has_smooth_meshes = bool((self._pieces.way == pieces.TO_BOTH_SIDES).any())
+        self._has_opposite_normals = self._pieces.has_opposite_normals
         self._kinds = set(kind.tolist())
         if self._has_beams and mi.is_spectral:
             raise NotImplementedError(
@@ -222,7 +223,7 @@ class LightEmission:
         if self._has_beams:
             is_beam = piece.parameter == float(pieces.AS_BEAM)
             local = dr.select(is_beam, mi.Vector3f(0, 0, 1), local)
-        d, cosine = mi.Frame3f(si.n).to_world(local), dr.abs(local.z)
+        d, cosine = mi.Frame3f(self.front(si)).to_world(local), dr.abs(local.z)
         pdf = self._cosine_density(local.z, piece.parameter)
         si.wi = si.to_local(d)
         weight = emitter.eval(si, active) * dr.select(pdf > 0, cosine / pdf, 0)
@@ -329,7 +330,8 @@ class LightEmission:
         Parameters:
             emitter: The light.
             d: The direction of emission.
-            n: Geometric normal of the light where the ray leaves it.
+            n: Normal of the light where the ray leaves it: :meth:`front`, or the shading normal
+                where only that is known.
             ref: A point that the light illuminates; used for lights at infinity only.
             knows_normal: Is ``n`` always the normal of the triangle? Then the densities are those
                 of :meth:`sample` itself.
@@ -362,6 +364,13 @@ class LightEmission:
         pdf = dr.select(row.is_beam, 1, pdf)
         known = active & (emitter != None)  # noqa: E711
         return dr.select(known, row.probability * row.density, 0), dr.select(known, pdf, 0)
+
+    def front(self, si: mi.SurfaceInteraction3f) -> mi.Normal3f:
+        """The geometric normal on the side to which a light emits: the side of the shading normal.
+        The two are opposite where ``to_world`` mirrors a mesh."""
+        if not self._has_opposite_normals:
+            return si.n
+        return dr.select(dr.dot(si.n, si.sh_frame.n) < 0, -si.n, si.n)
 
     def chance(self, index: mi.UInt32, active: mi.Bool) -> mi.Float:
         """The probability with which an emitter is chosen."""

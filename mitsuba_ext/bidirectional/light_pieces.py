@@ -18,15 +18,21 @@ import numpy as np
 
 from ..arrays import from_numpy
 from ..discrete_sampling import alias_tables
-from ..lights.division import emitter_shapes, has_interpolated_normals, triangles
+from ..lights.division import (
+    emitter_shapes,
+    has_interpolated_normals,
+    has_opposite_normals,
+    triangles,
+)
 from ..scene.movers import refuse_moving_lights
 from .emitter_choice import emitter_probabilities
 
 # Kinds of pieces
 TRIANGLE, DISK, SPHERE, CYLINDER, POINT, SPOT, PROJECTOR, INFINITE = range(8)
 
-#: The directions in which light leaves a surface: cosine-distributed to the front; to both sides
-#: (with interpolated normals, a mesh also emits to the back of its triangles); or along the normal.
+#: The directions in which light leaves a surface: cosine-distributed to the front, where the
+#: shading normal points; to both sides (with interpolated normals, a mesh also emits to the back of
+#: its triangles); or along the normal.
 TO_FRONT, TO_BOTH_SIDES, AS_BEAM = range(3)
 
 #: Words of a piece in its table.
@@ -56,6 +62,7 @@ class LightPieces:
         parameter (numpy.ndarray): For spots the cosine of the cutoff angle; for projectors the area
             of the image at distance 1; 0 for other emitters.
         axis (numpy.ndarray): The direction in which each spot and projector shines; [emitters, 3].
+        has_opposite_normals (bool): Is there a light that shines from the back of its triangles?
 
     Raises:
         NotImplementedError: Light paths cannot start from one of the emitters (a shape or emitter
@@ -69,6 +76,7 @@ class LightPieces:
         self.area, self.way = np.ones(count), np.full(count, TO_FRONT)
         self.kind, self.parameter = np.full(count, INFINITE), np.zeros(count)
         self.axis = np.zeros((count, 3))
+        self.has_opposite_normals = False
         tables, measures, owners = [], [], []
         for index, (emitter, shape) in enumerate(zip(emitters, shapes)):
             if shape is not None:
@@ -153,6 +161,7 @@ class LightPieces:
         row[:, 14] = np.arange(len(a))
         if self.way[index] == TO_FRONT and has_interpolated_normals(mesh):
             self.way[index] = TO_BOTH_SIDES
+        self.has_opposite_normals |= has_opposite_normals(mesh)
         return row, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
     def _point(self, index, emitter) -> np.ndarray:

@@ -72,7 +72,7 @@ class BidirectionalWeights(Weights):
     def emission(self, scene, si, ds, path, pdf) -> mi.Float:
         active = ds.emitter != None  # noqa: E711
         position, direction = self._emission.densities(
-            scene, ds.emitter, -ds.d, si.n, path.arrival.ref, active
+            scene, ds.emitter, -ds.d, self._emission.front(si), path.arrival.ref, active
         )
         # The density of next event estimation: per area for lights with a surface
         found = pdf * dr.select(

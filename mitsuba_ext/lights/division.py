@@ -173,16 +173,31 @@ def _cuts(edges: np.ndarray, limit: int) -> tuple[int, int]:
 
 
 def has_interpolated_normals(mesh: mi.Mesh) -> bool:
-    """Do the interpolated normals of a mesh differ from those of its faces?"""
+    """Do the interpolated normals of a mesh differ from those of its faces? (Being opposite to them
+    is no difference: see :func:`has_opposite_normals`.)"""
+    cosine = _shading_cosines(mesh)
+    return bool(np.any(np.abs(cosine) < 1 - 1e-4))
+
+
+def has_opposite_normals(mesh: mi.Mesh) -> bool:
+    """Do vertex normals of a mesh lie on the other side of its faces? Light leaves to the side of
+    the vertex normals. A mirroring ``to_world`` turns the faces of a mesh, but not its vertex
+    normals."""
+    return bool(np.any(_shading_cosines(mesh) < 0))
+
+
+def _shading_cosines(mesh: mi.Mesh) -> np.ndarray:
+    """Cosine between the vertex normals and the normal of each face that has an area, [3, faces];
+    empty for meshes without vertex normals."""
     if not mesh.has_vertex_normals() or mesh.has_face_normals():
-        return False
+        return np.zeros((3, 0))
     a, b, c = triangles(mesh)
     normal = _normalized(np.cross(b - a, c - a))
     face = np.array(mesh.faces_buffer()).reshape(-1, 3)
     vertex_normals = np.array(mesh.vertex_normals_buffer()).reshape(-1, 3)
     shading = np.stack([vertex_normals[face[:, i]] for i in range(3)])
     has_area = np.any(normal != 0, axis=1)
-    return bool(np.any(np.abs((shading * normal).sum(-1))[:, has_area] < 1 - 1e-4))
+    return (shading * normal).sum(-1)[:, has_area]
 
 
 def triangles(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -132,7 +132,7 @@ def trace_from_camera(
         ref = dr.zeros(mi.Interaction3f, dr.width(si))
         ref.p, ref.time = p_before, si.time
         starts, leaves = light_start_densities(
-            kinds, emission, scene, emitter, -d, si.n, ref, active & is_end
+            kinds, emission, scene, emitter, -d, emission.front(si), ref, active & is_end
         )
         L = kinds.emitter(emitter, active & is_end & ~unhittable).eval(
             si, active & is_end & ~unhittable
