@@ -36,7 +36,8 @@ class ProgressivePhotonMapping(WalkIntegrator):
      * - radius
        - |float|
        - Radius in which photons are looked for in a first pass of one sample per pixel, in
-         units of the scene. A pass of k samples per pixel has 1/k of the area. 0 stands for one in
+         units of the scene. A pass of k samples per pixel has 1/k of the area (except where all
+         samples of a pixel see one point, as with a :monosp:`radiancemeter`). 0 stands for one in
          which a disk holds about eight of the vertices of a pass, where there are any (light paths
          that are traced before the render measure it); but for at most 8 widths of a pixel at the
          first sample, which shrink with the samples so far, in passes of any size. (Default: 0)

@@ -113,6 +113,12 @@ def test_passes_of_any_size_have_the_same_largest_radius() -> None:
     assert MergingRadius(4.0, 0.75, pixels=100, footprint=0.1, widest=2.0).next(1600) == 1
 
 
+def test_where_samples_of_a_pixel_see_one_point_passes_of_any_size_have_the_same_disk() -> None:
+    radii = [MergingRadius(2.0, 0.75, pixels=8, footprint=0.0) for _ in range(2)]
+    assert [radii[0].next(8) for _ in range(64)][-1] == pytest.approx(radii[1].next(8 * 64))
+    assert radii[0].samples_per_vertex(1, 64) == 64
+
+
 def test_the_batches_of_a_render_shrink_the_radius(
     batches_of_sixteen_samples, monkeypatch, tmp_path
 ) -> None:
@@ -150,7 +156,37 @@ def test_the_footprint_is_the_width_of_a_pixel() -> None:
     assert footprint == pytest.approx(width, rel=0.01)
 
 
+def _meters(*targets: list[float], kind: str = "radiancemeter") -> dict:
+    """A batch of meters that look at these points of :func:`stage`."""
+    origin = np.array([0, -4, 1.2])
+    meters = {
+        f"meter_{i}": {"type": kind, "origin": origin.tolist(), "film": film(1, 1),
+                       "direction": (np.array(target) - origin).tolist()}
+        for i, target in enumerate(targets)
+    }  # fmt: skip
+    return {"type": "batch", "film": film(len(targets), 1), **meters}
+
+
+def test_the_pixels_of_radiance_meters_have_no_width() -> None:
+    scene = mi.load_dict(stage(camera=_meters([0, -0.5, 0], [-0.5, 0, 0])))
+    assert median_footprint(scene, scene.sensors()[0], SceneQuery()) == 0
+    ball = {"type": "sphere", "center": [0, -0.5, 0.5], "radius": 0.1,
+            "meter": {"type": "irradiancemeter", "film": film(1, 1)}}  # fmt: skip
+    scene = mi.load_dict(stage(camera={}, ball=ball))
+    assert median_footprint(scene, scene.sensors()[0], SceneQuery()) > 0.1
+
+
 # ---- Images ----
+
+
+def test_sppm_shows_what_radiance_meters_see() -> None:
+    """Many samples of few pixels: disks once held no photon."""
+    scene = mi.load_dict(stage(camera=_meters([0, -0.7, 0], [-0.6, -0.2, 0])))
+    images = batches(scene, make("sppm"), 8192, range(1, 9))[:, 0].mean(axis=-1)
+    path = mi.load_dict({"type": "path", "max_depth": 4})
+    expected = batches(scene, path, 4096, [9, 10])[:, 0].mean(axis=-1).mean(axis=0)
+    assert (images > 0).all()
+    np.testing.assert_allclose(images.mean(axis=0), expected, rtol=0.2)
 
 
 @pytest.mark.parametrize("parameters", [{"merging": "none"}, {}])

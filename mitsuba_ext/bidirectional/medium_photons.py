@@ -47,7 +47,13 @@ from .vertex_grid import VertexGrid
 _POINTS = 4
 
 #: The largest radius of a ball, in footprints of pixels.
-WIDEST_BALL = 20.0
+_WIDEST_BALL = 20.0
+
+
+def widest_ball(scene: mi.Scene, footprint: float) -> float:
+    """The largest radius of a ball, where a pixel is ``footprint`` wide (0: a radiance meter)."""
+    largest = LARGEST * scene_diagonal(scene)
+    return min(_WIDEST_BALL * footprint, largest) if footprint > 0 else largest
 
 
 class PassesThrough(Distances):
@@ -200,8 +206,9 @@ def suitable_ball(
     vertices = pilot_vertices(scene, sensor, light_walk)
     if vertices is None:
         return None
+    least = 2 * footprint or scene_diagonal(scene) / 500
     for doublings in range(DOUBLINGS):
-        radius = 2 * footprint * 2**doublings
+        radius = least * 2**doublings
         grid = VertexGrid(vertices, dr.opaque(mi.Float, radius), vertices.is_in_medium)
         if grid.count < FEW:
             return None
@@ -211,4 +218,4 @@ def suitable_ball(
     per_volume = max(others, 1e-6) / (2 * radius) ** 3
     count = HANDFUL * PILOT_PATHS / pixels
     found = (count / (4 / 3 * math.pi * per_volume)) ** (1 / 3)
-    return min(found, WIDEST_BALL * footprint, LARGEST * scene_diagonal(scene))
+    return min(found, widest_ball(scene, footprint))

@@ -51,26 +51,55 @@ HANDFUL = 8.0
 #: of a pixel, in footprints of pixels.
 FEW, WIDEST = 64, 8.0
 
-#: The largest radius in units of the diagonal of the scene: pixels of very small films are wide.
+#: The largest radius of the first sample, in units of the diagonal of the scene: pixels of very
+#: small films are wide.
 LARGEST = 0.04
 
 
+def widest_radius(scene: mi.Scene, footprint: float) -> float:
+    """The largest radius of the first sample of a pixel that is ``footprint`` wide (0: of a
+    radiance meter)."""
+    largest = LARGEST * scene_diagonal(scene)
+    return min(WIDEST * footprint, largest) if footprint > 0 else largest
+
+
 def median_footprint(scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery) -> float:
-    """The width of a pixel where the camera sees the scene: the median over the film. If rays
-    through a grid of places on the film hit nothing, or the sensor does not tell how far pixels are
-    apart, a thousandth of the diagonal of the scene."""
+    """The width of a pixel where the camera sees the scene: the median over the film; 0 if all rays
+    of a pixel are the same (a radiance meter). If rays through a grid of places on the film hit
+    nothing, a thousandth of the diagonal of the scene."""
     count = 64
     lane = dr.arange(mi.UInt32, count * count)
     position = (mi.Point2f(lane % count, lane // count) + 0.5) / count
     ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
+    pi = query.closest(scene, mi.Ray3f(ray), coherent=True, active=mi.Bool(True))
     if ray.has_differentials:
-        pi = query.closest(scene, mi.Ray3f(ray), coherent=True, active=mi.Bool(True))
         width = dr.norm((ray.o_x + ray.d_x * pi.t) - (ray.o + ray.d * pi.t))
         found = width.numpy()[pi.is_valid().numpy()]
-        found = found[np.isfinite(found)]
-        if len(found) and np.median(found) > 0:
-            return float(np.median(found))
-    return scene_diagonal(scene) / 1000
+        found = found[np.isfinite(found) & (found > 0)]
+    else:
+        found = _distances_in_pixels(scene, sensor, query, position)
+    return float(np.median(found)) if len(found) else scene_diagonal(scene) / 1000
+
+
+def _distances_in_pixels(
+    scene: mi.Scene, sensor: mi.Sensor, query: SceneQuery, position: mi.Point2f
+) -> np.ndarray:
+    """The distances between what two rays of a pixel hit, one through each of the places
+    ``position``; both use different random numbers."""
+    size = mi.Vector2f(sensor.film().crop_size())
+    numbers = mi.load_dict({"type": "independent"})
+    numbers.seed(0, dr.width(position))
+    pixel, points, hits = dr.floor(position * size), [], mi.Bool(True)
+    for _ in range(2):
+        ray, _ = sensor.sample_ray_differential(
+            sensor.shutter_open(), 0.5, (pixel + numbers.next_2d()) / size, numbers.next_2d()
+        )
+        ray = mi.Ray3f(ray)
+        pi = query.closest(scene, ray, coherent=False, active=hits)
+        points.append(ray(pi.t))
+        hits &= pi.is_valid()
+    distance = dr.norm(points[0] - points[1]).numpy()
+    return distance[np.broadcast_to(hits.numpy(), distance.shape)]
 
 
 def scene_diagonal(scene: mi.Scene) -> float:
@@ -102,10 +131,8 @@ def suitable_radius(
     kept = None if light_walk.outside is None else vertices.is_on_surface
     if only_caustic:
         kept = vertices.is_caustic
-    radius = disk_radius(vertices, kept, HANDFUL * PILOT_PATHS / pixels, 2 * footprint)
-    if radius is None:
-        return None
-    return min(radius, LARGEST * scene_diagonal(scene))
+    least = 2 * footprint or scene_diagonal(scene) / 500
+    return disk_radius(vertices, kept, HANDFUL * PILOT_PATHS / pixels, least)
 
 
 def pilot_vertices(

@@ -23,7 +23,10 @@ class MergingRadius:
         first: The radius of a first pass that has one light path per pixel.
         decay: α, in (0, 1]; 1 for a constant radius.
         pixels: Number of pixels.
-        footprint: The width of a pixel, where the camera sees the scene.
+        footprint: The width of a pixel, where the camera sees the scene. 0 if all samples of a
+            pixel see the same point (a radiance meter): a narrower disk for each of them would then
+            make their common error larger, and the disks of passes of any size have the same area
+            after the same number of samples.
         before: Light paths per pixel of passes that other renders have made before.
         widest: The largest radius after one light path per pixel; it shrinks with their number as
             that of passes of one.
@@ -73,7 +76,7 @@ class MergingRadius:
 
     def _radius(self, per_pixel: float, number: float) -> float:
         """That of the pass of this number, with so many light paths per pixel."""
-        shrinks = number ** (self.decay - 1) / per_pixel
-        radius = self.first * shrinks ** (1 / self.dimensions)
-        samples = number * per_pixel
-        return min(radius, self.widest * samples ** ((self.decay - 1) / self.dimensions))
+        by_samples = (number * per_pixel) ** (self.decay - 1)
+        shrinks = by_samples if self.footprint == 0 else number ** (self.decay - 1) / per_pixel
+        power = 1 / self.dimensions
+        return min(self.first * shrinks**power, self.widest * by_samples**power)

@@ -12,6 +12,7 @@ Source: H. W. Jensen et al., *State of the Art in Monte Carlo Global Illuminatio
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -87,7 +88,7 @@ class PhotonMaps:
             radii: Radii of the maps of caustics and of all light; 0 for those that suit the
                 photons.
             lookup_size: Number of photons that an estimate is to use.
-            least: See :func:`disk_radius`.
+            least: See :func:`disk_radius`; 0 for one that suits the scene.
         """
         rounds: list[LightVertices] = []
         sampler = mi.load_dict({"type": "independent"})
@@ -106,7 +107,7 @@ class PhotonMaps:
 
         diagonal = scene_diagonal(scene)
         # Pixels of small films are wide
-        least, widest = min(least, _LEAST * diagonal), _WIDEST * diagonal
+        least, widest = min(least or math.inf, _LEAST * diagonal), _WIDEST * diagonal
 
         def photon_map(given: float, kept: Kept | None) -> PhotonMap | None:
             if given > 0:

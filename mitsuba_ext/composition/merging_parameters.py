@@ -9,8 +9,13 @@ from typing import Any
 import mitsuba as mi
 
 from ..bidirectional.light_walk import LightWalk
-from ..bidirectional.medium_photons import WIDEST_BALL, suitable_ball
-from ..bidirectional.merging import WIDEST, median_footprint, suitable_radius
+from ..bidirectional.medium_photons import suitable_ball, widest_ball
+from ..bidirectional.merging import (
+    median_footprint,
+    scene_diagonal,
+    suitable_radius,
+    widest_radius,
+)
 from ..bidirectional.merging_radius import MergingRadius
 from ..decisions.camera.shared_numbers import TIME_STEP, WAVELENGTH_STEP, SharedNumbers
 from ..rendering.camera import film_extent
@@ -57,18 +62,23 @@ class MergingParameters:
         light_walk: LightWalk,
         only_caustic: bool,
         before: int,
+        alone: bool = False,
     ) -> MergingRadius | None:
         """The radius for a render, before which others have made ``before`` samples per pixel;
-        ``None`` if there are no caustics to merge. The other parameters are those of
-        :func:`suitable_radius`."""
+        ``None`` if there are no caustics to merge. ``alone``: is merging the only technique? The
+        other parameters are those of :func:`suitable_radius`."""
         if only_caustic and not _may_have_caustics(scene):
             return None
         footprint = median_footprint(scene, sensor, light_walk.query)
+        if not alone:
+            # Samples of a radiance meter share their vertices, and MIS weights do not know it: wide
+            # disks would make other techniques noisier
+            footprint = footprint or scene_diagonal(scene) / 1000
         width, height = film_extent(sensor.film())
         pixels = width * height
         radius, widest = self.radius, math.inf
         if radius == 0:
-            widest = WIDEST * footprint
+            widest = widest_radius(scene, footprint)
             radius = suitable_radius(scene, sensor, light_walk, footprint, pixels, only_caustic)
         if radius is None and only_caustic:
             return None
@@ -84,7 +94,7 @@ class MergingParameters:
         footprint = median_footprint(scene, sensor, light_walk.query)
         width, height = film_extent(sensor.film())
         radius = given or suitable_ball(scene, sensor, light_walk, footprint, width * height)
-        radius = radius or WIDEST_BALL * footprint
+        radius = radius or widest_ball(scene, footprint)
         return MergingRadius(
             radius, self.decay, width * height, footprint, before, dimensions=3
         )

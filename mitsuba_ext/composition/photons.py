@@ -48,7 +48,7 @@ def photon_mapper(
         emission, integrator.max_depth, integrator.rr_depth, query=query, outside=outside
     )
     before = round(integrator.samples_before * light_paths)
-    radius, ball = merging.radius_of(scene, sensor, light_walk, False, before), None
+    radius, ball = merging.radius_of(scene, sensor, light_walk, False, before, True), None
     if outside is not None:
         ball = merging.ball_of(scene, sensor, light_walk, before, radius_in_media)
     walk = Walk(
