@@ -120,6 +120,25 @@ def test_an_emitter_sends_out_what_path_sees(name: str) -> None:
     assert_image_of_path(scene, 3, 512)
 
 
+@pytest.mark.parametrize("name", ["spot", "projector", "envmap", "directional"])
+def test_a_distorting_transform_of_a_light_is_refused(name: str) -> None:
+    """Mirrors and, where they change nothing, scales are not."""
+    turn = T().rotate([1, 0, 0], 90)
+    scales = {"spot": [1, 1, 1.2], "projector": [2, 1, 1], "envmap": [2, 2, 2],
+              "directional": [1, 1, 2]}  # fmt: skip
+    harmless = {"spot": [-2, 2, 2], "projector": [-2, 2, 2], "envmap": [-1, 1, 1],
+                "directional": [-3, 1, 1]}  # fmt: skip
+    for scale, is_refused in ((harmless[name], False), (scales[name], True)):
+        light = {**EMITTERS[name](), "to_world": turn.scale(scale)}
+        light.pop("direction", None)
+        scene = mi.load_dict(stage(light=light), optimize=False)
+        if is_refused:
+            with pytest.raises(NotImplementedError, match='"light_tracer": .* to_world scales'):
+                light_tracer().render(scene, spp=1)
+        else:
+            light_tracer().render(scene, spp=1)
+
+
 #: Where next event estimation of ``path`` itself errs: found by BSDF samples.
 UNLIKE_PATH = {
     "textured turned sphere": lambda: _lamp("sphere", _texture()),

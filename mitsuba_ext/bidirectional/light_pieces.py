@@ -42,6 +42,10 @@ WORDS = 16
 #: a single-precision number.
 _LEAST_AREA = 1e-37
 
+#: Transforms of emitters may differ from rotations by this: of the squared lengths and dot products
+#: of their axes.
+_DISTORTION = 1e-3
+
 #: Factor by which the image plane of a projector is made larger: the field of view is read from its
 #: ``str()``, which has six digits.
 _MARGIN = 1 + 1e-5
@@ -66,12 +70,15 @@ class LightPieces:
 
     Raises:
         NotImplementedError: Light paths cannot start from one of the emitters (a shape or emitter
-            of an unsupported type), or a light moves.
+            of an unsupported type, or a ``to_world`` that distorts directions), or a light moves.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
         refuse_moving_lights(scene)
         emitters, shapes = scene.emitters(), emitter_shapes(scene)
+        for emitter, shape in zip(emitters, shapes):
+            if shape is None:
+                _check_distortion(emitter)
         count = len(emitters)
         self.area, self.way = np.ones(count), np.full(count, TO_FRONT)
         self.kind, self.parameter = np.full(count, INFINITE), np.zeros(count)
@@ -216,6 +223,29 @@ class Piece:
     def direction(self, x: mi.Float, y: mi.Float, z: mi.Float) -> mi.Vector3f:
         """The image of a vector."""
         return x * self.vector(1) + y * self.vector(2) + z * self.vector(3)
+
+
+def _check_distortion(emitter: mi.Emitter) -> None:
+    """
+    Raises:
+        NotImplementedError: The ``to_world`` of an emitter without surface distorts directions; or
+            it scales those of one at infinity, where Mitsuba's own values are then wrong.
+    """
+    name, scale = emitter.class_name(), 1.0
+    matrix = np.array(emitter.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+    if name in ("PointLight", "ConstantBackgroundEmitter"):
+        return
+    if name == "DirectionalEmitter":
+        matrix = matrix[:, 2:]
+    square = matrix.T @ matrix
+    if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
+        scale = np.trace(square) / 3
+    if np.abs(square - scale * np.eye(len(square))).max() > _DISTORTION * scale:
+        raise NotImplementedError(
+            f'paths cannot start from an emitter "{name}" whose to_world scales its axes by '
+            f"{np.linalg.norm(matrix, axis=0).round(4).tolist()} or shears them; give it a "
+            f"to_world that only turns, mirrors and moves"
+        )
 
 
 def _row(kind: int, *columns: np.ndarray) -> np.ndarray:
