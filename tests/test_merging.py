@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from stage import area, film, lookat, sensor, stage
-from statistical import assert_same_mean, batches, load
+from stage import area, bitmap, film, lookat, sensor, stage
+from statistical import assert_same_mean, batches, load, some
 from test_furnace import FURNACES
 
 from mitsuba_ext.bidirectional.merging import median_footprint
@@ -177,6 +177,24 @@ def test_the_pixels_of_radiance_meters_have_no_width() -> None:
 
 
 # ---- Images ----
+
+
+@pytest.mark.parametrize("name", some("sppm", of=["sppm", "vcm", "photon_map", "bdpt"]))
+def test_a_mask_before_a_hidden_sky_keeps_the_light_it_reflects(name: str) -> None:
+    """A card under a white sky, whose opacity is 0.25 on the left and 0.75 on the right."""
+    opacity = np.repeat(np.repeat([[[0.25], [0.75]]], 8, axis=0), 4, axis=1)
+    mask = {"type": "mask", "opacity": {"type": "bitmap", "bitmap": bitmap(opacity), "raw": True,
+                                        "filter_type": "nearest"}}  # fmt: skip
+    white = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+    view = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    scene = mi.load_dict({
+        "type": "scene", "sky": {"type": "constant"},
+        "card": {"type": "rectangle", "bsdf": {**mask, "bsdf": white}},
+        "sensor": sensor(to_world=view, fov=14.0, film=film(16, 16)),
+    })  # fmt: skip
+    images = batches(scene, make(name, hide_emitters=True), 256, range(1, 7)).mean(axis=(1, 3))
+    found = sorted(images[:, part].mean() for part in (slice(0, 7), slice(9, 16)))
+    np.testing.assert_allclose(found, [0.125, 0.375], rtol=0.02)
 
 
 def test_sppm_shows_what_radiance_meters_see() -> None:
