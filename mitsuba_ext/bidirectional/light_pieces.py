@@ -18,12 +18,7 @@ import numpy as np
 
 from ..arrays import from_numpy
 from ..discrete_sampling import alias_tables
-from ..lights.division import (
-    emitter_shapes,
-    has_interpolated_normals,
-    has_opposite_normals,
-    triangles,
-)
+from ..lights.division import are_interpolated, emitter_shapes, shading_cosines, triangles
 from ..scene.movers import refuse_moving_lights
 from .emitter_choice import emitter_probabilities
 
@@ -166,9 +161,10 @@ class LightPieces:
             return row, np.zeros(1)
         row[:, :3], row[:, 3:6], row[:, 6:9] = a, b - a, c - a
         row[:, 14] = np.arange(len(a))
-        if self.way[index] == TO_FRONT and has_interpolated_normals(mesh):
+        cosines = shading_cosines(mesh)
+        if self.way[index] == TO_FRONT and are_interpolated(cosines):
             self.way[index] = TO_BOTH_SIDES
-        self.has_opposite_normals |= has_opposite_normals(mesh)
+        self.has_opposite_normals |= bool((cosines < 0).any())
         return row, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
     def _point(self, index, emitter) -> np.ndarray:

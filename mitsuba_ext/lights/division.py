@@ -108,7 +108,7 @@ def _divide_shape(shape: mi.Shape, voxel: np.ndarray | None, limit: int) -> Divi
     whole = Division(_WHOLE, np.ones(1, int))
     kind = _GRIDS.get(shape.class_name())
     if kind is None and shape.is_mesh() and shape.face_count() > 0:
-        is_smooth = has_interpolated_normals(shape)
+        is_smooth = are_interpolated(shading_cosines(shape))
         is_cut = voxel is not None and limit > 1
         if not is_cut and not is_smooth:
             return whole
@@ -172,23 +172,17 @@ def _cuts(edges: np.ndarray, limit: int) -> tuple[int, int]:
 # ---- Meshes ----
 
 
-def has_interpolated_normals(mesh: mi.Mesh) -> bool:
-    """Do the interpolated normals of a mesh differ from those of its faces? (Being opposite to them
-    is no difference: see :func:`has_opposite_normals`.)"""
-    cosine = _shading_cosines(mesh)
-    return bool(np.any(np.abs(cosine) < 1 - 1e-4))
+def are_interpolated(cosines: np.ndarray) -> bool:
+    """Do vertex normals, of these :func:`shading_cosines`, differ from the normals of faces? Being
+    opposite to them is no difference."""
+    return bool(np.any(np.abs(cosines) < 1 - 1e-4))
 
 
-def has_opposite_normals(mesh: mi.Mesh) -> bool:
-    """Do vertex normals of a mesh lie on the other side of its faces? Light leaves to the side of
-    the vertex normals. A mirroring ``to_world`` turns the faces of a mesh, but not its vertex
-    normals."""
-    return bool(np.any(_shading_cosines(mesh) < 0))
-
-
-def _shading_cosines(mesh: mi.Mesh) -> np.ndarray:
-    """Cosine between the vertex normals and the normal of each face that has an area, [3, faces];
-    empty for meshes without vertex normals."""
+def shading_cosines(mesh: mi.Mesh) -> np.ndarray:
+    """Cosine between the three vertex normals and the normal of each face that has an area,
+    [3, faces]; empty for meshes without vertex normals. It is negative where vertex normals, to
+    whose side light leaves, lie on the other side of the face: a mirroring ``to_world`` turns the
+    faces of a mesh, but not its vertex normals."""
     if not mesh.has_vertex_normals() or mesh.has_face_normals():
         return np.zeros((3, 0))
     a, b, c = triangles(mesh)
