@@ -408,8 +408,8 @@ def test_what_the_image_does_not_show_is_said(run, make_scene, tmp_path):
 )  # fmt: skip
 def test_remarks_fit_the_integrators_of_mitsuba(variant, name, words):
     fog = {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
-    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "fog": fog})
-    remarks = scene_remarks(scene, scene.sensors()[0], mi.load_dict({"type": name}), name)
+    scene = load_scene({"type": "scene", "sensor": {"type": "perspective"}, "fog": fog})
+    remarks = scene_remarks(scene, mi.load_dict({"type": name}), name)
     assert len(remarks) == len(words)
     assert all(word in remark for word, remark in zip(words, remarks))
 

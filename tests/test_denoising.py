@@ -57,7 +57,7 @@ def test_a_long_render_is_denoised_too(run, make_scene, tmp_path, calls):
                      "--checkpoint", tmp_path / "kept",
                      "--preview", tmp_path / "b.png")  # fmt: skip
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    assert code == 0 and image_files.open_bitmap(tmp_path / "a.png").width() == 8
+    assert code == 0 and image_files.open_bitmap(tmp_path / "a.png")[0].width() == 8
     assert len(calls) == 1 and (tmp_path / "a.noisy.exr").exists()
 
 

@@ -60,9 +60,9 @@ if TYPE_CHECKING:
     "[default: 16 times the longest run]",
 )
 @click.option(
-    "--reference-integrator", default="path", show_default=True, metavar="INTEGRATOR",
-    shell_complete=candidates.integrators,
-    help="Integrator that renders the reference.",
+    "--reference-integrator", metavar="INTEGRATOR", shell_complete=candidates.integrators,
+    help="Integrator that renders the reference.  [default: path, or what sees what path misses in "
+    "the scene: volpath or volpathmis in media, bdpt for lights that no camera path finds]",
 )
 @click.option(
     "--out", type=FilledPath(), default="out/compare", show_default=True, metavar="DIR",
@@ -93,7 +93,7 @@ def compare(
     seeds: int,
     reference: Path | None,
     reference_spp: int | None,
-    reference_integrator: str,
+    reference_integrator: str | None,
     out: Path,
     limit: float | None,
     workers: int | None,
@@ -125,7 +125,8 @@ def compare(
     scenes, integrators = _sort_out(names)
     if not plugins:
         for specification in (*integrators, reference_integrator):
-            check_integrator(specification)
+            if specification is not None:
+                check_integrator(specification)
     for scene in scenes:
         check_scene_file(scene)
     if reference and len(scenes) > 1:
@@ -156,6 +157,7 @@ def compare(
         command=shlex.join(["mitsuba-ext", *supervisor.without_job(sys.argv[1:])]),
         only_stored=worker == supervisor.STORED,
         reference_workers=_reference_workers(executors, workers, dask, tuple(plugins)),
+        warn=lambda remark: say(f"mitsuba-ext: warning: {remark}"),
     )
     interrupted = worker == supervisor.STORED
     try:

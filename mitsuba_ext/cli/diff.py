@@ -74,6 +74,7 @@ class _Image:
     pixels: np.ndarray
     variance: np.ndarray | None
     channels: str
+    remarks: list[str]
 
     @property
     def size(self) -> list[int]:
@@ -105,7 +106,8 @@ def _read(path: Path) -> _Image:
     for name, values in (("", pixels), ("variance: ", variance)):
         if values is not None and (fault := metrics.describe_non_finite(values)):
             raise InputError(f"{path}: {name}{fault}")
-    return _Image(path, pixels, variance, str(metadata["channels"]))
+    remarks = metadata.get("remarks", [])
+    return _Image(path, pixels, variance, str(metadata["channels"]), remarks)
 
 
 def _compare(image: _Image, reference: _Image) -> _Difference:
@@ -159,6 +161,7 @@ def _record(image: _Image, reference: _Image, difference: _Difference) -> dict[s
         "image": str(image.path),
         "reference": str(reference.path),
         "channels": {"image": image.channels, "reference": reference.channels},
+        "remarks": {"image": image.remarks, "reference": reference.remarks},
         "size": image.size,
         "identical": difference.identical,
         **{name: _finite(getattr(difference.errors, name)) for name in _FIGURES},
@@ -188,6 +191,8 @@ def _print(image: _Image, reference: _Image, difference: _Difference) -> None:
     for name, item in (("A", image), ("B", reference)):
         taken = "" if item.channels in ("R/G/B", "Y", "array") else f" ({item.channels})"
         say(f"{name}  {item.path}{taken}")
+        for remark in item.remarks:
+            say(f"   warning: {remark}")
     say("")
     if difference.identical:
         say(f"The images are identical ({_times(image.size)}).")

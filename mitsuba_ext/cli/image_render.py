@@ -87,6 +87,7 @@ def render_image(
     if order.denoise:
         denoising.denoiser()
     guides = {}
+    remarks: list[str] = []
 
     def metadata() -> dict[str, object]:
         return {
@@ -99,6 +100,7 @@ def render_image(
             "spp": job.spp,
             "seconds": job.seconds,
             "interrupted": job.is_interrupted,
+            **({image_files.REMARKS: remarks} if remarks else {}),
             "versions": machine.versions(),
             "statistics": job.totals.known(),
             **job.about(),
@@ -150,7 +152,8 @@ def render_image(
                 image_files.check_film(file, job.film, job.integrator.aov_names())
             if job.chosen.note:
                 report.note(job.chosen.note)
-            for remark in job.chosen.remarks(is_sensor_chosen=sensor_index is not None):
+            remarks += job.chosen.remarks(is_sensor_chosen=sensor_index is not None)
+            for remark in remarks:
                 report.warn(remark)
             if order.denoise and (remark := denoising.remark(job.film)):
                 report.warn(remark)

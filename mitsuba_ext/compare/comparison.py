@@ -3,6 +3,7 @@ one folder. A comparison that is started again in its folder renders only what i
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import json
 import math
@@ -18,8 +19,9 @@ import mitsuba as mi
 from ..errors import InputError
 from ..files import replacing
 from ..images import image_files
+from ..inputs.scene_remarks import scene_remarks
 from ..inputs.scenes import LoadedScene, check_source, load_scene, scene_name
-from ..inputs.specifications import Specification, make_named
+from ..inputs.specifications import NamedIntegrator, Specification, make_named
 from ..marks import REFERENCES, in_use
 from ..progress import Step, reporting
 from ..startup.machine import machine, versions
@@ -27,6 +29,7 @@ from . import references, results, timing
 from .budgets import Budget
 from .experiment import Experiment, make_all
 from .notebook import Results
+from .reference_choice import choose_integrator
 from .references import Reference
 from .report import write_report
 
@@ -71,12 +74,15 @@ class Comparison:
         reference_spp: Samples per pixel of rendered references. Default: 16 times those of the
             longest run. With a time budget: as many as take 16 times that long. With ``until``:
             enough for a relMSE of 1/16 of the target.
-        reference_integrator: The integrator that renders references.
+        reference_integrator: The integrator that renders references. Default: ``path``, unless it
+            does not see everything in the scene (:mod:`.reference_choice`).
         reference_workers: The workers that render references. Default: this process. Measured runs
             are rendered in this process, one at a time, because times on other machines or shared
             cores cannot be compared.
         command: The command line, for the report.
         only_stored: Render nothing; make figures and report from the runs in the folder.
+        warn: Called with each remark about a scene, its reference and its stored runs as soon as it
+            is known; the results hold them too.
 
     Raises:
         InputError: No scene was given, an integrator cannot be made, ``budget`` is no
@@ -92,10 +98,11 @@ class Comparison:
         seeds: int = 3,
         folder: str | Path | None = None,
         reference_spp: int | None = None,
-        reference_integrator: Specification = "path",
+        reference_integrator: Specification | None = None,
         command: str | None = None,
         only_stored: bool = False,
         reference_workers: ReferenceWorkers | None = None,
+        warn: Callable[[str], None] = lambda remark: None,
     ) -> None:
         self.only_stored = only_stored
         self.scenes = _setups(scenes)
@@ -112,7 +119,7 @@ class Comparison:
                 f"or until(0.01) of mitsuba_ext.compare, found {budget!r}"
             )
         make_all(integrators)  # to report an unknown name before a reference is rendered
-        if not all(setup.reference for setup in self.scenes):
+        if reference_integrator and not all(setup.reference for setup in self.scenes):
             make_named(reference_integrator)
         self.integrators = integrators
         self.budget = budget
@@ -121,6 +128,7 @@ class Comparison:
         self._reference_spp = reference_spp
         self._reference_integrator = reference_integrator
         self._reference_workers = reference_workers
+        self._warn = warn
         self._temporary = None
         if folder is None:
             self._temporary = tempfile.TemporaryDirectory(prefix="mitsuba_ext_")
@@ -199,8 +207,9 @@ class Comparison:
     def _run_scene(self, setup: SceneSetup, name: str, progress: Callable[[Step], None]) -> None:
         scene = load_scene(setup.source, setup.size, setup.parameters, keep_integrator=False)
         experiment = Experiment(
-            scene, self.integrators, self.budget, self.seeds, self.folder / name, self.only_stored
-        )
+            scene, self.integrators, self.budget, self.seeds, self.folder / name, self.only_stored,
+            self._warn,
+        )  # fmt: skip
 
         def report_step(step: Step) -> None:
             count = f" ({len(self._records) + 1} of {len(self.scenes)})" * (len(self.scenes) > 1)
@@ -212,13 +221,28 @@ class Comparison:
             raise InputError(f"{scene.source}: {error}") from error
         if setup.reference:
             reference = references.load_reference(setup.reference, scene.size)
-        if not setup.reference:
-            reference = self._render_reference(scene, report_step)
+            self._remark_on_file(experiment, reference)
+        else:
+            reference = self._render_reference(experiment, report_step)
         if reference is None:
             return
         self._running = (name, experiment)
         experiment.run(reference, report_step)
         self._keep_record()
+
+    def _remark_on_file(self, experiment: Experiment, reference: Reference) -> None:
+        """Remarks on a reference that the user gives."""
+        if reference.fault not in ("", image_files.NO_CHECKSUM):
+            experiment.remark(f"{reference.path}: {reference.fault}: it was damaged, or edited")
+        # Its name only, as parameters can name files
+        name = str(reference.metadata.get("integrator", "")).partition(":")[0]
+        if name.isidentifier():
+            with contextlib.suppress(InputError):  # a plugin that is not here
+                self._remark_on_integrator(experiment, make_named(name))
+
+    def _remark_on_integrator(self, experiment: Experiment, named: NamedIntegrator) -> None:
+        for remark in scene_remarks(experiment.scene, named.integrator, named.label):
+            experiment.remark(f"the reference: {remark}")
 
     def _keep_record(self) -> None:
         """Adds the figures of the running scene to the results, and releases the scene."""
@@ -229,34 +253,42 @@ class Comparison:
             self._records.append(record)
 
     def _render_reference(
-        self, scene: LoadedScene, progress: Callable[[Step], None]
+        self, experiment: Experiment, progress: Callable[[Step], None]
     ) -> Reference | None:
+        scene, integrator = experiment.scene, self._reference_integrator
+        if integrator is None:
+            integrator, remarks = choose_integrator(scene)
+            for remark in remarks:
+                experiment.remark(remark)
+        else:
+            self._remark_on_integrator(experiment, make_named(integrator, scene.settings))
         folder = self.folder / REFERENCES
         folder.mkdir(exist_ok=True)
         if self.only_stored:
-            return references.stored_reference(scene, folder, self._reference_integrator)
+            return references.stored_reference(scene, folder, integrator)
         progress(Step("reference", 0.0, None))
         asked = self._reference_spp
-        spp = asked or self._derived_spp(scene)
+        spp = asked or self._derived_spp(scene, integrator)
         return references.render_reference(
             scene,
             spp,
             folder,
-            self._reference_integrator,
+            integrator,
             lambda done: progress(Step(f"reference {done:.0%}", 0.0, None)),
             # A derived number varies with the measured speed or noise: accept a stored reference
             # with half as many samples
             enough=asked or spp // 2,
             workers=self._reference_workers,
+            warn=experiment.remark,
         )
 
-    def _derived_spp(self, scene: LoadedScene) -> int:
+    def _derived_spp(self, scene: LoadedScene, specification: Specification) -> int:
         if self.budget.target:
             noise = self.budget.target / _REFERENCE_FACTOR
-            needed = references.samples_for_noise(scene, noise, self._reference_integrator)
+            needed = references.samples_for_noise(scene, noise, specification)
             return max(needed, _REFERENCE_FACTOR * int(self.budget.level(0)))
         if self.budget.is_time:
-            integrator = make_named(self._reference_integrator, scene.settings).integrator
+            integrator = make_named(specification, scene.settings).integrator
             seconds = _REFERENCE_FACTOR * self.budget.values[0]
             spp = timing.samples_for(seconds, integrator, scene.scene, references.FIRST_SEED)
             return max(references.MIN_BATCH_COUNT, 1 << round(math.log2(spp)))

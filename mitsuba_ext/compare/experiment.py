@@ -22,6 +22,7 @@ from pathlib import Path
 
 from ..errors import InputError, one_line
 from ..images import image_files, metrics
+from ..inputs.scene_remarks import scene_remarks
 from ..inputs.scenes import LoadedScene
 from ..inputs.specifications import NamedIntegrator, Specification, make_named
 from ..marks import has_crashed, mark_of, marked, renew
@@ -90,6 +91,10 @@ class Experiment:
         rounds: Runs of each integrator at each level.
         folder: Stores the runs; those that it already holds are not rendered again.
         only_stored: Use the stored runs only, and render nothing.
+        warn: Called with each sentence that is added to :attr:`remarks`.
+
+    Attributes:
+        remarks: Sentences about the scene, its reference and the folder.
 
     Raises:
         InputError: An integrator is unknown, rejects a parameter, or is given twice.
@@ -103,8 +108,11 @@ class Experiment:
         rounds: int,
         folder: Path,
         only_stored: bool = False,
+        warn: Callable[[str], None] = lambda remark: None,
     ) -> None:
         self.only_stored = only_stored
+        self.remarks: list[str] = []
+        self._warn = warn
         self.scene = scene
         self.budget = budget
         self.rounds = rounds
@@ -125,6 +133,16 @@ class Experiment:
         )
         self._progress: Callable[[Step], None] = lambda _step: None
         self._done = 0.0
+        for contender in self.contenders:
+            found = scene_remarks(scene, contender.named.integrator, contender.label)
+            contender.notes += found
+            for remark in found:
+                warn(remark)
+
+    def remark(self, sentence: str) -> None:
+        """Adds to :attr:`remarks`."""
+        self.remarks.append(sentence)
+        self._warn(sentence)
 
     def run(
         self, reference: Reference, progress: Callable[[Step], None] = lambda _step: None
@@ -197,6 +215,8 @@ class Experiment:
         if run is None:
             if self.only_stored:
                 return
+            if fault := self._folder.faults.get(path):
+                self.remark(f"{path}: {fault}: the run is measured anew")
             self._prepare(contender)
             self._progress(Step(contender.label, self._done, self._seconds_left()))
             with marked(self._mark(contender)):

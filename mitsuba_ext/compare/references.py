@@ -3,19 +3,18 @@
 A rendered reference is the mean of independent batches, so that the variance of this mean is known.
 On disk it is an EXR with the channels ``mean.R/G/B`` and ``variance.R/G/B`` (variance of the mean).
 An EXR with plain ``R/G/B`` is accepted too, with ``variance.R/G/B`` (which the integrator
-``variance`` writes) or without.
+``variance`` writes) or without. Stored references hold a checksum: one that is damaged, or that an
+earlier version has written without one, is rendered anew.
 """
 
 from __future__ import annotations
 
-import contextlib
 import glob
 import hashlib
 import json
 import math
 import tempfile
 import time
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,11 +25,13 @@ import numpy as np
 from ..errors import InputError, one_line
 from ..files import replacing
 from ..images import image_files, metrics
+from ..inputs.scene_remarks import scene_remarks
 from ..inputs.scenes import LoadedScene, scene_name
 from ..inputs.specifications import NamedIntegrator, Specification, make_named
 from ..marks import mark_of, marked
 from ..rendering.batches import Batches, batch_seeds, each_batch
 from ..startup.machine import versions
+from .reference_choice import choose_integrator
 
 if TYPE_CHECKING:
     from ..long_renders.divided_references import ReferenceWorkers
@@ -57,12 +58,15 @@ class Reference:
         variance: Variance of ``mean``, same shape; ``None`` if unknown.
         path: The file that holds it.
         metadata: The metadata of that file.
+        fault: Why the file is not as this package wrote it (:func:`.image_files.fault_of`); empty
+            if it is.
     """
 
     mean: np.ndarray
     variance: np.ndarray | None
     path: Path
     metadata: dict[str, object] = field(default_factory=dict)
+    fault: str = ""
 
     @property
     def noise(self) -> float | None:
@@ -96,7 +100,8 @@ def load_reference(path: str | Path, size: tuple[int, int] | None = None) -> Ref
     if mean is None:
         found = ", ".join(channels)
         raise InputError(f"{path}: needs the channels mean.R/G/B or R/G/B, found {found}")
-    reference = Reference(mean, variance, path, metadata)
+    fault = image_files.fault_of(channels, metadata)
+    reference = Reference(mean, variance, path, metadata, fault)
     if size is not None and reference.size != size:
         raise InputError(
             f"{path}: is {_times(reference.size)}, but the scene renders {_times(size)} "
@@ -114,10 +119,11 @@ def render_reference(
     scene: LoadedScene,
     spp: int,
     folder: Path,
-    integrator: Specification = "path",
+    integrator: Specification | None = None,
     progress: Callable[[float], None] | None = None,
     enough: int | None = None,
     workers: ReferenceWorkers | None = None,
+    warn: Callable[[str], None] = lambda remark: None,
 ) -> Reference:
     """Renders a reference with the settings of the scene's integrator, or loads it from ``folder``.
 
@@ -128,10 +134,12 @@ def render_reference(
         scene: The scene.
         spp: Samples per pixel of all batches together; rounded up to a multiple of the batches.
         folder: Where references are stored. It must exist.
-        integrator: The integrator that renders it; it must be unbiased.
+        integrator: The integrator that renders it; it must be unbiased. Default:
+            :func:`.reference_choice.choose_integrator`.
         progress: Called after each batch with the fraction that is done.
         enough: A stored reference with at least so many samples is used. Default: ``spp``.
         workers: The workers that render it. Default: this process.
+        warn: Called with a sentence about each stored file that is damaged, and thus rendered anew.
 
     Raises:
         InputError: ``spp`` is below 8, the integrator fails, or the image is black or holds NaN or
@@ -139,12 +147,15 @@ def render_reference(
     """
     if spp < MIN_BATCH_COUNT:
         raise InputError(f"a reference needs at least {MIN_BATCH_COUNT} samples, found {spp}")
+    integrator = integrator or choose_integrator(scene).integrator
     named = make_named(integrator, scene.settings)
-    cached = _best_cached(folder, _identity(scene, named))
+    cached, faults = _best_cached(folder, _identity(scene, named))
     if cached is not None and (cached.spp or 0) >= min(spp, enough or spp):
         return cached
+    for path, fault in faults.items():
+        warn(f"{path}: {fault}: the reference is rendered anew")
     try:
-        return _render(scene, spp, folder, named, integrator, progress, workers)
+        return _render(scene, spp, folder, named, integrator, progress, workers, warn)
     except InputError as error:
         raise InputError(f'{scene.source}: the reference of "{named.label}" {error}') from error
     except Exception as error:  # an integrator may raise anything
@@ -153,10 +164,10 @@ def render_reference(
 
 
 def stored_reference(
-    scene: LoadedScene, folder: Path, integrator: Specification = "path"
+    scene: LoadedScene, folder: Path, integrator: Specification
 ) -> Reference | None:
     """The reference with the most samples that ``folder`` holds for the scene, if any."""
-    return _best_cached(folder, _identity(scene, make_named(integrator, scene.settings)))
+    return _best_cached(folder, _identity(scene, make_named(integrator, scene.settings)))[0]
 
 
 def _render(
@@ -167,6 +178,7 @@ def _render(
     specification: Specification,
     progress: Callable[[float], None] | None,
     workers: ReferenceWorkers | None,
+    warn: Callable[[str], None],
 ) -> Reference:
     batch_count = min(BATCH_COUNT, spp)
     batch_spp = -(-spp // batch_count)
@@ -174,6 +186,8 @@ def _render(
     path = folder / f"{identity['stem']}_{batch_spp * batch_count}spp.exr"
     partial = path.with_suffix(".partial.npz")
     batches = unfinished = _unfinished(partial)
+    if batches is None and partial.exists():
+        warn(f"{partial}: it is damaged: the reference begins anew")
     if workers is None:
         seeds = batch_seeds(FIRST_SEED, batch_count)[unfinished.count if unfinished else 0 :]
         rendered = each_batch(named.integrator, scene.scene, 0, batch_spp, seeds, unfinished)
@@ -195,8 +209,10 @@ def _render(
     variance = image_files.to_rgb(batches.variance, batches.channels)
     if not mean.any():
         raise InputError("is black")
+    remarks = scene_remarks(scene, named.integrator, named.label)
     metadata = {
         **identity,
+        **({image_files.REMARKS: remarks} if remarks else {}),
         "spp": batches.spp,
         "seeds": f"{batch_count} batches of {batches.spp // batch_count} spp",
         "variance": f"of the mean, from {batch_count} independent batches",
@@ -224,7 +240,7 @@ def _identity(scene: LoadedScene, named: NamedIntegrator) -> dict[str, object]:
     return {**identity, "key": key, "stem": stem}
 
 
-def samples_for_noise(scene: LoadedScene, noise: float, integrator: Specification = "path") -> int:
+def samples_for_noise(scene: LoadedScene, noise: float, integrator: Specification) -> int:
     """Samples per pixel (a power of two) after which a reference has at most the relMSE ``noise``,
     extrapolated from a short pilot reference.
 
@@ -241,19 +257,27 @@ def _unfinished(path: Path) -> Batches | None:
     """The stored batches of an interrupted reference; ``None`` if there are none, or damaged."""
     try:
         return Batches.load(path)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+    except Exception:  # zipfile, zlib and NumPy raise many kinds
         return None
 
 
-def _best_cached(folder: Path, identity: Mapping[str, object]) -> Reference | None:
-    """The stored reference with the most samples; damaged files are ignored."""
-    found = []
+def _best_cached(
+    folder: Path, identity: Mapping[str, object]
+) -> tuple[Reference | None, dict[Path, str]]:
+    """The stored reference with the most samples, and what is wrong with others: these are not
+    used."""
+    found, faults = [], {}
     for path in folder.glob(f"{glob.escape(str(identity['stem']))}_*spp.exr"):
-        with contextlib.suppress(InputError):
+        try:
             reference = load_reference(path)
-            if reference.metadata.get("key") == identity["key"]:
-                found.append(reference)
-    return max(found, key=lambda reference: reference.spp or 0, default=None)
+        except InputError as error:
+            faults[path] = str(error).removeprefix(f"{path}: ")
+            continue
+        if reference.fault:
+            faults[path] = reference.fault
+        elif reference.metadata.get("key") == identity["key"]:
+            found.append(reference)
+    return max(found, key=lambda reference: reference.spp or 0, default=None), faults
 
 
 def _stack(channels: Mapping[str, np.ndarray], prefix: str) -> np.ndarray | None:

@@ -47,6 +47,7 @@ def refusal(reference: Reference | None, runs: Sequence[Run]) -> str:
 
 def _warnings(experiment: Experiment) -> Iterator[str]:
     scene, reference = experiment.scene, experiment.reference
+    yield from experiment.remarks
     sensor_count = experiment.sensor_count
     if sensor_count > 1:
         yield f"the scene has {sensor_count} sensors: the first is used"

@@ -2,8 +2,9 @@
 
 Every run is one EXR: its image, and a header with its cost. The file name contains a hash of
 everything that the run depends on: a comparison that is started again uses the stored runs, but
-never those of another scene, integrator, version or machine. A run that was timed again in another
-session has a JSON file with these times beside it.
+never those of another scene, integrator, version or machine, nor files that are damaged: they hold
+a checksum. A run that was timed again in another session has a JSON file with these times beside
+it.
 """
 
 from __future__ import annotations
@@ -99,10 +100,14 @@ class RunFolder:
     Args:
         folder: The folder of the EXRs; made when the first one is written.
         identity: What all runs of the scene depend on: scene, versions, machine.
+
+    Attributes:
+        faults: What is wrong with the files that :meth:`load` found damaged.
     """
 
     def __init__(self, folder: Path, identity: Mapping[str, object]) -> None:
         self.folder = folder
+        self.faults: dict[Path, str] = {}
         self._identity = dict(identity)
 
     def path(self, label: str, integrator: str, level: str, round: int, seed: int) -> Path:
@@ -125,9 +130,12 @@ class RunFolder:
         if not path.is_file():
             return None
         try:
-            _, metadata = image_files.read_exr(path)
+            channels, metadata = image_files.read_exr(path)
+            if fault := image_files.fault_of(channels, metadata):
+                raise InputError(fault)
             run = Run(**json.loads(str(metadata["run"])), path=path)
-        except (InputError, KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError) as error:
+            self.faults[path] = str(error).removeprefix(f"{path}: ")
             return None
         run.timed_again = _read_times(path.with_suffix(_TIMES))
         return run
@@ -145,13 +153,18 @@ class RunFolder:
         """Stores the seconds that a run took when it was repeated in this session."""
         run.timed_again[marks.SESSION] = seconds
         with replacing(run.path.with_suffix(_TIMES)) as temporary:
-            temporary.write_text(json.dumps(run.timed_again), encoding="utf-8")
+            times = json.dumps(run.timed_again)
+            temporary.write_text(json.dumps([_checksum(times), times]), encoding="utf-8")
 
 
 def _read_times(path: Path) -> dict[str, float]:
     """Times of other sessions; empty if the file is missing or damaged."""
     try:
-        times = json.loads(path.read_text(encoding="utf-8"))
-        return {str(session): float(seconds) for session, seconds in times.items()}
+        checksum, times = json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(times) if checksum == _checksum(times) else {}
     except (OSError, ValueError, TypeError, AttributeError):
         return {}
+
+
+def _checksum(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

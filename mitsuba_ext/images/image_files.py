@@ -8,6 +8,7 @@ warnings to the terminal and returns an empty image.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -31,6 +32,19 @@ EXTENSIONS = (".exr", ".png", ".jpg", ".jpeg", ".hdr", ".pfm")
 
 #: Mitsuba's names of their formats.
 _FORMATS = dict(zip(EXTENSIONS, ("OpenEXR", "PNG", "JPEG", "JPEG", "RGBE", "PFM")))
+
+#: The attribute of an EXR's header with the checksum of channels and metadata, and the names of the
+#: attributes that it covers.
+_CHECKSUM = "checksum"
+
+#: Attributes that Mitsuba writes, whatever their values were.
+_OF_MITSUBA = ("generatedBy", "pixelAspectRatio", "screenWindowWidth")
+
+#: The attribute with the warnings of the render, a list of sentences as JSON.
+REMARKS = "remarks"
+
+#: What :func:`fault_of` says about files of earlier versions, and of other programs.
+NO_CHECKSUM = "it has no checksum, as files of earlier versions"
 
 
 def check_target(path: Path) -> None:
@@ -63,7 +77,8 @@ def check_exr_target(path: Path) -> None:
 def write_exr(
     path: Path, pixels: np.ndarray, channels: Sequence[str], metadata: Mapping[str, object]
 ) -> None:
-    """Writes 32-bit channels; ``pixels`` has the shape (height, width, number of channels)."""
+    """Writes 32-bit channels; ``pixels`` has the shape (height, width, number of channels). The
+    file holds a checksum of them and of ``metadata`` (:func:`fault_of`)."""
     _save(_exr(pixels, channels, metadata), path)
 
 
@@ -75,10 +90,49 @@ def _exr(
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
     # Without the format, up to four channels would be called R, G, B and A
     bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, list(channels))
+    header = {key: _attribute(value) for key, value in metadata.items()}
+    planes = {name: pixels[:, :, index] for index, name in enumerate(channels)}
+    covered = {key: header[key] for key in header.keys() - {_CHECKSUM, *_OF_MITSUBA}}
+    header[_CHECKSUM] = json.dumps([_checksum(planes, covered), *covered])
     attributes = bitmap.metadata()
-    for key, value in metadata.items():
-        attributes[key] = _attribute(value)
+    for key, value in header.items():
+        attributes[key] = value
     return bitmap
+
+
+def fault_of(planes: Mapping[str, np.ndarray], metadata: Mapping[str, object]) -> str:
+    """Why the channels and the metadata of an EXR are not those that :func:`write_exr` wrote;
+    empty if they are."""
+    if _CHECKSUM not in metadata:
+        return NO_CHECKSUM
+    try:
+        checksum, *keys = json.loads(str(metadata[_CHECKSUM]))
+        if checksum == _checksum(planes, {key: metadata[key] for key in keys}):
+            return ""
+    except (ValueError, TypeError, KeyError):
+        pass
+    return "its content does not match its checksum"
+
+
+def remarks_of(planes: Mapping[str, np.ndarray], metadata: Mapping[str, object]) -> list[str]:
+    """Sentences about an image that the user names: what :func:`mitsuba_ext.inputs.scene_remarks`
+    said when it was rendered, and whether it was changed since."""
+    remarks = []
+    with contextlib.suppress(ValueError):
+        found = json.loads(str(metadata.get(REMARKS, "[]")))
+        remarks += [str(remark) for remark in found] if isinstance(found, list) else []
+    if (fault := fault_of(planes, metadata)) and fault != NO_CHECKSUM:
+        remarks.append(f"{fault}: it was damaged, or edited")
+    return remarks
+
+
+def _checksum(planes: Mapping[str, np.ndarray], header: Mapping[str, object]) -> str:
+    """SHA-256 of channels, their names, and attributes of the header."""
+    sha = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name, plane in sorted(planes.items()):
+        sha.update(f"{name} {plane.shape}".encode())
+        sha.update(np.ascontiguousarray(plane, dtype="<f4").tobytes())
+    return sha.hexdigest()
 
 
 def write_exr_fast(
@@ -106,21 +160,20 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
     """
     import mitsuba as mi
 
-    bitmap = open_bitmap(path)
-    metadata = bitmap.metadata()
+    bitmap, names, metadata = open_bitmap(path)
     if bitmap.component_format() not in (mi.Struct.Type.Float16, mi.Struct.Type.Float32):
         raise InputError(f"{path}: not a floating-point image")
     pixels = np.array(bitmap, dtype=np.float32)
     pixels = pixels.reshape(pixels.shape[0], pixels.shape[1], -1)
-    names = [entry.name for entry in bitmap.struct_()]
-    return (
-        {name: pixels[:, :, index] for index, name in enumerate(names)},
-        {key: metadata[key] for key in metadata.keys()},
-    )
+    return {name: pixels[:, :, index] for index, name in enumerate(names)}, metadata
 
 
-def open_bitmap(path: Path) -> mi.Bitmap:
+def open_bitmap(path: Path) -> tuple[mi.Bitmap, list[str], dict[str, object]]:
     """Opens any image that Mitsuba can read, whatever its extension.
+
+    Returns:
+        The image, the names of its channels, and its metadata. Texts that are not in UTF-8 are left
+        out of the metadata.
 
     Raises:
         InputError: The file is missing, damaged, or not an image.
@@ -129,10 +182,19 @@ def open_bitmap(path: Path) -> mi.Bitmap:
 
     check_file(path)
     try:
-        return mi.Bitmap(str(path))
-    except RuntimeError as error:
+        bitmap = mi.Bitmap(str(path))
+        names = [entry.name for entry in bitmap.struct_()]
+    except MemoryError as error:
+        raise InputError(f"{path}: unreadable (its size needs too much memory)") from error
+    except Exception as error:  # Mitsuba's readers raise many kinds
         reason = one_line(error).replace(f'"{path}": ', "")
         raise InputError(f"{path}: unreadable ({reason})") from error
+    metadata: dict[str, object] = {}
+    with contextlib.suppress(UnicodeDecodeError):  # of a key
+        for key in bitmap.metadata().keys():
+            with contextlib.suppress(UnicodeDecodeError):  # of its value
+                metadata[key] = bitmap.metadata()[key]
+    return bitmap, names, metadata
 
 
 def check_file(path: Path) -> None:
@@ -315,12 +377,6 @@ def _encoded(bitmap: mi.Bitmap, path: Path) -> bytes:
     except RuntimeError as error:
         raise OSError(f"{path}: {one_line(error)}") from error
     return stream.raw_buffer()
-
-
-def _annotate(bitmap: mi.Bitmap, metadata: Mapping[str, object]) -> None:
-    attributes = bitmap.metadata()
-    for key, value in metadata.items():
-        attributes[key] = _attribute(value)
 
 
 def _attribute(value: object) -> str | float | int:

@@ -34,7 +34,8 @@ def read_image(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, dict[st
     Returns:
         The image (height, width, 3) and its variance of the same shape (``None`` if unknown), in
         single precision, and the metadata of the file. The entry ``channels`` of the metadata names
-        the channels that were read, for example ``"ViewLayer.Combined.R/G/B"``.
+        the channels that were read, for example ``"ViewLayer.Combined.R/G/B"``; ``remarks``, if
+        there are any, those of :func:`.image_files.remarks_of`.
 
     Raises:
         InputError: The file cannot be read, or does not contain exactly one image.
@@ -42,12 +43,17 @@ def read_image(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, dict[st
     path = Path(path)
     if path.suffix.lower() in (".npy", ".npz"):
         return _read_arrays(path)
-    channels, metadata = _read_channels(path)
+    try:
+        channels, metadata = _read_channels(path)
+    except MemoryError as error:  # also if only a damaged header says that it is so large
+        raise InputError(f"{path}: unreadable (its size needs too much memory)") from error
     for pick in (_reference, _plain, _grey, _layer):
         found = pick(channels)
         if found is not None:
             pixels, variance, name = found
-            return pixels, variance, {**metadata, "channels": name}
+            about = {**metadata, "channels": name}
+            about["remarks"] = image_files.remarks_of(channels, metadata)
+            return pixels, variance, about
     layers = _layers(channels)
     more = " (only the first part of the file is read)" if "chunkCount" in metadata else ""
     raise InputError(
@@ -66,7 +72,7 @@ def srgb_to_linear(values: np.ndarray) -> np.ndarray:
 
 
 def _read_channels(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    bitmap = image_files.open_bitmap(path)
+    bitmap, names, metadata = image_files.open_bitmap(path)
     values = np.array(bitmap)
     if values.dtype in (np.uint8, np.uint16):
         values = values / np.float64(np.iinfo(values.dtype).max)
@@ -75,11 +81,7 @@ def _read_channels(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]
     elif not np.issubdtype(values.dtype, np.floating):
         raise InputError(f"{path}: holds {values.dtype} values, which are no image")
     values = values.reshape(*values.shape[:2], -1).astype(np.float32)
-    metadata = bitmap.metadata()
-    return (
-        {entry.name: values[:, :, index] for index, entry in enumerate(bitmap.struct_())},
-        {key: metadata[key] for key in metadata.keys()},
-    )
+    return {name: values[:, :, index] for index, name in enumerate(names)}, metadata
 
 
 def _reference(channels: Channels) -> tuple[np.ndarray, np.ndarray | None, str] | None:

@@ -87,7 +87,7 @@ class Chosen:
 
     def remarks(self, is_sensor_chosen: bool) -> list[str]:
         """Warnings about parts of the scene that the image will not show."""
-        remarks = scene_remarks(self.scene, self.sensor, self.named.integrator, self.named.name)
+        remarks = scene_remarks(self.loaded, self.named.integrator, self.named.name)
         count = len(self.scene.sensors())
         if count > 1 and not is_sensor_chosen:
             remarks.append(f"the scene has {count} sensors: the first is rendered (see --sensor)")

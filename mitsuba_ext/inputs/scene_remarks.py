@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..scene.media import has_media
 from ..scene.nesting import class_name, with_nested
+from .scenes import LoadedScene
 
 #: Integrators that need no light and ignore media by design: two show properties of surfaces, one
 #: renders primitives that emit.
@@ -17,12 +17,12 @@ _NO_LIGHT_NEEDED = {
 _SEES_MEDIA = {"VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator"}
 
 
-def scene_remarks(
-    scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator, name: str
-) -> list[str]:
+def scene_remarks(loaded: LoadedScene, integrator: mi.Integrator, name: str) -> list[str]:
     """Warns of media that ``integrator`` does not render, and of a scene without lights.
 
     Parameters:
+        loaded: The scene.
+        integrator: What renders it.
         name: The name of the integrator in the sentences.
 
     Returns:
@@ -43,10 +43,10 @@ def scene_remarks(
         for each in tracers
         if class_name(each) not in _SEES_MEDIA and not hasattr(each, "sees_media")
     ]
-    if blind and has_media(scene):
+    if blind and loaded.has_media:
         remarks.append(
             f'the scene has participating media, and "{name}" treats them as absent: use "volpath"'
         )
-    if tracers and not scene.emitters():
+    if tracers and not loaded.scene.emitters():
         remarks.append("the scene has no light: the image is black")
     return remarks

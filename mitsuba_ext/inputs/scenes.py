@@ -82,6 +82,8 @@ class LoadedScene:
         integrator_name: Plugin name of the scene's own integrator; empty if there is none.
         only_says_path: Does the scene say nothing else about its integrator than ``path`` and these
             ``settings``? True also if there is none.
+        has_media: Are there participating media in the scene? Also true if its file names one, and
+            there are instances, which may contain it.
         size: Width and height of the image in pixels (of the crop window, if there is one).
     """
 
@@ -94,6 +96,7 @@ class LoadedScene:
     settings: dict[str, int | bool]
     integrator_name: str
     only_says_path: bool
+    has_media: bool
     size: tuple[int, int]
 
     @property
@@ -144,6 +147,8 @@ def load_scene(
     """
     import mitsuba as mi
 
+    from ..scene.media import has_instances, has_media
+
     is_dict = isinstance(source, Mapping)
     check_source(source)
     path = None if is_dict else Path(source)
@@ -171,6 +176,7 @@ def load_scene(
             # Before transform_all(): afterwards, a node may be freed memory
             integrator_name = integrator.props.plugin_name() if integrator else ""
             settings, only_says_path = _settings(integrator), _only_says_path(state)
+            names_media = any(node.type == mi.ObjectType.Medium for node in state.nodes)
             if not keep_integrator:
                 _drop_integrators(state)
             if size is not None:
@@ -200,6 +206,7 @@ def load_scene(
         settings=settings,
         integrator_name=integrator_name,
         only_says_path=only_says_path,
+        has_media=has_media(scene) or (names_media and has_instances(scene)),
         size=(int(film.crop_size()[0]), int(film.crop_size()[1])),
     )
 

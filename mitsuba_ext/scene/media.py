@@ -7,7 +7,9 @@ from collections.abc import Iterable, Iterator
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from .bounds import scene_bounds, shape_bounds
 from .movers import all_shapes, movers
 
 
@@ -21,18 +23,39 @@ def may_have_media(scene: mi.Scene) -> bool:
     """Like :func:`has_media`, but also true if an instance may contain a medium."""
     if has_media(scene):
         return True
-    return any(s.class_name() == "Instance" for s in all_shapes(scene.shapes())) and _any_is_alive()
+    return has_instances(scene) and _any_is_alive()
+
+
+def has_instances(scene: mi.Scene) -> bool:
+    """Are there instances in ``scene``? What they contain cannot be found."""
+    return any(shape.class_name() == "Instance" for shape in all_shapes(scene.shapes()))
 
 
 def may_have_grids(scene: mi.Scene) -> bool:
     """May there be a medium in ``scene`` that is not homogeneous?"""
-    is_known = all(s.class_name() != "Instance" for s in all_shapes(scene.shapes()))
-    return not is_known or any(not medium.is_homogeneous() for medium in _media(scene))
+    return has_instances(scene) or any(not medium.is_homogeneous() for medium in _media(scene))
 
 
 def has_homogeneous_media(scene: mi.Scene) -> bool:
     """Is there a homogeneous medium in ``scene``, outside of instances?"""
     return any(medium.is_homogeneous() for medium in _media(scene))
+
+
+def extinction_varies(scene: mi.Scene) -> bool:
+    """Has a medium of ``scene``, outside of instances, another extinction in one colour (or
+    wavelength) than in another? Compares them at random points."""
+    # By identity, with the medium itself, so that it stays the same object
+    found: dict[int, tuple[mi.Medium, mi.ScalarBoundingBox3f]] = {}
+    everything = scene_bounds(scene)
+    places = [(sensor.get_medium(), everything) for sensor in scene.sensors()]
+    for shape in all_shapes(scene.shapes()):
+        if shape.is_medium_transition():
+            places.append((shape.interior_medium(), shape_bounds(shape)))
+            places.append((shape.exterior_medium(), everything))
+    for medium, box in places:
+        if medium is not None:
+            found.setdefault(id(medium), (medium, mi.ScalarBoundingBox3f()))[1].expand(box)
+    return any(_extinction_varies(medium, box) for medium, box in found.values())
 
 
 def refuse_media(scene: mi.Scene, what: str, instead: str) -> None:
@@ -94,6 +117,22 @@ def _media(scene: mi.Scene) -> Iterator[mi.Medium]:
         if sensor.get_medium() is not None:
             yield sensor.get_medium()
     yield from _of_shapes(scene.shapes())
+
+
+#: At how many points, and wavelengths, the extinction of a medium is examined.
+_PROBES = 1024
+
+
+def _extinction_varies(medium: mi.Medium, box: mi.ScalarBoundingBox3f) -> bool:
+    numbers = mi.PCG32(_PROBES)
+    at = dr.zeros(mi.MediumInteraction3f, _PROBES)
+    share = mi.Point3f(*(numbers.next_float32() for _ in range(3)))
+    at.p = mi.Point3f(box.min) + share * mi.Vector3f(box.max - box.min)
+    if mi.is_spectral:
+        at.wavelengths, _ = mi.sample_rgb_spectrum(mi.sample_shifted(numbers.next_float32()))
+    _scattering, _absorption, extinction = medium.get_scattering_coefficients(at)
+    σ = np.array(extinction)
+    return bool(np.ptp(σ, axis=0).max() > 1e-4 * abs(σ).max())
 
 
 def _of_shapes(shapes: Iterable[mi.Shape]) -> Iterator[mi.Medium]:

@@ -1,0 +1,98 @@
+"""Chooses the integrator of a reference by what the scene contains."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mitsuba as mi
+
+from ..bidirectional.emission import LightEmission
+from ..bidirectional.sensor import ConnectableSensor
+from ..inputs.scenes import LoadedScene
+from ..rendering.camera import check_takes_splats
+from ..scene.media import extinction_varies
+from ..scene.movers import all_shapes
+from ..scene.unseen import has_unseen_shapes
+from ..startup.runtime import SUPPORTED_VARIANTS
+
+#: Lights that no ray hits, because they are points, or shine in a single direction.
+_UNHITTABLE = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+
+
+class ReferenceChoice(NamedTuple):
+    """The integrator of a reference.
+
+    Attributes:
+        integrator: Its name.
+        remarks: Why it is not ``path``, and what light the reference lacks.
+    """
+
+    integrator: str
+    remarks: tuple[str, ...] = ()
+
+
+def choose_integrator(loaded: LoadedScene) -> ReferenceChoice:
+    """The integrator that renders the reference of a scene where the user names none: ``path``,
+    unless it does not see everything in the scene.
+
+    ===================================  ========================================================
+    media                                ``volpath``, or ``volpathmis`` if their extinction is
+                                         coloured
+    light that no camera path finds      ``bdpt``, where it can render the scene
+    ``moving`` or lightweight shapes     ``composed_path``, if none of the others is chosen
+    ===================================  ========================================================
+    """
+    scene = loaded.scene
+    missed = _missed_light(scene, loaded.has_media)
+    if loaded.has_media:
+        name = "volpathmis" if extinction_varies(scene) else "volpath"
+        name = "composed_path" if has_unseen_shapes(scene) else name
+        why = f'"{name}" renders the reference: the scene has participating media'
+        return ReferenceChoice(name, (why, *_lacks(missed, '"bdpt" does not see media')))
+    if missed and _takes_light_paths(loaded):
+        why = f'"bdpt" renders the reference: no camera path finds {missed}'
+        if "smooth" in missed:
+            why += (
+                "; where such light is seen in a mirror, or through glass, the reference lacks it "
+                'even so ("vcm" has it, slightly blurred)'
+            )
+        return ReferenceChoice("bdpt", (why,))
+    lacks = _lacks(missed, '"bdpt" cannot render this scene')
+    if has_unseen_shapes(scene):
+        why = '"composed_path" renders the reference: the scene has shapes that "path" does not see'
+        return ReferenceChoice("composed_path", (why, *lacks))
+    return ReferenceChoice("path", tuple(lacks))
+
+
+def _lacks(missed: str, why: str) -> list[str]:
+    """What the reference does not show of the light that no camera path finds."""
+    lacks = f"the reference lacks light: no camera path finds {missed}, and {why}"
+    return [lacks] if missed else []
+
+
+def _missed_light(scene: mi.Scene, has_media: bool) -> str:
+    """The light that no camera path finds, as the object of a sentence; empty if there is none."""
+    flags = [int(emitter.flags()) for emitter in scene.emitters()]
+    unhittable = [each for each in flags if each & _UNHITTABLE]
+    if any(each & mi.EmitterFlags.Surface for each in unhittable):
+        return 'the light of "directionalarea"'
+    # Integrators for media see through index-matched surfaces when they connect to a light
+    smooth = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
+    smooth |= 0 if has_media else mi.BSDFFlags.Null
+    bsdfs = (shape.bsdf() for shape in all_shapes(scene.shapes()))
+    if unhittable and any(bsdf is not None and int(bsdf.flags()) & smooth for bsdf in bsdfs):
+        return "the light of point lights or parallel light that smooth surfaces pass on"
+    return ""
+
+
+def _takes_light_paths(loaded: LoadedScene) -> bool:
+    """Can ``bdpt`` render the scene, and connect light paths to its sensor?"""
+    sensor = loaded.scene.sensors()[0]
+    if mi.variant() not in SUPPORTED_VARIANTS or not ConnectableSensor.can_connect(sensor):
+        return False
+    try:
+        check_takes_splats(sensor.film())
+        LightEmission(loaded.scene)
+    except NotImplementedError:
+        return False
+    return True
