@@ -7,6 +7,7 @@ import errno
 import importlib
 import json
 import os
+import re
 import signal
 import sys
 import time
@@ -20,7 +21,7 @@ from conftest import PATH, PLAIN_PATH
 
 from mitsuba_ext.cli import image_render
 from mitsuba_ext.cli.stopping import Stop, stopping
-from mitsuba_ext.compare import load_scene, read_exr, write_exr
+from mitsuba_ext.compare import load_scene, read_exr, timing, write_exr
 from mitsuba_ext.images import image_files
 from mitsuba_ext.inputs.scene_remarks import scene_remarks
 from mitsuba_ext.rendering import interrupts, plan, seed_passes
@@ -160,6 +161,20 @@ def test_render_fills_a_time(run, make_scene, tmp_path):
     metadata = read_exr(tmp_path / "a.exr")[1]
     # Loose: other processes share the machine
     assert 0.1 < metadata["seconds"] < 5
+
+
+@pytest.mark.parametrize("integrator", ["path", "auto", "composed_path"])
+def test_a_render_says_how_much_of_the_time_it_used(
+    run, make_scene, tmp_path, integrator, monkeypatch
+):
+    """Of our integrators, those that learn plan for the time, and others are measured."""
+    monkeypatch.setattr(timing, "samples_for", lambda *_: 2)
+    command = ["render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", integrator]
+    _, out, err = run(*command, "--time", 0.5 if integrator != "composed_path" else 60)
+    if integrator == "composed_path":
+        assert re.search(r"a.exr: 2 spp in \d+\.\d of 60 s", out + err)
+    else:
+        assert read_exr(tmp_path / "a.exr")[1]["spp"] > 2
 
 
 def test_size_of_a_sensor_without_film(make_scene):

@@ -53,6 +53,42 @@ def test_error_slope_and_efficiency_of_a_known_noise_are_found(clock, tmp_path):
     assert first["levels"][-1]["ratios"]["efficiency"]["value"] == pytest.approx(1)
 
 
+@pytest.mark.parametrize("budget", [0.3, 1.0, 2.0, 3.5, 5.0, 30.0])
+def test_a_time_is_used_although_longer_renders_learn_before(monkeypatch, budget):
+    def seconds(spp: int) -> float:
+        return 0.04 * spp + (3.0 if spp >= 11 else 0.0)
+
+    def render(integrator, scene, seed, spp, sensor):
+        return timing.Timed(seconds(spp), False, 0.0, 1, spp, 0, None)
+
+    monkeypatch.setattr(timing, "timed_render", render)
+    spp = timing.samples_for(budget, None, None, 0)
+    most = max(n for n in range(1, 1000) if seconds(n) <= budget)
+    assert seconds(spp) <= 1.01 * budget
+    assert seconds(spp) > 0.5 * seconds(most)
+
+
+def test_integrators_that_learn_plan_for_the_time_themselves(variant, monkeypatch, tmp_path):
+    """No number of samples takes two seconds if a few more make it learn for three."""
+    calls = []
+    lamp = {"type": "sphere", "center": [0, 0, 5], "emitter": {"type": "area"}}
+    for kind in ("auto_path", "auto"):
+        render = type(mi.load_dict({"type": kind})).render
+
+        def remembered(self, *arguments, _render=render, **named):
+            calls.append((self.timeout, named["spp"]))
+            return _render(self, *arguments, **named)
+
+        monkeypatch.setattr(type(mi.load_dict({"type": kind})), "render", remembered)
+    comparison = compare.Comparison(
+        {**WHITE, "lamp": lamp}, ["auto_path", "auto"], compare.equal_time(0.1), seeds=1,
+        reference_spp=64, folder=tmp_path,
+    )  # fmt: skip
+    for contender in comparison.run(progress=False)["scenes"][0]["integrators"]:
+        assert contender["runs"][0]["spp"] > 0 and not contender["error"]
+    assert calls and all(timeout == 0.1 and spp > 1 << 16 for timeout, spp in calls)
+
+
 @pytest.mark.parametrize(
     "fixed, cost",
     some((3.0, 0.01), (0.0, 1.7), of=[(0.0, 0.01), (3.0, 0.01), (0.0, 1.7), (0.1, 0.0003)]),

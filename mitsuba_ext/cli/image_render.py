@@ -25,6 +25,9 @@ from .render_job import RenderJob
 from .reports import Report
 from .stopping import stopping
 
+#: With less than this share of the time that was asked for, that time is shown too.
+_USED = 0.8
+
 
 class Order(NamedTuple):
     """The options that all images of a call have in common."""
@@ -211,7 +214,10 @@ def render_image(
             return stop.exit_code
     is_slow = kernels_compiled() > compiled and not is_new  # else it was printed above
     remark = " (compiled kernels: the next such render starts faster)" if is_slow else ""
-    report.end(f"{output}: {job.spp} spp in {job.seconds:.1f} s{remark}", costs, **figures)
+    asked = None if long else order.seconds
+    # Another number of samples would have taken longer than it should
+    of = f" of {asked:g}" if asked and job.seconds < _USED * asked else ""
+    report.end(f"{output}: {job.spp} spp in {job.seconds:.1f}{of} s{remark}", costs, **figures)
     if job.failure:
         raise job.failure
     return 1 if bad else 0

@@ -46,8 +46,9 @@ from .frames import FrameRange, Sensors, pictures
 @click.option(
     "--time", "seconds", type=click.FloatRange(min=0, min_open=True), metavar="S",
     help="Take as many samples as fit into S seconds of rendering. The first samples measure the "
-    "speed; with our integrators and with structured samplers, a few short renders do, which take "
-    "additional time.",
+    "speed, with Mitsuba's integrators and with those of ours that learn (whose kernels are then "
+    "compiled within S). With others, and with structured samplers, a few short renders do, which "
+    "take additional time.",
 )
 @click.option(
     "--seed", type=click.IntRange(0, MAX_SEED), default=0, metavar="N",

@@ -70,7 +70,7 @@ class RenderJob:
                         '--time would measure what "checkpoint" keeps: give the integrator a '
                         '"timeout" instead'
                     )
-                if seconds is not None and not (self._passes and is_independent(self.sensor)):
+                if seconds is not None and not self._can_plan():
                     spp, seconds = self._measured(seconds, bars), None
                     begin = time.perf_counter()
                 self._render(spp, seconds, bars, report)
@@ -79,6 +79,12 @@ class RenderJob:
             raise InputError(message) from error
         finally:
             self.seconds = time.perf_counter() - begin
+
+    def _can_plan(self) -> bool:
+        """Can the number of samples be computed from the time during the render?"""
+        if self._passes is not None:
+            return is_independent(self.sensor)
+        return timing.plans_for_time(self.integrator, self.scene, self.chosen.sensor_index)
 
     def _measured(self, seconds: float, bars: Progress) -> int:
         self._is_measuring = True
@@ -97,6 +103,9 @@ class RenderJob:
         begin, speed = time.perf_counter(), Speed()
 
         def progress(done: float) -> None:
+            if seconds is not None and self._passes is None:
+                # It knows only the fraction of more samples than it will take
+                done = min(1.0, (time.perf_counter() - begin) / seconds)
             per_second = speed(done)
             left = (1 - done) / per_second if per_second else None
             text, samples = self.name, None
@@ -120,9 +129,11 @@ class RenderJob:
             return
         if hasattr(self.integrator, "progress"):
             self.integrator.progress = progress
-        timing.timed_render(
-            self.integrator, self.scene, self._seed, spp or 0, self.chosen.sensor_index
-        )
+        index = self.chosen.sensor_index
+        if seconds is not None:
+            timing.render_for(seconds, self.integrator, self.scene, self._seed, index)
+        else:
+            timing.timed_render(self.integrator, self.scene, self._seed, spp or 0, index)
 
     def variance(self) -> dict[str, np.ndarray]:
         """Channels with the variance of the image: none, as it is not known."""

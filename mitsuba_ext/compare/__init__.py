@@ -27,7 +27,8 @@ from ..inputs.specifications import NamedIntegrator, make_named
 from ..progress import Step
 from .budgets import Budget, equal_samples, equal_time, sweep, until
 from .comparison import Comparison, SceneSetup
-from .experiment import Contender, Experiment
+from .contenders import Contender
+from .experiment import Experiment
 from .intervals import Estimate
 from .notebook import Results
 from .references import Reference, load_reference, render_reference

@@ -27,7 +27,8 @@ from ..progress import Step, reporting
 from ..startup.machine import machine, versions
 from . import references, results, timing
 from .budgets import Budget
-from .experiment import Experiment, make_all
+from .contenders import make_all
+from .experiment import Experiment
 from .notebook import Results
 from .reference_choice import choose_integrator
 from .references import Reference

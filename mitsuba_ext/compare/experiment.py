@@ -4,6 +4,8 @@
   ``hide_emitters``) unless its specification sets them, so that all solve the same problem.
 - Small renders compile the kernels beforehand. A measured run that compiled a kernel after all
   (for a size of pass that the small renders did not have) is discarded and repeated.
+- With a time budget, integrators that learn plan for it (``timing.plans_for_time``); for others, the
+  number of samples is computed from their speed.
 - The integrators take turns (A B C A B C …), round by round, so that a machine that slows down
   affects all of them. Each round and each level has its own seed, which the integrators share.
 - Times are compared within one session only. A stored run of an earlier session is timed again (its
@@ -17,20 +19,19 @@ from __future__ import annotations
 import traceback
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..errors import InputError, one_line
+from ..errors import one_line
 from ..images import image_files, metrics
 from ..inputs.scene_remarks import scene_remarks
 from ..inputs.scenes import LoadedScene
-from ..inputs.specifications import NamedIntegrator, Specification, make_named
+from ..inputs.specifications import Specification
 from ..marks import has_crashed, mark_of, marked, renew
 from ..progress import Step
-from ..scene.nesting import with_nested
 from ..startup.machine import machine, versions
 from . import timing
 from .budgets import Budget
+from .contenders import Contender, make_all
 from .references import Reference
 from .runs import Run, RunFolder
 from .zero_radiance import zero_radiance_share
@@ -42,42 +43,6 @@ _TIME_ATTEMPTS = 3
 
 #: Most samples per pixel of ``until`` if the file of the reference does not give its own number.
 _MAX_UNTIL_SPP = 1 << 16
-
-
-@dataclass
-class Contender:
-    """An integrator of an experiment, and its runs.
-
-    Attributes:
-        named: The integrator, its label, name and parameters.
-        runs: In the order in which they were measured.
-        compile_seconds: Time to compile or to load the kernels, without tracing.
-        error: Why there are no (more) runs; empty if all went well.
-        traceback: The error's traceback, for authors of integrators.
-        notes: Sentences that a reader of the figures should know.
-    """
-
-    named: NamedIntegrator
-    runs: list[Run] = field(default_factory=list)
-    compile_seconds: float = 0.0
-    error: str = ""
-    traceback: str = ""
-    notes: list[str] = field(default_factory=list)
-    _zero_radiance: float | None = None  # measured here if the integrator does not count it
-    _pace: float | None = None  # seconds per sample per pixel
-    _is_prepared: bool = False
-
-    @property
-    def label(self) -> str:
-        return self.named.label
-
-    def levels(self) -> list[float]:
-        """The levels that have runs, ascending."""
-        return sorted({run.level for run in self.runs})
-
-    def at(self, level: float) -> list[Run]:
-        """The runs of a level, in the order of their rounds."""
-        return sorted((r for r in self.runs if r.level == level), key=lambda run: run.round)
 
 
 class Experiment:
@@ -246,8 +211,9 @@ class Experiment:
         label = f"{contender.label}: timing again"
         self._progress(Step(label, self._done, self._seconds_left()))
         with marked(self._mark(contender)):
-            timed = self._render_compiled(contender, run.spp, run.seed)
-        self._folder.add_time(run, timed.seconds)
+            timed = self._render_compiled(contender, run.level, run.spp, run.seed)
+        # Where the integrator plans for the time, it took another number of samples in that time
+        self._folder.add_time(run, timed.seconds * run.spp / timed.spp)
         self._done += timed.seconds
 
     def _measure(self, contender: Contender, index: int, round: int, path: Path) -> Run:
@@ -284,7 +250,7 @@ class Experiment:
         spp = self._samples(contender, level)
         attempts: list[timing.Timed] = []
         while len(attempts) < _TIME_ATTEMPTS:
-            timed = self._render_compiled(contender, spp, seed)
+            timed = self._render_compiled(contender, level, spp, seed)
             if not self.budget.is_time:
                 return timed
             attempts.append(timed)
@@ -294,9 +260,13 @@ class Experiment:
             spp = better
         return min(attempts, key=lambda timed: abs(timed.seconds - level))
 
-    def _render_compiled(self, contender: Contender, spp: int, seed: int) -> timing.Timed:
-        timed = self._timed(contender, spp, seed)
-        return self._timed(contender, spp, seed) if timed.compiled else timed
+    def _render_compiled(
+        self, contender: Contender, level: float, spp: int, seed: int
+    ) -> timing.Timed:
+        """Renders ``spp`` samples; for the ``level`` of a time budget, if the integrator plans for
+        it."""
+        timed = self._timed(contender, level, spp, seed)
+        return self._timed(contender, level, spp, seed) if timed.compiled else timed
 
     def _prepare(self, contender: Contender) -> None:
         """Compiles the kernels of the runs and measures the speed of the integrator."""
@@ -312,21 +282,29 @@ class Experiment:
         counts = () if self.budget.is_time else self._counts()
         # One sample per pixel, powers of two and other counts have different kernels (Mitsuba
         # divides the index of a sample by the count): compile each kind that occurs.
+        spp = 0
         for spp in sorted({1 if n == 1 else 2 if n & (n - 1) == 0 else 3 for n in counts}):
-            self._timed(contender, spp, seed=0)
-        if self.budget.is_time:
-            seconds = self.budget.values[0]
-            spp = timing.samples_for(seconds, integrator, self.scene.scene, run_seed(0, 0))
-            contender._pace = seconds / spp
+            self._timed(contender, 0, spp, seed=0)
+        level = self.budget.values[0]
+        contender._plans = self.budget.is_time and timing.plans_for_time(
+            integrator, self.scene.scene
+        )
+        if self.budget.is_time and not contender._plans:
+            spp = timing.samples_for(level, integrator, self.scene.scene, run_seed(0, 0))
+            contender._pace = level / spp
         else:
-            timed = self._timed(contender, spp, seed=0)
+            timed = self._timed(contender, level, spp, seed=0)
             contender._pace = timed.seconds / timed.spp
         if timing.own_statistics(integrator) is None:
             contender._zero_radiance = zero_radiance_share(integrator, self.scene.scene, seed=0)
 
-    def _timed(self, contender: Contender, spp: int, seed: int) -> timing.Timed:
+    def _timed(self, contender: Contender, level: float, spp: int, seed: int) -> timing.Timed:
         renew(self._mark(contender))
-        timed = timing.timed_render(contender.named.integrator, self.scene.scene, seed, spp)
+        integrator, scene = contender.named.integrator, self.scene.scene
+        if contender._plans:
+            timed = timing.render_for(level, integrator, scene, seed)
+        else:
+            timed = timing.timed_render(integrator, scene, seed, spp)
         contender.compile_seconds += timed.compile_seconds
         return timed
 
@@ -373,42 +351,6 @@ def run_seed(index: int, round: int) -> int:
     samplers at seed s + ``spp`` give a pixel the strata that its neighbour has at seed s. It has
     31 bits, so that it fits into an integer attribute of an EXR."""
     return zlib.crc32(f"level {index}, round {round}".encode()) >> 1
-
-
-def make_all(
-    integrators: Sequence[Specification] | Mapping[str, Specification],
-    inherited: Mapping[str, object] | None = None,
-) -> list[NamedIntegrator]:
-    """Makes the integrators of a comparison.
-
-    Raises:
-        InputError: No integrator was given, one cannot be made, a label is empty, or two labels are
-            the same.
-    """
-    if isinstance(integrators, Mapping) and "type" not in integrators:
-        pairs = list(integrators.items())
-    elif isinstance(integrators, (str, Path, Mapping)):
-        pairs = [(None, integrators)]
-    else:
-        pairs = [(None, specification) for specification in integrators]
-    if not pairs:
-        raise InputError("no integrator was given")
-    if any(label is not None and not str(label).strip() for label, _specification in pairs):
-        raise InputError("the label of an integrator is empty")
-    made = [make_named(specification, inherited, label) for label, specification in pairs]
-    labels = [named.label for named in made]
-    for label in labels:
-        if labels.count(label) > 1:
-            raise InputError(
-                f'the integrator "{label}" is given twice; for more runs of it, increase --seeds'
-            )
-    for named in made:
-        if any(getattr(each, "checkpoint", "") for each in with_nested(named.integrator)):
-            raise InputError(
-                f'the integrator "{named.label}" has the parameter "checkpoint", with which it '
-                f"does not render everything: leave it out"
-            )
-    return made
 
 
 def _mean_error(runs: Sequence[Run]) -> float:

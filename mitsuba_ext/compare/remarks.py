@@ -6,7 +6,8 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 
-from .experiment import TIME_TOLERANCE, Contender, Experiment
+from .contenders import Contender
+from .experiment import TIME_TOLERANCE, Experiment
 from .references import Reference
 from .runs import Run
 

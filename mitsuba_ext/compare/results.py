@@ -58,7 +58,8 @@ from pathlib import Path
 from typing import Any
 
 from . import intervals, remarks
-from .experiment import Contender, Experiment
+from .contenders import Contender
+from .experiment import Experiment
 from .intervals import Estimate
 from .references import Reference
 from .runs import Run

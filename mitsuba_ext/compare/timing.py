@@ -1,13 +1,16 @@
-"""Times renders, and computes how many samples take a given time."""
+"""Times renders, and renders for a given time."""
 
 from __future__ import annotations
 
 import gc
+import math
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..rendering.batches import sample_count
-from ..rendering.camera import forget_state
+from ..rendering.camera import film_extent, forget_state
+from ..rendering.seed_passes import is_independent
 from ..rendering.statistics import RenderStatistics
 from ..scene.unseen import check_all_is_seen
 
@@ -17,6 +20,9 @@ if TYPE_CHECKING:
 #: Limit of ``samples_for``: with more, even a film of 16x16 pixels exceeds the 2^32 samples of a
 #: wavefront.
 _MAX_SPP = 2**24
+
+#: The time of a render jumps if it is more than this multiple of what its samples account for.
+_JUMP = 1.25
 
 #: A render shorter than this (in seconds) is timed twice, as a short disturbance can double its
 #: time.
@@ -88,6 +94,42 @@ def timed_render(
     )
 
 
+def plans_for_time(integrator: mi.Integrator, scene: mi.Scene, sensor: int = 0) -> bool:
+    """Does the integrator learn in pilots, and plan them for a ``timeout`` (``rendering/pace.py``)?
+
+    The time of such a render does not grow evenly with its samples: with a few more, it begins to
+    learn. Often, no number of samples takes a given time.
+    """
+    view = scene.sensors()[sensor]
+    if not (hasattr(integrator, "pace_stage") and is_independent(view)):
+        return False
+    spp = _more_than_fit(view)
+    learns = integrator.pilots(scene, math.prod(film_extent(view.film())), spp)
+    # Sets of samples would be smaller with a timeout
+    has_sets = integrator.samples_per_set(spp) > 1
+    return bool(learns and not has_sets and integrator.pace_stage(scene, view, spp))
+
+
+def render_for(
+    seconds: float, integrator: mi.Integrator, scene: mi.Scene, seed: int, sensor: int = 0
+) -> Timed:
+    """Renders for ``seconds``, with an integrator for which :func:`plans_for_time` is true: as
+    :func:`timed_render` with the parameter ``timeout``."""
+    own = integrator.timeout
+    integrator.timeout = min(own, seconds) if own > 0 else seconds
+    try:
+        spp = _more_than_fit(scene.sensors()[sensor])
+        return timed_render(integrator, scene, seed, spp, sensor)
+    finally:
+        integrator.timeout = own
+
+
+def _more_than_fit(sensor: mi.Sensor) -> int:
+    """Samples per pixel that take longer than any time limit, about an hour."""
+    pixel_count = math.prod(film_extent(sensor.film()))
+    return min(_MAX_SPP, max(1 << 20, (1 << 32) // pixel_count))
+
+
 def own_statistics(integrator: mi.Integrator) -> RenderStatistics | None:
     """Statistics of the last render, if the integrator is one of ours; else ``None``."""
     report = getattr(integrator, "statistics", None)
@@ -99,11 +141,14 @@ def samples_for(
 ) -> int:
     """How many samples per pixel take ``budget`` seconds.
 
-    Mitsuba's own integrators ignore ``timeout`` outside of the scalar variants, and integrators
-    that learn plan their pilot passes by the number of samples. Therefore, this function measures
-    the speed and computes the number. It doubles the samples until a render takes an eighth of the
-    budget (or four seconds). The last two renders give the cost of a sample and the fixed cost of a
-    render.
+    Mitsuba's own integrators ignore ``timeout`` outside of the scalar variants, and most of ours
+    render otherwise with it. Therefore, this function measures the speed and computes the number.
+    It doubles the samples until a render takes an eighth of the budget (or four seconds). The last
+    two renders give the cost of a sample and the fixed cost of a render.
+
+    If the time more than doubles with the samples, the longer render does something that the
+    shorter one does not, such as learning, and the two tell nothing about a render in between.
+    Then, this function measures a longer one, or looks for the number of samples between the two.
     """
 
     def seconds_of(spp: int) -> float:
@@ -115,15 +160,32 @@ def samples_for(
     # Start with 8: with fewer, an integrator may have no pilot pass
     spp = 8
     shorter = seconds_of(spp)
-    if shorter > min(budget / 2, 4):
+    if shorter > min(budget, 4):
         return max(1, int(budget / shorter * spp))
     while True:
         spp *= 2
         seconds = seconds_of(spp)
-        if seconds >= min(budget / 8, 4) or spp >= _MAX_SPP:
+        jumps = seconds > _JUMP * 2 * shorter
+        is_measured = seconds >= min(budget / 8, 4) and not (jumps and seconds < budget / 2)
+        if is_measured or spp >= _MAX_SPP:
             break
         shorter = seconds
+    if jumps and seconds > budget:
+        return _between(seconds_of, spp // 2, spp, budget)
+    if jumps:
+        return int(budget / seconds * spp)
     # At least half the average: the difference of two noisy times can be close to zero
     per_sample = max((seconds - shorter) / (spp / 2), seconds / spp / 2)
     fixed = max(0.0, seconds - per_sample * spp)
     return min(_MAX_SPP, max(1, int((budget - fixed) / per_sample)))
+
+
+def _between(seconds_of: Callable[[int], float], fits: int, too_many: int, budget: float) -> int:
+    """The most samples that fit into ``budget`` seconds, up to an eighth of those that do."""
+    while too_many - fits > max(1, fits // 8):
+        middle = (fits + too_many) // 2
+        if seconds_of(middle) <= budget:
+            fits = middle
+        else:
+            too_many = middle
+    return fits
