@@ -70,6 +70,22 @@ def test_every_budget_works(run, make_scene, tmp_path, budget, kind, levels, wit
         assert found == levels if levels else found[0] == 8
 
 
+def test_the_changes_of_a_scene_are_those_of_all_its_images(
+    run, make_scene, tmp_path, without_report
+):
+    command = ("compare", make_scene(), "path", "prb", "--spp", 2, "--seeds", 1, "--out", tmp_path,
+               "--reference-spp", 64)  # fmt: skip
+    changes = ("--size", "12x8", "--crop", "5x4+6+3", "--filter", "box", "--max-depth", 2)
+    assert run(*command, *changes)[0] == 0
+    (scene,) = json.loads((tmp_path / "results.json").read_text())["scenes"]
+    assert scene["size"] == [5, 4] and scene["settings"]["max_depth"] == 2
+    assert all(each["parameters"]["max_depth"] == 2 for each in scene["integrators"])
+    # With another filter and depth, all is rendered again
+    assert run(*command, *changes[:-4])[0] == 0
+    assert len(list(tmp_path.glob("*/path_*.exr"))) == 2
+    assert len(list(tmp_path.glob("references/*.exr"))) == 2
+
+
 def test_several_scenes_are_compared_in_turn(run, make_scene, tmp_path):
     nearer = make_scene("nearer.xml", body=SPHERE.replace('z="5"', 'z="4"'))
     out = tmp_path / "results"

@@ -163,6 +163,65 @@ def test_render_fills_a_time(run, make_scene, tmp_path):
     assert 0.1 < metadata["seconds"] < 5
 
 
+_CHANGES = ["--size", "12x8", "--crop", "5x4+6+3", "--filter", "tent:radius=2", "--max-depth", 1]
+
+
+def test_crop_window_filter_and_depth_replace_those_of_the_scene(run, make_scene, tmp_path):
+    def image(path, *options) -> np.ndarray:
+        command = ["render", path, "-o", tmp_path / "a.exr", "--integrator", "path", "--spp", 4]
+        assert run(*command, *options)[0] == 0
+        return np.stack([read_exr(tmp_path / "a.exr")[0][name] for name in "RGB"])
+
+    changed = image(make_scene(), *_CHANGES)
+    assert json.loads(read_exr(tmp_path / "a.exr")[1]["changes"]) == {
+        "reconstruction filter": "tent:radius=2", "crop window": "5x4+6+3", "maximum depth": "1",
+    }  # fmt: skip
+    window = {"width": 12, "height": 8, "crop_width": 5, "crop_height": 4, "crop_offset_x": 6,
+              "crop_offset_y": 3}  # fmt: skip
+    integers = "".join(f'<integer name="{k}" value="{v}"/>' for k, v in window.items())
+    text = make_scene().read_text()
+    film = f'{integers}<rfilter type="tent"><float name="radius" value="2"/></rfilter>'
+    text = re.sub(r'(?s)(<film type="hdrfilm">).*(</film>)', rf"\1{film}\2", text)
+    same = tmp_path / "same.xml"
+    same.write_text(text.replace('"max_depth" value="3"', '"max_depth" value="1"'))
+    assert changed.shape == (3, 4, 5) and np.array_equal(changed, image(same))
+    # Also where the sensor has no film, or the film has a crop window already
+    without = tmp_path / "without.xml"
+    without.write_text(re.sub("(?s)<film.*</film>", "", text))
+    assert np.array_equal(changed, image(without, *_CHANGES))
+    assert np.array_equal(changed, image(same, *_CHANGES))
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        (["--filter", "bxo"], 'unknown reconstruction filter "bxo": use box, tent'),
+        (["--filter", "tent:width=2"], '"tent:width=2": Found 1 unreferenced property'),
+        (["--filter", "box:"], "expected NAME or NAME:key=value"),
+        (["--crop", "5x4"], "expected something like 64x36+100+20"),
+        (["--crop", "50x4+0+0"], "Invalid crop window"),
+        (["--max-depth", "-2"], "is not in the range"),
+    ],
+)
+def test_changes_that_do_not_fit_a_scene_are_refused(run, make_scene, tmp_path, options, words):
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", *options)
+    assert code == 2 and words in err and err.count("\n") == 1
+
+
+def test_a_depth_for_an_integrator_without_one_is_refused(run, make_scene, tmp_path):
+    scene = make_scene(integrator='<integrator type="depth"/>')
+    code, _, err = run("render", scene, "-o", tmp_path / "a.exr", "--max-depth", 3)
+    assert code == 2 and '"depth" has no maximum depth' in err
+
+
+def test_a_checkpoint_folder_belongs_to_the_changes_of_its_scene(run, make_scene, tmp_path):
+    command = ["render", make_scene(), "-o", tmp_path / "a.exr", "--integrator", "path",
+               "--checkpoint", tmp_path / "kept", "--spp", 4, "--filter"]  # fmt: skip
+    assert run(*command, "box")[0] == 0
+    code, _, err = run(*command, "tent")
+    assert code == 2 and '"reconstruction filter" differs (box there, tent here)' in err
+
+
 @pytest.mark.parametrize("integrator", ["path", "auto", "composed_path"])
 def test_a_render_says_how_much_of_the_time_it_used(
     run, make_scene, tmp_path, integrator, monkeypatch

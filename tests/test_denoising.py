@@ -104,8 +104,10 @@ def test_without_the_package_one_sentence_says_what_to_install(
 def test_a_filter_that_correlates_pixels_is_named(run, make_scene, tmp_path, calls):
     scene = make_scene()
     scene.write_text(scene.read_text().replace('rfilter type="box"', 'rfilter type="gaussian"'))
-    code, _, err = run("render", scene, "-o", tmp_path / "a.exr", "--denoise")
-    assert code == 0 and "use a film with a box filter" in err
+    command = ("render", scene, "-o", tmp_path / "a.exr", "--denoise")
+    code, _, err = run(*command)
+    assert code == 0 and "use --filter box" in err
+    assert run(*command, "--filter", "box")[2] == ""
 
 
 def _guides(*shapes, **film):

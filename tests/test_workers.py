@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_ext.compare import InputError, load_scene, render_reference
+from mitsuba_ext.compare import InputError, SceneChanges, load_scene, render_reference
 from mitsuba_ext.long_renders import dispatch, tasks
 from mitsuba_ext.long_renders.batch_renderer import BatchRenderer, RenderRequest
 from mitsuba_ext.long_renders.bundle import Bundle
@@ -324,7 +324,8 @@ def test_references_are_those_of_one_process(make_scene, tmp_path):
                 self.waiting.clear()
             return future
 
-    scene = load_scene(make_scene(), keep_integrator=False)
+    changes = SceneChanges((5, 4, 2, 1), "tent", 2)
+    scene = load_scene(make_scene(), keep_integrator=False, changes=changes)
     for name in ("here", "there"):
         (tmp_path / name).mkdir()
     here = render_reference(scene, 64, tmp_path / "here")

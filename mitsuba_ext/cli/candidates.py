@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..inputs import names
+from ..inputs.scene_changes import FILTERS
 from ..startup import registry
 
 if TYPE_CHECKING:
@@ -49,6 +50,11 @@ def plugins(_context: click.Context, _option: Any, text: str) -> list[Completion
     """Plugins of this package, of any kind."""
     found = sorted(name for of_kind in registry.plugin_names().values() for name in of_kind)
     return _items((name, "plain") for name in found if name.startswith(text))
+
+
+def filters(_context: click.Context, _option: Any, text: str) -> list[CompletionItem]:
+    """Reconstruction filters."""
+    return _items((name, "") for name in FILTERS if name.startswith(text))
 
 
 def variants(_context: click.Context, _option: Any, text: str) -> list[CompletionItem]:

@@ -38,6 +38,16 @@ class Size(click.ParamType):
         return int(match.group(1)), int(match.group(2))
 
 
+class Crop(click.ParamType):
+    name = "crop"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[int, ...]:
+        match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)\+(\d+)\+(\d+)", value)
+        if not match:
+            self.fail(f'expected something like 64x36+100+20, found "{value}"', param, ctx)
+        return tuple(map(int, match.groups()))
+
+
 class Numbers(click.ParamType):
     name = "numbers"
 
@@ -85,6 +95,21 @@ def scene_options(command: Callable) -> Callable:
         click.option(
             "--size", type=Size(), metavar="WxH",
             help="Size of the image, instead of the film's.",
+        ),
+        click.option(
+            "--crop", type=Crop(), metavar="WxH+X+Y",
+            help="Render W by H pixels of the image, from the column X and the row Y on.",
+        ),
+        click.option(
+            "--filter", "rfilter", default="", metavar="FILTER",
+            shell_complete=candidates.filters,
+            help="Reconstruction filter, instead of the film's: NAME[:key=value,…], such as box or "
+            "gaussian:stddev=0.4.",
+        ),
+        click.option(
+            "--max-depth", type=click.IntRange(min=-1), metavar="N",
+            help="Maximum depth of paths, instead of the scene's; -1 for no limit. An INTEGRATOR "
+            "that sets max_depth keeps it.",
         ),
         click.option(
             "-D", "definitions", type=Definition(), multiple=True, metavar="KEY=VALUE",

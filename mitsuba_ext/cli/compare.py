@@ -100,6 +100,9 @@ def compare(
     dask: str | None,
     worker: str | None,
     size: tuple[int, int] | None,
+    crop: tuple[int, int, int, int] | None,
+    rfilter: str,
+    max_depth: int | None,
     definitions: Sequence[tuple[str, str]],
     plugins: Sequence[str],
     variant: str,
@@ -137,7 +140,7 @@ def compare(
         return supervisor.supervise(sys.argv[1:], out, limit or math.inf)
     elif limit is not None:
         raise click.UsageError("--limit needs worker processes, which only the command has")
-    from ..compare import Comparison, SceneSetup, budgets, show
+    from ..compare import Comparison, SceneChanges, SceneSetup, budgets, show
 
     make = {
         "--spp": budgets.equal_samples, "--time": budgets.equal_time,
@@ -145,9 +148,10 @@ def compare(
     }
     (budget,) = (make[name](value) for name, value in given.items() if value is not None)
     select_variant(variant, plugins)
+    changes = SceneChanges(crop, rfilter, max_depth)
     executors = contextlib.ExitStack()
     comparison = Comparison(
-        [SceneSetup(scene, size, dict(definitions), reference) for scene in scenes],
+        [SceneSetup(scene, size, dict(definitions), reference, changes) for scene in scenes],
         integrators,
         budget,
         seeds=seeds,

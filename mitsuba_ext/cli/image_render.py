@@ -12,6 +12,7 @@ import numpy as np
 from ..composition.guides import render_guides
 from ..images import denoising, image_files
 from ..inputs.chosen import LastScene
+from ..inputs.scene_changes import SceneChanges
 from ..inputs.variants import select_variant
 from ..long_renders.batch_renderer import RenderRequest
 from ..long_renders.folder import CheckpointFolder
@@ -44,6 +45,7 @@ class Order(NamedTuple):
     long: LongOptions | None
     is_one_of_many: bool
     preview: Path | None
+    changes: SceneChanges
 
 
 def is_finished(order: Order, picture: Picture) -> bool:
@@ -97,6 +99,7 @@ def render_image(
             "scene": str(order.scene),
             "scene_parameters": dict(definitions),
             **({"scene_values": values} if values else {}),
+            **({"changes": changed} if (changed := order.changes.described()) else {}),
             "integrator": job.name,
             "parameters": job.parameters,
             "seed": seed,
@@ -140,14 +143,14 @@ def render_image(
                     RenderRequest(
                         str(order.scene), order.size, definitions, order.specification,
                         sensor_index or 0, seed, order.variant, order.plugins,
-                        threads=order.threads or 0, values=values,
+                        threads=order.threads or 0, values=values, changes=order.changes,
                     ),
                     long, scenes,
                 )  # fmt: skip
             else:
                 chosen = scenes.choose(
                     order.scene, order.size, dict(definitions), order.specification,
-                    sensor_index or 0, values,
+                    sensor_index or 0, values, changes=order.changes,
                 )  # fmt: skip
                 job = RenderJob(chosen, seed)
             is_new = kernels_compiled() > compiled

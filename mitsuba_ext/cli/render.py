@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 from ..inputs.names import check_integrator
+from ..inputs.scene_changes import SceneChanges
 from ..inputs.variants import select_variant
 from ..long_renders.intervals import Interval
 from ..parameters import MOST_SPP
@@ -136,6 +137,9 @@ def render(
     as_json: bool,
     threads: int | None,
     size: tuple[int, int] | None,
+    crop: tuple[int, int, int, int] | None,
+    rfilter: str,
+    max_depth: int | None,
     definitions: Sequence[tuple[str, str]],
     plugins: Sequence[str],
     variant: str,
@@ -181,7 +185,7 @@ def render(
             checkpoint, every, add, until, workers or 0, dask or "", preview is not None
         ) if is_long else None,
         is_one_of_many=frames is not None or (sensors is not None and len(sensors) != 1),
-        preview=preview,
+        preview=preview, changes=SceneChanges(crop, rfilter, max_depth),
     )  # fmt: skip
     if order.is_one_of_many and add is not None:
         raise click.UsageError("--add is for one image: give --spp, the number that all shall have")

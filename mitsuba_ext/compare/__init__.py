@@ -22,6 +22,7 @@ from ..images.flip import mean_flip
 from ..images.image_files import read_exr, write_exr
 from ..images.metrics import Errors, errors, reference_noise, relative_mse
 from ..images.reading import read_image
+from ..inputs.scene_changes import SceneChanges
 from ..inputs.scenes import LoadedScene, load_scene
 from ..inputs.specifications import NamedIntegrator, make_named
 from ..progress import Step
@@ -49,6 +50,7 @@ __all__ = [
     "Reference",
     "Results",
     "Run",
+    "SceneChanges",
     "SceneSetup",
     "Step",
     "equal_samples",

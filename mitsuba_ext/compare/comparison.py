@@ -19,6 +19,7 @@ import mitsuba as mi
 from ..errors import InputError
 from ..files import replacing
 from ..images import image_files
+from ..inputs.scene_changes import UNCHANGED, SceneChanges
 from ..inputs.scene_remarks import scene_remarks
 from ..inputs.scenes import LoadedScene, check_source, load_scene, scene_name
 from ..inputs.specifications import NamedIntegrator, Specification, make_named
@@ -52,12 +53,14 @@ class SceneSetup:
         size: Width and height that replace those of the film.
         parameters: Values for the ``$name`` placeholders of the file.
         reference: The file of its reference. Default: render a reference.
+        changes: What else replaces something of the scene.
     """
 
     source: SceneSource
     size: tuple[int, int] | None = None
     parameters: Mapping[str, object] | None = None
     reference: str | Path | None = None
+    changes: SceneChanges = UNCHANGED
 
 
 class Comparison:
@@ -206,7 +209,10 @@ class Comparison:
         write_report(self.folder)
 
     def _run_scene(self, setup: SceneSetup, name: str, progress: Callable[[Step], None]) -> None:
-        scene = load_scene(setup.source, setup.size, setup.parameters, keep_integrator=False)
+        scene = load_scene(
+            setup.source, setup.size, setup.parameters, keep_integrator=False,
+            changes=setup.changes,
+        )  # fmt: skip
         experiment = Experiment(
             scene, self.integrators, self.budget, self.seeds, self.folder / name, self.only_stored,
             self._warn,

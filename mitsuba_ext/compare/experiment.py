@@ -4,8 +4,8 @@
   ``hide_emitters``) unless its specification sets them, so that all solve the same problem.
 - Small renders compile the kernels beforehand. A measured run that compiled a kernel after all
   (for a size of pass that the small renders did not have) is discarded and repeated.
-- With a time budget, integrators that learn plan for it (``timing.plans_for_time``); for others, the
-  number of samples is computed from their speed.
+- With a time budget, integrators that learn plan for it (``timing.plans_for_time``). For others,
+  the number of samples is computed from their speed.
 - The integrators take turns (A B C A B C …), round by round, so that a machine that slows down
   affects all of them. Each round and each level has its own seed, which the integrators share.
 - Times are compared within one session only. A stored run of an earlier session is timed again (its

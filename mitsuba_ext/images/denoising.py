@@ -55,7 +55,7 @@ def remark(film: mi.Film) -> str | None:
     if film.rfilter().radius() > 0.5 + 1e-3:
         return (
             f'denoising works badly with the reconstruction filter "{film.rfilter().class_name()}" '
-            f"of the film, which gives neighbours the same noise: use a film with a box filter"
+            f"of the film, which gives neighbours the same noise: use --filter box"
         )
     return None
 

@@ -13,6 +13,7 @@ from ..errors import InputError
 from ..startup.runtime import SUPPORTED_VARIANTS
 from .content_hash import hash_code
 from .names import OF_SCENE
+from .scene_changes import UNCHANGED, SceneChanges
 from .scene_remarks import scene_remarks
 from .scene_values import SceneValues
 from .scenes import LoadedScene, load_scene
@@ -105,7 +106,7 @@ class LastScene:
     def choose(
         self, path: Path, size: tuple[int, int] | None, definitions: Mapping[str, str],
         specification: str | None, sensor_index: int, values: str | None = None,
-        moved: Callable[[str], str] | None = None,
+        moved: Callable[[str], str] | None = None, changes: SceneChanges = UNCHANGED,
     ) -> Chosen:  # fmt: skip
         """Loads the scene of a file, and makes its integrator.
 
@@ -116,18 +117,21 @@ class LastScene:
             specification: See :meth:`Chosen.of`.
             values: Values of parameters of the loaded scene, from :func:`.scene_values.as_text`;
                 ``None`` if no image of the call has any.
-            moved: See :func:`.scenes.load_scene`.
+            moved, changes: See :func:`.scenes.load_scene`.
 
         Raises:
             InputError: The scene, the integrator or the sensor cannot be used.
         """
         is_own, has_values = specification in (None, OF_SCENE), values is not None
-        key = (mi.variant(), path, size, tuple(definitions.items()), is_own, has_values)
+        items = tuple(definitions.items())
+        key = (mi.variant(), path, size, items, is_own, has_values, changes)
         if key != self._key:
             # Free the last scene first, as Dr.Jit compiles the methods of all living objects
             self._key = self._loaded = self._values = None
             gc.collect()  # the object that mi.traverse returns refers to itself
-            self._loaded = load_scene(path, size, definitions, is_own, has_values, moved)
+            self._loaded = load_scene(
+                path, size, definitions, is_own, has_values, moved, changes
+            )
             self._values = SceneValues(self._loaded.scene) if has_values else None
             self._key = key
         if self._values:

@@ -10,7 +10,7 @@ from typing import Any
 from ..errors import InputError
 
 
-def parse_plugin(text: str) -> dict[str, Any]:
+def parse_plugin(text: str, kind: str = "integrator") -> dict[str, Any]:
     """The plugin that ``text`` describes, as a dict for ``mi.load_dict``.
 
     - A comma begins a parameter only where ``key=`` follows. Other commas belong to the value,
@@ -23,13 +23,17 @@ def parse_plugin(text: str) -> dict[str, Any]:
     >>> parse_plugin("variance:nested=[path:max_depth=6],batches=8")
     {'type': 'variance', 'nested': {'type': 'path', 'max_depth': 6}, 'batches': 8}
 
+    Args:
+        text: The text.
+        kind: What it describes, for the message of an error.
+
     Raises:
         InputError: The text has another form; the message quotes it.
     """
     try:
         return _parse(text)
     except ValueError as error:
-        raise InputError(f'integrator "{text}": {error}') from error
+        raise InputError(f'{kind} "{text}": {error}') from error
 
 
 def _parse(text: str) -> dict[str, Any]:

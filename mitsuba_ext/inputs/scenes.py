@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InputError, one_line
 from ..rendering.aovs import check_nodes
 from .content_hash import hash_each, hash_files
+from .scene_changes import UNCHANGED, SceneChanges, change_films
 from .scene_files import files_of, named_in
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ class LoadedScene:
         integrator_name: Plugin name of the scene's own integrator; empty if there is none.
         only_says_path: Does the scene say nothing else about its integrator than ``path`` and these
             ``settings``? True also if there is none.
+        changes: What the caller has changed, besides the size.
         has_media: Are there participating media in the scene? Also true if its file names one, and
             there are instances, which may contain it.
         size: Width and height of the image in pixels (of the crop window, if there is one).
@@ -96,6 +98,7 @@ class LoadedScene:
     settings: dict[str, int | bool]
     integrator_name: str
     only_says_path: bool
+    changes: SceneChanges
     has_media: bool
     size: tuple[int, int]
 
@@ -127,6 +130,7 @@ def load_scene(
     keep_integrator: bool = True,
     keep_names: bool = False,
     moved: Callable[[str], str] | None = None,
+    changes: SceneChanges = UNCHANGED,
 ) -> LoadedScene:
     """Loads a scene in the active variant.
 
@@ -140,10 +144,11 @@ def load_scene(
             merges meshes of the same material, and equal materials.
         moved: Maps the absolute path of a file to its present path; returns all other texts as
             they are.
+        changes: What else replaces something of the file.
 
     Raises:
         InputError: The file is missing or broken, something in it cannot be made or is of another
-            variant, it has no sensor, or ``size`` was given for a film with a crop window.
+            variant, it has no sensor, or ``size`` or ``changes`` do not fit the scene.
     """
     import mitsuba as mi
 
@@ -171,16 +176,20 @@ def load_scene(
                     node.props[key] = moved(name)
             files = files_of(state, strings)
             file_hashes = hash_each(files)
-            content_hash = hash_files(file_hashes, strings, source if is_dict else None)
+            named = {**strings, **changes.described()}
+            content_hash = hash_files(file_hashes, named, source if is_dict else None)
             integrator = _integrator_node(state)
             # Before transform_all(): afterwards, a node may be freed memory
             integrator_name = integrator.props.plugin_name() if integrator else ""
+            if changes.max_depth is not None:
+                _set_max_depth(state, changes.max_depth, keep_integrator)
             settings, only_says_path = _settings(integrator), _only_says_path(state)
+            if changes.max_depth is not None:
+                settings[SETTINGS[0]] = changes.max_depth
             names_media = any(node.type == mi.ObjectType.Medium for node in state.nodes)
             if not keep_integrator:
                 _drop_integrators(state)
-            if size is not None:
-                _set_film_size(state, size)
+            change_films(state, size, changes)
             mi.parser.transform_all(config, state)
             scene = mi.parser.instantiate(config, state)
         except InputError as error:
@@ -193,9 +202,6 @@ def load_scene(
     if not scene.sensors():
         raise InputError(f"{label}: the scene has no sensor")
     film = scene.sensors()[0].film()
-    if size is not None and tuple(film.size()) != size:
-        # A sensor without a <film> element got Mitsuba's default one
-        _resize_default_film(scene, size)
     return LoadedScene(
         scene=scene,
         path=path,
@@ -206,6 +212,7 @@ def load_scene(
         settings=settings,
         integrator_name=integrator_name,
         only_says_path=only_says_path,
+        changes=changes,
         has_media=has_media(scene) or (names_media and has_instances(scene)),
         size=(int(film.crop_size()[0]), int(film.crop_size()[1])),
     )
@@ -279,10 +286,7 @@ def _settings(node: mi.parser.SceneNode | None) -> dict[str, int | bool]:
     if node is None:
         return {}
     own = mi.Properties(node.props)  # a copy, because reading a property marks it as queried
-    text = ""
-    with contextlib.suppress(Exception):  # a wrapper or an unknown plugin: its defaults are unknown
-        properties = mi.Properties(node.props.plugin_name())
-        text = str(mi.PluginManager.instance().create_object(properties))
+    text = _printed(node)
     settings: dict[str, int | bool] = {}
     for key in SETTINGS:
         printed = re.search(rf"\b{key} = (-?\d+)", text)
@@ -292,6 +296,31 @@ def _settings(node: mi.parser.SceneNode | None) -> dict[str, int | bool]:
             value = int(printed.group(1))
             settings[key] = -1 if value == _UNLIMITED else value
     return settings
+
+
+def _printed(node: mi.parser.SceneNode) -> str:
+    """The ``str()`` of an integrator with its default parameters; empty if these are unknown."""
+    import mitsuba as mi
+
+    with contextlib.suppress(Exception):  # a wrapper or an unknown plugin
+        properties = mi.Properties(node.props.plugin_name())
+        return str(mi.PluginManager.instance().create_object(properties))
+    return ""
+
+
+def _set_max_depth(state: mi.parser.ParserState, max_depth: int, is_needed: bool) -> None:
+    """Sets the maximum depth of all integrators in the scene that have one.
+
+    Raises:
+        InputError: It ``is_needed``, and none of the integrators has one.
+    """
+    key, nodes = SETTINGS[0], _integrator_nodes(state)
+    found = [node for node in nodes if key in node.props or f"{key} =" in _printed(node)]
+    for node in found:
+        node.props[key] = max_depth
+    if is_needed and nodes and not found:
+        name = nodes[0].props.plugin_name()
+        raise InputError(f'"{name}" has no maximum depth that --max-depth could replace')
 
 
 def _drop_integrators(state: mi.parser.ParserState) -> None:
@@ -320,24 +349,3 @@ def _is_integrator(node: mi.parser.SceneNode, key: str) -> bool:
         return isinstance(mi.PluginManager.instance().create_object(properties), mi.Integrator)
     except Exception:  # no such plugin, or it cannot be made without its parameters
         return key == "integrator"
-
-
-def _set_film_size(state: mi.parser.ParserState, size: tuple[int, int]) -> None:
-    import mitsuba as mi
-
-    for node in state.nodes:
-        if node.type == mi.ObjectType.Film:
-            if any(key.startswith("crop_") for key in node.props.keys()):
-                raise InputError(
-                    f"a size cannot be given for a film with a crop window "
-                    f"({mi.parser.file_location(state, node)})"
-                )
-            node.props["width"], node.props["height"] = size
-
-
-def _resize_default_film(scene: mi.Scene, size: tuple[int, int]) -> None:
-    import mitsuba as mi
-
-    parameters = mi.traverse(scene.sensors()[0])
-    parameters["film.size"] = list(size)
-    parameters.update()

@@ -10,6 +10,7 @@ from typing import Any
 
 from ..errors import InputError, one_line
 from ..inputs.chosen import LastScene
+from ..inputs.scene_changes import UNCHANGED, SceneChanges
 from ..scene.nesting import with_nested
 from ..startup.machine import versions
 from .bundle import Bundle
@@ -31,6 +32,7 @@ class RenderRequest:
         threads: Threads of a process; 0 for as many as there are cores.
         values: Values of parameters of the loaded scene, from
             :func:`~mitsuba_ext.inputs.scene_values.as_text`; ``None`` if no frame has any.
+        changes: What else replaces something of the file.
         description: Everything that the image depends on, as JSON. A process refuses the request if
             its own files or versions give another description. Empty to skip this check.
     """
@@ -45,6 +47,7 @@ class RenderRequest:
     plugins: tuple[str, ...] = ()
     threads: int = 0
     values: str | None = None
+    changes: SceneChanges = UNCHANGED
     description: str = ""
 
 
@@ -74,7 +77,7 @@ class BatchRenderer(IntegratorBatches):
                 scene, specification = moved(scene), specification and moved(specification)
             self.chosen = (scenes or LastScene()).choose(
                 Path(scene), request.size, dict(request.definitions), specification,
-                request.sensor, request.values, moved,
+                request.sensor, request.values, moved, request.changes,
             )  # fmt: skip
         self.chosen.loaded.path = Path(request.scene)
         integrator = self.chosen.named.integrator
@@ -99,6 +102,7 @@ class BatchRenderer(IntegratorBatches):
         return {
             "scene": loaded.source,
             "scene parameters": loaded.parameters,
+            **request.changes.described(),
             "scene files hash": loaded.content_hash,
             "scene files": {
                 os.path.relpath(file, folder): found for file, found in loaded.file_hashes.items()

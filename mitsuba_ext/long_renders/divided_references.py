@@ -64,11 +64,12 @@ class ReferenceWorkers:
                 "reference's integrator must be given as text"
             )
         film = scene.scene.sensors()[0].film()
-        has_crop_window = tuple(film.crop_size()) != tuple(film.size())
+        changes = scene.changes
+        has_crop_window = tuple(film.crop_size()) != tuple(film.size()) and not changes.crop
         request = RenderRequest(
             str(scene.path), None if has_crop_window else tuple(map(int, film.size())),
             tuple(scene.parameters.items()), specification, seed=seed, variant=mi.variant(),
-            plugins=self._plugins, threads=self._threads,
+            plugins=self._plugins, threads=self._threads, changes=changes,
         )  # fmt: skip
         renderer = BatchRenderer(request, scenes=_Loaded(scene))
         dispatch = Dispatch(self._executor, renderer, lambda: self._count)

@@ -1,0 +1,113 @@
+"""What the command line changes in the film and the integrator of a scene."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from ..errors import InputError, one_line
+from .plugin_text import parse_plugin
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+#: The reconstruction filters of Mitsuba.
+FILTERS = ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos")
+
+
+class SceneChanges(NamedTuple):
+    """Changes of a scene, besides the size of its film.
+
+    Attributes:
+        crop: The crop window in pixels: width, height, and the place (x, y) of its upper left
+            corner. Replaces that of the film.
+        rfilter: The reconstruction filter, as text: :func:`.plugin_text.parse_plugin`. Empty for
+            the film's own.
+        max_depth: The maximum depth, in place of that of the scene's integrator.
+    """
+
+    crop: tuple[int, int, int, int] | None = None
+    rfilter: str = ""
+    max_depth: int | None = None
+
+    def described(self) -> dict[str, str]:
+        """What is changed, by name."""
+        found = {"reconstruction filter": self.rfilter}
+        if self.crop is not None:
+            found["crop window"] = "{}x{}+{}+{}".format(*self.crop)
+        if self.max_depth is not None:
+            found["maximum depth"] = str(self.max_depth)
+        return {name: value for name, value in found.items() if value}
+
+
+#: Leaves a scene as it is.
+UNCHANGED = SceneChanges()
+
+
+def change_films(
+    state: mi.parser.ParserState, size: tuple[int, int] | None, changes: SceneChanges
+) -> None:
+    """Changes all films of a parsed scene. A sensor without one gets one.
+
+    Raises:
+        InputError: ``size`` is given, and a film has a crop window; or there is no such filter.
+    """
+    import mitsuba as mi
+
+    parameters: dict[str, object] = {}
+    if size is not None:
+        parameters["width"], parameters["height"] = size
+    if changes.crop is not None:
+        names = ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
+        parameters.update(zip(names, changes.crop))
+    if changes.rfilter:
+        parameters["rfilter"] = _filter(changes.rfilter)
+    if not parameters:
+        return
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Film:
+            has_window = any(key.startswith("crop_") for key in node.props.keys())
+            if size is not None and has_window and changes.crop is None:
+                raise InputError(
+                    f"a size cannot be given for a film with a crop window, unless --crop gives "
+                    f"another one ({mi.parser.file_location(state, node)})"
+                )
+            if changes.rfilter:
+                for key, _child in _children(state, node, mi.ObjectType.ReconstructionFilter):
+                    del node.props[key]
+            for key, value in parameters.items():
+                node.props[key] = value
+        elif node.type == mi.ObjectType.Sensor and not (
+            _children(state, node, mi.ObjectType.Film)
+            or _children(state, node, mi.ObjectType.Sensor)
+        ):
+            node.props["film"] = mi.load_dict({"type": "hdrfilm", **parameters})
+
+
+def _children(
+    state: mi.parser.ParserState, node: mi.parser.SceneNode, kind: mi.ObjectType
+) -> list[tuple[str, object]]:
+    """The children of a node that are of a kind, by their keys."""
+    import mitsuba as mi
+
+    properties, found = mi.Properties(node.props), []  # a copy: reading marks as queried
+    for key in properties.keys():
+        value = properties[key]
+        if isinstance(value, mi.Properties.ResolvedReference):
+            if state.nodes[value.index()].type == kind:
+                found.append((key, value))
+        elif isinstance(value, mi.Object) and value.type() == kind:
+            found.append((key, value))
+    return found
+
+
+def _filter(text: str) -> mi.ReconstructionFilter:
+    import mitsuba as mi
+
+    plugin = parse_plugin(text, "reconstruction filter")
+    if plugin["type"] not in FILTERS:
+        raise InputError(f'unknown reconstruction filter "{text}": use {", ".join(FILTERS)}')
+    try:
+        return mi.load_dict(plugin)
+    except Exception as error:  # a plugin's constructor may raise anything
+        message = one_line(error).removeprefix('While loading dictionary node "root": ')
+        raise InputError(f'reconstruction filter "{text}": {message}') from error
