@@ -44,10 +44,14 @@ def make_folder(folder: Path) -> None:
 
 
 def check_target(path: Path) -> None:
-    """Raises :class:`InputError` if the file ``path`` cannot be made; for use before a render."""
+    """Raises :class:`InputError` if the file ``path`` cannot be made or replaced; for use before a
+    render."""
     if path.is_dir():
         raise InputError(f"{path}: is a folder")
     check_folder(path.parent)
+    # Where the folder can be written, so could the file be replaced, against its owner's wish
+    if path.exists() and not os.access(path, os.W_OK):
+        raise InputError(f"{path}: is read-only")
 
 
 def _is_alive(process: int) -> bool:

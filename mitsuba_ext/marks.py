@@ -146,7 +146,7 @@ def locked(folder: Path) -> Iterator[None]:
     """
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     make_folder(folder)
-    file = _lock(folder)
+    file = _lock(folder / _LOCK, f"{folder}: another process uses this folder", "folder")
     try:
         yield
     finally:
@@ -158,11 +158,29 @@ def locked(folder: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def _lock(folder: Path) -> TextIO | None:
-    """The locked file; ``None`` on a system without locks."""
+@contextlib.contextmanager
+def written_alone(path: Path) -> Iterator[None]:
+    """Locks ``path``, which a render will write, against other renders: the image of the one that
+    ends later would replace that of the other. The lock ends with the process.
+
+    Raises:
+        InputError: Another render will write it.
+    """
+    mark = path.with_name(f".{path.name}{_LOCK}")
+    file = _lock(mark, f"{path}: another render writes this file", "file")
+    try:
+        yield
+    finally:
+        if file is not None:
+            mark.unlink(missing_ok=True)
+            file.close()
+
+
+def _lock(path: Path, refusal: str, what: str) -> TextIO | None:
+    """Makes the file ``path``, and locks it; ``None`` on a system without locks. ``refusal`` begins
+    the message if another process has locked it; ``what`` that process uses."""
     if fcntl is None:
         return None
-    path = folder / _LOCK
     while True:
         file = _opened(path)
         try:
@@ -172,8 +190,7 @@ def _lock(folder: Path) -> TextIO | None:
             process = file.read() or "unknown"  # the other process has not written it yet
             file.close()
             raise InputError(
-                f"{folder}: another process uses this folder (process {process}): wait "
-                f"for its end, or name another folder"
+                f"{refusal} (process {process}): wait for its end, or name another {what}"
             ) from None
         except OSError:  # a file system without locks
             file.close()

@@ -11,6 +11,7 @@ import re
 import signal
 import sys
 import time
+from pathlib import Path
 
 import click
 import drjit as dr
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 from conftest import PATH, PLAIN_PATH
 
+from mitsuba_ext import marks
 from mitsuba_ext.cli import image_render
 from mitsuba_ext.cli.stopping import Stop, stopping
 from mitsuba_ext.compare import load_scene, read_exr, timing, write_exr
@@ -161,6 +163,38 @@ def test_render_fills_a_time(run, make_scene, tmp_path):
     metadata = read_exr(tmp_path / "a.exr")[1]
     # Loose: other processes share the machine
     assert 0.1 < metadata["seconds"] < 5
+
+
+def test_a_file_that_another_render_writes_is_refused(run, make_scene, tmp_path):
+    output = tmp_path / "out" / "a.exr"
+    output.parent.mkdir()
+    command = ("render", make_scene(), "-o", output, "--spp", 1)
+    with marks.written_alone(output):
+        code, _, err = run(*command)
+        assert code == 2 and f"another render writes this file (process {os.getpid()})" in err
+        assert run(*command[:3], tmp_path / "b.exr", "--spp", 1)[0] == 0
+    assert run(*command)[0] == 0
+    assert [path.name for path in output.parent.iterdir()] == ["a.exr"]
+
+
+@pytest.mark.parametrize("which", ["a.exr", "a.noisy.exr", "b.png"])
+def test_a_read_only_target_is_found_before_the_render(
+    run, make_scene, tmp_path, monkeypatch, which
+):
+    """Not by its mode, as the user that runs the tests may write all files."""
+    (tmp_path / which).touch()
+
+    def access(path, mode, *, _access=os.access, **named) -> bool:
+        is_refused = mode == os.W_OK and Path(path).name == which
+        return not is_refused and _access(path, mode, **named)
+
+    monkeypatch.setattr(os, "access", access)
+    monkeypatch.setattr(image_render, "select_variant", lambda *_: pytest.fail("too late"))
+    options = ("--preview", tmp_path / "b.png", "--denoise")
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", *options)
+    assert code == 2 and f"{which}: is read-only" in err
+    code, _, err = run("render", make_scene(), "-o", tmp_path / "none" / "a.exr")
+    assert code == 2 and "no such folder" in err
 
 
 _CHANGES = ["--size", "12x8", "--crop", "5x4+6+3", "--filter", "tent:radius=2", "--max-depth", 1]

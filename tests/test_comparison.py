@@ -9,6 +9,7 @@ from statistical import some
 from mitsuba_ext import compare
 from mitsuba_ext.compare import InputError, timing
 from mitsuba_ext.compare.experiment import run_seed
+from mitsuba_ext.inputs.scenes import scene_name
 
 import mitsuba as mi  # isort: skip
 
@@ -232,3 +233,13 @@ def test_scalar_variants_are_refused():
     with pytest.raises(InputError, match="scalar_rgb"):
         compare.Comparison(WHITE, ["path"], compare.equal_samples(4))
     mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.mark.parametrize(
+    "path, name",
+    [("kitchen/scene.xml", "kitchen"), ("/home/me/kitchen/scene.xml", "kitchen"),
+     ("scene.xml", "scene"), ("./scene.xml", "scene"), ("../scene.xml", "scene"),
+     ("kitchen/night.xml", "night"), ({}, "scene")],
+)  # fmt: skip
+def test_a_file_called_scene_has_the_name_of_the_folder_that_its_path_names(path, name):
+    assert scene_name(path) == name

@@ -202,9 +202,9 @@ def test_other_values_need_no_other_kernels(run, make_scene, tmp_path, monkeypat
     (tmp_path / "animate.py").write_text(FUNCTION)
     counts, choose = [], chosen.LastScene.choose
 
-    def counted(self, *arguments):
+    def counted(self, *arguments, **named):
         counts.append(kernels_compiled())
-        return choose(self, *arguments)
+        return choose(self, *arguments, **named)
 
     monkeypatch.setattr(chosen.LastScene, "choose", counted)
     # The scene is loaded again for the last one, where another $x is given

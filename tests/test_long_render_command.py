@@ -69,6 +69,19 @@ def test_more_samples_later_and_merged(run, make_scene, tmp_path):
         "merge", tmp_path / "1", tmp_path / "3", "-o", tmp_path / "c")[2]  # fmt: skip
 
 
+def test_a_render_says_what_its_folder_holds(run, make_scene, tmp_path):
+    kept = tmp_path / "kept"
+    command = ("render", make_scene(), "-o", tmp_path / "a.exr", "--checkpoint", kept, "--spp")
+    assert "continued" not in run(*command, 16)[2]
+    assert f"{kept}: continued from 16 samples per pixel\n" == run(*command, 32)[2]
+    assert "holds all 32 samples" in run(*command, 32)[2]
+    code, out, err = run(*command, 8)
+    assert code == 0 and "warning" in err and "holds 32 samples per pixel already" in err
+    assert "32 spp" in out
+    *_, warning, end = map(json.loads, run(*command, 8, "--json")[1].splitlines())
+    assert "not 8" in warning["text"] and end["spp"] == 32
+
+
 def test_a_merged_folder_is_whole_or_not_there(run, make_scene, tmp_path, monkeypatch):
     scene, kept = make_scene(), [tmp_path / "a", tmp_path / "b"]
     for seed, folder in enumerate(kept):

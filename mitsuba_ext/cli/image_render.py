@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .. import marks
 from ..composition.guides import render_guides
 from ..images import denoising, image_files
 from ..inputs.chosen import LastScene
@@ -90,6 +91,7 @@ def render_image(
     for file in filter(None, (output, order.preview)):
         image_files.check_target(file)
     if order.denoise:
+        image_files.check_target(_noisy(output))
         denoising.denoiser()
     guides = {}
     remarks: list[str] = []
@@ -129,7 +131,7 @@ def render_image(
     report.image = {}
     if picture.name:
         report.image = {"file": str(output), "frame": picture.frame, "sensor": picture.sensor}
-    with stopping() as stop:
+    with marks.written_alone(output), stopping() as stop:
         job = None
         try:
             select_variant(order.variant, plugins)
@@ -187,7 +189,7 @@ def render_image(
         if job.is_interrupted and (output.exists() or order.is_one_of_many) and not is_kept:
             target = picture.unfinished
         if order.denoise:
-            noisy = target.with_name(f"{target.stem}.noisy.exr")
+            noisy = _noisy(target)
             write(noisy, guides)
             denoising.denoise_file(noisy, filter(None, (target, order.preview)), metadata())
         else:
@@ -224,3 +226,8 @@ def render_image(
     if job.failure:
         raise job.failure
     return 1 if bad else 0
+
+
+def _noisy(path: Path) -> Path:
+    """The file of the image before it is denoised."""
+    return path.with_name(f"{path.stem}.noisy.exr")

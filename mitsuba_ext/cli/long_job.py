@@ -125,6 +125,8 @@ class LongJob:
             spp = state.spp + options.add
         elif spp is None and options.until is None and seconds is None:
             spp = self._renderer.sensor.sampler().sample_count()
+        if state.done:
+            self._say_what_is_kept(spp, report)
         last = LastKept(state.spp)
         is_due_at_once = options.has_preview
 
@@ -182,6 +184,19 @@ class LongJob:
                 # Go on: the disk may have room for the image, which is smaller
                 problem = InputError(f"the render could not be kept: {problem}")
                 self.failure = self.failure or problem
+
+    def _say_what_is_kept(self, spp: int | None, report: Report) -> None:
+        """Says that the render is continued, or that ``spp`` samples are there already."""
+        folder, kept = self._options.folder, self._state.spp
+        if spp is None or kept < spp:
+            report.note(f"{folder}: continued from {kept} samples per pixel")
+        elif kept == spp:
+            report.note(f"{folder}: holds all {kept} samples per pixel already")
+        else:
+            report.warn(
+                f"{folder}: holds {kept} samples per pixel already, and the image shows all of "
+                f"them, not {spp}"
+            )
 
     @contextlib.contextmanager
     def _executor(

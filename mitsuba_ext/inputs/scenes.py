@@ -109,12 +109,13 @@ class LoadedScene:
 
 
 def scene_name(source: str | Path | Mapping[str, Any] | None) -> str:
-    """A short name: that of the file, or of its folder if the file is called ``scene.xml``."""
+    """A short name: that of the file. A file ``scene.xml`` has the name of its folder if the path
+    as it was given names that: ``kitchen/scene.xml`` is "kitchen", and ``scene.xml`` is "scene"."""
     if source is None or isinstance(source, Mapping):
         return "scene"
     path = Path(source)
-    generic = path.stem == "scene" and path.resolve().parent.name
-    return generic or path.stem
+    folder = path.parent.name if path.stem == "scene" else ""
+    return path.stem if folder in ("", "..") else folder
 
 
 def check_scene_file(path: Path) -> None:

@@ -70,6 +70,8 @@ class KeptRender:
                 mi.Log(
                     mi.LogLevel.Warn, f"{damaged}: is damaged: going on from the state before it"
                 )
+            if state.done:
+                self._say_what_is_kept(state.spp, goal.spp or 0)
             last = LastKept(state.spp)
 
             def after_batch(render: LongRender) -> None:
@@ -100,6 +102,14 @@ class KeptRender:
         if is_interrupted and not state.done:
             raise KeyboardInterrupt
         return state, is_interrupted
+
+    def _say_what_is_kept(self, kept: int, spp: int) -> None:
+        where, has = f'"{self._integrator.name}": {self._folder.path}', f"{kept} samples per pixel"
+        if kept > spp:
+            text = f"{where} holds {has}, and the image shows all of them, not {spp}"
+            mi.Log(mi.LogLevel.Warn, text)
+        else:
+            mi.Log(mi.LogLevel.Info, f"{where}: continued from {has}")
 
     def _save(self, state: RenderState) -> None:
         try:
