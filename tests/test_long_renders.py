@@ -183,27 +183,47 @@ def test_a_black_image_has_no_error_to_reach(run, make_scene, tmp_path):
     assert run(*command, "--spp", 1 << 20, "--time", 0.2)[0] == 0
 
 
-def test_the_first_batches_tell_how_many_fit_into_the_time(request_of, monkeypatch):
+@pytest.fixture
+def paced(monkeypatch):
+    """A clock that only batches move: the first one compiles, and those after the fifth are
+    slow."""
+
     class Clock:
         now = 0.0
 
         def perf_counter(self):
             return self.now
 
-    clock = Clock()
+    clock, batch = Clock(), BatchRenderer.render
     monkeypatch.setattr(long_render, "time", clock)
 
-    batch, request = BatchRenderer.render, request_of("path")
-
     def timed(self, which, learned):
-        # The first one compiles, and those after the fifth are slow
-        clock.now += 5 if which.index == 0 else 1 if which.index < 5 else 3
+        clock.now += 5 * (which.index == 0) + which.spp * (0.1 if which.index < 5 else 0.3)
         return batch(self, which, learned)
 
     monkeypatch.setattr(BatchRenderer, "render", timed)
-    render = LongRender(BatchRenderer(request), RenderState())
+    return clock
+
+
+def test_the_first_batches_tell_how_many_fit_into_the_time(request_of, paced):
+    render = LongRender(BatchRenderer(request_of("path")), RenderState())
     assert render.run(Goal(seconds=15))
-    assert len(render.state.done) == 11
+    assert render.state.spp == 100
+
+
+@pytest.mark.parametrize(("seconds", "spp"), [(5.5, 5), (6.2, 12), (8.0, 30)])
+def test_a_time_in_which_few_batches_fit_is_kept(request_of, paced, seconds, spp):
+    """A batch of the usual length has 16 samples per pixel."""
+    render = LongRender(BatchRenderer(request_of("path")), RenderState())
+    assert render.run(Goal(seconds=seconds))
+    assert render.state.spp == spp and paced.now <= 1.05 * seconds
+
+
+def test_a_batch_learns_for_others_only_where_there_is_time_for_them(request_of, paced):
+    for seconds, learns in ((8.0, False), (40.0, True)):
+        state = RenderState()
+        LongRender(BatchRenderer(request_of(LEARNER)), state).run(Goal(seconds=seconds))
+        assert (state.learned is not None) == learns
 
 
 # ---- The folder ----

@@ -18,6 +18,12 @@ from .state import Batch, BatchResult, RenderState
 #: The fewest batches from which the error of an image is estimated.
 _FEWEST = 8
 
+#: More samples per pixel than a batch has.
+_ANY = 1 << 30
+
+#: Batches that measure the speed are shorter by this factor.
+_PROBE_DIVISOR = 16
+
 #: The error is computed again when the number of batches has grown by this factor: for large
 #: images, the computation takes as long as some of their samples.
 _LATER = 1.05
@@ -31,7 +37,8 @@ class Goal:
         spp: Samples per pixel; ``None`` for no limit.
         error: The relMSE of the image, as estimated from its batches; ``None`` for none.
         seconds: The time of this call; ``None`` for no limit. The speed of the first batches
-            decides how many fit: a render that ended by the clock would prefer fast samples.
+            decides how many fit: a render that ended by the clock would prefer fast samples. In
+            this process, these batches are short, and learn nothing for others.
     """
 
     spp: int | None = None
@@ -61,6 +68,7 @@ class LongRender:
     ) -> None:
         self._renderer, self._progress = renderer, progress
         self.state, self.goal_spp = state, 0
+        self._probes = self._teaches_late = False
         # The number of batches after which the error was computed last, and that error
         self._error: tuple[int, float | None] = (0, None)
 
@@ -84,6 +92,8 @@ class LongRender:
             InputError: A batch cannot be rendered.
         """
         self._goal, self.goal_spp = goal, goal.spp or 0
+        is_timed_here = goal.seconds is not None and executor is None
+        self._probes, self._teaches_late = is_timed_here, is_timed_here
         count_workers = workers if callable(workers) else lambda: workers
         if executor is None:
             results = self._here()
@@ -92,6 +102,8 @@ class LongRender:
             results = dispatch.results(self._batches(), lambda: self._learned, is_stopped)
         # The speed is measured from the first result to the one with this number
         measured = 1 + QUEUE * count_workers()
+        # Batches that use what one of them has learned have another speed
+        plans = (measured, measured + 2) if self._teaches_late else (measured,)
         begin, warm, count = time.perf_counter(), 0.0, 0
         while not self._is_reached():
             if is_stopped() or (result := next(results, None)) is None:
@@ -99,12 +111,13 @@ class LongRender:
             self._renderer.check(result)
             self.state.add(result)
             count += 1
-            if count == 1:
-                # Its time is not measured, as its kernels may have been compiled
+            if count in (1, measured + 1):
+                # Its time is not measured: its kernels may have been compiled, or it learned
                 warm, before = time.perf_counter(), self.state.spp
-            elif goal.seconds is not None and count == measured:
+            elif goal.seconds is not None and count in plans:
                 seconds = (time.perf_counter() - warm) / (self.state.spp - before)
                 self._plan(goal.seconds - (time.perf_counter() - begin), seconds)
+                self._probes = False
             self._progress(self)
         return True
 
@@ -154,7 +167,17 @@ class LongRender:
     @property
     def _learned(self) -> bytes | None:
         """The learned state that the next batch loads; ``None`` if that batch has to learn it."""
-        return self.state.learned if self._renderer.learns else b""
+        if not self._renderer.learns or (self.state.learned is None and self._is_short):
+            return b""
+        return self.state.learned
+
+    @property
+    def _is_short(self) -> bool:
+        """Is the time of this call too short for a batch that learns for others, or unknown yet
+        whether it is?"""
+        longest = self._renderer.length(_ANY, teaches=True)
+        left = self.goal_spp - self.state.spp
+        return self._probes or (self._teaches_late and left < 2 * longest)
 
     def _batches(self) -> Iterator[Batch]:
         """The next batches: indices that are missing among the finished batches come first."""
@@ -164,8 +187,10 @@ class LongRender:
             if self.goal_spp and spp >= self.goal_spp:
                 return
             if index not in known:
-                left = self.goal_spp - spp if self.goal_spp else 1 << 30
+                left = self.goal_spp - spp if self.goal_spp else _ANY
                 length = self._renderer.length(left, teaches=self._learned is None)
+                if self._probes:
+                    length = max(1, length // _PROBE_DIVISOR)
                 yield Batch(seed, index, length)
                 spp += length
 
