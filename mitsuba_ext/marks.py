@@ -146,7 +146,8 @@ def locked(folder: Path) -> Iterator[None]:
     """
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     make_folder(folder)
-    file = _lock(folder / _LOCK, f"{folder}: another process uses this folder", "folder")
+    lock = folder / _LOCK
+    file = _lock(lock, lock, f"{folder}: another process uses this folder", "folder")
     try:
         yield
     finally:
@@ -167,7 +168,7 @@ def written_alone(path: Path) -> Iterator[None]:
         InputError: Another render will write it.
     """
     mark = path.with_name(f".{path.name}{_LOCK}")
-    file = _lock(mark, f"{path}: another render writes this file", "file")
+    file = _lock(mark, path, f"{path}: another render writes this file", "file")
     try:
         yield
     finally:
@@ -176,9 +177,14 @@ def written_alone(path: Path) -> Iterator[None]:
             file.close()
 
 
-def _lock(path: Path, refusal: str, what: str) -> TextIO | None:
-    """Makes the file ``path``, and locks it; ``None`` on a system without locks. ``refusal`` begins
-    the message if another process has locked it; ``what`` that process uses."""
+def _lock(path: Path, named: Path, refusal: str, what: str) -> TextIO | None:
+    """Makes the file ``path``, and locks it; ``None`` on a system without locks.
+
+    Parameters:
+        named: What the message names if the file cannot be written.
+        refusal: Begins the message if another process has locked it.
+        what: What that process uses.
+    """
     if fcntl is None:
         return None
     while True:
@@ -207,7 +213,7 @@ def _lock(path: Path, refusal: str, what: str) -> TextIO | None:
         path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):  # closing it writes what is left
             file.close()
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+        raise InputError(f"{named}: cannot be written ({error.strerror})") from None
     return file
 
 
