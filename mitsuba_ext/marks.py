@@ -172,8 +172,8 @@ def written_alone(path: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        mark.unlink(missing_ok=True)
         if file is not None:
-            mark.unlink(missing_ok=True)
             file.close()
 
 

@@ -123,7 +123,8 @@ class Comparison:
                 f"or until(0.01) of mitsuba_ext.compare, found {budget!r}"
             )
         make_all(integrators)  # to report an unknown name before a reference is rendered
-        if reference_integrator and not all(setup.reference for setup in self.scenes):
+        is_needed = not all(setup.reference for setup in self.scenes)
+        if reference_integrator is not None and is_needed:
             make_named(reference_integrator)
         self.integrators = integrators
         self.budget = budget

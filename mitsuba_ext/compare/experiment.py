@@ -282,8 +282,8 @@ class Experiment:
         counts = () if self.budget.is_time else self._counts()
         # One sample per pixel, powers of two and other counts have different kernels (Mitsuba
         # divides the index of a sample by the count): compile each kind that occurs.
-        spp = 0
-        for spp in sorted({1 if n == 1 else 2 if n & (n - 1) == 0 else 3 for n in counts}):
+        kinds = sorted({1 if n == 1 else 2 if n & (n - 1) == 0 else 3 for n in counts})
+        for spp in kinds:
             self._timed(contender, 0, spp, seed=0)
         level = self.budget.values[0]
         contender._plans = self.budget.is_time and timing.plans_for_time(
@@ -293,7 +293,7 @@ class Experiment:
             spp = timing.samples_for(level, integrator, self.scene.scene, run_seed(0, 0))
             contender._pace = level / spp
         else:
-            timed = self._timed(contender, level, spp, seed=0)
+            timed = self._timed(contender, level, kinds[-1] if kinds else 0, seed=0)
             contender._pace = timed.seconds / timed.spp
         if timing.own_statistics(integrator) is None:
             contender._zero_radiance = zero_radiance_share(integrator, self.scene.scene, seed=0)

@@ -179,11 +179,11 @@ def load_scene(
             file_hashes = hash_each(files)
             named = {**strings, **changes.described()}
             content_hash = hash_files(file_hashes, named, source if is_dict else None)
+            if changes.max_depth is not None:
+                _set_max_depth(state, changes.max_depth, keep_integrator)
             integrator = _integrator_node(state)
             # Before transform_all(): afterwards, a node may be freed memory
             integrator_name = integrator.props.plugin_name() if integrator else ""
-            if changes.max_depth is not None:
-                _set_max_depth(state, changes.max_depth, keep_integrator)
             settings, only_says_path = _settings(integrator), _only_says_path(state)
             if changes.max_depth is not None:
                 settings[SETTINGS[0]] = changes.max_depth
