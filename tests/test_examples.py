@@ -23,7 +23,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 
 def test_quickstart_runs_in_any_folder(tmp_path, monkeypatch, capsys):
     """All but the render."""
-    monkeypatch.setattr(mi, "render", lambda scene, seed: np.ones((2, 4, 3), np.float32))
+    monkeypatch.setattr(mi, "render", lambda scene, **_: np.ones((2, 4, 3), np.float32))
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(EXAMPLES / "quickstart.py"), run_name="__main__")
     assert (tmp_path / "door_ajar.exr").is_file()

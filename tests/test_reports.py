@@ -122,7 +122,7 @@ def test_threads_are_those_of_all_processes(run, make_scene, tmp_path):
     finally:
         dr.set_thread_count(before)
     code, _, err = run("render", make_scene(), "-o", tmp_path / "a.exr", "--threads", 1)
-    assert code == 2 and "1 is not in the range x>=2" in err
+    assert code == 2 and "1 is not in the range 2<=x<=" in err
     job = long_job.LongJob(
         long_job.RenderRequest(str(make_scene()), threads=5), long_job.LongOptions(workers=2))
     assert job._request.threads == 5
