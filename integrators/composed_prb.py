@@ -12,6 +12,7 @@ from mitsuba.ad.integrators import common
 from mitsuba_ext.composition.remembering_path import RememberingPath
 from mitsuba_ext.composition.sensitive_path import SensitivePath
 from mitsuba_ext.rendering.camera import film_extent, find_sensor
+from mitsuba_ext.rendering.turns import in_turn
 from mitsuba_ext.scene.gradients import refuse_geometry
 from mitsuba_ext.startup import registry
 from mitsuba_ext.transport.estimator import CameraRays
@@ -141,20 +142,24 @@ class ComposedPRB(common.RBIntegrator):
         self._sensitive.forget()
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        with dr.suspend_grad():
+        sensor = find_sensor(scene, sensor)
+        with in_turn(self, sensor), dr.suspend_grad():
             return self.path.render(scene, sensor, seed, spp, develop, evaluate)
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
-        self._learn_for(scene, params, sensor, seed, spp)
-        return super().render_forward(scene, params, sensor, seed, spp)
+        sensor = find_sensor(scene, sensor)
+        with in_turn(self, sensor):
+            self._learn_for(scene, params, sensor, seed, spp)
+            return super().render_forward(scene, params, sensor, seed, spp)
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
-        self._learn_for(scene, params, sensor, seed, spp)
-        super().render_backward(scene, params, grad_in, sensor, seed, spp)
+        sensor = find_sensor(scene, sensor)
+        with in_turn(self, sensor):
+            self._learn_for(scene, params, sensor, seed, spp)
+            super().render_backward(scene, params, grad_in, sensor, seed, spp)
 
     def _learn_for(self, scene, params, sensor, seed, spp) -> None:
         refuse_geometry(self.name, params)
-        sensor = find_sensor(scene, sensor)
         learned = self._sensitive.prepare(scene, params, sensor, seed, spp)
         self._for_gradients = self._sensitive if learned else self.path
 

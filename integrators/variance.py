@@ -15,6 +15,7 @@ from mitsuba_ext.rendering.batches import Batches, batch_seeds, each_batch, samp
 from mitsuba_ext.rendering.camera import develop as develop_film
 from mitsuba_ext.rendering.camera import find_sensor
 from mitsuba_ext.rendering.statistics import RenderStatistics
+from mitsuba_ext.rendering.turns import in_turn
 from mitsuba_ext.scene.nesting import refuse_checkpoint
 from mitsuba_ext.startup import registry
 
@@ -151,10 +152,14 @@ class Variance(mi.AdjointIntegrator):
     # ---- What Mitsuba calls ----
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        sensor = find_sensor(scene, sensor)
+        with in_turn(self, sensor):
+            return self._render(scene, sensor, seed, spp, develop, evaluate)
+
+    def _render(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
         start = time.perf_counter()
         self.is_cancelled = False
         self.statistics = RenderStatistics()
-        sensor = find_sensor(scene, sensor)
         film = sensor.film()
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
             raise NotImplementedError(

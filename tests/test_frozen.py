@@ -86,7 +86,7 @@ def test_sensors_with_hidden_arrays(monkeypatch, camera: dict, known: bool, rend
     assert counts == renders
     _assert_same(*images)
     _assert_same(images[0], _traced(scene, mi.load_dict({"type": "composed_path", "max_depth": 3})))
-    recorded = [key[0].__qualname__ for k in frozen._scenes.values() for key in k.recordings]
+    recorded = [key[0].__qualname__ for k in frozen._process.scenes.values() for key in k.recordings]
     assert recorded == (["_estimated"] if known else [])
 
 
@@ -120,7 +120,7 @@ def test_a_trial_of_light_paths_is_recorded() -> None:
         return integrator.statistics.effects["light_paths"]
 
     found = [effect(_image, seed) for seed in (1, 2)]
-    recorded = {key[0].__qualname__ for kept in frozen._scenes.values() for key in kept.recordings}
+    recorded = {key[0].__qualname__ for kept in frozen._process.scenes.values() for key in kept.recordings}
     assert {"_walked", "LightImage._connect"} <= recorded
     expected = [effect(_traced, seed) for seed in (1, 2)]
     assert [e["light_paths"] for e in found] == [e["light_paths"] for e in expected]
@@ -149,7 +149,7 @@ def test_a_batch_of_sensors_is_not_recorded() -> None:
     scene = _scene(camera={"type": "batch", "film": film, **views})
     integrator = mi.load_dict({"type": "auto_path", "max_depth": 3, "pilot_spp": 8})
     _assert_same(_image(scene, integrator, spp=32), _traced(scene, integrator, spp=32))
-    assert not frozen._scenes
+    assert not frozen._process.scenes
 
 
 def test_parameters_without_a_value_are_no_error() -> None:
@@ -264,7 +264,7 @@ def test_scenes_that_share_their_sensor_are_two() -> None:
         # Its successor may get its address
         del scene
         gc.collect()
-    assert len(frozen._scenes) == 2
+    assert len(frozen._process.scenes) == 2
 
 
 def test_parameters_of_the_integrator_are_seen() -> None:
@@ -311,12 +311,12 @@ def test_plugins_in_python_are_traced_each_time() -> None:
     for scene in (other, _scene()):
         for seed in (1, 2):
             _assert_same(_image(scene, integrator, seed), _traced(scene, integrator, seed))
-    assert not frozen._scenes
+    assert not frozen._process.scenes
     scene = _scene()
     del other
     gc.collect()
     _image(scene, integrator)
-    assert len(frozen._scenes) == 1
+    assert len(frozen._process.scenes) == 1
 
 
 class _ReadingWalk(Walk):

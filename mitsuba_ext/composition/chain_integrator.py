@@ -18,7 +18,7 @@ from ..metropolis.chains.render import ChainRender
 from ..metropolis.chains.target import ImageTarget
 from ..parameters import MOST_SPP
 from ..rendering.batches import sample_count
-from ..rendering.camera import check_takes_splats, find_sensor
+from ..rendering.camera import check_takes_splats
 from ..rendering.camera import develop as develop_film
 from ..rendering.interrupts import deferred_interrupt
 from ..rendering.stages import OneStage
@@ -165,7 +165,6 @@ class ChainIntegrator(WalkIntegrator):
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate):
         start = time.perf_counter()
-        sensor = find_sensor(scene, sensor)
         try:
             check_takes_splats(sensor.film())
         except NotImplementedError as error:

@@ -11,6 +11,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..rendering.stages import OneStage
+from ..scene.mark import SceneMark
 from ..scene.media import refuse_media
 from ..scene.movers import movers
 from ..transport.heroes import disperses
@@ -25,6 +26,22 @@ _SLOTS = ("directions", "next_event", "roulette", "connections", "mis", "shadow_
 
 #: Decisions whose weights are not radiance / density.
 _NOT_DETACHED = {"next_event": ("resampled_lights", "two_stage_lights"), "directions": ("swarm",)}
+
+
+class _Remembered:
+    """What a render has learned. (Neither a tuple nor a dataclass: Dr.Jit does not look for arrays
+    in it, as it does in the attributes of a scene's own integrator.)
+
+    Attributes:
+        scene: The scene that was rendered.
+        decisions: The decisions of the last stage that differ from those of ``path``, by slot.
+        said: ``learned`` and ``effects`` of the statistics.
+    """
+
+    def __init__(
+        self, scene: SceneMark, decisions: dict[str, Any], said: tuple[str, dict[str, Any]]
+    ) -> None:
+        self.scene, self.decisions, self.said = scene, decisions, said
 
 
 class RememberingPath(WalkIntegrator):
@@ -46,10 +63,8 @@ class RememberingPath(WalkIntegrator):
         self.learn_every = 0
         if self.can_learn:
             self.learn_every = self.parameter(props, "learn_every", 16, minimum=0)
-        self._scene: mi.Scene | None = None
-        self._decisions: dict[str, Any] | None = None
+        self._remembered: _Remembered | None = None
         self._schedule: Schedule | None = None
-        self._learned: tuple[str, dict[str, Any]] = "", {}
         self._renders = 0
 
     def parameters(self) -> dict[str, Any]:
@@ -64,20 +79,20 @@ class RememberingPath(WalkIntegrator):
 
     def forget(self) -> None:
         """Learns in the next render, whatever ``learn_every`` is."""
-        self._scene = self._decisions = None
+        self._remembered = None
 
     def remembered(self, scene: mi.Scene) -> Walk:
         """The walk of the last stage of the last render of ``scene``. If there was none, decisions
         that learn fall back to their defaults."""
         if self._knows(scene):
-            return self.walk(**self._decisions)
+            return self.walk(**self._remembered.decisions)
         setting = Setting(scene, scene.sensors()[0], 0, self.max_depth, self.rr_depth, 1)
         decisions = {slot: p.decision(setting) for slot, p in self.slots.items()}
         return self.walk(query=self.query(scene), **{s: d for s, d in decisions.items() if d})
 
     def _knows(self, scene: mi.Scene) -> bool:
         # Decisions that do not learn are made again: what they depend on may have changed
-        return self.can_learn and self._scene is scene and self._decisions is not None
+        return self.can_learn and bool(self._remembered) and self._remembered.scene.is_of(scene)
 
     @property
     def is_due(self) -> bool:
@@ -99,7 +114,7 @@ class RememberingPath(WalkIntegrator):
     def schedule(self, scene, sensor, samples, seed):
         self._renders += 1
         if self._knows(scene):
-            return OneStage(self.walk(**self._decisions))
+            return OneStage(self.walk(**self._remembered.decisions))
         self._schedule, self._renders = super().schedule(scene, sensor, samples, seed), 1
         return self._schedule
 
@@ -107,10 +122,11 @@ class RememberingPath(WalkIntegrator):
         self._schedule = None
         image = super().render_once(scene, sensor, seed, spp, develop, evaluate)
         if self._schedule is not None and not self.statistics.interrupted:
-            self._scene, self._decisions = scene, dict(self._schedule.decisions)
-            self._learned = self.statistics.learned, self.statistics.effects
+            said = self.statistics.learned, self.statistics.effects
+            decisions = dict(self._schedule.decisions)
+            self._remembered = _Remembered(SceneMark(scene), decisions, said)
         elif self._knows(scene):
-            self.statistics.learned, self.statistics.effects = self._learned
+            self.statistics.learned, self.statistics.effects = self._remembered.said
         self._schedule = None
         return image
 

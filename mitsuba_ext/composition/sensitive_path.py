@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..scene.gradients import Optimized
+from ..scene.mark import SceneMark
 from ..transport.estimator import Estimator
 from ..transport.path_decisions import Weights
 from ..transport.sensitivity import Sensitivity
@@ -29,7 +30,7 @@ class SensitivePath(RememberingPath):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.save_learned = ""
-        self._requested: tuple[mi.Scene, frozenset[str]] | None = None
+        self._requested: tuple[SceneMark, frozenset[str]] | None = None
         self._optimized: Optimized | None = None
 
     def prepare(
@@ -43,16 +44,22 @@ class SensitivePath(RememberingPath):
         if not self.can_learn or self.load_learned:
             return False
         items = params.items() if hasattr(params, "items") else ()
-        requested = scene, frozenset(str(key) for key, x in items if dr.grad_enabled(x))
-        is_known = self._requested == requested and not self.is_due
+        keys = frozenset(str(key) for key, x in items if dr.grad_enabled(x))
+        is_known = self._has_requested(scene, keys) and not self.is_due
         self._renders += 1
         if not is_known:
             self.forget()
-            self._requested, self._optimized = requested, Optimized(scene)
+            self._requested, self._optimized = (SceneMark(scene), keys), Optimized(scene)
             if self._optimized.lights_differ:
                 self._learn(scene, sensor, seed, spp)
             self._renders = 1
         return self._knows(scene)
+
+    def _has_requested(self, scene: mi.Scene, keys: frozenset[str]) -> bool:
+        if self._requested is None:
+            return False
+        mark, known = self._requested
+        return known == keys and mark.is_of(scene)
 
     def _learn(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> None:
         spp = spp or sensor.sampler().sample_count()

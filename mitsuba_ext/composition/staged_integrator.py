@@ -21,6 +21,7 @@ from ..rendering import camera
 from ..rendering import render as rendering
 from ..rendering.stages import Schedule, Stage
 from ..rendering.statistics import RenderStatistics
+from ..rendering.turns import in_turn
 
 #: Stands for "no limit" in counts.
 NO_LIMIT = 0xFFFFFFFF
@@ -148,13 +149,15 @@ class StagedIntegrator(mi.SamplingIntegrator):
     # ---- What Mitsuba calls ----
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        sensor = camera.find_sensor(scene, sensor)
         spp = spp or self.default_spp
-        if self._is_batch:
+        with in_turn(self, sensor):
+            if self._is_batch:
+                return self.render_once(scene, sensor, seed, spp, develop, evaluate)
+            self.is_cancelled = False
+            if self.checkpoint:
+                return self._render_kept(scene, sensor, seed, spp, develop, evaluate)
             return self.render_once(scene, sensor, seed, spp, develop, evaluate)
-        self.is_cancelled = False
-        if self.checkpoint:
-            return self._render_kept(scene, sensor, seed, spp, develop, evaluate)
-        return self.render_once(scene, sensor, seed, spp, develop, evaluate)
 
     def render_once(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
         """Renders the whole image, or one batch of a checkpointed render."""
@@ -194,7 +197,6 @@ class StagedIntegrator(mi.SamplingIntegrator):
         from ..long_renders.kept_render import KeptRender
 
         begin = time.perf_counter()
-        sensor = camera.find_sensor(scene, sensor)
         seed = int(seed[0]) if isinstance(seed, mi.UInt32) else operator.index(seed)
         shown = {**self.common_parameters(), **self.parameters()}
         shown = {key: value for key, value in shown.items() if key not in _NOT_OF_THE_IMAGE}

@@ -17,6 +17,13 @@ traced in each pass, and what follows is recorded.) The log says why (level ``De
 cannot record a function, the render begins anew, nothing more is recorded in that scene, and the
 log says so (level ``Info``).
 
+Nor is anything recorded or replayed while another thread renders, or while one exists that is no
+daemon, and so may use Dr.Jit: functions are traced then. While Dr.Jit 1.5.0 records or replays, it
+holds its own lock when it calls Python, and waits for a thread that waits for that lock; it keeps
+the state of a replay in static variables, with the lock released wherever memory is allocated; and
+it reads and replaces the arrays of all objects that kernels can call, those of other scenes
+included. Processes hung, ended, or returned other images.
+
 Rules for a frozen function:
 
 - It does not assign attributes of its arguments; it changes only the contents of their arrays.
@@ -36,6 +43,7 @@ Rules for a frozen function:
 from __future__ import annotations
 
 import functools
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -45,6 +53,7 @@ from typing import Any, TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from ..scene.mark import SceneMark
 from ..scene.parameter_values import values_of
 from ..startup import registry
 from ..startup.garbage import garbage_left_alone
@@ -66,8 +75,7 @@ class _SceneRecordings:
     """The recordings of one scene.
 
     Attributes:
-        mark: An array of the scene, whose index identifies the scene: while the array is held, no
-            other one has its index. Scenes cannot be referenced weakly, and must not be kept alive.
+        mark: Identifies the scene.
         held: Objects outside of the scene that descriptions name by their address.
         recordings: The recordings, by description.
         refused: Functions that are not frozen.
@@ -75,7 +83,7 @@ class _SceneRecordings:
             render has taken many samples already.
     """
 
-    mark: Any
+    mark: SceneMark
     held: dict[int, Any] = field(default_factory=dict)
     recordings: OrderedDict[Any, _Recording] = field(default_factory=OrderedDict)
     refused: set[Any] = field(default_factory=set)
@@ -99,9 +107,35 @@ class _Current:
     own: frozenset[int]
 
 
-_scenes: OrderedDict[int, _SceneRecordings] = OrderedDict()
-_current: _Current | None = None
-_is_forbidden = False
+class _Thread(threading.local):
+    """What a thread renders.
+
+    Attributes:
+        renders: How many renders, each within the one before.
+        current: The innermost one.
+        is_forbidden: Is nothing recorded in it?
+    """
+
+    renders = 0
+    current: _Current | None = None
+    is_forbidden = False
+
+
+class _Process:
+    """What the threads share.
+
+    Attributes:
+        lock: Held while a function is recorded or replayed, and while something here is changed.
+        threads: How many threads render.
+        scenes: The recordings of each scene.
+    """
+
+    def __init__(self) -> None:
+        self.lock, self.threads = threading.RLock(), 0
+        self.scenes: OrderedDict[int, _SceneRecordings] = OrderedDict()
+
+
+_thread, _process = _Thread(), _Process()
 
 T = TypeVar("T")
 
@@ -109,29 +143,45 @@ T = TypeVar("T")
 def with_recordings(scene: mi.Scene, sensor: mi.Sensor, act: Callable[[], T]) -> T:
     """Calls ``act``, which renders ``scene``: frozen functions use what was recorded in earlier
     renders of it. If Dr.Jit cannot record one of them, ``act`` begins anew, without recordings."""
-    try:
-        with _state(_begun(scene, sensor) if _can_freeze() else None, _is_forbidden):
+    with _counted():
+        try:
+            current = _begun(scene, sensor) if _can_freeze() else None
+            with _state(current, _thread.is_forbidden):
+                return act()
+        except NotRecordableError as reason:
+            mi.Log(mi.LogLevel.Info, f"the render begins anew, without recordings: {reason}")
+        with _state(None, True):
             return act()
-    except NotRecordableError as reason:
-        mi.Log(mi.LogLevel.Info, f"the render begins anew, without recordings: {reason}")
-    with _state(None, True):
-        return act()
+
+
+@contextmanager
+def _counted() -> Iterator[None]:
+    """Tells the other threads that this one renders."""
+    with _process.lock:  # not before a frozen function of another one has ended
+        _process.threads += _thread.renders == 0
+        _thread.renders += 1
+    try:
+        yield
+    finally:
+        with _process.lock:
+            _thread.renders -= 1
+            _process.threads -= _thread.renders == 0
 
 
 @contextmanager
 def _state(current: _Current | None, is_forbidden: bool) -> Iterator[None]:
-    global _current, _is_forbidden
-    before = _current, _is_forbidden
-    _current, _is_forbidden = current, is_forbidden
+    before = _thread.current, _thread.is_forbidden
+    _thread.current, _thread.is_forbidden = current, is_forbidden
     try:
         yield
     finally:
-        _current, _is_forbidden = before
+        _thread.current, _thread.is_forbidden = before
 
 
 def forget_recordings() -> None:
     """Deletes all recordings."""
-    _scenes.clear()
+    with _process.lock:
+        _process.scenes.clear()
 
 
 def frozen(function: Callable | None = None, *, any_width: bool = False) -> Callable:
@@ -145,17 +195,26 @@ def frozen(function: Callable | None = None, *, any_width: bool = False) -> Call
 
     @functools.wraps(function)
     def call(*args: Any) -> Any:
-        if _current is None or dr.flag(dr.JitFlag.FreezingScope):
+        if _thread.current is None or dr.flag(dr.JitFlag.FreezingScope):
             return function(*args)
-        return _call(_current, function, args, any_width)
+        with _process.lock:
+            if _is_alone() and not registry.is_any_called():
+                return _call(_thread.current, function, args, any_width)
+        return function(*args)
 
     return call
+
+
+def _is_alone() -> bool:
+    """Does no other thread use Dr.Jit? Threads that are no daemons may: users start them."""
+    others = set(threading.enumerate()) - {threading.current_thread()}
+    return _process.threads == 1 and all(thread.daemon for thread in others)
 
 
 def _can_freeze() -> bool:
     wanted = dr.is_jit_v(mi.Float) and not mi.is_spectral and dr.flag(dr.JitFlag.KernelFreezing)
     # A user may freeze a render as a whole
-    return wanted and not _is_forbidden and not dr.flag(dr.JitFlag.FreezingScope)
+    return wanted and not _thread.is_forbidden and not dr.flag(dr.JitFlag.FreezingScope)
 
 
 def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
@@ -172,13 +231,10 @@ def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
         # Dr.Jit 1.5.0 ends the process: "jit_var(r0): unknown variable"
         mi.Log(mi.LogLevel.Debug, "nothing is recorded: there are textures of a GPU")
         return None
-    mark = next((m for m in (scene.shapes_dr(), scene.emitters_dr()) if dr.width(m) > 0), None)
-    if mark is None or mark.state != dr.VarState.Evaluated:
+    mark = SceneMark(scene)
+    if mark.array is None or mark.array.state != dr.VarState.Evaluated:
         return None
-    kept = _scenes.setdefault(mark.index, _SceneRecordings(mark))
-    _scenes.move_to_end(mark.index)
-    while len(_scenes) > _MOST_SCENES:
-        _scenes.popitem(last=False)
+    kept = _kept(mark)
     if kept.cannot_be_recorded:
         return None
     sensors = scene.sensors()
@@ -189,6 +245,17 @@ def _begun(scene: mi.Scene, sensor: mi.Sensor) -> _Current | None:
     if address(sensor) not in own:
         kept.held[address(sensor)] = sensor
     return _Current(kept, scene, values, own)
+
+
+def _kept(mark: SceneMark) -> _SceneRecordings:
+    """The recordings of a scene; makes room for them."""
+    scenes = _process.scenes
+    with _process.lock:
+        kept = scenes.setdefault(mark.index, _SceneRecordings(mark))
+        scenes.move_to_end(mark.index)
+        while len(scenes) > _MOST_SCENES:
+            scenes.popitem(last=False)
+        return kept
 
 
 def _is_foreign(thing: mi.Object) -> bool:

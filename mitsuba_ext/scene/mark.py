@@ -1,0 +1,26 @@
+"""Recognizes a scene later on, without keeping it alive."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+
+class SceneMark:
+    """Holds an array of a scene: while it is held, no other array has its index.
+
+    Scenes cannot be referenced weakly. An integrator must not hold one: where it is the scene's
+    own, the two would keep each other alive, and Dr.Jit, which looks for arrays in the attributes
+    of both, would never end. (It does not look into objects of classes such as this one.)
+
+    Attributes:
+        index: Identifies the scene; 0 if it has neither shapes nor lights.
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        arrays = scene.shapes_dr(), scene.emitters_dr()
+        self.array = next((array for array in arrays if len(array) > 0), None)
+        self.index = 0 if self.array is None else self.array.index
+
+    def is_of(self, scene: mi.Scene) -> bool:
+        """Is it the mark of this scene?"""
+        return self.index > 0 and self.index == SceneMark(scene).index
