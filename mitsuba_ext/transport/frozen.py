@@ -17,8 +17,8 @@ traced in each pass, and what follows is recorded.) The log says why (level ``De
 cannot record a function, the render begins anew, nothing more is recorded in that scene, and the
 log says so (level ``Info``).
 
-Nor is anything recorded or replayed while another thread renders, or while one exists that is no
-daemon, and so may use Dr.Jit: functions are traced then. While Dr.Jit 1.5.0 records or replays, it
+Nor is anything recorded or replayed while another thread renders, or while one exists that may use
+Dr.Jit (it is neither a daemon nor a timer): functions are traced then. While Dr.Jit 1.5.0 records or replays, it
 holds its own lock when it calls Python, and waits for a thread that waits for that lock; it keeps
 the state of a replay in static variables, with the lock released wherever memory is allocated; and
 it reads and replaces the arrays of all objects that kernels can call, those of other scenes
@@ -46,7 +46,7 @@ import functools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, is_dataclass
 from typing import Any, TypeVar
 
@@ -143,7 +143,7 @@ T = TypeVar("T")
 def with_recordings(scene: mi.Scene, sensor: mi.Sensor, act: Callable[[], T]) -> T:
     """Calls ``act``, which renders ``scene``: frozen functions use what was recorded in earlier
     renders of it. If Dr.Jit cannot record one of them, ``act`` begins anew, without recordings."""
-    with _counted():
+    with _counted(), _nothing_left_waiting():
         try:
             current = _begun(scene, sensor) if _can_freeze() else None
             with _state(current, _thread.is_forbidden):
@@ -178,6 +178,19 @@ def _state(current: _Current | None, is_forbidden: bool) -> Iterator[None]:
         _thread.current, _thread.is_forbidden = before
 
 
+@contextmanager
+def _nothing_left_waiting() -> Iterator[None]:
+    """After an exception, evaluates what the interrupted pass has traced. What it scatters would
+    otherwise be computed with the next kernels of the thread, when the scene may be gone."""
+    try:
+        yield
+    except BaseException:
+        if not dr.flag(dr.JitFlag.FreezingScope):
+            with suppress(RuntimeError):
+                dr.eval()
+        raise
+
+
 def forget_recordings() -> None:
     """Deletes all recordings."""
     with _process.lock:
@@ -206,9 +219,11 @@ def frozen(function: Callable | None = None, *, any_width: bool = False) -> Call
 
 
 def _is_alone() -> bool:
-    """Does no other thread use Dr.Jit? Threads that are no daemons may: users start them."""
+    """Does no other thread use Dr.Jit? Threads of users may, which are no daemons."""
+    if _process.threads > 1:
+        return False
     others = set(threading.enumerate()) - {threading.current_thread()}
-    return _process.threads == 1 and all(thread.daemon for thread in others)
+    return all(thread.daemon or isinstance(thread, threading.Timer) for thread in others)
 
 
 def _can_freeze() -> bool:
