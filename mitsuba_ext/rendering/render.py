@@ -33,6 +33,7 @@ from .plan import Planned, plan_render
 from .stages import DivisibleSchedule, EndingSchedule, Schedule, Stage
 from .statistics import RenderStatistics
 from .time_budget import TimeBudget
+from .turns import let_others
 
 
 class Staged(Planned, Protocol):
@@ -270,6 +271,8 @@ class Job:
         self.statistics.spp += 1
 
     def _stopped(self, interrupt: threading.Event) -> bool:
+        """Is it time to stop? Asked between passes, where other threads get their turn."""
+        let_others()
         return interrupt.is_set() or self.integrator.is_cancelled
 
     def _run_scout(self, stage: Stage) -> None:

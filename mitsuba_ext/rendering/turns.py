@@ -1,12 +1,17 @@
-"""Renders of several threads that share an integrator or a film take turns.
+"""Renders of several threads take turns.
 
-A render keeps what it learns, and its statistics, in the integrator, and puts its image into the
-film of the sensor.
+Dr.Jit 1.5.0 has faults where two threads trace and evaluate at once (rarely, an image lacks a
+part), and uses all processors for each kernel. So one thread renders at a time, and lets others
+render a pass between two of its own (:func:`let_others`).
+
+Besides, a render keeps what it learns, and its statistics, in the integrator, and puts its image
+into the film of the sensor: renders that share one of these follow each other.
 """
 
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
@@ -15,8 +20,67 @@ import mitsuba as mi
 from ..scene.nesting import with_nested
 
 
-class _Turn:
-    """Whose turn it is to use an object.
+class _Turns:
+    """Whose turn it is. Threads wait in the order in which they came."""
+
+    def __init__(self) -> None:
+        self._lock, self._is_taken = threading.Lock(), False
+        self._waiting: deque[threading.Lock] = deque()
+
+    def take(self) -> None:
+        """Waits for a turn."""
+        with self._lock:
+            if not self._is_taken:
+                self._is_taken = True
+                return
+            handed_over = threading.Lock()
+            handed_over.acquire()
+            self._waiting.append(handed_over)
+        try:
+            handed_over.acquire()
+        except BaseException:  # Ctrl-C
+            with self._lock:
+                if handed_over in self._waiting:
+                    self._waiting.remove(handed_over)
+                else:
+                    self._hand_over()
+            raise
+
+    def give(self) -> None:
+        """Ends a turn."""
+        with self._lock:
+            self._hand_over()
+
+    def pause(self) -> None:
+        """Gives, and takes again, if others wait. An exception meanwhile is raised in turn."""
+        if not self._waiting:
+            return
+        self.give()
+        error = None
+        while True:
+            try:
+                self.take()
+                break
+            except BaseException as caught:
+                error = caught
+        if error is not None:
+            raise error
+
+    def _hand_over(self) -> None:
+        if self._waiting:
+            self._waiting.popleft().release()
+        else:
+            self._is_taken = False
+
+
+class _Thread(threading.local):
+    """The renders of a thread, each within the one before."""
+
+    depth = 0
+
+
+class _Shared:
+    """An object that renders share.
 
     Attributes:
         lock: Held by the thread that uses it.
@@ -27,31 +91,46 @@ class _Turn:
         self.lock, self.count = threading.RLock(), 0
 
 
+_turns, _thread = _Turns(), _Thread()
 _lock = threading.Lock()
-_turns: dict[int, _Turn] = {}
+_shared: dict[int, _Shared] = {}
 
 
 @contextmanager
 def in_turn(integrator: mi.Integrator, sensor: mi.Sensor) -> Iterator[None]:
-    """A context in which no other thread renders with the integrator, with one that is nested in
-    it, or into the film of the sensor. It begins as soon as others have ended."""
+    """A context in which no other thread renders, except in :func:`let_others`; and there, none
+    with the integrator, with one that is nested in it, or into the film of the sensor."""
     with ExitStack() as stack:
-        # All threads in the same order: none waits for one that waits for it
+        # All threads in the same order, and before their turn: none waits for one that waits for it
         for place in sorted({each.ptr for each in (*with_nested(integrator), sensor.film())}):
-            stack.enter_context(_in_turn(place))
-        yield
+            stack.enter_context(_used(place))
+        if _thread.depth == 0:
+            _turns.take()
+        _thread.depth += 1
+        try:
+            yield
+        finally:
+            _thread.depth -= 1
+            if _thread.depth == 0:
+                _turns.give()
+
+
+def let_others() -> None:
+    """Lets other threads render a pass, if they wait for it."""
+    if _thread.depth > 0:
+        _turns.pause()
 
 
 @contextmanager
-def _in_turn(place: int) -> Iterator[None]:
+def _used(place: int) -> Iterator[None]:
     with _lock:
-        turn = _turns.setdefault(place, _Turn())
-        turn.count += 1
+        shared = _shared.setdefault(place, _Shared())
+        shared.count += 1
     try:
-        with turn.lock:
+        with shared.lock:
             yield
     finally:
         with _lock:
-            turn.count -= 1
-            if turn.count == 0:
-                del _turns[place]
+            shared.count -= 1
+            if shared.count == 0:
+                del _shared[place]

@@ -17,8 +17,8 @@ traced in each pass, and what follows is recorded.) The log says why (level ``De
 cannot record a function, the render begins anew, nothing more is recorded in that scene, and the
 log says so (level ``Info``).
 
-Nor is anything recorded or replayed while another thread renders, or while one exists that may use
-Dr.Jit (it is neither a daemon nor a timer): functions are traced then. While Dr.Jit 1.5.0 records or replays, it
+Nor is anything recorded or replayed while another thread lives that may use Dr.Jit: one that has
+rendered, or that is neither a daemon nor a timer. Functions are traced then. While Dr.Jit 1.5.0 records or replays, it
 holds its own lock when it calls Python, and waits for a thread that waits for that lock; it keeps
 the state of a replay in static variables, with the lock released wherever memory is allocated; and
 it reads and replaces the arrays of all objects that kernels can call, those of other scenes
@@ -44,6 +44,7 @@ from __future__ import annotations
 
 import functools
 import threading
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -111,12 +112,10 @@ class _Thread(threading.local):
     """What a thread renders.
 
     Attributes:
-        renders: How many renders, each within the one before.
-        current: The innermost one.
+        current: The render that is running.
         is_forbidden: Is nothing recorded in it?
     """
 
-    renders = 0
     current: _Current | None = None
     is_forbidden = False
 
@@ -125,13 +124,14 @@ class _Process:
     """What the threads share.
 
     Attributes:
-        lock: Held while a function is recorded or replayed, and while something here is changed.
-        threads: How many threads render.
+        lock: Held while recordings are used.
+        threads: Those that have rendered.
         scenes: The recordings of each scene.
     """
 
     def __init__(self) -> None:
-        self.lock, self.threads = threading.RLock(), 0
+        self.lock = threading.RLock()
+        self.threads: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
         self.scenes: OrderedDict[int, _SceneRecordings] = OrderedDict()
 
 
@@ -143,7 +143,9 @@ T = TypeVar("T")
 def with_recordings(scene: mi.Scene, sensor: mi.Sensor, act: Callable[[], T]) -> T:
     """Calls ``act``, which renders ``scene``: frozen functions use what was recorded in earlier
     renders of it. If Dr.Jit cannot record one of them, ``act`` begins anew, without recordings."""
-    with _counted(), _nothing_left_waiting():
+    with _process.lock:
+        _process.threads.add(threading.current_thread())
+    with _nothing_left_waiting():
         try:
             current = _begun(scene, sensor) if _can_freeze() else None
             with _state(current, _thread.is_forbidden):
@@ -152,20 +154,6 @@ def with_recordings(scene: mi.Scene, sensor: mi.Sensor, act: Callable[[], T]) ->
             mi.Log(mi.LogLevel.Info, f"the render begins anew, without recordings: {reason}")
         with _state(None, True):
             return act()
-
-
-@contextmanager
-def _counted() -> Iterator[None]:
-    """Tells the other threads that this one renders."""
-    with _process.lock:  # not before a frozen function of another one has ended
-        _process.threads += _thread.renders == 0
-        _thread.renders += 1
-    try:
-        yield
-    finally:
-        with _process.lock:
-            _thread.renders -= 1
-            _process.threads -= _thread.renders == 0
 
 
 @contextmanager
@@ -219,10 +207,11 @@ def frozen(function: Callable | None = None, *, any_width: bool = False) -> Call
 
 
 def _is_alone() -> bool:
-    """Does no other thread use Dr.Jit? Threads of users may, which are no daemons."""
-    if _process.threads > 1:
-        return False
+    """Does no other thread use Dr.Jit? Those that have rendered may, and those of users, which are
+    no daemons."""
     others = set(threading.enumerate()) - {threading.current_thread()}
+    if not _process.threads.isdisjoint(others):
+        return False
     return all(thread.daemon or isinstance(thread, threading.Timer) for thread in others)
 
 

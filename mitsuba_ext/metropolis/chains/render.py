@@ -14,6 +14,7 @@ from ...rendering.camera import film_extent
 from ...rendering.render import kernel_cache_misses
 from ...rendering.statistics import RenderStatistics
 from ...rendering.time_budget import TimeBudget
+from ...rendering.turns import let_others
 from .chains import Chains, Counts
 from .looped import LoopedChains
 from .path_chains import PathChains
@@ -92,6 +93,7 @@ class ChainRender:
         integrator, done = self._integrator, 0
         budget = TimeBudget(integrator.timeout, self._start, width, 0).stage(count, 0, True)
         while done < budget.samples:
+            let_others()
             if interrupt.is_set() or integrator.is_cancelled:
                 return False
             begin, misses = time.perf_counter(), kernel_cache_misses()
