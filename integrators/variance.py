@@ -251,7 +251,9 @@ class Variance(mi.AdjointIntegrator):
             total.spp += batch_spp
             return
         black = total.zero_radiance * total.spp + batch.zero_radiance * batch.spp
-        for key in ("passes", "spp", "compile_seconds", "learning_seconds", "connections"):
+        for key in (
+            "passes", "spp", "compile_seconds", "tracing_seconds", "learning_seconds", "connections"
+        ):  # fmt: skip
             setattr(total, key, getattr(total, key) + getattr(batch, key))
         total.rays = {key: total.rays[key] + batch.rays[key] for key in total.rays}
         total.zero_radiance = black / max(1, total.spp)

@@ -105,7 +105,7 @@ def batches_of_sixteen_samples(variant: str, monkeypatch: pytest.MonkeyPatch) ->
     from mitsuba_ext.rendering import seed_passes
 
     for table in (seed_passes._PASS_SAMPLES, integrator_batches._SAMPLES):
-        monkeypatch.setitem(table, dr.JitBackend.LLVM, 48 * 16)
+        monkeypatch.setitem(table, dr.backend_v(mi.Float), 48 * 16)
     monkeypatch.setattr(integrator_batches, "_LEARNING_SPP", 16)
 
 

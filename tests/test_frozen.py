@@ -47,6 +47,12 @@ def _traced(scene: mi.Scene, integrator: mi.Integrator, seed: int = 1, spp: int 
         return _image(scene, integrator, seed, spp)
 
 
+def _recorded() -> list[str]:
+    """The names of the functions that are recorded."""
+    kept = frozen._process.scenes.values()
+    return [key[0].__qualname__ for each in kept for key in each.recordings]
+
+
 def _assert_same(image: np.ndarray, other: np.ndarray) -> None:
     # Threads add in any order
     np.testing.assert_allclose(image, other, rtol=1e-3, atol=1e-4 * other.mean())
@@ -86,8 +92,7 @@ def test_sensors_with_hidden_arrays(monkeypatch, camera: dict, known: bool, rend
     assert counts == renders
     _assert_same(*images)
     _assert_same(images[0], _traced(scene, mi.load_dict({"type": "composed_path", "max_depth": 3})))
-    recorded = [key[0].__qualname__ for k in frozen._process.scenes.values() for key in k.recordings]
-    assert recorded == (["_estimated"] if known else [])
+    assert _recorded() == (["_estimated"] if known else [])
 
 
 @pytest.mark.parametrize("name", ["auto_path", "bdpt", "pssmlt"])
@@ -120,8 +125,7 @@ def test_a_trial_of_light_paths_is_recorded() -> None:
         return integrator.statistics.effects["light_paths"]
 
     found = [effect(_image, seed) for seed in (1, 2)]
-    recorded = {key[0].__qualname__ for kept in frozen._process.scenes.values() for key in kept.recordings}
-    assert {"_walked", "LightImage._connect"} <= recorded
+    assert {"_walked", "LightImage._connect"} <= set(_recorded())
     expected = [effect(_traced, seed) for seed in (1, 2)]
     assert [e["light_paths"] for e in found] == [e["light_paths"] for e in expected]
     for e, other in zip(found, expected):

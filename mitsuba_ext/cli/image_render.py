@@ -217,8 +217,9 @@ def render_image(
             if job.failure:
                 raise job.failure
             return stop.exit_code
-    is_slow = kernels_compiled() > compiled and not is_new  # else it was printed above
-    remark = " (compiled kernels: the next such render starts faster)" if is_slow else ""
+    count = 0 if is_new else kernels_compiled() - compiled  # else it was printed above
+    kernels = f"{count} kernel{'' if count == 1 else 's'}"
+    remark = f" (compiled {kernels}: the next such render starts faster)" if count else ""
     asked = None if long else order.seconds
     # Another number of samples would have taken longer than it should
     of = f" of {asked:g}" if asked and job.seconds < _USED * asked else ""

@@ -214,7 +214,8 @@ class StagedIntegrator(mi.SamplingIntegrator):
             len(state.done), state.spp, time.perf_counter() - begin, totals.compile_seconds,
             totals.learning_seconds, dict(totals.rays), totals.connections,
             self.statistics.zero_radiance, totals.learned, dict(totals.effects),
-            totals.memory_bytes, is_interrupted or self.is_cancelled,
+            totals.memory_bytes, is_interrupted or self.is_cancelled, totals.tracing_seconds,
+            dict(totals.kernels),
         )  # fmt: skip
         image = camera.develop(sensor.film(), develop, evaluate)
         if is_interrupted:

@@ -13,7 +13,7 @@ import numpy as np
 from ..arrays import channel_mean, from_numpy
 from . import camera
 from .pixel_moments import PixelMoments
-from .render import Job, kernel_cache_misses
+from .render import Job, kernel_cache_misses, kernels_compiled
 from .sample_allocation import SampleAllocation
 from .stages import Stage
 from .time_budget import TimeBudget
@@ -106,15 +106,15 @@ class AdaptiveJob(Job):
     def _run_sets(self, stage: Stage, sets: np.ndarray, weight: np.ndarray) -> bool:
         """Renders ``sets`` sets of each pixel into the block. Returns True if it compiled a
         kernel."""
-        begin, misses = time.perf_counter(), kernel_cache_misses()
+        begin, misses, before = time.perf_counter(), kernel_cache_misses(), kernels_compiled()
         pixels = np.repeat(np.arange(len(sets), dtype=np.uint32), sets)
         table = from_numpy(mi.Float, weight)
         for start in range(0, len(pixels), self._most_sets):
             self._run_part_of_sets(stage, pixels[start : start + self._most_sets], table)
         seconds, compiled = time.perf_counter() - begin, kernel_cache_misses() > misses
-        if compiled:
+        if kernels_compiled() > before:
             self.statistics.compile_seconds += seconds
-        elif len(pixels):
+        if not compiled and len(pixels):
             self._seconds_per_sample = seconds / (len(pixels) * self._set_size)
         self.statistics.spp = round(self.moments.count.sum() / self.plan.pixel_count)
         return compiled

@@ -23,7 +23,10 @@ def _rows(statistics: RenderStatistics) -> Iterator[tuple[str, str]]:
     end = ", interrupted" if statistics.interrupted else ""
     passes = f"{statistics.passes} pass{'' if statistics.passes == 1 else 'es'}"
     yield "samples per pixel", f"{statistics.spp:,} in {passes}{end}"
-    parts = {"learning": statistics.learning_seconds, "kernels": statistics.compile_seconds}
+    parts = {
+        "learning": statistics.learning_seconds, "compiling": statistics.compile_seconds,
+        "tracing": statistics.tracing_seconds,
+    }  # fmt: skip
     yield "seconds", f"{statistics.seconds:.2f}" + _in_brackets(
         f"{name} {seconds:.2f}" for name, seconds in parts.items() if seconds > 0
     )

@@ -35,10 +35,10 @@ def plan_for_timeout(job: Job) -> RenderPlan:
         return plan
     compiling, is_new = 0.0, True
     while is_new:
-        begin, before = time.perf_counter(), job.statistics.compile_seconds
+        begin, before = time.perf_counter(), _tracing(job)
         is_new = job._run_pass(stage, budget.short)
         # Long passes take no longer to trace than this one: their speed is that of the kernel
-        tracing = job.statistics.compile_seconds - before
+        tracing = _tracing(job) - before
         seconds = time.perf_counter() - begin - tracing
         compiling += tracing if is_new else 0.0
         if time.perf_counter() >= budget.end:
@@ -50,3 +50,8 @@ def plan_for_timeout(job: Job) -> RenderPlan:
     pilots = integrator.pilots(job.scene, job.sensor, fits - taken, kernels)
     budget.pilot_factor = 1.0
     return replace(plan, stages=(*pilots, fits - taken - sum(pilots)))
+
+
+def _tracing(job: Job) -> float:
+    """Seconds before kernels could run."""
+    return job.statistics.compile_seconds + job.statistics.tracing_seconds

@@ -121,6 +121,7 @@ class Job:
 
     def __init__(self, integrator, scene, sensor, seed, spp) -> None:
         self.start = time.perf_counter()
+        self._kernels = dr.detail.launch_stats()
         dr.detail.malloc_clear_statistics()
         self.integrator, self.scene, self.sensor, self.film = (
             integrator, scene, sensor, sensor.film(),
@@ -259,12 +260,13 @@ class Job:
         """Takes one sample of each pixel, in a stage for each part of them."""
         for pixels in parts:
             stage, begin = self._next_stage(schedule), time.perf_counter()
+            before = kernels_compiled()
             sampler = self.sampler.clone()
             self._seed(sampler, self.statistics.passes, 1, pixels)
             pixel = from_numpy(mi.UInt32, pixels)
             lanes = camera.lanes_at(self.film, pixel, dr.opaque(mi.UInt32, 0))
             self._take(stage, sampler, lanes)
-            self.statistics.compile_seconds += time.perf_counter() - begin
+            self._add_tracing(begin, before)
             dr.sync_thread()
             self.statistics.passes += 1
             self.statistics.rays["camera"] += len(pixels)
@@ -276,10 +278,10 @@ class Job:
         return interrupt.is_set() or self.integrator.is_cancelled
 
     def _run_scout(self, stage: Stage) -> None:
-        begin = time.perf_counter()
+        begin, before = time.perf_counter(), kernels_compiled()
         for pixels in self.parts if stage.pixels is None else [stage.pixels]:
             self._scout(stage, pixels)
-        self.statistics.compile_seconds += time.perf_counter() - begin
+        self._add_tracing(begin, before)
         dr.sync_thread()
 
     def _scout(self, stage: Stage, pixels: range | np.ndarray | None) -> None:
@@ -314,16 +316,20 @@ class Job:
         """Renders ``spp`` samples per pixel into the block. Returns True if it compiled a
         kernel."""
         begin = time.perf_counter()
-        misses = kernel_cache_misses()
+        misses, before = kernel_cache_misses(), kernels_compiled()
         for part in range(len(self.parts)):
             self._run_part(stage, spp, part)
-        self.statistics.compile_seconds += time.perf_counter() - begin
+        self._add_tracing(begin, before)
         dr.sync_thread()
 
         self.statistics.passes += 1
         self.statistics.spp += spp
         self.statistics.rays["camera"] += self._lanes(spp)
         return kernel_cache_misses() > misses
+
+    def _add_tracing(self, begin: float, compiled: int) -> None:
+        seconds = time.perf_counter() - begin
+        self.statistics.add_tracing(seconds, kernels_compiled() > compiled)
 
     def _run_part(self, stage: Stage, spp: int, part: int) -> None:
         sampler, pixels = self._part_sampler(spp, part), self.parts[part]
@@ -408,6 +414,8 @@ class Job:
         statistics.zero_radiance = black / max(1, statistics.rays["camera"])
         statistics.memory = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
         statistics.seconds = time.perf_counter() - self.start
+        launched = (now - then for now, then in zip(dr.detail.launch_stats(), self._kernels))
+        statistics.kernels = dict(zip(("launched", "loaded", "compiled"), launched))
         mi.Log(
             mi.LogLevel.Info,
             f"Rendering {'interrupted' if statistics.interrupted else 'finished'}. "
@@ -420,3 +428,8 @@ def kernel_cache_misses() -> int:
     """The number of kernels that this process has compiled, or loaded from the disk."""
     _launches, soft_misses, hard_misses = dr.detail.launch_stats()
     return soft_misses + hard_misses
+
+
+def kernels_compiled() -> int:
+    """The number of kernels that this process has compiled: they were in no cache."""
+    return dr.detail.launch_stats()[2]

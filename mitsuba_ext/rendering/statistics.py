@@ -16,7 +16,10 @@ class RenderStatistics:
         passes: Passes whose samples are in the film.
         spp: Samples per pixel that were taken.
         seconds: Wall clock of the whole call, compilation and learning included.
-        compile_seconds: Of these, the time to trace passes and to compile (or load) their kernels.
+        compile_seconds: Of these, the time to trace the passes for which Dr.Jit compiled kernels,
+            and to compile these. Later renders find them in its cache on the disk.
+        tracing_seconds: Of ``seconds``, the time to trace and record the other passes, to load
+            their kernels and to launch them.
         learning_seconds: Of these, the time before the last stage began.
         rays: Rays traced, by kind: ``camera``, ``scatter`` (found by sampling a BSDF), ``shadow``.
         connections: Connections to lights that were considered; ``path`` traces a shadow ray for
@@ -29,6 +32,8 @@ class RenderStatistics:
             (:class:`~mitsuba_ext.learning.effect.Effect`; of light paths,
             :class:`~mitsuba_ext.composition.predicted_errors.PredictedErrors`).
         memory: Peak of the memory that Dr.Jit held during the render, in bytes.
+        kernels: The kernels that were ``launched``, and of these the ``loaded`` ones, which came
+            from the disk, and the ``compiled`` ones. (Those of other threads count, too.)
         interrupted: Did Ctrl-C, :meth:`cancel` or an error end the render before all samples were
             taken? Ctrl-C in the last pass does not.
     """
@@ -47,6 +52,15 @@ class RenderStatistics:
     effects: dict[str, dict[str, Any]] = field(default_factory=dict)
     memory: int = 0
     interrupted: bool = False
+    tracing_seconds: float = 0.0
+    kernels: dict[str, int] = field(default_factory=dict)
+
+    def add_tracing(self, seconds: float, compiled: bool) -> None:
+        """Adds the time before the kernels of a pass run; were some of them compiled?"""
+        if compiled:
+            self.compile_seconds += seconds
+        else:
+            self.tracing_seconds += seconds
 
     def _repr_html_(self) -> str:
         return statistics_table(self)

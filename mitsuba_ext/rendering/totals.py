@@ -15,8 +15,10 @@ from ..stored.arrays import StoredArrays
 from .camera import film_extent
 from .statistics import RenderStatistics
 
-#: The kinds of rays that are counted.
-_KINDS = ("camera", "scatter", "shadow")
+#: What is counted of rays and kernels.
+_KINDS = {
+    "rays": ("camera", "scatter", "shadow"), "kernels": ("launched", "loaded", "compiled"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,9 @@ class RenderTotals:
         connections: See :class:`~mitsuba_ext.rendering.statistics.RenderStatistics`.
         render_seconds: The sum of the times of all renders, which may have run in parallel
             processes.
-        learning_seconds, compile_seconds: Parts of ``render_seconds``.
+        learning_seconds, compile_seconds, tracing_seconds: Parts of ``render_seconds``; see
+            :class:`~mitsuba_ext.rendering.statistics.RenderStatistics`.
+        kernels: See there; the sum of all renders.
         memory_bytes: Peak of the memory that Dr.Jit held in a render, the scene included.
         learned: Summary of what the integrator has learned.
         effects: See :class:`~mitsuba_ext.rendering.statistics.RenderStatistics`.
@@ -43,6 +47,8 @@ class RenderTotals:
     memory_bytes: int = 0
     learned: str = ""
     effects: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    tracing_seconds: float = 0.0
+    kernels: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -61,7 +67,7 @@ class RenderTotals:
             return cls(rays, render_seconds=seconds, memory_bytes=memory_peak())
         return cls(
             dict(own.rays), own.connections, seconds, own.learning_seconds, own.compile_seconds,
-            own.memory, own.learned, own.effects,
+            own.memory, own.learned, own.effects, own.tracing_seconds, own.kernels,
         )  # fmt: skip
 
     @classmethod
@@ -81,9 +87,8 @@ class RenderTotals:
 
     def plus(self, later: RenderTotals) -> RenderTotals:
         """The cost of both."""
-        kinds = dict.fromkeys([*self.rays, *later.rays])
         return RenderTotals(
-            {kind: self.rays.get(kind, 0) + later.rays.get(kind, 0) for kind in kinds},
+            _sums(self.rays, later.rays),
             self.connections + later.connections,
             self.render_seconds + later.render_seconds,
             self.learning_seconds + later.learning_seconds,
@@ -91,6 +96,8 @@ class RenderTotals:
             max(self.memory_bytes, later.memory_bytes),
             later.learned or self.learned,
             self.effects or later.effects,
+            self.tracing_seconds + later.tracing_seconds,
+            _sums(self.kernels, later.kernels),
         )
 
     def known(self) -> dict[str, Any]:
@@ -100,9 +107,9 @@ class RenderTotals:
 
 def _is_cost(key: str, value: Any) -> bool:
     """Can an attribute of :class:`RenderTotals` have this value?"""
-    if key == "rays":
+    if key in _KINDS:
         return isinstance(value, dict) and all(
-            kind in _KINDS and _is_number(count) for kind, count in value.items()
+            kind in _KINDS[key] and _is_number(count) for kind, count in value.items()
         )
     if key == "effects":
         return isinstance(value, dict) and all(isinstance(x, dict) for x in value.values())
@@ -113,6 +120,10 @@ def _is_cost(key: str, value: Any) -> bool:
 
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and 0 <= value < math.inf
+
+
+def _sums(one: Mapping[str, int], other: Mapping[str, int]) -> dict[str, int]:
+    return {key: one.get(key, 0) + other.get(key, 0) for key in dict.fromkeys([*one, *other])}
 
 
 def forget_memory_peak() -> None:

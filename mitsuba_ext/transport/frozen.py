@@ -18,11 +18,11 @@ cannot record a function, the render begins anew, nothing more is recorded in th
 log says so (level ``Info``).
 
 Nor is anything recorded or replayed while another thread lives that may use Dr.Jit: one that has
-rendered, or that is neither a daemon nor a timer. Functions are traced then. While Dr.Jit 1.5.0 records or replays, it
-holds its own lock when it calls Python, and waits for a thread that waits for that lock; it keeps
-the state of a replay in static variables, with the lock released wherever memory is allocated; and
-it reads and replaces the arrays of all objects that kernels can call, those of other scenes
-included. Processes hung, ended, or returned other images.
+rendered, or that is neither a daemon nor a timer. Functions are traced then. While Dr.Jit 1.5.0
+records or replays, it holds its own lock when it calls Python, and may wait for a thread that waits
+for that lock; it keeps the state of a replay in static variables, and releases the lock wherever
+memory is allocated; and it reads and replaces the arrays of all objects that kernels can call,
+those of other scenes included. Processes hung, ended, or returned other images.
 
 Rules for a frozen function:
 
