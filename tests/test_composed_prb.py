@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from typing import Any
 
 import drjit as dr
@@ -276,3 +277,29 @@ def test_what_has_no_gradients_is_refused() -> None:
     ):
         with pytest.raises(RuntimeError, match=message):
             make(**parameters)
+
+
+@pytest.mark.parametrize("with_gradients", [False, True])
+def test_a_scene_with_its_own_renders_again_and_is_freed(with_gradients: bool) -> None:
+    """The integrator held the scene, which holds the integrator: Dr.Jit searched both for arrays
+    without an end, and neither was freed."""
+    learns = {"directions": "guided", "next_event": "contribution", "pilot_spp": 4}
+    described = stage()
+    described["integrator"] = {"type": "composed_prb", "max_depth": 3, **learns}
+    ids = []
+    for _ in range(3):
+        scene = mi.load_dict(described, optimize=False)
+        parameters = mi.traverse(scene)
+        key = next(k for k in parameters.keys() if k.endswith("reflectance.value"))
+        for seed in range(3):
+            if with_gradients:
+                dr.enable_grad(parameters[key])
+                dr.backward(dr.mean(mi.render(scene, parameters, seed=seed, spp=8)))
+                assert np.isfinite(dr.grad(parameters[key]).numpy()).all()
+            else:
+                assert np.isfinite(mi.render(scene, seed=seed, spp=8).numpy()).all()
+        pointer = mi.BSDFPtr(scene.shapes()[0].bsdf())
+        ids.append(int(dr.reinterpret_array(mi.UInt32, pointer)[0]))
+        del scene, parameters, pointer
+        gc.collect()
+    assert len(set(ids)) == 1, "the scenes are kept"

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from stage import stage
 
 from mitsuba_ext.rendering import interrupts, plan, time_budget
 from mitsuba_ext.rendering import render as rendering
@@ -400,3 +401,26 @@ def test_render_takes_the_arguments_that_mitsuba_takes(scene):
     assert sensor.sampler().sample_count() == 5, "the scene's sampler is left as it was"
     with pytest.raises(ValueError, match="there is no sensor 1"):
         integrator.render(scene, sensor=1)
+
+
+def test_statistics_tell_compiling_from_tracing() -> None:
+    scene = mi.load_dict(stage())
+    integrator = mi.load_dict({"type": "composed_path", "max_depth": 3})
+    for _ in range(2):
+        integrator.render(scene, scene.sensors()[0], spp=4)
+    statistics = integrator.statistics
+    assert statistics.compile_seconds == 0 < statistics.tracing_seconds < statistics.seconds
+    assert statistics.kernels["compiled"] == 0 < statistics.kernels["launched"]
+    dr.flush_kernel_cache()
+    integrator.render(scene, scene.sensors()[0], spp=4)
+    assert integrator.statistics.kernels["loaded"] + integrator.statistics.kernels["compiled"] > 0
+
+
+def test_an_interrupted_mi_render_says_where_the_image_is() -> None:
+    scene = mi.load_dict(stage())
+    integrator = mi.load_dict({"type": "composed_path", "max_depth": 3, "samples_per_pass": 1})
+    integrator.progress = lambda done: signal.raise_signal(signal.SIGINT) if done < 0.3 else None
+    with pytest.raises(RuntimeError) as caught:
+        mi.render(scene, integrator=integrator, spp=8)
+    assert "the film holds the image of the finished passes" in str(caught.value.__cause__)
+    assert scene.sensors()[0].film().develop().numpy().mean() > 0

@@ -20,7 +20,7 @@ from ..parameters import MOST_SPP
 from ..rendering.batches import sample_count
 from ..rendering.camera import check_takes_splats
 from ..rendering.camera import develop as develop_film
-from ..rendering.interrupts import deferred_interrupt
+from ..rendering.interrupts import deferred_interrupt, interrupted
 from ..rendering.stages import OneStage
 from ..transport.estimator import CameraRays, Estimator, Sample
 from ..transport.frozen import with_recordings
@@ -179,7 +179,7 @@ class ChainIntegrator(WalkIntegrator):
         self.statistics.seconds = time.perf_counter() - start
         image = develop_film(sensor.film(), develop, evaluate)
         if is_interrupted:
-            raise KeyboardInterrupt
+            raise interrupted(self.name)
         return image
 
     def _render_all(self, scene, sensor, seed: int, spp: int, start: float) -> bool:

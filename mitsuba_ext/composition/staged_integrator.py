@@ -19,6 +19,7 @@ from ..long_renders.intervals import Interval
 from ..parameters import read_parameter
 from ..rendering import camera
 from ..rendering import render as rendering
+from ..rendering.interrupts import interrupted
 from ..rendering.stages import Schedule, Stage
 from ..rendering.statistics import RenderStatistics
 from ..rendering.turns import in_turn
@@ -219,7 +220,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
         )  # fmt: skip
         image = camera.develop(sensor.film(), develop, evaluate)
         if is_interrupted:
-            raise KeyboardInterrupt
+            raise interrupted(self.name)
         return image
 
     def check_sampled(self) -> None:

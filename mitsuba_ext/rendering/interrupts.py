@@ -67,6 +67,15 @@ class InterruptHandler:
         mi.Log(mi.LogLevel.Warn, "Interrupted: finishing the running pass.")
 
 
+def interrupted(plugin: str) -> KeyboardInterrupt:
+    """What a render raises that Ctrl-C has ended: ``mi.render`` turns it into a ``RuntimeError``,
+    whose cause then says where the image is."""
+    return KeyboardInterrupt(
+        f'"{plugin}": Ctrl-C ended the render; the film holds the image of the finished passes: '
+        f"scene.sensors()[0].film().develop()"
+    )
+
+
 @contextlib.contextmanager
 def requests_to_keep(
     handler: Callable[[int, FrameType | None], None] | signal.Handlers,

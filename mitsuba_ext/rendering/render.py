@@ -25,7 +25,7 @@ from ..transport.frozen import with_recordings
 from . import camera
 from .dither import dithered_parts
 from .filter_weights import put_splats
-from .interrupts import deferred_interrupt
+from .interrupts import deferred_interrupt, interrupted
 from .pace import plan_for_timeout
 from .pass_images import FEWEST_PASSES
 from .pass_samples import GradientsError, count_rays, look, put_samples
@@ -106,7 +106,7 @@ def render(
     image = camera.develop(sensor.film(), develop, evaluate)
     made.finish()
     if interrupt.is_set():
-        raise KeyboardInterrupt
+        raise interrupted(integrator.name)
     return image
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import threading
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -51,6 +52,7 @@ _BASES = (
 )
 
 _registered: set[str] = set()
+_registering = threading.RLock()
 
 #: The kinds of plugins whose methods kernels call, and their instances that are in memory.
 _CALLED = ("emitters", "bsdfs", "shapes", "sensors")
@@ -107,10 +109,14 @@ def install() -> None:
 
 
 def _register(variant: str) -> None:
+    with _registering:  # another thread may select the variant, too
+        if variant not in _registered:
+            _register_plugins(variant)
+
+
+def _register_plugins(variant: str) -> None:
     import mitsuba as mi
 
-    if variant in _registered:
-        return
     if variant in runtime.SUPPORTED_VARIANTS:
         runtime.check(variant)
         runtime.check_meshes(mi.Mesh)
