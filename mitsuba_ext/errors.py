@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import re
+from collections.abc import Iterable
 
 #: The text before the traceback in Mitsuba's message for an error in a plugin written in Python.
 _TRACEBACK = "Traceback (most recent call last):\n"
@@ -14,6 +16,12 @@ class InputError(ValueError):
 
 class InstallationError(RuntimeError):
     """Installed software cannot be used. The message says what to do."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``': did you mean "neepp"?'``, or nothing if no known name resembles ``name``."""
+    close = difflib.get_close_matches(name.lower(), known, n=1)
+    return f': did you mean "{close[0]}"?' if close else ""
 
 
 def one_line(error: BaseException | str) -> str:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from .errors import did_you_mean
+
 if TYPE_CHECKING:
     import mitsuba as mi
 
@@ -49,7 +51,8 @@ def read_parameter(
     if kind is float and not math.isfinite(value):
         raise ValueError(message("finite"))
     if choices and value not in choices:
-        raise ValueError(message(f"one of {', '.join(choices)}"))
+        hint = did_you_mean(value, choices) if isinstance(value, str) else ""
+        raise ValueError(message(f"one of {', '.join(choices)}{hint}"))
     if minimum is not None and not value >= minimum:
         raise ValueError(message(f"at least {minimum}"))
     if maximum is not None and not value <= maximum:

@@ -13,8 +13,8 @@ import pytest
 from conftest import in_subprocess
 
 from mitsuba_ext.compare import read_exr
-from mitsuba_ext.inputs import pages
 from mitsuba_ext.inputs.names import MITSUBA_INTEGRATORS
+from mitsuba_ext.startup import pages
 
 # ---- bad input ----
 
@@ -44,7 +44,7 @@ BAD_INPUT = [
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--size", "8"], 'found "8"'),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--size", "0x8"], 'found "0x8"'),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "-D", "spp"], "expected key=value"),
-    (["render", "{scene}", "-o", "{tmp}/a.exr", "-D", "none=1"], "none=1"),
+    (["render", "{scene}", "-o", "{tmp}/a.exr", "-D", "none=1"], "no parameter $none"),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "-D", "spp=many"], '"many"'),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--variant", "none"], 'unknown variant "none"'),
     (["render", "{scene}", "-o", "{tmp}/a.exr", "--integrator", "none"], 'integrator "none"'),

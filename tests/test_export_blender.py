@@ -13,8 +13,7 @@ import mitsuba as mi
 import pytest
 
 from mitsuba_ext.cli.export_blender import blender_table
-from mitsuba_ext.inputs import pages
-from mitsuba_ext.startup import registry
+from mitsuba_ext.startup import pages, registry
 
 pytestmark = pytest.mark.usefixtures("variant")
 

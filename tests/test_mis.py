@@ -96,7 +96,7 @@ def test_bsdf_samples_alone_trace_no_shadow_rays() -> None:
 @pytest.mark.parametrize("parameters, message", [
     ({"heuristic": "best"}, "one of power, balance, cutoff, maximum, bsdf, light"),
     ({"exponent": 0.5}, "at least"), ({"heuristic": "cutoff", "threshold": 2.0}, "at most"),
-    ({"heuristic": "cutoff", "exponent": 3.0}, "unreferenced"),
+    ({"heuristic": "cutoff", "exponent": 3.0}, "nothing here uses"),
 ])  # fmt: skip
 def test_wrong_parameters_are_refused(parameters: dict[str, Any], message: str) -> None:
     with pytest.raises((RuntimeError, TypeError, ValueError), match=message):

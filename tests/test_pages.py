@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from mitsuba_ext.composition.slots import SLOTS
-from mitsuba_ext.inputs import pages
 from mitsuba_ext.inputs.specifications import make_named
-from mitsuba_ext.startup import registry
+from mitsuba_ext.startup import pages, registry
 
 import mitsuba as mi  # isort: skip
 

@@ -325,7 +325,7 @@ def test_a_warning_tells_that_a_chain_stayed(monkeypatch: pytest.MonkeyPatch) ->
     ({"p_large": 1.5}, r"p_large.*1\.5"),
     ({"luminance_samples": 0}, "luminance_samples.*0"),
     ({"next_event": "contribution"}, '"next_event".*pilots'),
-    ({"pilot_spp": 3}, "unreferenced"),
+    ({"pilot_spp": 3}, "has no parameter"),
 ])  # fmt: skip
 def test_wrong_parameters_are_named(parameters: dict[str, Any], words: str) -> None:
     with pytest.raises((ValueError, RuntimeError), match=f'(?s)"pssmlt".*{words}|{words}'):

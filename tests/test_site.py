@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from mitsuba_ext.inputs import pages
-from mitsuba_ext.startup import registry
+from mitsuba_ext.startup import pages, registry
 
 ROOT = Path(__file__).parents[1]
 SITE = ROOT / "docs" / "site"

@@ -156,7 +156,7 @@ def test_wrong_use_is_explained(parameters, message):
 
 @pytest.mark.parametrize("unknown", ["max_depth", "hide_emitters", "timeout", "spp"])
 def test_parameters_of_the_nested_integrator_are_refused(unknown):
-    with pytest.raises(RuntimeError, match=f'unreferenced.*"variance"(.|\n)*{unknown}'):
+    with pytest.raises(RuntimeError, match=f'"variance" has no parameter "{unknown}"'):
         with_variance(**{unknown: 4})
 
 

@@ -23,8 +23,7 @@ from sphinx.parsers import RSTParser
 from sphinx.util.docutils import SphinxDirective, SphinxRole
 from sphinx.util.logging import getLogger
 
-from mitsuba_ext.inputs import pages
-from mitsuba_ext.startup import registry
+from mitsuba_ext.startup import pages, registry
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx

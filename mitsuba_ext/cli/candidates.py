@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..inputs import names
 from ..inputs.scene_changes import FILTERS
-from ..startup import registry
+from ..startup import plugin_parameters, registry
 
 if TYPE_CHECKING:
     import click
@@ -20,10 +20,8 @@ if TYPE_CHECKING:
 #: The type of a candidate that more text can follow: no space is written after it.
 PART = "part"
 
-#: Parameters of Mitsuba's integrators that trace paths.
-_SETTINGS = ("max_depth", "rr_depth", "hide_emitters")
-
-_WITHOUT_SETTINGS = ("aov", "depth", "direct", "direct_projective", "moment", "stokes")
+#: Parameters of Mitsuba's integrators that are true or false.
+_SWITCHES = ("hide_emitters", "use_spectral_mis", "srgb_primitives", "guiding_proj")
 
 
 def integrators(_context: click.Context, _option: Any, text: str) -> list[CompletionItem]:
@@ -116,13 +114,14 @@ def _specifications(text: str) -> list[tuple[str, str]]:
 
 def _parameters(name: str) -> dict[str, str]:
     """The types of a plugin's parameters."""
-    found = {
-        key: row.type for row in names.parameter_rows(name) for key in row.name.split(", ")
-        if key.isidentifier()
+    if name in names.MITSUBA_INTEGRATORS:
+        return {
+            key: "bool" if key in _SWITCHES else "" for key in names.MITSUBA_INTEGRATORS[name]
+        }
+    return {
+        key: row.type for row in plugin_parameters.parameter_rows(name)
+        for key in row.name.split(", ") if key.isidentifier()
     }  # fmt: skip
-    if name in names.MITSUBA_INTEGRATORS and name not in _WITHOUT_SETTINGS:
-        return dict.fromkeys(_SETTINGS, "") | {_SETTINGS[-1]: "bool"}
-    return found
 
 
 def _innermost(text: str) -> tuple[str, str]:

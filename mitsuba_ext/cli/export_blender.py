@@ -26,7 +26,7 @@ from ..files import check_target, replacing
 from .common import say
 
 if TYPE_CHECKING:
-    from ..inputs.pages import Page, Parameter
+    from ..startup.pages import Page, Parameter
 
 _TYPES = {
     "int": "integer", "integer": "integer", "float": "float", "bool": "boolean",
@@ -80,8 +80,7 @@ def export_blender(output: Path | None) -> int:
 
 def blender_table() -> dict[str, dict[str, Any]]:
     """The entries of our integrators that render images and nest no others."""
-    from ..inputs import pages
-    from ..startup import registry
+    from ..startup import pages, registry
 
     found = [pages.read_page(file) for file in registry.plugin_files("integrators")]
     return {page.name: _entry(page) for page in found if not _is_left_out(page)}

@@ -19,8 +19,7 @@ def list_plugins(name: str | None) -> int:
     """Show the plugins, or the page of the plugin NAME."""
     from rich.table import Table
 
-    from ..inputs import pages
-    from ..startup import registry
+    from ..startup import pages, registry
 
     files = {kind: registry.plugin_files(kind) for kind in registry.plugin_names()}
     console = console_for_tables()
@@ -52,6 +51,7 @@ def list_plugins(name: str | None) -> int:
 
 
 def _no_page(name: str, ours: list[str]) -> click.UsageError:
+    from ..errors import did_you_mean
     from ..inputs import names
 
     if name in names.MITSUBA_INTEGRATORS:
@@ -63,5 +63,5 @@ def _no_page(name: str, ours: list[str]) -> click.UsageError:
         return click.UsageError(
             f'"{name}" is a plugin of Mitsuba\'s own: its page is in {_MITSUBA_PLUGINS}'
         )
-    hint = names.did_you_mean(name, [*ours, *names.MITSUBA_INTEGRATORS])
+    hint = did_you_mean(name, [*ours, *names.MITSUBA_INTEGRATORS])
     return click.UsageError(f'no plugin "{name}"{hint} (there are: {", ".join(ours)})')

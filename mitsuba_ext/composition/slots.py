@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import mitsuba as mi
 
+from ..errors import did_you_mean
 from ..pointsets import PATTERNS
 from .camera_numbers import PURPOSES, WeightedNumbers
 from .connections import Connections
@@ -99,4 +100,5 @@ def _accepted(slot: str, value: object) -> str:
     nested = f", {number}or a nested plugin: {' or '.join(plugins)}" if plugins else ""
     if slot == "light_paths":
         nested = f", or a number from 0 to {MOST_PATHS:g}"
-    return f"{found}; it must be one of {', '.join(words)}{nested}"
+    hint = did_you_mean(value, words) if isinstance(value, str) else ""
+    return f"{found}; it must be one of {', '.join(words)}{nested}{hint}"

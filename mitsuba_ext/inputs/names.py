@@ -7,34 +7,48 @@ once.
 
 from __future__ import annotations
 
-import difflib
+import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from ..startup import registry
-from .pages import Parameter, read_page
+from ..errors import InputError, did_you_mean
+from ..startup import plugin_parameters, registry
 from .plugin_text import parse_plugin
 
-#: Mitsuba's own integrators.
-MITSUBA_INTEGRATORS = (
-    "aov", "depth", "direct", "direct_projective", "moment", "path", "prb", "prb_basic",
-    "prb_projective", "prbvolpath", "ptracer", "stokes", "volpath", "volpathmis",
-    "volprim_rf_basic",
+_SAMPLING = ("block_size", "hide_emitters", "samples_per_pass", "timeout")
+_PATHS = ("max_depth", "rr_depth", *_SAMPLING)
+_PROJECTIVE = (
+    *_PATHS, "sppc", "sppp", "sppi", "guiding", "guiding_proj", "guiding_rounds", "project_seed",
 )  # fmt: skip
 
+#: Mitsuba's own integrators, and their parameters (without nested integrators).
+MITSUBA_INTEGRATORS: Mapping[str, tuple[str, ...]] = {
+    "aov": ("aovs", *_SAMPLING),
+    "depth": _SAMPLING,
+    "direct": ("shading_samples", "emitter_samples", "bsdf_samples", *_SAMPLING),
+    "direct_projective": _PROJECTIVE,
+    "moment": _SAMPLING,
+    "path": _PATHS,
+    "prb": _PATHS,
+    "prb_basic": _PATHS,
+    "prb_projective": _PROJECTIVE,
+    "prbvolpath": _PATHS,
+    "ptracer": tuple(key for key in _PATHS if key != "block_size"),
+    "stokes": _SAMPLING,
+    "volpath": _PATHS,
+    "volpathmis": ("use_spectral_mis", *_PATHS),
+    "volprim_rf_basic": ("srgb_primitives", *_PATHS),
+}
+
+
+#: The suffixes of the files of Mitsuba's plugins.
+_LIBRARIES = (".so", ".dylib", ".dll")
 
 #: Stands for the scene's own integrator, where one is named.
 OF_SCENE = "scene"
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """``': did you mean "neepp"?'``, or nothing if no known name resembles ``name``."""
-    close = difflib.get_close_matches(name.lower(), known, n=1)
-    return f': did you mean "{close[0]}"?' if close else ""
 
 
 def unknown_plugin(name: str, is_nested: bool = False) -> InputError:
@@ -57,25 +71,21 @@ def unknown_parameter(kind: str, name: str, key: str) -> InputError:
         name: Its name.
         key: The name of the parameter.
     """
-    known = parameter_names(name)
-    if key in known:
-        return InputError(
-            f'{kind} "{name}": nothing here uses the parameter "{key}": leave it out '
-            f"('mitsuba-ext list {name}' says what it is for)"
-        )
-    return InputError(f'{kind} "{name}" has no parameter "{key}"{did_you_mean(key, known)}')
+    known = MITSUBA_INTEGRATORS.get(name, ())
+    return InputError(f"{kind} {plugin_parameters.unread(name, key, known)}")
 
 
-def parameter_names(name: str) -> list[str]:
-    """The parameters of a plugin of this package, from its page; none for other plugins."""
-    return [key for row in parameter_rows(name) for key in row.name.split(", ")]
-
-
-def parameter_rows(name: str) -> list[Parameter]:
-    """The rows of the parameter table of a plugin of this package; none for other plugins."""
-    files = [file for kind in registry.plugin_names() for file in registry.plugin_files(kind)]
-    pages = [read_page(file) for file in files if file.stem == name]
-    return [row for page in pages for row in page.parameters]
+def explained(message: str) -> str:
+    """A message of Mitsuba's parser about an unknown plugin or an unknown parameter of an
+    integrator, with the known name that resembles it, if there is one."""
+    plugin = re.search(r'Plugin "(\w+)" not found!', message)
+    if plugin:
+        known = [name for of_kind in registry.plugin_names().values() for name in of_kind]
+        hint = did_you_mean(plugin[1], [*known, *MITSUBA_INTEGRATORS, *_files_of_mitsuba()])
+        return message.replace(plugin[0], f"{plugin[0][:-1]}{hint}" if hint else plugin[0])
+    unread = re.search(r'unreferenced propert.* plugin of type "(\w+)": \w+ "(\w+)"', message)
+    return message + did_you_mean(unread[2], MITSUBA_INTEGRATORS.get(unread[1], ())) if unread \
+        else message
 
 
 def check_integrator(specification: str) -> None:
@@ -113,8 +123,21 @@ def _ours(is_nested: bool) -> list[str]:
 
 def is_file_of_mitsuba(name: str) -> bool:
     """Is there a plugin in C++ of this name? ``True`` also if Mitsuba is not found."""
+    folder = _plugin_folder()
+    if folder is None:
+        return True
+    return any((folder / f"{name}{suffix}").exists() for suffix in _LIBRARIES)
+
+
+def _files_of_mitsuba() -> list[str]:
+    """The names of the plugins in C++."""
+    folder = _plugin_folder()
+    files = folder.glob("*.*") if folder else ()
+    return [file.stem for file in files if file.suffix in _LIBRARIES]
+
+
+def _plugin_folder() -> Path | None:
     spec = PathFinder.find_spec("mitsuba")
     if spec is None or not spec.submodule_search_locations:
-        return True
-    folder = Path(spec.submodule_search_locations[0]) / "plugins"
-    return any((folder / f"{name}{suffix}").exists() for suffix in (".so", ".dylib", ".dll"))
+        return None
+    return Path(spec.submodule_search_locations[0]) / "plugins"

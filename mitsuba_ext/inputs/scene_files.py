@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +28,21 @@ def files_of(state: mi.parser.ParserState, parameters: Mapping[str, str]) -> lis
         if file.is_file():
             files.add(file)
     return sorted(files)
+
+
+def parameters_of(path: Path) -> list[str]:
+    """The ``$name`` parameters of an XML file, and of the files beside it that it includes."""
+    names: dict[str, None] = {}
+    for file in (path, *_included(path)):
+        text = file.read_text(encoding="utf-8", errors="replace")
+        names.update(dict.fromkeys(re.findall(r"\$(\w+)", text)))
+    return list(names)
+
+
+def _included(path: Path) -> list[Path]:
+    text = path.read_text(encoding="utf-8", errors="replace")
+    found = re.findall(r"<include\s[^>]*filename=[\"']([^\"'$]+)[\"']", text)
+    return [path.parent / name for name in found if (path.parent / name).is_file()]
 
 
 def named_by_absolute_path(files: list[Path], parameters: Mapping[str, str]) -> list[str]:

@@ -13,8 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import InputError, one_line
-from .names import did_you_mean
+from ..errors import InputError, did_you_mean, one_line
 
 
 def as_text(values: Mapping[str, Any]) -> str:

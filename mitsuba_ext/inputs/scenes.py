@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError, one_line
+from ..errors import InputError, did_you_mean, one_line
 from ..rendering.aovs import check_nodes
 from .content_hash import hash_each, hash_files
+from .names import explained
 from .scene_changes import UNCHANGED, SceneChanges, change_films
-from .scene_files import files_of, named_in
+from .scene_files import files_of, named_in, parameters_of
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -196,7 +197,9 @@ def load_scene(
         except InputError as error:
             raise InputError(f"{label}: {error}") from error
         except Exception as error:  # a plugin's constructor may raise anything
-            message = one_line(error)
+            message = explained(one_line(error))
+            if "unused parameters" in message and path is not None:
+                message = _unused(path, list(strings))
             raise InputError(message if label in message else f"{label}: {message}") from error
     if not isinstance(scene, mi.Scene):
         raise InputError(f"{label}: the outermost element must be a <scene>")
@@ -217,6 +220,16 @@ def load_scene(
         has_media=has_media(scene) or (names_media and has_instances(scene)),
         size=(int(film.crop_size()[0]), int(film.crop_size()[1])),
     )
+
+
+def _unused(path: Path, given: list[str]) -> str:
+    """Says which of the given ``$parameters`` a scene file does not have."""
+    known = parameters_of(path)
+    key = next((key for key in given if key not in known), given[0])
+    hint = did_you_mean(key, known)
+    if not hint:
+        hint = f" (it has {', '.join(f'${name}' for name in known)})" if known else ""
+    return f"the scene has no parameter ${key}{hint}"
 
 
 def _with_own_bitmaps(source: Mapping[str, Any]) -> dict[str, Any]:

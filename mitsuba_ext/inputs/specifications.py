@@ -13,9 +13,10 @@ from xml.etree import ElementTree
 
 from ..errors import InputError, one_line
 from ..rendering.aovs import check_aovs, check_nodes
+from ..startup.plugin_parameters import parameter_names
 from ..startup.registry import plugin_names
 from .content_hash import hash_code, hash_value
-from .names import is_file_of_mitsuba, unknown_parameter, unknown_plugin
+from .names import explained, is_file_of_mitsuba, unknown_parameter, unknown_plugin
 from .plugin_text import parse_plugin
 from .scenes import check_variant
 
@@ -172,7 +173,11 @@ def _make(
     objects = {key: made.integrator for key, made in nested.items()}
     if any(isinstance(item, mi.Integrator) for item in objects.values()):
         inherited = {}  # these are for the nested integrator, which traces the paths
-    name, given = plugin["type"], {**inherited, **own, **objects}
+    name = plugin["type"]
+    if _is_ours(name):  # it refuses parameters that it does not have
+        known = parameter_names(name)
+        inherited = {key: value for key, value in inherited.items() if key in known}
+    given = {**inherited, **own, **objects}
     properties = mi.Properties(name)
     for key, value in given.items():
         properties[key] = value
@@ -184,10 +189,9 @@ def _make(
         if "not found!" in str(error) and f'Plugin "{name}"' in str(error):
             raise unknown_plugin(name, kind != "integrator") from error
         message = one_line(error)
-        own_prefix = f'"{name}": '
-        if message.startswith(own_prefix):  # our plugins name themselves
-            message = message[len(own_prefix) :]
-        raise InputError(f'{kind} "{name}": {message}') from error
+        if not message.startswith(f'"{name}"'):  # our plugins name themselves
+            message = f'"{name}": {message}'
+        raise InputError(f"{kind} {message}") from error
     if kind == "integrator" and not isinstance(made, mi.Integrator):
         raise InputError(f'"{name}" is a plugin of Mitsuba, but not an integrator')
     made = (made.expand() or [made])[0]  # "volpathmis" is made in two steps
@@ -250,7 +254,7 @@ def _from_parser(
         mi.parser.transform_all(config, state)
         integrator = mi.parser.instantiate(config, state)
     except Exception as error:  # a plugin's constructor may raise anything
-        raise InputError(f'integrator "{source}": {one_line(error)}') from error
+        raise InputError(f'integrator "{source}": {explained(one_line(error))}') from error
     if not isinstance(integrator, mi.Integrator):
         raise InputError(f'"{name}" ({source}) is a plugin of Mitsuba, but not an integrator')
     nested = [_class_of(other) for other in names - {name}]
@@ -265,9 +269,13 @@ def _class_of(name: str) -> type | None:
         return type(mi.PluginManager.instance().create_object(mi.Properties(name)))
     except Exception:  # a plugin that needs parameters, such as a wrapper
         pass
-    if any(name in names for names in plugin_names().values()):
+    if _is_ours(name):
         return _Made  # the hash of any class of this package covers all of its files
     return mi.Object if is_file_of_mitsuba(name) else None
+
+
+def _is_ours(name: str) -> bool:
+    return any(name in names for names in plugin_names().values())
 
 
 def _knows(name: str, key: str, value: Value) -> bool:

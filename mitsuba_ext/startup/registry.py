@@ -66,7 +66,10 @@ def plugin(cls: type) -> type:
     _, kind, name = cls.__module__.rsplit(".", 2)
 
     def made(props: mi.Properties) -> mi.Object:
+        from .plugin_parameters import refuse_unread  # it imports this module
+
         instance = cls(props)
+        refuse_unread(name, props)
         if kind in _CALLED:
             _alive.add(instance)
         return instance
@@ -147,7 +150,7 @@ def _register_refusals(variant: str) -> None:
     def refuse(name: str) -> Callable[[mi.Properties], None]:
         def constructor(_props: mi.Properties) -> None:
             raise RuntimeError(
-                f'"{name}" does not work in the variant "{variant}": select one of '
+                f'"{name}": does not work in the variant "{variant}": select one of '
                 f"{', '.join(runtime.SUPPORTED_VARIANTS)}."
             )
 

@@ -1,0 +1,77 @@
+"""The parameters of our plugins, from their pages; the error for a parameter that none of them
+reads.
+
+Mitsuba, too, refuses parameters that a plugin did not read, but suggests no name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from ..errors import did_you_mean
+from . import registry
+from .pages import Parameter, read_page
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+
+def parameter_rows(name: str) -> list[Parameter]:
+    """The rows of the parameter table of a plugin of this package; none for other plugins."""
+    files = [file for kind in registry.plugin_names() for file in registry.plugin_files(kind)]
+    pages = [read_page(file) for file in files if file.stem == name]
+    return [row for page in pages for row in page.parameters]
+
+
+def parameter_names(name: str) -> list[str]:
+    """The parameters of a plugin of this package, from its page; none for other plugins."""
+    return [key for row in parameter_rows(name) for key in row.name.split(", ")]
+
+
+def unread(name: str, key: str, others: Sequence[str] = ()) -> str:
+    """Says of a plugin that it does not read a parameter, and what was probably meant.
+
+    Args:
+        name: The plugin.
+        key: The parameter.
+        others: The parameters of a plugin that is not of this package, as far as they are known.
+    """
+    ours = parameter_names(name)
+    if key in ours:
+        return (
+            f'"{name}": nothing here uses the parameter "{key}": leave it out '
+            f"('mitsuba-ext list {name}' says what it is for)"
+        )
+    hint = did_you_mean(key, ours or others)
+    if ours and not hint:
+        hint = f" ('mitsuba-ext list {name}' shows its parameters)"
+    return f'"{name}" has no parameter "{key}"{hint}'
+
+
+def refuse_unread(name: str, props: mi.Properties) -> None:
+    """
+    Args:
+        name: A plugin of this package, which has been constructed.
+        props: The parameters that the scene gives.
+
+    Raises:
+        ValueError: The plugin did not read one of them.
+    """
+    keys = props.unqueried()
+    if not keys:
+        return
+    key, value = keys[0], props[keys[0]]
+    if key.startswith("_arg_"):
+        raise ValueError(f'"{name}": {_nameless(value)}')
+    raise ValueError(unread(name, key))
+
+
+def _nameless(value: Any) -> str:
+    """Says of a nested plugin without a name that it cannot be used."""
+    what = getattr(value, "name", None) or value.class_name()
+    decision = getattr(value, "decision_parameters", None)
+    if decision is None:
+        return f'nothing here uses the nested "{what}": leave it out'
+    slots = " or ".join(f'name="{slot}"' for slot in decision.slots)
+    return f'the nested "{what}" needs the name of what it decides: {slots}'
