@@ -54,9 +54,9 @@ class AdaptiveSampling(WrappingIntegrator):
     than others, and samples there take no longer than elsewhere; or when the render is to end at a
     :monosp:`threshold`. **Not when** the mean error matters, noise is about the same everywhere,
     noisy pixels are also the slow ones (objects before an empty background), or a stratified
-    sampler does better than independent samples. ``docs/results/adaptive.md`` has figures: in the
-    three scenes measured, at equal time, the 95th percentile of the errors was 0.93 to 1.21 times
-    that of uniform sampling, and the mean error 1.06 to 1.31 times.
+    sampler does better than independent samples. The page ``docs/results/adaptive.md`` of the
+    sources has figures: in the three scenes measured, at equal time, the 95th percentile of the
+    errors was 0.93 to 1.21 times that of uniform sampling, and the mean error 1.06 to 1.31 times.
 
     The sensor's number of samples (:monosp:`spp`) is the mean over all pixels. The first pass takes
     the same number of samples in each pixel, and so do the pilot passes of a nested integrator that

@@ -70,7 +70,8 @@ class EffectiveCircleOfConfusion(WrappingIntegrator):
 
     **Use it when** you want a preview, an animation or a look, and most noise comes from defocus.
     **Not when** the image must be correct: use :monosp:`path` with a :monosp:`thinlens`.
-    ``docs/results/ecoc_dof.md`` has figures, and pictures that show where it is wrong.
+    The page ``docs/results/ecoc_dof.md`` of the sources has figures, and pictures that show where
+    it is wrong.
 
     **Layers.** There are up to five: two before the focus, one in focus, two behind it; fewer where
     all surfaces are blurred alike. One ray for each pixel determines the limits between them. Each

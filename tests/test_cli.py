@@ -12,6 +12,7 @@ import click
 import pytest
 from conftest import in_subprocess
 
+from mitsuba_ext import cli
 from mitsuba_ext.compare import read_exr
 from mitsuba_ext.inputs.names import MITSUBA_INTEGRATORS
 from mitsuba_ext.startup import pages
@@ -220,7 +221,10 @@ def test_list_shows_every_plugin(run):
     for names in registry.plugin_names().values():
         for name in names:
             assert name in out
-            assert run("list", name)[0] == 0
+            code, page, _ = run("list", name)
+            assert code == 0
+            # None of the marks of reStructuredText; stars remain in "cuda_*" and in code
+            assert not re.findall(r"``|\*\*|:\w+:`|`_|\|\w+\||^ *\.\. \w+::|\B\*\w", page)
 
 
 def test_page_is_read_from_the_docstring():
@@ -264,6 +268,20 @@ def test_page_is_read_from_the_docstring():
     assert page.summary == "It is fancy. It is new."
     assert "Use it rarely." in page.text and "'type': 'fancy'" in page.text
     assert "pluginparameters" not in page.text and "tab" not in page.text
+
+
+def test_stars_of_emphasis_are_removed_except_in_code():
+    text = "**Use it\nwhen** it is *very* fast (2 * 3, a_*).\n\n    {**scene, 'a': 2 ** 3, *b}\n"
+    assert pages.parse_page("stars", text).text == (
+        "Use it\nwhen it is very fast (2 * 3, a_*).\n\n    {**scene, 'a': 2 ** 3, *b}"
+    )
+
+
+@pytest.mark.parametrize("command", ["", *cli.cli.commands])
+def test_help_is_plain_and_names_no_file_of_the_sources(run, command):
+    code, out, _ = run(*command.split(), "--help")
+    assert code == 0
+    assert not re.findall(r"`|\*\*|:\w+:`|\bdocs/|\.md\b", out)
 
 
 def test_page_of_a_plugin_without_docstring_is_empty():

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+import mitsuba_ext
+
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 PAGES = [
@@ -41,6 +43,17 @@ def test_links_lead_to_files_and_headings(page: Path) -> None:
         if not target.exists() or (anchor and anchor not in _anchors(target)):
             lost.append(link)
     assert not lost
+
+
+def test_sample_output_names_the_present_version() -> None:
+    stale = [
+        f"{page.relative_to(ROOT)}: {found}"
+        for page in PAGES
+        if page.name != "CHANGELOG.md"
+        for found in re.findall(r"mitsuba_ext (\d+\.\d+\.\d+)", page.read_text(encoding="utf-8"))
+        if found != mitsuba_ext.__version__
+    ]
+    assert not stale
 
 
 def test_the_readme_is_short() -> None:

@@ -63,7 +63,10 @@ _PATH = {
 def export_blender(output: Path | None) -> int:
     """Write the parameters of our integrators for the menus of the add-on mitsuba-blender.
 
-    docs/command.md tells how to install the file.
+    FILE is engine/integrators.json in the folder of the add-on. With Blender 4.2 on Linux, that is
+    ~/.config/blender/4.2/scripts/addons/mitsuba-blender/engine/integrators.json. Restart Blender
+    afterwards. To render with our integrators, Blender needs an add-on for Mitsuba 3.9; with an
+    older one, export the scene as XML, and use mitsuba-ext render.
     """
     old = _read(output) if output is not None and output.exists() else {"path": _PATH}
     table = {**old, **blender_table()}

@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     shell_complete=candidates.folders,
 )
 def merge(folders: Sequence[Path], output: Path) -> int:
-    """Merge the samples of renders that ``render --checkpoint DIR`` has saved: of the same scene,
-    by the same integrator, with different seeds. Each render is weighted by its samples."""
+    """Merge the samples of renders that 'mitsuba-ext render --checkpoint DIR' has saved: of the
+    same scene, by the same integrator, with different seeds. Each render is weighted by its
+    samples."""
     from ..errors import InputError
     from ..files import make_folder
     from ..long_renders.folder import CheckpointFolder, check_same

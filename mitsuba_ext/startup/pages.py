@@ -154,4 +154,13 @@ def _plain(text: str) -> str:
     text = re.sub(r":\w+(?::\w+)?:`([^`]*)`", r"\1", text)
     text = re.sub(r"``([^`]*)``", r"\1", text)
     text = re.sub(r"(?<![\w|])\|(\w+)\|(?!\w)", r"\1", text)
-    return text.replace("\\infty", "∞")
+    text = text.replace("\\infty", "∞")
+    # Stars are left in code, which is indented
+    blocks = re.split(r"(\n{2,})", text)
+    return "".join(block if block[:1].isspace() else _without_stars(block) for block in blocks)
+
+
+def _without_stars(text: str) -> str:
+    """reStructuredText without the marks of strong and emphasized words."""
+    text = re.sub(r"\*\*(?=\S)(.+?)(?<=\S)\*\*", r"\1", text, flags=re.S)
+    return re.sub(r"(?<![\w*])\*(?=[^\s*])([^*]+?)(?<=\S)\*(?![\w*])", r"\1", text)
