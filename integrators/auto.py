@@ -88,11 +88,12 @@ class Auto(LightPathIntegrator):
     few as 4096. Where light paths have less than 0.4 of the variance, the samples before are left
     out of the image.
 
-    Renders of less than 262144 samples are those of :monosp:`path`, unless they save what they
-    learn: they would take longer to learn, and to compile the kernels of learning, than for all
-    samples. Light paths must gain more, the shorter a render is: 1.1 times the efficiency, and
-    twice that of the rest in renders of half a million samples. With a :monosp:`timeout`, they are
-    tried only where there is time to compile their kernels.
+    Renders of less than 262144 samples are those of :monosp:`path`, and
+    :monosp:`statistics.learned` says so, unless they save what they learn: they would take longer
+    to learn, and to compile the kernels of learning, than for all samples. Light paths must gain
+    more, the shorter a render is: 1.1 times the efficiency, and twice that of the rest in renders
+    of half a million samples. With a :monosp:`timeout`, they are tried only where there is time to
+    compile their kernels.
 
     The best choice is that with the least expected squared error in a render of this length, times
     its time. Light that only light paths find counts as missing without them, by its square: in
@@ -163,11 +164,12 @@ class Auto(LightPathIntegrator):
         return NO_LIMIT
 
     def pilots(self, scene, sensor, spp, kernels=math.inf):
-        pixel_count, saves = math.prod(film_extent(sensor.film())), self.save_learned
-        is_short = pixel_count * spp < light_path_schedule.LEAST_SAMPLES
-        if is_short and not (saves or self.keep_learned):
-            spp = 0
-        stages = super().pilots(scene, sensor, spp, kernels)
+        pixel_count, least = math.prod(film_extent(sensor.film())), light_path_schedule.LEAST_SAMPLES
+        is_kept = self.save_learned or self.keep_learned
+        is_short = pixel_count * spp < least and not is_kept
+        stages = super().pilots(scene, sensor, 0 if is_short else spp, kernels)
+        if is_short and not self.restores:
+            self.too_short = f"nothing: path renders less than {least} samples"
         self._has_media = may_have_media(scene)
         self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene)
         trial = PhotonTrial if self._has_media else LightPathTrial
@@ -204,6 +206,10 @@ class Auto(LightPathIntegrator):
         """The estimator of a stage in a scene with media; ``mapper`` makes that of photons."""
         choice: PhotonChoice = decisions.pop("light_paths", PhotonChoice())
         return choice.estimator(self.walk(**decisions), mapper)
+
+    def parameters(self):
+        learns_from = f"{light_path_schedule.LEAST_SAMPLES} samples (with fewer, it is path)"
+        return {**super().parameters(), "learns_from": learns_from}
 
     def merging_radius(self, scene, sensor, side, *sums):
         return super().merging_radius(scene, sensor, side, *sums) if _can_merge(scene) else None

@@ -41,6 +41,11 @@ def learned(scene: mi.Scene | dict, spp: int, integrator: mi.Integrator | None =
     return integrator.statistics.learned
 
 
+def test_a_render_that_is_too_short_to_learn_says_that_it_is_path() -> None:
+    assert learned(stage(), 4) == "nothing: path renders less than 262144 samples"
+    assert "262144 samples (with fewer, it is path)" in str(auto())
+
+
 def test_light_paths_that_merge_take_the_place_of_guides_where_they_pay() -> None:
     integrator = auto()
     text = learned(load("caustic", width=96, height=54), 64, integrator)

@@ -69,7 +69,7 @@ def test_nothing_is_learned_where_it_would_take_too_long(monkeypatch, timeout, c
     _Clock(monkeypatch, compiling)
     integrator = _integrator("auto_path", timeout=timeout)
     integrator.render(_scene(), spp=5000)
-    assert integrator.statistics.learned == ""
+    assert integrator.statistics.learned == "nothing: the time limit is too short"
     assert integrator.statistics.spp > 5
 
 

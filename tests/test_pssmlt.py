@@ -83,7 +83,10 @@ def test_camera_samples_alone_find_short_paths(max_depth: int) -> None:
     image, path = (batches(scene, i, 16, [5])[0] for i in (integrator, REFERENCE.make(max_depth)))
     assert path.any() == (max_depth > 0)
     assert_same_image(image, path) if path.any() else assert_images_are_sound(image)
-    assert image.any() == path.any() and integrator.statistics.learned == ""
+    assert image.any() == path.any()
+    assert "nothing for chains to find: the image is 16 camera samples" in (
+        integrator.statistics.learned
+    )
 
 
 @pytest.mark.parametrize("light", [{}, {"type": "point", "position": [0, 0, -5]}],
@@ -92,7 +95,7 @@ def test_camera_samples_alone_find_short_paths(max_depth: int) -> None:
 def test_an_image_without_light_is_black(light: dict[str, Any], direct: int) -> None:
     integrator = pssmlt(direct_samples=direct)
     assert not batches(mi.load_dict(stage(light=light)), integrator, 16, [1]).any()
-    assert integrator.statistics.learned in ("", "no light was found")
+    assert "the image is 16 camera samples per pixel" in integrator.statistics.learned
     assert not integrator.statistics.interrupted
 
 

@@ -139,7 +139,7 @@ def test_the_same_seed_gives_the_same_image() -> None:
 def test_few_samples_cost_nothing(spp: int) -> None:
     integrator = swarm()
     mi.render(_streaks(5, 3), integrator=integrator, spp=spp)
-    assert (integrator.statistics.learned == "") == (spp < 4)
+    assert integrator.statistics.learned.startswith("nothing") == (spp < 4)
 
 
 _CROPPED = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 7, "crop_height": 5}

@@ -188,6 +188,11 @@ class ChainIntegrator(WalkIntegrator):
         target = self.target(setting)
         self._render_camera_samples(scene, sensor, seed, spp, target is not None)
         statistics, camera_spp = self.statistics, self.statistics.spp
+        if target is None and not statistics.learned:
+            statistics.learned = (
+                f"there is nothing for chains to find: the image is {camera_spp} camera samples "
+                f"per pixel"
+            )
         if target is None or self.is_cancelled:
             return False
         chains = self.chain_render(target, seed, spp, camera_spp, statistics, start)

@@ -97,6 +97,7 @@ class Schedule:
             schedule saves, restores and reports what they learn.
         decisions: The decisions of the next stage that differ from those of ``path``, by slot.
         camera: Chooses points of the aperture, times and wavelengths.
+        remark: What statistics say if nothing was learned.
         estimator: The parameter.
     """
 
@@ -116,7 +117,7 @@ class Schedule:
         self.decisions: dict[str, Any] = {"query": query}
         self.learners: dict[str, Learner] = {}
         self.beside: dict[str, Learner] = {}
-        self.camera = CameraSamples()
+        self.camera, self.remark = CameraSamples(), ""
         for slot, parameters in slots.items():
             if isinstance(parameters, WeightedNumbers):
                 setattr(self.camera, slot, parameters.numbers(plugin, slot, setting))
@@ -231,7 +232,7 @@ class Schedule:
             known = {s: x for s, x in self._states.items() if x and s in self._everyone}
             for save in self._savers:
                 save(known)
-        learned = "; ".join(filter(None, map(str, self._everyone.values())))
+        learned = "; ".join(filter(None, map(str, self._everyone.values()))) or self.remark
         estimator = self.estimator(**self.decisions)
         most = getattr(estimator, "most_lanes", 0)
         effects = {slot: learner.effect for slot, learner in self._everyone.items()}

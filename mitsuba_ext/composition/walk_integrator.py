@@ -39,6 +39,9 @@ from .swarm import Swarm, stage_weights
 #: pilots, and that of the last stage, are larger, and there are many small ones.
 LEARNING_KERNELS = 6
 
+#: Pilots are a quarter of all samples: with fewer samples per pixel, there is none.
+_LEAST_SPP = 4
+
 
 class WalkIntegrator(StagedIntegrator):
     """An integrator whose samples are random walks.
@@ -90,6 +93,8 @@ class WalkIntegrator(StagedIntegrator):
         self.slots: dict[str, DecisionParameters] = {}
         self.learners: Mapping[str, Learner] = {}
         self._pilot_spp: int | None = None
+        #: Says why the last render learned nothing, if it was too short.
+        self.too_short = ""
         self.save_learned = self.load_learned = ""
         self.keep_learned = False
         self._kept: kept_learning.Kept | None = None
@@ -173,6 +178,7 @@ class WalkIntegrator(StagedIntegrator):
         self.learners, self._kept = {}, None
         if self.save_learned:
             self.check_target("save_learned", self.save_learned)
+        self.too_short = ""
         if self.max_depth < 2 or self.load_learned:
             return []
         pixel_count = math.prod(film_extent(sensor.film()))
@@ -182,7 +188,12 @@ class WalkIntegrator(StagedIntegrator):
             if kept is not None and sum(pilots) <= kept.pilot_spp:
                 self._kept = kept
                 return []
-        return pilots if kernels >= LEARNING_KERNELS else []
+        if kernels < LEARNING_KERNELS:
+            self.too_short = "nothing: the time limit is too short"
+            return []
+        if self._pilot_spp and spp < _LEAST_SPP:
+            self.too_short = f"nothing: {spp} spp are too few"
+        return pilots
 
     def pace_stage(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Stage | None:
         if self.has_light_paths:
@@ -226,6 +237,7 @@ class WalkIntegrator(StagedIntegrator):
             self.query(scene), self._restored(scene, sensor),
             self._savers(scene, sensor, sum(pilots)),
         )  # fmt: skip
+        schedule.remark = self.too_short
         self.learners = schedule.learners
         return schedule
 

@@ -31,13 +31,14 @@ class Chosen:
         loaded: The scene.
         named: The integrator.
         sensor_index: The index of the sensor.
-        is_default: Is the integrator :data:`DEFAULT`, because none was named?
+        note: A sentence about the integrator, if none was named, and it is :data:`DEFAULT`, or
+            would be in another variant; else empty.
     """
 
     loaded: LoadedScene
     named: NamedIntegrator
     sensor_index: int
-    is_default: bool = False
+    note: str = ""
 
     @classmethod
     def of(cls, loaded: LoadedScene, specification: str | None, sensor_index: int) -> Chosen:
@@ -51,8 +52,8 @@ class Chosen:
         Raises:
             InputError: The integrator or the sensor cannot be used.
         """
-        is_default = specification is None and loaded.only_says_path
-        is_default &= mi.variant() in SUPPORTED_VARIANTS
+        wants_default = specification is None and loaded.only_says_path
+        is_default = wants_default and mi.variant() in SUPPORTED_VARIANTS
         if is_default:
             specification = DEFAULT
         if specification in (None, OF_SCENE):
@@ -64,7 +65,8 @@ class Chosen:
             raise InputError(
                 f"{loaded.source}: there is no sensor {sensor_index}: the scene has {count}"
             )
-        return cls(loaded, named, sensor_index, is_default)
+        note = _note(loaded.integrator_name, is_default) if wants_default else ""
+        return cls(loaded, named, sensor_index, note)
 
     @property
     def scene(self) -> mi.Scene:
@@ -73,18 +75,6 @@ class Chosen:
     @property
     def sensor(self) -> mi.Sensor:
         return self.scene.sensors()[self.sensor_index]
-
-    @property
-    def note(self) -> str:
-        """A sentence about the integrator, if it was neither named nor the scene's."""
-        if not self.is_default:
-            return ""
-        if not self.loaded.integrator_name:
-            return f'"{DEFAULT}" renders this scene, which names no integrator'
-        return (
-            f'"{DEFAULT}" renders this scene, in place of its "{self.loaded.integrator_name}" '
-            f"(which --integrator {OF_SCENE} would use)"
-        )
 
     def remarks(self, is_sensor_chosen: bool) -> list[str]:
         """Warnings about parts of the scene that the image will not show."""
@@ -137,6 +127,25 @@ class LastScene:
         if self._values:
             self._values.set(values or "")
         return Chosen.of(self._loaded, specification, sensor_index)
+
+
+def _note(name: str, is_default: bool) -> str:
+    """See :attr:`Chosen.note`.
+
+    Args:
+        name: The scene's integrator; empty if there is none.
+    """
+    if not is_default:
+        return (
+            f'"{name}" renders this scene: "{DEFAULT}" would, but the integrators of mitsuba_ext '
+            f'do not work in the variant "{mi.variant()}" (they do in "{SUPPORTED_VARIANTS[0]}")'
+        )
+    if not name:
+        return f'"{DEFAULT}" renders this scene, which names no integrator'
+    return (
+        f'"{DEFAULT}" renders this scene, in place of its "{name}" (which --integrator {OF_SCENE} '
+        f"would use)"
+    )
 
 
 def _of_scene(loaded: LoadedScene) -> NamedIntegrator:

@@ -27,7 +27,11 @@ def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
         with signals_wait():
             mi.set_variant(variant)
     except (ImportError, RuntimeError) as error:
-        raise InputError(f'the variant "{variant}" does not start: {one_line(error)}') from error
+        why = one_line(error)
+        if "backend hasn't been initialized" in why:
+            what = "GPU of NVIDIA" if variant.startswith("cuda") else "LLVM library"
+            why = f"Dr.Jit found no {what} that it can use ('mitsuba-ext doctor' looks)"
+        raise InputError(f'the variant "{variant}" does not start: {why}') from error
     for name in plugins:
         try:
             _import_module(name)

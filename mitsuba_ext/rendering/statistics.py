@@ -25,7 +25,8 @@ class RenderStatistics:
         connections: Connections to lights that were considered; ``path`` traces a shadow ray for
             each, ours only for those that would contribute and that the shadow test lets through.
         zero_radiance: Fraction of the camera samples whose radiance is zero.
-        learned: Summary of what the integrator learned; empty if it does not learn.
+        learned: Summary of what the integrator learned, or why it learned nothing; empty if it does
+            not learn.
         effects: For each learned decision (``directions``, ``next_event``, ``light_paths``, …):
             ``is_kept``, the ``variance`` and ``time`` that pilots predict in units of those
             without it, and what else was chosen

@@ -116,7 +116,10 @@ class MetropolisRender(ChainRender):
         finally:
             statistics.learning_seconds += time.perf_counter() - begin
         if chains is None:
-            statistics.learned = "no light was found"
+            statistics.learned = (
+                f"the chains found no light: the image is {self._camera_spp} camera samples per "
+                f"pixel"
+            )
             statistics.interrupted = False
             return
         count = chains.count
