@@ -19,6 +19,20 @@ from .errors import InputError
 _HOST = re.sub(r"\W", "_", platform.node())
 
 
+def is_utf8(text: str) -> bool:
+    """Can Mitsuba take the text? (In Python, the name of a file may contain any bytes.)"""
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def printable(text: str) -> str:
+    """The text without bytes that are not UTF-8."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
+
 def check_folder(folder: Path) -> None:
     """Raises :class:`InputError` if no file can be made in ``folder``."""
     if not folder.is_dir():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import re
 import subprocess
 import sys
@@ -139,6 +140,33 @@ def test_no_traceback_from_the_process(tmp_path):
     result = in_subprocess("render", tmp_path / "none.xml", "-o", tmp_path / "a.exr")
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1 and "none.xml" in result.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have names in UTF-8")
+def test_names_of_files_may_have_any_letters_in_any_locale(make_scene, tmp_path):
+    folder = tmp_path / "szène ☃"
+    folder.mkdir()
+    scene = make_scene("szène ☃/büro 1.xml")
+    plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0"}
+    result = in_subprocess("render", scene, "-o", folder / "ä.exr", env=plain, encoding="utf-8")
+    assert result.returncode == 0, result.stderr
+    assert "szène ☃/ä.exr: " in result.stdout and (folder / "ä.exr").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have names in UTF-8")
+def test_names_that_are_not_utf8_are_refused(run, make_scene, tmp_path, monkeypatch):
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/b\xe9d"))
+    folder.mkdir()
+    scene, named = make_scene(), make_scene(f"{folder.name}/scene.xml")
+    for arguments in (
+        (named, "-o", "a.exr"), (scene, "-o", folder / "a.png"),
+        (scene, "-o", "a.exr", "--integrator", f"neepp:save_learned={folder}/learned.npz"),
+    ):  # fmt: skip
+        code, _, err = run("render", *arguments)
+        assert code == 2 and "b�d" in err and "is not UTF-8" in err and err.count("\n") == 1
+    monkeypatch.chdir(folder)
+    code, _, err = run("render", "scene.xml", "-o", "a.exr")
+    assert code == 2 and "b�d" in err and "is not UTF-8" in err and err.count("\n") == 1
 
 
 def test_terminal_that_is_gone_changes_no_exit_code(run, tmp_path, monkeypatch):

@@ -15,6 +15,8 @@ import click
 
 from .. import __version__
 from ..errors import InputError, InstallationError
+from ..files import is_utf8, printable
+from ..startup.processes import restart_in_utf8
 from .common import INTERRUPTED, say
 from .compare import compare
 from .completion import completion, register
@@ -54,6 +56,12 @@ for command in (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command and returns its exit code."""
+    if arguments is None:
+        restart_in_utf8()
+    for text in map(str, sys.argv[1:] if arguments is None else arguments):
+        if not is_utf8(text):
+            _complain(f'"{printable(text)}" is not UTF-8, which Mitsuba needs: rename the file')
+            return 2
     register()
     try:
         # Only if started from a shell, and not from Python, do comparisons run in worker processes

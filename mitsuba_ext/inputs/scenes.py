@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, did_you_mean, one_line
+from ..files import is_utf8, printable
 from ..rendering.aovs import check_nodes
 from .content_hash import hash_each, hash_files
 from .names import explained
@@ -121,6 +122,12 @@ def scene_name(source: str | Path | Mapping[str, Any] | None) -> str:
 
 def check_scene_file(path: Path) -> None:
     """Raises :class:`InputError` if there is no such file; does not import Mitsuba."""
+    name = str(path.resolve())
+    if not is_utf8(name):
+        raise InputError(
+            f"{printable(name)}: the name of the file, or of a folder, is not UTF-8, which Mitsuba "
+            f"needs: rename it"
+        )
     if not path.is_file():
         raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such scene'}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import sys
 
@@ -22,3 +23,13 @@ def python_command(module: str, *arguments: str) -> list[str]:
         f"runpy.run_module({module!r}, run_name='__main__', alter_sys=True)"
     )
     return [sys.executable, "-c", code, *arguments]
+
+
+def restart_in_utf8() -> None:
+    """Starts this command again in Python's UTF-8 mode, where file names have another encoding (as
+    with ``LC_ALL=C`` and ``PYTHONUTF8=0``): Mitsuba takes names in UTF-8 only."""
+    is_utf8 = codecs.lookup(sys.getfilesystemencoding()).name == "utf-8"
+    if is_utf8 or os.name != "posix" or not sys.executable:
+        return
+    os.environ["PYTHONUTF8"] = "1"
+    os.execv(sys.executable, python_command("mitsuba_ext", *sys.argv[1:]))
