@@ -164,8 +164,8 @@ class Auto(LightPathIntegrator):
         return NO_LIMIT
 
     def pilots(self, scene, sensor, spp, kernels=math.inf):
-        pixel_count, least = math.prod(film_extent(sensor.film())), light_path_schedule.LEAST_SAMPLES
-        is_kept = self.save_learned or self.keep_learned
+        pixel_count = math.prod(film_extent(sensor.film()))
+        least, is_kept = light_path_schedule.LEAST_SAMPLES, self.save_learned or self.keep_learned
         is_short = pixel_count * spp < least and not is_kept
         stages = super().pilots(scene, sensor, 0 if is_short else spp, kernels)
         if is_short and not self.restores:

@@ -8,8 +8,11 @@ selected later. Scenes then name the plugins as they name Mitsuba's own::
     mi.set_variant("llvm_ad_rgb")
     scene = mi.load_file("scene.xml")
     image = mi.render(scene, integrator=mi.load_dict({"type": "auto"}))
+
+``mitsuba_ext.compare`` measures the speed and the error of integrators.
 """
 
+from importlib import import_module
 from pathlib import Path
 
 from .startup import mitsuba_import
@@ -17,6 +20,9 @@ from .startup import mitsuba_import
 __version__ = "0.2.0"
 
 __all__ = ["__version__"]
+
+#: Public modules, which are imported when they are first used: they import Mitsuba.
+_MODULES = ("compare",)
 
 # An installed package contains the folders of plugins. In the source tree they are beside it.
 _folder = Path(__file__).parent
@@ -29,3 +35,14 @@ if not (_folder / "integrators").is_dir():
     __path__.append(str(_folder.parent))
 
 mitsuba_import.prepare()
+
+
+def __getattr__(name: str) -> object:
+    if name in _MODULES:
+        return import_module(f".{name}", __name__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """The public names. Modules that are not among them are internal, and may change."""
+    return sorted({*__all__, *_MODULES, *(name for name in globals() if name.startswith("__"))})

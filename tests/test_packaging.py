@@ -51,6 +51,21 @@ def test_version_is_that_of_the_changes_and_of_the_citation() -> None:
     assert re.search(r'^version = \{ attr = "mitsuba_ext.__version__" \}$', PYPROJECT, re.MULTILINE)
 
 
+def test_authors_and_keywords_are_those_of_the_citation() -> None:
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    names = re.findall(r"^  - name: (.+)$", citation, re.MULTILINE)
+    keywords = re.search(r"^keywords:\n((?:  - .+\n?)+)", citation, re.MULTILINE)[1]
+    authors = ", ".join(f'{{ name = "{name}" }}' for name in names)
+    assert names and f"\nauthors = [{authors}]\n" in PYPROJECT
+    words = ", ".join(f'"{line[4:]}"' for line in keywords.splitlines())
+    assert f"\nkeywords = [{words}]\n" in PYPROJECT
+
+
+def test_internal_names_are_not_listed() -> None:
+    public = [name for name in dir(mitsuba_ext) if not name.startswith("__")]
+    assert public == ["compare"] and mitsuba_ext.compare.Comparison
+
+
 def test_workflow_of_github_runs_the_steps_of_the_ci() -> None:
     yaml = pytest.importorskip("yaml")
     text = (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
@@ -225,6 +240,10 @@ def test_wheel_has_plugins_and_templates_and_nothing_else(built: tuple[Path, Pat
     info = f"mitsuba_ext-{mitsuba_ext.__version__}.dist-info/"
     assert {name for name in names if not name.startswith(info)} == wanted
     assert info + "licenses/LICENSE" in names
+    with zipfile.ZipFile(wheel) as file:
+        metadata = file.read(info + "METADATA").decode()
+    assert "\nAuthor: The mitsuba_ext developers\n" in metadata
+    assert "\nLicense-Expression: MIT\n" in metadata and "\nKeywords: rendering," in metadata
 
 
 @pytest.mark.slow
