@@ -27,7 +27,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 def one_line(error: BaseException | str) -> str:
     """A message of Mitsuba without source positions ("[parser.cpp:12] ", "[PLYMesh] ") and line
     breaks. For an error in a plugin that is written in Python, Mitsuba quotes the whole traceback:
-    this keeps only the message at its end."""
+    this keeps only the message at its end. For an error in a traced function, Dr.Jit only says "see
+    above": this is the message of its cause."""
+    while "(see above)" in str(error) and isinstance(error, BaseException):
+        cause = error.__cause__ or error.__context__
+        if cause is None:
+            break
+        error = cause
     text = str(error)
     if _TRACEBACK in text:
         before, *_, last = text.split(_TRACEBACK)

@@ -77,6 +77,20 @@ def test_auto_renders_scenes_that_ask_for_path_or_nothing(
         assert json.loads(metadata["parameters"])["max_depth"] == 3
 
 
+@pytest.mark.parametrize("options", [[], ["--integrator", "path"], ["--checkpoint", "{tmp}/kept"]])
+def test_a_sampler_without_samples_is_refused(run, make_scene, tmp_path, options):
+    scene = make_scene(integrator=PLAIN_PATH)
+    options = ["-D", "spp=0", *(option.format(tmp=tmp_path) for option in options)]
+    code, _, err = run("render", scene, "-o", tmp_path / "a.exr", *options)
+    assert code == 2 and "0 samples per pixel" in err and str(scene) in err
+
+
+def test_errors_in_traced_code_are_named(run, make_scene, tmp_path):
+    scene = make_scene(body='<emitter type="solid_angle_area"/>')
+    code, _, err = run("render", scene, "-o", tmp_path / "a.exr", "--integrator", "auto")
+    assert code == 2 and '"solid_angle_area": the light needs a shape' in err
+
+
 def test_a_scene_without_integrator_needs_one_where_auto_is_not_supported(
     run, make_scene, tmp_path
 ):

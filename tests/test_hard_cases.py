@@ -304,6 +304,37 @@ def test_unknown_parameter_is_refused(plugin: str, unknown: str) -> None:
         mi.load_dict({"type": plugin, unknown: 4})
 
 
+@pytest.mark.parametrize(("arguments", "message"), [
+    (("scene.xml",), "a scene is needed .*, found an object of type str"),
+    ((None, 0, 0, 4.5), "spp is 4.5; it must be a whole number"),
+    ((None, 0, 0, "4"), "spp is '4'; it must be a whole number"),
+])  # fmt: skip
+def test_wrong_arguments_of_render_are_named(arguments: tuple, message: str) -> None:
+    scene, *others = arguments
+    with pytest.raises(TypeError, match=f'"neepp": {message}'):
+        TECHNIQUES["neepp"].make(2).render(scene or _scene("plain"), *others)
+
+
+def test_integrators_and_scenes_of_another_variant_are_refused() -> None:
+    integrator, scene, active = TECHNIQUES["neepp"].make(2), _scene("plain"), mi.variant()
+    try:
+        mi.set_variant("llvm_ad_mono" if "llvm" in active else "cuda_ad_mono")
+        with pytest.raises(ValueError, match=f'"neepp" was made in the variant "{active}"'):
+            integrator.render(scene, spp=1)
+        with pytest.raises(ValueError, match=f'the scene was made in the variant "{active}"'):
+            TECHNIQUES["neepp"].make(2).render(scene, spp=1)
+    finally:
+        mi.set_variant(active)
+
+
+@pytest.mark.parametrize("name", ["neepp", "mlt"])
+def test_a_sampler_without_samples_is_refused(name: str) -> None:
+    scene = mi.load_dict(stage())
+    scene.sensors()[0].sampler().set_sample_count(0)
+    with pytest.raises(ValueError, match="the sampler has 0 samples per pixel"):
+        mi.load_dict({"type": name, "max_depth": 3}).render(scene)
+
+
 def test_missing_sensor_is_named() -> None:
     with pytest.raises(ValueError, match="there is no sensor 1: the scene has 1"):
         TECHNIQUES["neepp"].make(2).render(_scene("plain"), sensor=1, spp=1)

@@ -22,6 +22,7 @@ from ..long_renders.long_render import Goal, LongRender
 from ..long_renders.state import RenderState
 from ..long_renders.workers import Workers, threads_of_each
 from ..rendering import interrupts
+from ..rendering.batches import sample_count
 from ..rendering.interrupts import deferred_interrupt
 from ..rendering.totals import RenderTotals
 from .long_progress import LongProgress
@@ -124,7 +125,10 @@ class LongJob:
         if options.add:
             spp = state.spp + options.add
         elif spp is None and options.until is None and seconds is None:
-            spp = self._renderer.sensor.sampler().sample_count()
+            try:
+                spp = sample_count(self._renderer.sensor, 0)
+            except ValueError as error:
+                raise InputError(f"{self.chosen.loaded.source}: {error}") from None
         if state.done:
             self._say_what_is_kept(spp, report)
         last = LastKept(state.spp)

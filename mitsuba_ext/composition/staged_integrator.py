@@ -150,8 +150,8 @@ class StagedIntegrator(mi.SamplingIntegrator):
     # ---- What Mitsuba calls ----
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        spp = self._checked(scene, spp) or self.default_spp
         sensor = camera.find_sensor(scene, sensor)
-        spp = spp or self.default_spp
         with in_turn(self, sensor):
             if self._is_batch:
                 return self.render_once(scene, sensor, seed, spp, develop, evaluate)
@@ -241,6 +241,31 @@ class StagedIntegrator(mi.SamplingIntegrator):
         """Reads and checks a parameter of the scene: see
         :func:`mitsuba_ext.parameters.read_parameter`, also for what ``accepted`` can be."""
         return read_parameter(self.name, props, key, default, **accepted)
+
+    def _checked(self, scene: Any, spp: Any) -> int:
+        """The argument ``spp`` of :meth:`render`.
+
+        Raises:
+            TypeError: An argument has another type.
+            ValueError: The integrator or the scene is of another variant than the active one.
+        """
+        if type(scene).__name__ != "Scene":  # each variant has a class of this name
+            raise TypeError(
+                f'"{self.name}": a scene is needed (from mi.load_file or mi.load_dict), found an '
+                f"object of type {type(scene).__name__}"
+            )
+        for what, value in ((f'"{self.name}"', self), ("the scene", scene)):
+            if value.variant_name() != mi.variant():
+                raise ValueError(
+                    f'{what} was made in the variant "{value.variant_name()}", and the active one '
+                    f'is "{mi.variant()}": select that one, or make it again'
+                )
+        try:
+            return operator.index(spp)
+        except TypeError:
+            raise TypeError(
+                f'"{self.name}": spp is {spp!r}; it must be a whole number'
+            ) from None
 
     def no_gradients(self) -> NotImplementedError:
         """The error for a render with gradients."""

@@ -19,6 +19,9 @@ from ..startup.garbage import garbage_left_alone
 from ..stored.arrays import StoredArrays
 from .camera import film_told, find_sensor
 
+#: What is wrong with a sampler that has no samples.
+NO_SAMPLES = "the sampler has 0 samples per pixel (sample_count): give it 1 or more"
+
 
 class Batches:
     """Running mean and variance of batches, each weighted by its samples. Memory and cost per batch
@@ -188,13 +191,19 @@ def batch_seeds(seed: int | mi.UInt32, count: int, first: int = 0) -> list[int]:
 
 def sample_count(sensor: mi.Sensor, spp: int) -> int:
     """The samples per pixel that a render with ``spp`` takes, since stratified samplers round up. 0
-    stands for the sampler's own number."""
+    stands for the sampler's own number.
+
+    Raises:
+        ValueError: The sampler has no samples.
+    """
     sampler = sensor.sampler()
     before = sampler.sample_count()
     if spp:
         sampler.set_sample_count(spp)
     count = sampler.sample_count()
     sampler.set_sample_count(before)
+    if count == 0:
+        raise ValueError(NO_SAMPLES)
     return count
 
 

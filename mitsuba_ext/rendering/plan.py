@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..parameters import MOST_SPP
+from .batches import NO_SAMPLES
 from .camera import film_extent
 
 #: Samples per pass. Tracing a pass in Python takes 5 to 70 ms (many materials take longest), the
@@ -137,6 +138,8 @@ def plan_render(
     if spp:
         sampler.set_sample_count(spp)
     spp = sampler.sample_count()
+    if spp == 0:
+        raise ValueError(f'"{integrator.name}": {NO_SAMPLES}')
     check_extent(sensor.film())
     pixel_count = math.prod(film_extent(sensor.film()))
     structured = sampler.class_name() != "IndependentSampler"
