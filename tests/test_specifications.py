@@ -101,7 +101,8 @@ def test_nested_integrators_take_over_the_settings_and_are_checked(variant):
             "composed_path:next_event=learned_lights",
             "'learned_lights'; it must be one of uniform, power, spatial, linear, visibility, "
             "contribution, resampled, two_stage, triple_product, portals, or a nested plugin: "
-            '"learned_lights" or "spatial_lights"',
+            '"learned_lights" or "spatial_lights" or "resampled_lights" or "two_stage_lights" or '
+            '"portal_lights": nest the plugin (on the command line: next_event=[learned_lights])',
         ),
         ("composed_path:connections=-3", 'the parameter "connections" is -3; it must be at least'),
         ("composed_path:time=latice", "one of sampler, swarm, independent, stratified,"),
@@ -113,6 +114,17 @@ def test_nested_integrators_take_over_the_settings_and_are_checked(variant):
         with pytest.raises(InputError) as error:
             make_named(text, DEPTH)
         assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_values_of_none_which_end_mitsuba_are_refused(variant, tmp_path):
+    file = tmp_path / "path.json"
+    file.write_text('{"type": "path", "max_depth": null}')
+    scene = {"type": "scene", "sensor": {"type": "perspective", "fov": None}}
+    for what, key in ((file, "max_depth"), ({"type": "path", "rr_depth": None}, "rr_depth")):
+        with pytest.raises(InputError, match=f'"{key}" has no value .None, null.: leave it out'):
+            make_named(what)
+    with pytest.raises(InputError, match='"fov" has no value'):
+        load_scene(scene)
 
 
 @pytest.mark.parametrize("plugin", ["aov", "composed_path"])

@@ -101,4 +101,6 @@ def _accepted(slot: str, value: object) -> str:
     if slot == "light_paths":
         nested = f", or a number from 0 to {MOST_PATHS:g}"
     hint = did_you_mean(value, words) if isinstance(value, str) else ""
+    if f'"{value}"' in plugins:
+        hint = f": nest the plugin (on the command line: {slot}=[{value}])"
     return f"{found}; it must be one of {', '.join(words)}{nested}{hint}"

@@ -52,15 +52,17 @@ def check_source(source: object) -> None:
 
 def check_variant(value: object) -> None:
     """Checks that the objects of Mitsuba in ``value`` (a scene's dict, or an item of one) are of
-    the active variant: Mitsuba ignores others, or misinterprets them.
+    the active variant: Mitsuba ignores others, or misinterprets them. (It dies of ``None``.)
 
     Raises:
-        InputError: One is of another variant.
+        InputError: One is of another variant, or ``None``.
     """
     import mitsuba as mi
 
     if isinstance(value, Mapping):
-        for item in value.values():
+        for key, item in value.items():
+            if item is None:
+                raise InputError(f'the parameter "{key}" has no value (None, null): leave it out')
             check_variant(item)
     elif isinstance(value, mi.Object) and value.variant_name() not in ("", mi.variant()):
         raise InputError(

@@ -90,6 +90,7 @@ def make_named(
         )
     elif Path(specification).suffix.lower() in (".xml", ".json"):
         content = _read_fragment(Path(specification))
+        check_variant(content)
         made = _from_parser(str(specification), content, inherited)
     else:
         plugin = parse_plugin(str(specification))
