@@ -108,6 +108,7 @@ def test_bad_input_is_one_line_and_exit_code_2(run, make_scene, tmp_path, argume
         ('<float name="fov"', '<float name="fovv"', "unreferenced"),
         ('<rfilter type="box"/>', '<string name="filtre" value="box"/>', "unreferenced"),
         ('name="width" value="8"', 'name="width" value="$none"', "$none"),
+        ('name="width" value="8"', 'name="width" value="0"', "the film has the width 0"),
     ],
 )
 def test_broken_scene_is_one_line_that_names_the_file(

@@ -85,6 +85,12 @@ def test_a_sampler_without_samples_is_refused(run, make_scene, tmp_path, options
     assert code == 2 and "0 samples per pixel" in err and str(scene) in err
 
 
+def test_an_integrator_that_nests_none_is_black_and_says_so(run, make_scene, tmp_path):
+    render = ("render", make_scene(), "-o", tmp_path / "a.exr", "--integrator")
+    assert '"moment" nests no integrator' in run(*render, "moment")[2]
+    assert "nests no" not in run(*render, "moment:image=[path]")[2]
+
+
 def test_errors_in_traced_code_are_named(run, make_scene, tmp_path):
     scene = make_scene(body='<emitter type="solid_angle_area"/>')
     code, _, err = run("render", scene, "-o", tmp_path / "a.exr", "--integrator", "auto")

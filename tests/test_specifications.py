@@ -88,6 +88,7 @@ def test_nested_integrators_take_over_the_settings_and_are_checked(variant):
         ("variance:nested=[path:max_depth=a,b]", 'nested plugin "path": The property "max_depth"'),
         ("path:nested=[path]", 'integrator "path" has no parameter "nested"'),
         ("variance:nested=[independent]", "exactly one integrator must be nested in it"),
+        ("variance:nested=path", "found none (nested plugins are in brackets: nested=[path])"),
         ("independent", "not an integrator"),
         ("composed_path:directions=[guided_direction]", 'did you mean "guided_directions"?'),
         ("composed_path:direction=guided", 'no parameter "direction": did you mean "directions"?'),

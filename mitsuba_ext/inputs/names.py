@@ -105,6 +105,11 @@ def check_integrator(specification: str) -> None:
         _check_plugin(parse_plugin(specification))
 
 
+def is_plugin(name: str) -> bool:
+    """Is it an integrator or a decision of ours, or a plugin of Mitsuba?"""
+    return name in (*_ours(True), *MITSUBA_INTEGRATORS) or is_file_of_mitsuba(name)
+
+
 def _check_plugin(plugin: Mapping[str, Any], is_nested: bool = False) -> None:
     name = plugin["type"]
     is_known = name in (*_ours(is_nested), *MITSUBA_INTEGRATORS)

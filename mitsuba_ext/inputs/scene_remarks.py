@@ -37,6 +37,8 @@ def scene_remarks(loaded: LoadedScene, integrator: mi.Integrator, name: str) -> 
         and len(with_nested(each)) == 1
     ]
     remarks = []
+    if class_name(integrator) == "MomentIntegrator" and len(with_nested(integrator)) == 1:
+        remarks.append(f'"{name}" nests no integrator that renders the image: it is black')
     # Our integrators render media, or refuse scenes that have them
     blind = [
         each

@@ -16,7 +16,7 @@ from ..rendering.aovs import check_aovs, check_nodes
 from ..startup.plugin_parameters import parameter_names
 from ..startup.registry import plugin_names
 from .content_hash import hash_code, hash_value
-from .names import explained, is_file_of_mitsuba, unknown_parameter, unknown_plugin
+from .names import explained, is_file_of_mitsuba, is_plugin, unknown_parameter, unknown_plugin
 from .plugin_text import parse_plugin
 from .scenes import check_variant
 
@@ -192,6 +192,9 @@ def _make(
         message = one_line(error)
         if not message.startswith(f'"{name}"'):  # our plugins name themselves
             message = f'"{name}": {message}'
+        words = [key for key, value in own.items() if isinstance(value, str) and is_plugin(value)]
+        if "must be nested" in message and words:
+            message += f" (nested plugins are in brackets: {words[0]}=[{own[words[0]]}])"
         raise InputError(f"{kind} {message}") from error
     if kind == "integrator" and not isinstance(made, mi.Integrator):
         raise InputError(f'"{name}" is a plugin of Mitsuba, but not an integrator')
