@@ -44,5 +44,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """The public names. Modules that are not among them are internal, and may change."""
+    """The public names. The page of the Python API names a few functions of other modules."""
     return sorted({*__all__, *_MODULES, *(name for name in globals() if name.startswith("__"))})

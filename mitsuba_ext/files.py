@@ -29,8 +29,8 @@ def is_utf8(text: str) -> bool:
 
 
 def printable(text: str) -> str:
-    """The text without bytes that are not UTF-8."""
-    return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    """The text, with question marks for bytes that are not UTF-8."""
+    return text.encode("utf-8", "replace").decode("utf-8")
 
 
 def check_folder(folder: Path) -> None:

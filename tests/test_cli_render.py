@@ -91,10 +91,11 @@ def test_an_integrator_that_nests_none_is_black_and_says_so(run, make_scene, tmp
     assert "nests no" not in run(*render, "moment:image=[path]")[2]
 
 
-def test_errors_in_traced_code_are_named(run, make_scene, tmp_path):
-    scene = make_scene(body='<emitter type="solid_angle_area"/>')
-    code, _, err = run("render", scene, "-o", tmp_path / "a.exr", "--integrator", "auto")
-    assert code == 2 and '"solid_angle_area": the light needs a shape' in err
+@pytest.mark.parametrize("light", ["area", "solid_angle_area"])
+def test_a_light_that_is_in_no_shape_is_refused(run, make_scene, tmp_path, light):
+    scene = make_scene(body=f'<emitter type="{light}"/>')
+    code, _, err = run("render", scene, "-o", tmp_path / "a.exr")
+    assert code == 2 and f'"{light}" is in no shape' in err and str(scene) in err
 
 
 def test_a_scene_without_integrator_needs_one_where_auto_is_not_supported(

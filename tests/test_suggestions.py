@@ -84,6 +84,15 @@ def test_in_dicts_for_mitsuba(plugin: str, key: str, meant: str) -> None:
                                            f'did you mean "{meant}"?')  # fmt: skip
 
 
+def test_errors_in_traced_code_keep_their_sentence() -> None:
+    with pytest.raises(RuntimeError) as caught:
+        try:
+            raise ValueError("the light needs a shape")
+        except ValueError as error:
+            raise RuntimeError("dr.while_loop(): encountered an exception (see above).") from error
+    assert one_line(caught.value) == "the light needs a shape"
+
+
 def test_a_nested_decision_without_a_name_is_told_its_slot(run, tmp_path: Path) -> None:
     err = _complaint(
         run, tmp_path, integrator="composed_path", inside='<sampler type="mis_heuristic"/>'

@@ -84,8 +84,9 @@ def explained(message: str) -> str:
         hint = did_you_mean(plugin[1], [*known, *MITSUBA_INTEGRATORS, *_files_of_mitsuba()])
         return message.replace(plugin[0], f"{plugin[0][:-1]}{hint}" if hint else plugin[0])
     unread = re.search(r'unreferenced propert.* plugin of type "(\w+)": \w+ "(\w+)"', message)
-    return message + did_you_mean(unread[2], MITSUBA_INTEGRATORS.get(unread[1], ())) if unread \
-        else message
+    if unread:
+        return message + did_you_mean(unread[2], MITSUBA_INTEGRATORS.get(unread[1], ()))
+    return message
 
 
 def check_integrator(specification: str) -> None:

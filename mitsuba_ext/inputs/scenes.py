@@ -19,6 +19,7 @@ from ..files import is_utf8, printable
 from ..rendering.aovs import check_nodes
 from .content_hash import hash_each, hash_files
 from .names import explained
+from .parsed_scene import check_parsed
 from .scene_changes import UNCHANGED, SceneChanges, change_films
 from .scene_files import files_of, named_in, parameters_of
 
@@ -182,7 +183,7 @@ def load_scene(
             else:
                 state = mi.parser.parse_file(config, str(path), **strings)
             check_nodes(state)
-            _check_films(state)
+            check_parsed(state)
             if moved:
                 for (node, key), name in list(named_in(state)):
                     node.props[key] = moved(name)
@@ -373,16 +374,3 @@ def _is_integrator(node: mi.parser.SceneNode, key: str) -> bool:
         return isinstance(mi.PluginManager.instance().create_object(properties), mi.Integrator)
     except Exception:  # no such plugin, or it cannot be made without its parameters
         return key == "integrator"
-
-
-def _check_films(state: mi.parser.ParserState) -> None:
-    """Refuses a film without pixels, for which Mitsuba's sensor blames its field of view."""
-    import mitsuba as mi
-
-    for node in state.nodes:
-        own = mi.Properties(node.props)  # a copy, because reading a property marks it as queried
-        for key in ("width", "height") if node.type == mi.ObjectType.Film else ():
-            if key in own and own[key] == 0:
-                raise InputError(
-                    f"the film has the {key} 0 ({mi.parser.file_location(state, node)})"
-                )

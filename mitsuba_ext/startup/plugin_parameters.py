@@ -6,6 +6,7 @@ Mitsuba, too, refuses parameters that a plugin did not read, but suggests no nam
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 
+@functools.cache
 def parameter_rows(name: str) -> list[Parameter]:
     """The rows of the parameter table of a plugin of this package; none for other plugins."""
     files = [file for kind in registry.plugin_names() for file in registry.plugin_files(kind)]
