@@ -109,7 +109,8 @@ class ComposedPath(WalkIntegrator):
        - Keep what is learned for later renders of this process (frames, notebooks)? A render of the
          same scene, with the same parameters and film size, then takes no pilot samples, also from
          another camera. It learns again where it would have more pilot samples than the earlier
-         one. An image then depends on the renders before it. (Default: false)
+         one. An image then depends on the renders before it. The parameter is accepted only if a
+         decision learns. (Default: false)
      * - (Common parameters)
        - |several|
        - Those of :class:`WalkIntegrator`: max_depth, rr_depth, hide_emitters, timeout, aovs,

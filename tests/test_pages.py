@@ -147,7 +147,7 @@ def test_pages_have_what_their_readers_look_for(name):
     page, text = pages.read_page(FILES[name]), FILES[name].read_text()
     prose = " ".join(page.text.split())
     assert page.title.endswith(f"({name})") and f"-{name}:\n" in text and page.parameters
-    for words in ("**Use it when**", "**Not when**", "Source", "'type': '", ' type="'):
+    for words in ("Use it when", "Not when", "Source", "'type': '", ' type="'):
         assert words in prose
     for row in page.parameters:
         assert row.type and len(row.description) > 10, row

@@ -122,7 +122,7 @@ def _parameter(name: str, row: Parameter, value: bool | int | float) -> dict[str
 
 def _is_conditional(row: Parameter) -> bool:
     """Is the parameter refused, even with its default, unless another one is set?"""
-    return bool(re.search(r"^With [a-z]|only with ", row.description))
+    return bool(re.search(r"^With [a-z]|only with |accepted only if ", row.description))
 
 
 def _default(row: Parameter) -> bool | int | float | None:
