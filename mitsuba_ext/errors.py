@@ -41,5 +41,7 @@ def one_line(error: BaseException | str) -> str:
         kind, _colon, message = re.sub(r"\A(?: .*\n)*", "", last).partition(": ")
         text = before + (message or kind)
     text = re.sub(r"\[\w+(?:\.(?:cpp|h):\d+)?\] ", "", text)
+    # A nested object is printed with all its parameters
+    text = re.sub(r'(- object "\w+": \w+)\[.*\]', r"\1", text, flags=re.S)
     # "Found 1 unreferenced property in …:\n  - float "radiusx": 3"
     return re.sub(r"\s*\n\s*(?:- )?", " ", text).strip() or type(error).__name__

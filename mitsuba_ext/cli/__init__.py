@@ -8,6 +8,7 @@ SIGHUP).
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 
@@ -75,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not list(sys.argv[1:] if arguments is None else arguments):
             error.show()  # the help, because no subcommand was given
         else:
-            _complain(error.format_message())
+            _complain(_explained(error))
         return 2
     except (InputError, InstallationError) as error:
         _complain(str(error))
@@ -87,6 +88,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _complain(f"{error.filename}: {error.strerror}" if is_named else str(error))
         return 2
     return code if isinstance(code, int) else 0
+
+
+def _explained(error: click.ClickException) -> str:
+    """The message of click, with what a first user may not know."""
+    text = error.format_message()
+    for kind, meant in (("integer", "whole number"), ("float", "number")):
+        text = text.replace(f"valid {kind} range", meant)
+    unknown = re.fullmatch(r"No such command '(.*)'\.", text)
+    if unknown and unknown[1].lower().endswith(".xml"):
+        return f"{text[:-1]}: 'mitsuba-ext render {unknown[1]} -o image.exr' renders this scene"
+    if unknown:
+        return f"{text[:-1]} ('mitsuba-ext --help' lists the commands)"
+    if isinstance(error, click.MissingParameter) and isinstance(error.param, click.Option):
+        what = re.split(r"[:.] ", error.param.help or "")[0]
+        return f"{text.rstrip('.')}: {what[:1].lower()}{what[1:]}"
+    return text
 
 
 def _complain(message: str) -> None:

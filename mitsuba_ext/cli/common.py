@@ -84,6 +84,7 @@ class Definition(click.ParamType):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, str]:
         key, equals, text = value.partition("=")
+        key = key.lstrip("$")  # as the scene file names it
         if not key or not equals:
             self.fail(f'expected key=value, found "{value}"', param, ctx)
         return key, text

@@ -33,7 +33,17 @@ def parse_plugin(text: str, kind: str = "integrator") -> dict[str, Any]:
     try:
         return _parse(text)
     except ValueError as error:
-        raise InputError(f'{kind} "{text}": {error}') from error
+        raise InputError(f'{kind} "{text}": {error}{_meant(text)}') from error
+
+
+def _meant(text: str) -> str:
+    """The right form of "bdpt,max_depth=4" or "bdpt: max_depth=4"; empty for other texts."""
+    likely = re.sub(r"\W+", ":", text.strip(), count=1)
+    try:
+        _parse(likely)
+    except ValueError:
+        return ""
+    return f': did you mean "{likely}"?'
 
 
 def _parse(text: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
-from ..errors import InputError
+from ..errors import InputError, did_you_mean
 from ..startup.signals import signals_wait
 
 
@@ -22,7 +22,9 @@ def select_variant(variant: str, plugins: Sequence[str] = ()) -> None:
     from ..errors import one_line
 
     if variant not in mi.variants():
-        raise InputError(f'unknown variant "{variant}" (there are: {", ".join(mi.variants())})')
+        known = mi.variants()
+        hint = did_you_mean(variant, known)
+        raise InputError(f'unknown variant "{variant}"{hint} (there are: {", ".join(known)})')
     try:
         with signals_wait():
             mi.set_variant(variant)

@@ -51,10 +51,10 @@ def unread(name: str, key: str, others: Sequence[str] = ()) -> str:
     return f'"{name}" has no parameter "{key}"{hint}'
 
 
-def refuse_unread(name: str, props: mi.Properties) -> None:
+def refuse_unread(plugin: mi.Object, props: mi.Properties) -> None:
     """
     Args:
-        name: A plugin of this package, which has been constructed.
+        plugin: A plugin of this package.
         props: The parameters that the scene gives.
 
     Raises:
@@ -63,17 +63,23 @@ def refuse_unread(name: str, props: mi.Properties) -> None:
     keys = props.unqueried()
     if not keys:
         return
-    key, value = keys[0], props[keys[0]]
+    name, key, value = props.plugin_name(), keys[0], props[keys[0]]
     if key.startswith("_arg_"):
         raise ValueError(f'"{name}": {_nameless(value)}')
-    raise ValueError(unread(name, key))
+    message = unread(name, key)
+    if hasattr(plugin, "decision_parameters") and "did you mean" not in message:
+        message += f"; it is for nesting in an integrator, with {_names(plugin)}"
+    raise ValueError(message)
 
 
 def _nameless(value: Any) -> str:
     """Says of a nested plugin without a name that it cannot be used."""
     what = getattr(value, "name", None) or value.class_name()
-    decision = getattr(value, "decision_parameters", None)
-    if decision is None:
+    if not hasattr(value, "decision_parameters"):
         return f'nothing here uses the nested "{what}": leave it out'
-    slots = " or ".join(f'name="{slot}"' for slot in decision.slots)
-    return f'the nested "{what}" needs the name of what it decides: {slots}'
+    return f'the nested "{what}" needs the name of what it decides: {_names(value)}'
+
+
+def _names(decision: Any) -> str:
+    """The names with which a decision can be nested."""
+    return " or ".join(f'name="{slot}"' for slot in decision.decision_parameters.slots)

@@ -69,7 +69,7 @@ def plugin(cls: type) -> type:
         from .plugin_parameters import refuse_unread  # it imports this module
 
         instance = cls(props)
-        refuse_unread(name, props)
+        refuse_unread(instance, props)
         if kind in _CALLED:
             _alive.add(instance)
         return instance
