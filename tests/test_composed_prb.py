@@ -257,6 +257,18 @@ def test_where_one_of_several_lights_is_optimized_it_is_chosen_more_often() -> N
     assert abs(np.mean(ours) - np.mean(theirs)) < np.std(theirs)
 
 
+def test_gradients_of_another_scene_in_memory_refuse_no_render() -> None:
+    optimized, other = (mi.load_dict(stage(), optimize=False) for _ in range(2))
+    parameters = small(optimized)
+    key = next(key for key in parameters.keys() if key.endswith("reflectance.value"))
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    plain = mi.load_dict({"type": "composed_path", "max_depth": 3})
+    with pytest.raises(NotImplementedError, match="does not compute gradients"):
+        plain.render(optimized, spp=1)
+    assert plain.render(other, spp=1).numpy().mean() > 0
+
+
 def test_what_has_no_gradients_is_refused() -> None:
     scene = mi.load_dict(stage(), optimize=False)
     parameters = small(scene)

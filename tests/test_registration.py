@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -41,6 +42,16 @@ def _run(code: str) -> str:
     )
     assert result.returncode == 0, result.stderr
     return result.stdout
+
+
+def test_every_file_that_is_executed_once_per_variant_is() -> None:
+    root = Path(__file__).parents[1]
+    named = {
+        ".".join(file.relative_to(root).with_suffix("").parts)
+        for file in (root / "mitsuba_ext").rglob("*.py")
+        if "This file is executed once per variant" in file.read_text(encoding="utf-8")
+    }
+    assert named == set(registry._BASES)
 
 
 @pytest.mark.parametrize(

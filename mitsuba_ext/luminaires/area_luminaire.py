@@ -1,4 +1,7 @@
-"""The base class of lights on shapes whose directions are sampled by solid angle."""
+"""The base class of lights on shapes whose directions are sampled by solid angle.
+
+This file is executed once per variant (see ``registry.py``): its base class is variant-bound.
+"""
 
 from __future__ import annotations
 

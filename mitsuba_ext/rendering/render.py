@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..arrays import from_numpy
+from ..scene.gradients import has_gradients
 from ..transport import heroes
 from ..transport.estimator import CameraRays, Sample
 from ..transport.frozen import with_recordings
@@ -95,14 +96,19 @@ def render(
         try:
             with deferred_interrupt() as interrupt:
                 made.run(interrupt)
-        except GradientsError:
-            raise integrator.no_gradients() from None
         finally:
             # Also after an exception, the film holds the passes that were finished
             made.fill_film()
         return made, interrupt
 
-    made, interrupt = with_recordings(scene, sensor, attempt)
+    try:
+        made, interrupt = with_recordings(scene, sensor, attempt)
+    except GradientsError:
+        if has_gradients(scene, sensor):
+            raise integrator.no_gradients() from None
+        # Another scene has them: Dr.Jit traces the methods of all BSDFs and lights in memory
+        with dr.suspend_grad():
+            made, interrupt = with_recordings(scene, sensor, attempt)
     image = camera.develop(sensor.film(), develop, evaluate)
     made.finish()
     if interrupt.is_set():

@@ -91,9 +91,11 @@ def _contains(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
 def _all_in_memory() -> Iterator[mi.BSDF]:
     for index in range(1, _NUMBERS):
         try:
-            yield dr.reinterpret_array(mi.BSDFPtr, mi.UInt32(index))[0]
-        except RuntimeError:  # an index that is not in use
+            bsdf = dr.reinterpret_array(mi.BSDFPtr, mi.UInt32(index))[0]
+        except RuntimeError:  # an index that was never in use
             continue
+        if bsdf is not None:
+            yield bsdf
 
 
 def _index(bsdf: mi.BSDF) -> int:

@@ -35,6 +35,11 @@ def refuse_geometry(plugin: str, params: Any) -> None:
             )
 
 
+def has_gradients(*things: mi.Object) -> bool:
+    """Do parameters of a scene, or of a sensor, have gradients?"""
+    return any(dr.grad_enabled(value) for each in things for _, value in mi.traverse(each))
+
+
 class Optimized:
     """Which BSDFs and lights of a scene have parameters with gradients.
 

@@ -41,6 +41,7 @@ _BASES = (
     "mitsuba_ext.composition.decision_plugin",
     "mitsuba_ext.composition.walk_integrator",
     "mitsuba_ext.composition.remembering_path",
+    "mitsuba_ext.composition.sensitive_path",
     "mitsuba_ext.composition.bidirectional_integrator",
     "mitsuba_ext.composition.chain_integrator",
     "mitsuba_ext.composition.metropolis_integrator",
