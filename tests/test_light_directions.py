@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from typing import Any
 
 import drjit as dr
@@ -21,6 +22,7 @@ from statistical import (
 
 from mitsuba_ext.bidirectional.light_directions import NOT_RECIPROCAL, LightDirections
 from mitsuba_ext.bidirectional.scattering import adjoint_value
+from mitsuba_ext.scene import bsdfs
 from mitsuba_ext.scene.bsdfs import bsdf_table
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -203,3 +205,10 @@ def test_the_image_is_that_of_path(where: str, name: str, integrator: str, spp: 
     images = batches(scene, ours, spp, SEEDS[:MANY_SEEDS])
     expected = batches(scene, path, 1024, REFERENCE_SEEDS[:MANY_SEEDS])
     assert_same_quarters(images, expected, 0.006)
+
+
+def test_bsdfs_that_were_freed_are_not_among_those_in_memory() -> None:
+    kept = [mi.load_dict(diffuse(0.5)) for _ in range(20)]
+    del kept[3:17]
+    gc.collect()
+    assert all(isinstance(bsdf, mi.BSDF) for bsdf in bsdfs._all_in_memory())
