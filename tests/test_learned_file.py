@@ -107,6 +107,19 @@ def test_kept_renders_draw_what_loaded_ones_draw(name, tmp_path: Path) -> None:
     np.testing.assert_array_equal(*images)
 
 
+@pytest.mark.usefixtures("nothing_kept")
+def test_a_render_that_restores_nothing_claims_no_light_paths() -> None:
+    """`auto` has never tried light paths for a scene in which nothing was kept."""
+    scene, make = _small("rooms"), {"type": "auto", "max_depth": 6, "keep_learned": True}
+    integrator = mi.load_dict(make)
+    learned_by = integrator._learned_by(scene.sensors()[0])
+    kept_learning.put(scene, learned_by, pilot_spp=64, states={})
+    integrator.render(scene, seed=5, spp=32)
+    assert integrator.restores
+    assert integrator.statistics.learned.startswith("nothing")
+    assert "light_paths" not in integrator.statistics.effects
+
+
 def test_load_learned_excludes_keep_learned() -> None:
     with pytest.raises((RuntimeError, ValueError), match='leave "keep_learned" out'):
         mi.load_dict({"type": "neepp", "load_learned": "some.npz", "keep_learned": True})

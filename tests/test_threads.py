@@ -7,6 +7,7 @@ import gc
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import drjit as dr
@@ -107,6 +108,31 @@ def test_renders_of_several_threads_alternate_and_those_with_one_integrator_do_n
             thread.join(60)
         assert sorted(order) == [1] * 4 + [2] * 4
         assert (order in ([1] * 4 + [2] * 4, [2] * 4 + [1] * 4)) == are_same
+
+
+def test_progress_may_render_with_what_another_thread_uses_and_wait_for_it() -> None:
+    """The other thread has the second integrator already, and waits for its turn."""
+    scene = mi.load_dict(stage())
+    one, two = (mi.load_dict({"type": "composed_path", "max_depth": 2}) for _ in range(2))
+    ended = []
+
+    def end(act) -> threading.Thread:
+        thread = threading.Thread(target=lambda: ended.append(act()), daemon=True)
+        thread.start()
+        return thread
+
+    def render(integrator: mi.Integrator) -> mi.TensorXf:
+        return integrator.render(scene, mi.load_dict(stage()["sensor"]), spp=1)
+
+    def progress(done: float) -> None:
+        other = end(lambda: render(two))
+        time.sleep(0.05)
+        render(two)
+        other.join(60)
+
+    one.progress = progress
+    end(lambda: render(one)).join(60)
+    assert len(ended) == 2, "the renders wait for each other"
 
 
 def test_the_collector_starts_again_when_the_last_thread_allows_it() -> None:

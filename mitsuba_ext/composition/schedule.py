@@ -220,6 +220,11 @@ class Schedule:
                 self._replace(slot, learner.restore(self._setting.scene, states[slot]))
         for learner in self.learners.values():
             learner.finish()
+        for slot in set(self._everyone) - set(states):  # they decide as ``path``
+            self.learners.pop(slot, None)
+            self.beside.pop(slot, None)
+        if not states:
+            self.remark = "nothing: an earlier render has found that nothing pays"
         return self._last_stage()
 
     @property

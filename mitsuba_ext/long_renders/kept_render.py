@@ -14,6 +14,7 @@ from ..inputs.content_hash import hash_code
 from ..maps.light_map_file import fingerprint
 from ..rendering.batches import sample_count
 from ..rendering.interrupts import deferred_interrupt
+from ..rendering.turns import tell
 from ..scene.nesting import with_nested
 from ..startup.machine import versions
 from .folder import CheckpointFolder
@@ -79,7 +80,7 @@ class KeptRender:
                     last.mark(state.spp)
                     self._save(state)
                 if progress is not None:
-                    progress(min(1.0, state.spp / (render.goal_spp or goal.spp)))
+                    tell(progress, min(1.0, state.spp / (render.goal_spp or goal.spp)))
 
             render = LongRender(batches, state, after_batch)
             is_interrupted = False

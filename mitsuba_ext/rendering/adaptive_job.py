@@ -17,6 +17,7 @@ from .render import Job, kernel_cache_misses, kernels_compiled
 from .sample_allocation import SampleAllocation
 from .stages import Stage
 from .time_budget import TimeBudget
+from .turns import tell
 
 #: By default, each pass takes all samples divided by this number.
 _PASS_SHARE = 8
@@ -87,7 +88,7 @@ class AdaptiveJob(Job):
             if self.integrator.progress is not None:
                 is_done = passes == 1 or not self.allocation.is_active.any()
                 done = int(self.moments.count.sum())
-                self.integrator.progress(1.0 if is_done else done / (done + left))
+                tell(self.integrator.progress, 1.0 if is_done else done / (done + left))
         self.statistics.interrupted = self._stopped(interrupt) and bool(
             self.allocation.is_active.any()
         )

@@ -34,7 +34,7 @@ from .plan import Planned, plan_render
 from .stages import DivisibleSchedule, EndingSchedule, Schedule, Stage
 from .statistics import RenderStatistics
 from .time_budget import TimeBudget
-from .turns import let_others
+from .turns import let_others, tell
 
 
 class Staged(Planned, Protocol):
@@ -244,7 +244,7 @@ class Job:
                 is_known = is_last and not budget.is_open
                 wanted = max(done, self.plan.whole(before, budget.samples, samples))
                 total = before + wanted if is_known else self.plan.spp
-                self.integrator.progress((before + done) / total)
+                tell(self.integrator.progress, (before + done) / total)
         self.statistics.interrupted = not is_last
 
     def _next_stage(self, schedule: Schedule) -> Stage:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 import mitsuba as mi
@@ -52,10 +52,13 @@ class _Turns:
             self._hand_over()
 
     def pause(self) -> None:
-        """Gives, and takes again, if others wait. An exception meanwhile is raised in turn."""
-        if not self._waiting:
-            return
-        self.give()
+        """Gives, and takes again, if others wait."""
+        if self._waiting:
+            self.give()
+            self.take_again()
+
+    def take_again(self) -> None:
+        """Waits for a turn that was given. An exception meanwhile is raised in turn."""
         error = None
         while True:
             try:
@@ -119,6 +122,20 @@ def let_others() -> None:
     """Lets other threads render a pass, if they wait for it."""
     if _thread.depth > 0:
         _turns.pause()
+
+
+def tell(progress: Callable[[float], None], done: float) -> None:
+    """Calls ``progress`` of a render. It may render, or wait for threads that do: meanwhile, this
+    thread has no turn."""
+    depth, _thread.depth = _thread.depth, 0
+    if depth > 0:
+        _turns.give()
+    try:
+        progress(done)
+    finally:
+        if depth > 0:
+            _turns.take_again()
+        _thread.depth = depth
 
 
 @contextmanager

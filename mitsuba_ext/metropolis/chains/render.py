@@ -14,7 +14,7 @@ from ...rendering.camera import film_extent
 from ...rendering.render import kernel_cache_misses
 from ...rendering.statistics import RenderStatistics
 from ...rendering.time_budget import TimeBudget
-from ...rendering.turns import let_others
+from ...rendering.turns import let_others, tell
 from .chains import Chains, Counts
 from .looped import LoopedChains
 from .path_chains import PathChains
@@ -104,7 +104,7 @@ class ChainRender:
                 budget.passed(made, done, time.perf_counter() - begin)
             self._statistics.passes += 1
             if integrator.progress is not None:
-                integrator.progress(min(1.0, done / budget.samples))
+                tell(integrator.progress, min(1.0, done / budget.samples))
         return True
 
     def _count(self, counts: Counts, mutations: int) -> None:
