@@ -205,6 +205,27 @@ def test_damaged_and_foreign_runs_are_rendered_again(clock, tmp_path):
     assert (run_seed(0, 0), 8) in calls
 
 
+def test_a_run_under_the_name_of_another_one_is_rendered_again(clock, tmp_path):
+    calls = []
+    integrators = {
+        name: noisy_integrator(clock, sigma=sigma, calls=calls)
+        for name, sigma in (("one", 1.0), ("two", 3.0))
+    }
+
+    def run() -> dict:
+        return compare_noisy(compare.equal_samples(8), integrators, tmp_path, seeds=1)
+
+    before = run()
+    one, two = (tmp_path / each["runs"][0]["image"] for each in before["integrators"])
+    two.write_bytes(one.read_bytes())
+    calls.clear()
+    again = run()
+    assert (run_seed(0, 0), 8) in calls
+    relmse = [[each["levels"][0]["figures"]["relmse"] for each in scene["integrators"]]
+              for scene in (before, again)]  # fmt: skip
+    assert relmse[0] == relmse[1]
+
+
 def test_runs_of_a_live_object_are_not_taken_up(clock, tmp_path):
     calls = []
     integrator = mi.load_dict({"type": noisy_integrator(clock, calls=calls)})

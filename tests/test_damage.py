@@ -128,6 +128,21 @@ def test_edited_checkpoints_are_states_or_fall_back(tmp_path: Path, count: int) 
         json.dumps(state.totals.known())
 
 
+def test_a_state_of_another_folder_is_not_taken_up(tmp_path: Path) -> None:
+    folders = []
+    for scene in ("one", "two"):
+        folder = CheckpointFolder(tmp_path / scene)
+        folder.path.mkdir()
+        folder.describe({"scene hash": scene})
+        state = RenderState()
+        state.add(_result(0))
+        folder.save(state)
+        folders.append(folder.path / "state.npz")
+    assert CheckpointFolder(tmp_path / "one").load().spp == 4
+    folders[0].write_bytes(folders[1].read_bytes())
+    assert refused(CheckpointFolder(tmp_path / "one").load) is None
+
+
 def test_a_checkpoint_whose_states_are_both_damaged_is_refused(tmp_path: Path) -> None:
     folder, _ = _checkpoint(tmp_path / "kept")
     for name in ("state.npz", "state.before.npz"):

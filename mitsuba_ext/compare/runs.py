@@ -2,9 +2,9 @@
 
 Every run is one EXR: its image, and a header with its cost. The file name contains a hash of
 everything that the run depends on: a comparison that is started again uses the stored runs, but
-never those of another scene, integrator, version or machine, nor files that are damaged: they hold
-a checksum. A run that was timed again in another session has a JSON file with these times beside
-it.
+never those of another scene, integrator, version or machine, nor files that are damaged or renamed:
+they hold their name, and a checksum. A run that was timed again in another session has a JSON file
+with these times beside it.
 """
 
 from __future__ import annotations
@@ -126,13 +126,16 @@ class RunFolder:
         return self.folder / name
 
     def load(self, path: Path) -> Run | None:
-        """A run that was finished earlier; ``None`` if there is none, or its file is damaged."""
+        """A run that was finished earlier; ``None`` if there is none, or its file is damaged, or
+        that of another run."""
         if not path.is_file():
             return None
         try:
             channels, metadata = image_files.read_exr(path)
             if fault := image_files.fault_of(channels, metadata):
                 raise InputError(fault)
+            if metadata.get("file") != path.name:
+                raise InputError("it is another run, renamed")
             run = Run(**json.loads(str(metadata["run"])), path=path)
         except (KeyError, TypeError, ValueError) as error:
             self.faults[path] = str(error).removeprefix(f"{path}: ")
@@ -145,7 +148,7 @@ class RunFolder:
     ) -> Run:
         """Writes a run, and returns it with its path."""
         header = {**metadata, "spp": run.spp, "seed": run.seed, "seconds": run.seconds,
-                  "run": json.dumps(run.record())}
+                  "run": json.dumps(run.record()), "file": path.name}
         image_files.write_exr(path, image, "RGB", header)
         return replace(run, path=path)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from .. import marks
 from ..errors import InputError
@@ -26,6 +28,10 @@ _FILES = "scene files"
 
 #: What a state is, and the version of its format.
 _FORM = "mitsuba_ext render 3"
+
+#: The array of a state that holds the digest of the description: a state that somebody has copied
+#: from another folder is not taken up.
+_OF = "description"
 
 #: The most bytes of a description.
 _MOST_BYTES = 1 << 26
@@ -103,6 +109,9 @@ class CheckpointFolder:
                 arrays = archives.read(file, _FORM, f"{file}", "delete it")
                 # States are not compressed, so that they are not larger than their files
                 state = RenderState.from_arrays(arrays, file.stat().st_size)
+                if _OF in arrays:
+                    of = arrays.text(_OF)
+                    arrays.require(of == self._digest(), f"it is no state of {_DESCRIPTION}")
             except (DamagedError, OSError):
                 continue
             if film is not None and not state.fits(film):
@@ -125,13 +134,22 @@ class CheckpointFolder:
         file = self.path / _STATE
         with replacing(file) as temporary:
             with temporary.open("wb") as stream:
-                archives.write_to(stream, _FORM, state.arrays(), is_compressed=False)
+                arrays = {**state.arrays(), _OF: np.array(self._digest())}
+                archives.write_to(stream, _FORM, arrays, is_compressed=False)
                 stream.flush()
                 os.fsync(stream.fileno())
             # A damaged state must not replace the one before it, which is not damaged
             if file.exists() and self.damaged is None:
                 os.replace(file, self.path / _BEFORE)
         self.damaged = None
+
+    def _digest(self) -> str:
+        """That of the stored description; empty if there is none."""
+        try:
+            contents = archives.read_bytes(self.path / _DESCRIPTION, _MOST_BYTES)
+        except OSError:
+            return ""
+        return hashlib.sha256(contents).hexdigest()
 
 
 def check_same(
