@@ -110,6 +110,21 @@ def test_renders_of_several_threads_alternate_and_those_with_one_integrator_do_n
         assert (order in ([1] * 4 + [2] * 4, [2] * 4 + [1] * 4)) == are_same
 
 
+def test_a_render_that_waits_for_its_turn_can_be_cancelled() -> None:
+    scene = mi.load_dict(stage())
+    one, two = (mi.load_dict({"type": "composed_path", "max_depth": 2}) for _ in range(2))
+    ended: list = []
+    with in_turn(one, mi.load_dict(stage()["sensor"])):
+        waiting = threading.Thread(target=lambda: ended.append(two.render(scene, spp=8)))
+        two.is_cancelled = True  # an earlier render was cancelled
+        waiting.start()
+        while two.is_cancelled:
+            time.sleep(0.001)
+        two.cancel()
+    waiting.join(60)
+    assert ended and two.statistics.interrupted and two.statistics.spp < 8
+
+
 def test_progress_may_render_with_what_another_thread_uses_and_wait_for_it() -> None:
     """The other thread has the second integrator already, and waits for its turn."""
     scene = mi.load_dict(stage())

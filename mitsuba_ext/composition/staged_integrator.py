@@ -152,11 +152,8 @@ class StagedIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         spp = self._checked(scene, spp) or self.default_spp
         sensor = camera.find_sensor(scene, sensor)
-        with in_turn(self, sensor):
-            if self._is_batch:
-                return self.render_once(scene, sensor, seed, spp, develop, evaluate)
-            self.is_cancelled = False
-            if self.checkpoint:
+        with in_turn(self, sensor, self._begin):
+            if self.checkpoint and not self._is_batch:
                 return self._render_kept(scene, sensor, seed, spp, develop, evaluate)
             return self.render_once(scene, sensor, seed, spp, develop, evaluate)
 
@@ -185,6 +182,12 @@ class StagedIntegrator(mi.SamplingIntegrator):
         return f"{self.name}[\n{lines}\n]"
 
     # ---- Checkpointed renders ----
+
+    def _begin(self) -> None:
+        """Forgets that an earlier render was cancelled. (Not in turn: whoever cancels a render that
+        waits for its turn means this one.)"""
+        if not self._is_batch:
+            self.is_cancelled = False
 
     def _interval(self, props: mi.Properties) -> Interval:
         text = self.parameter(props, "checkpoint_every", "60s")

@@ -100,13 +100,17 @@ _shared: dict[int, _Shared] = {}
 
 
 @contextmanager
-def in_turn(integrator: mi.Integrator, sensor: mi.Sensor) -> Iterator[None]:
+def in_turn(
+    integrator: mi.Integrator, sensor: mi.Sensor, begin: Callable[[], None] = lambda: None
+) -> Iterator[None]:
     """A context in which no other thread renders, except in :func:`let_others`; and there, none
-    with the integrator, with one that is nested in it, or into the film of the sensor."""
+    with the integrator, with one that is nested in it, or into the film of the sensor. ``begin`` is
+    called when these are no longer used, before the turn."""
     with ExitStack() as stack:
         # All threads in the same order, and before their turn: none waits for one that waits for it
         for place in sorted({each.ptr for each in (*with_nested(integrator), sensor.film())}):
             stack.enter_context(_used(place))
+        begin()
         if _thread.depth == 0:
             _turns.take()
         _thread.depth += 1
