@@ -15,7 +15,7 @@ from mitsuba_ext.rendering.batches import Batches, batch_seeds, each_batch, samp
 from mitsuba_ext.rendering.camera import develop as develop_film
 from mitsuba_ext.rendering.camera import find_sensor
 from mitsuba_ext.rendering.statistics import RenderStatistics
-from mitsuba_ext.rendering.turns import in_turn
+from mitsuba_ext.rendering.turns import in_turn, let_others, tell
 from mitsuba_ext.scene.nesting import refuse_checkpoint
 from mitsuba_ext.startup import registry
 
@@ -153,12 +153,14 @@ class Variance(mi.AdjointIntegrator):
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         sensor = find_sensor(scene, sensor)
-        with in_turn(self, sensor):
+        with in_turn(self, sensor, self._begin):
             return self._render(scene, sensor, seed, spp, develop, evaluate)
+
+    def _begin(self) -> None:
+        self.is_cancelled = False
 
     def _render(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:
         start = time.perf_counter()
-        self.is_cancelled = False
         self.statistics = RenderStatistics()
         film = sensor.film()
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
@@ -173,7 +175,8 @@ class Variance(mi.AdjointIntegrator):
             for batches in each_batch(self.nested, scene, sensor, batch_spp, seeds):
                 self._count(batch_spp)
                 if self.progress is not None:
-                    self.progress(batches.count / batch_count)
+                    tell(self.progress, batches.count / batch_count)
+                let_others()
                 if self.is_cancelled:
                     break
         finally:
