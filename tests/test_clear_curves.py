@@ -3,6 +3,7 @@ refused by methods that need light paths to find it."""
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import mitsuba as mi
 import pytest
 from stage import diffuse, film, lookat, sensor
 from statistical import MANY_SEEDS, REFERENCE_SEEDS, SEEDS, assert_same_quarters, batches, some
+
+from mitsuba_ext.scene.bsdfs import has_clear_curves
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -51,6 +54,21 @@ def test_hair_is_refused_where_only_light_paths_would_find_its_light(
     ours = mi.load_dict({"type": integrator, "max_depth": 4})
     with pytest.raises(NotImplementedError, match=f'"{integrator}": light paths do not pass.*hair'):
         ours.render(_strands(tmp_path, _HAIR), spp=1)
+
+
+def test_hair_in_an_instance_is_found(tmp_path: Path) -> None:
+    strand = tmp_path / "strand.txt"
+    strand.write_text("\n".join(f"{x} 0 0 0.3" for x in range(-3, 4)))
+    for bsdf, is_clear in ((diffuse(), False), (_HAIR, True)):
+        scene = mi.load_dict({
+            "type": "scene",
+            "group": {"type": "shapegroup", "strand": {
+                "type": "bsplinecurve", "filename": str(strand), "bsdf": bsdf,
+            }},
+            "instance": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+        })  # fmt: skip
+        gc.collect()
+        assert has_clear_curves(scene) == is_clear
 
 
 def test_opaque_curves_are_not_refused(tmp_path: Path) -> None:

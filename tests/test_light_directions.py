@@ -108,6 +108,19 @@ def test_samples_carry_on_all_light_with_little_noise(name: str) -> None:
         assert found.std() < 3 * max(means[1], 0.1), (wi, found.std(), found.max())
 
 
+def test_a_bsdf_in_an_instance_is_found_after_another_scene_is_deleted() -> None:
+    others = [mi.load_dict({"type": "diffuse"}) for _ in range(1100)]
+    bump = {"type": "bumpmap", "texture": {"type": "checkerboard"}, "bsdf": diffuse()}
+    scene = mi.load_dict({
+        "type": "scene",
+        "group": {"type": "shapegroup", "ball": {"type": "sphere", "bsdf": bump}},
+        "instance": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+    })  # fmt: skip
+    others.clear()
+    gc.collect()
+    assert bsdf_table(scene, NOT_RECIPROCAL) is not None
+
+
 def test_a_mirror_under_a_normal_map_has_the_weight_that_a_camera_path_finds() -> None:
     """The map darkens what comes from steep directions: seen from the camera, that is the light."""
     mirror = {"type": "conductor", "material": "none"}

@@ -3,26 +3,25 @@ paths cannot render."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Iterator
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .media import has_instances
 from .movers import all_shapes
-
-#: How many of Dr.Jit's indices of BSDFs are examined in scenes with instances.
-_NUMBERS = 1024
 
 
 def bsdf_table(scene: mi.Scene, classes: Collection[str]) -> mi.Bool | None:
     """Which BSDFs of ``scene`` are, or contain, one of the ``classes``: a table over Dr.Jit's
     indices of BSDFs. ``None`` if there is none. The BSDFs of an instance are not accessible: where
     there is one, all BSDFs in memory are examined."""
-    shapes = list(all_shapes(scene.shapes()))
+    shapes = all_shapes(scene.shapes())
     bsdfs = [shape.bsdf() for shape in shapes if shape.bsdf() is not None]
-    if any(shape.class_name() == "Instance" for shape in shapes):
-        bsdfs += _all_in_memory()
+    if has_instances(scene):
+        bsdfs += _all_in_memory(mi.BSDFPtr)
     found = [_index(bsdf) for bsdf in set(bsdfs) if _contains(bsdf, classes)]
     if not found:
         return None
@@ -41,14 +40,19 @@ def has_clear_curves(scene: mi.Scene) -> bool:
     """Does light pass through a curve, such as one with the BSDF ``hair``?
 
     No ray hits a curve from inside. A camera path that enters a curve leaves it unseen: its vertex
-    is where it enters. The reverse light path meets the other side of the curve instead."""
+    is where it enters. The reverse light path meets the other side of the curve instead.
+
+    The shapes of an instance are not accessible: where there is one, all in memory are examined."""
     F = mi.BSDFFlags
+    shapes = list(all_shapes(scene.shapes()))
+    if has_instances(scene):
+        shapes += _all_in_memory(mi.ShapePtr)
     transmits = int(F.DiffuseTransmission) | int(F.GlossyTransmission) | int(F.DeltaTransmission)
     return any(
         shape.class_name() in ("BSplineCurve", "LinearCurve")
         and shape.bsdf() is not None
         and bool(int(shape.bsdf().flags()) & transmits)
-        for shape in all_shapes(scene.shapes())
+        for shape in shapes
     )
 
 
@@ -88,14 +92,15 @@ def _contains(bsdf: mi.BSDF, classes: Collection[str]) -> bool:
     return nested.is_found
 
 
-def _all_in_memory() -> Iterator[mi.BSDF]:
-    for index in range(1, _NUMBERS):
+def _all_in_memory(kind: type) -> Iterator[mi.Object]:
+    """The objects to which arrays of pointers, of this ``kind``, may point."""
+    for index in itertools.count(1):
         try:
-            bsdf = dr.reinterpret_array(mi.BSDFPtr, mi.UInt32(index))[0]
-        except RuntimeError:  # an index that was never in use
-            continue
-        if bsdf is not None:
-            yield bsdf
+            found = dr.reinterpret_array(kind, mi.UInt32(index))[0]
+        except RuntimeError:  # no index from here on was ever in use
+            return
+        if found is not None:  # the object of this index is not deleted
+            yield found
 
 
 def _index(bsdf: mi.BSDF) -> int:
