@@ -1,10 +1,10 @@
-"""Recovers colours from an image: those of all materials in a house with 24 lamps (``rooms``), or
-that of walls that are lit through the gap of a door (``door_ajar``).
+"""Recovers colours from an image: the colours of all materials in a house with 24 lamps
+(``rooms``), or of walls that are lit through the gap of a door (``door_ajar``).
 
     python examples/inverse_rendering.py rooms
 
-Gradients are those of ``composed_prb``, which learns where light comes from; for comparison, as
-many steps with Mitsuba's ``prb``. Prints the error at the end, and writes a plot,
+``composed_prb``, which learns where light comes from, computes the gradients; for comparison,
+Mitsuba's ``prb`` then takes as many steps. Prints the error at the end, and writes a plot,
 ``inverse_rendering.png``.
 """
 

@@ -1,4 +1,4 @@
-"""A technique of one's own: connect a vertex to the light that is nearest to it.
+"""A technique of your own: connect a vertex to the light that is nearest to it.
 
     mitsuba-ext compare scenes/rooms.xml --plugin examples/nearest_light.py --size 160x90 \\
         --spp 16 path "composed_path:next_event=[nearest_light:share=0.7]"

@@ -1,4 +1,4 @@
-"""A learner of one's own: choose lights by the light that pilot connections to each have found.
+"""A learner of your own: choose lights by the light that pilot connections to each have found.
 
     mitsuba-ext compare scenes/window.xml --plugin examples/own_learner.py --size 160x90 \\
         --spp 64 path "composed_path:next_event=[proven_lights],pilot_spp=8"
