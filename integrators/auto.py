@@ -88,9 +88,9 @@ class Auto(LightPathIntegrator):
     few as 4096. Where light paths have less than 0.4 of the variance, the samples before are left
     out of the image.
 
-    Renders of less than 262144 samples are those of :monosp:`path`, and
-    :monosp:`statistics.learned` says so, unless they save what they learn: they would take longer
-    to learn, and to compile the kernels of learning, than for all samples. Light paths must gain
+    With fewer than 262144 samples, it renders as :monosp:`path` does, unless it saves or keeps what
+    it learns: to learn, and to compile the kernels of learning, would take longer than all samples.
+    :monosp:`statistics.learned` then says so. Light paths must gain
     more, the shorter a render is: 1.1 times the efficiency, and twice that of the rest in renders
     of half a million samples. With a :monosp:`timeout`, they are tried only where there is time to
     compile their kernels.
@@ -169,7 +169,7 @@ class Auto(LightPathIntegrator):
         is_short = pixel_count * spp < least and not is_kept
         stages = super().pilots(scene, sensor, 0 if is_short else spp, kernels)
         if is_short and not self.restores:
-            self.too_short = f"nothing: path renders less than {least} samples"
+            self.too_short = f"nothing: with fewer than {least} samples, it is path"
         self._has_media = may_have_media(scene)
         self._has_light_paths = pixel_count <= _MOST_PIXELS and self._can_try(scene)
         trial = PhotonTrial if self._has_media else LightPathTrial

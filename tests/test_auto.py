@@ -42,7 +42,7 @@ def learned(scene: mi.Scene | dict, spp: int, integrator: mi.Integrator | None =
 
 
 def test_a_render_that_is_too_short_to_learn_says_that_it_is_path() -> None:
-    assert learned(stage(), 4) == "nothing: path renders less than 262144 samples"
+    assert learned(stage(), 4) == "nothing: with fewer than 262144 samples, it is path"
     assert "262144 samples (with fewer, it is path)" in str(auto())
 
 

@@ -255,7 +255,7 @@ def test_crop_window_filter_and_depth_replace_those_of_the_scene(run, make_scene
         (["--filter", "tent:width=2"], '"tent:width=2": Found 1 unreferenced property'),
         (["--filter", "box:"], "expected NAME or NAME:key=value"),
         (["--crop", "5x4"], "expected something like 64x36+100+20"),
-        (["--crop", "50x4+0+0"], "Invalid crop window"),
+        (["--crop", "50x4+0+0"], "the crop window 50x4+0+0 does not fit into the image of "),
         (["--max-depth", "-2"], "is not in the range"),
     ],
 )

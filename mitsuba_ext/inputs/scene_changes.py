@@ -39,6 +39,9 @@ class SceneChanges(NamedTuple):
         return {name: value for name, value in found.items() if value}
 
 
+#: Width and height of a film for which a scene gives none.
+_DEFAULT_SIZE = 768, 576
+
 #: Leaves a scene as it is.
 UNCHANGED = SceneChanges()
 
@@ -49,7 +52,8 @@ def change_films(
     """Changes all films of a parsed scene. A sensor without one gets one.
 
     Raises:
-        InputError: ``size`` is given, and a film has a crop window; or there is no such filter.
+        InputError: ``size`` is given, and a film has a crop window; the new crop window does not
+            fit into a film; or there is no such filter.
     """
     import mitsuba as mi
 
@@ -71,6 +75,8 @@ def change_films(
                     f"a size cannot be given for a film with a crop window, unless --crop gives "
                     f"another one ({mi.parser.file_location(state, node)})"
                 )
+            if changes.crop is not None:
+                _check_crop(changes.crop, size or _size(node))
             if changes.rfilter:
                 for key, _child in _children(state, node, mi.ObjectType.ReconstructionFilter):
                     del node.props[key]
@@ -80,7 +86,27 @@ def change_films(
             _children(state, node, mi.ObjectType.Film)
             or _children(state, node, mi.ObjectType.Sensor)
         ):
+            if changes.crop is not None:
+                _check_crop(changes.crop, size or _DEFAULT_SIZE)
             node.props["film"] = mi.load_dict({"type": "hdrfilm", **parameters})
+
+
+def _size(film: mi.parser.SceneNode) -> tuple[int, int]:
+    """The width and height of a parsed film."""
+    import mitsuba as mi
+
+    own = mi.Properties(film.props)  # a copy: reading marks as queried
+    width, height = (own.get(key, x) for key, x in zip(("width", "height"), _DEFAULT_SIZE))
+    return width, height
+
+
+def _check_crop(crop: tuple[int, int, int, int], size: tuple[int, int]) -> None:
+    width, height, x, y = crop
+    if x + width > size[0] or y + height > size[1]:
+        raise InputError(
+            f"the crop window {width}x{height}+{x}+{y} does not fit into the image of "
+            f"{size[0]}x{size[1]} pixels"
+        )
 
 
 def _children(

@@ -6,6 +6,7 @@ Values are passed as JSON text, so that requests to other processes can hold and
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -70,10 +71,7 @@ class SceneValues:
         found = self._parameters
         for key in values:
             if key not in found:
-                raise InputError(
-                    f'the scene has no parameter "{key}"{did_you_mean(key, list(found.keys()))} '
-                    f"(an object with an id is called by it)"
-                )
+                raise InputError(_unknown(key, list(found.keys())))
             if key not in self._before:
                 self._before[key] = _copy(found[key])
         for key, own in self._before.items():
@@ -123,3 +121,15 @@ def _is_transform(value: Any) -> bool:
 def _short(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) < 60 else f"{text[:50]}…"
+
+
+def _unknown(key: str, known: list[str]) -> str:
+    """Says that a scene has no such parameter, and what to do."""
+    name = key.partition(".")[0]
+    own = [f'"{each}"' for each in known if each.startswith(f"{name}.")]
+    hint = did_you_mean(key, [each for each in known if not re.match(r"object_\d+\.", each)])
+    if not hint and own:
+        hint = f": it has {', '.join(own[:5])}"
+    elif not hint:
+        hint = f': no object of the file has the id "{name}"'
+    return f'the scene has no parameter "{key}"{hint}'

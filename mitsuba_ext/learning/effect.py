@@ -12,8 +12,11 @@ class Effect:
 
     Attributes:
         is_kept: Does the last stage use it?
-        variance, time: Those of the last stage with it, divided by those without it; ``None`` where
-            they were not measured. Of a decision that is not kept: why it is not.
+        variance: The variance of the last stage with it, divided by the variance without it;
+            ``None`` where it was not measured. For a decision that is not kept, this and ``time``
+            are the reason.
+        time: The time of the last stage with it, divided by the time without it; ``None`` where it
+            was not measured.
         about: What else was chosen.
     """
 

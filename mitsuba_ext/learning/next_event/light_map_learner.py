@@ -124,7 +124,7 @@ class LightMapLearner(Learner):
             # Mitsuba samples these with a wrong density
             self._is_needed |= self.map.cells.has_smooth_meshes
             if self.map.cells.count == 1 and not self._is_needed:
-                self.map, self._summary = None, "lights: there is one to choose"
+                self.map, self._summary = None, "lights: there is only one"
         if self.map is None:
             return None
         self._scene = scene
@@ -272,7 +272,8 @@ class LightMapLearner(Learner):
         # A trial need not be certain
         least, error = (_TRIAL_EFFICIENCY, 0.0) if is_trial else (_LEAST_EFFICIENCY, error)
         if not is_worth(efficiency, error, least):
-            self._summary = f"lights as path: with {self.map}, {self._effect}"
+            would = f"a map would give {self._effect}"
+            self._summary = f"lights as path chooses them: {would} ({self.map})"
             return False
         self._is_tested = True
         # Later pilots go on recording: without that, they would have other kernels
