@@ -117,7 +117,7 @@ for name in {names!r}:
         print(str(error).splitlines()[-1])
 """)
     for name in names:
-        assert f'"{name}": does not work in the variant "{variant}"' in output
+        assert f'"{name}" does not work in the variant "{variant}"' in output
     assert all(supported in output for supported in runtime.SUPPORTED_VARIANTS)
 
 

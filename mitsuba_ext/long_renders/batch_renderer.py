@@ -24,15 +24,17 @@ class RenderRequest:
 
     Attributes:
         scene: The file.
-        size, definitions: Size of the image, and values of the file's ``$name`` parameters.
-        specification: See :meth:`mitsuba_ext.inputs.chosen.Chosen.of`.
+        size: Width and height of the image in pixels; ``None`` for the film's.
+        definitions: Values of the file's ``$name`` parameters, as pairs.
+        specification: The integrator, as on the command line; ``None`` for the command's default.
         sensor: The index of the sensor.
         seed: The seed of the random numbers.
-        variant, plugins: Mitsuba's variant, and modules that register other plugins.
+        variant: Mitsuba's variant.
+        plugins: Modules that register other plugins.
         threads: Threads of a process; 0 for as many as there are cores.
         values: Values of parameters of the loaded scene, from
             :func:`~mitsuba_ext.inputs.scene_values.as_text`; ``None`` if no frame has any.
-        changes: What else replaces something of the file.
+        changes: The changes of the film and the depth.
         description: Everything that the image depends on, as JSON. A process refuses the request if
             its own files or versions give another description. Empty to skip this check.
     """

@@ -151,7 +151,7 @@ def _register_refusals(variant: str) -> None:
     def refuse(name: str) -> Callable[[mi.Properties], None]:
         def constructor(_props: mi.Properties) -> None:
             raise RuntimeError(
-                f'"{name}": does not work in the variant "{variant}": select one of '
+                f'"{name}" does not work in the variant "{variant}": select one of '
                 f"{', '.join(runtime.SUPPORTED_VARIANTS)}."
             )
 
