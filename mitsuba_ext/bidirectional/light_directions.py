@@ -12,7 +12,8 @@ the surface (a mixture, or one-sample MIS with the balance heuristic: Veach, PhD
 which is large at grazing angles: it reaches 1400 at a ``principledthin`` of roughness 0.3.
 
 A mirror under a bump map leads light and camera paths the same way only if the frame is the same
-for both. Its weight is that of a sample in the reverse direction, which tells.
+for both. A sample of such a mirror therefore has the weight with which a camera path passes it in
+the reverse direction: zero if the mirror leads that path elsewhere.
 """
 
 from __future__ import annotations
