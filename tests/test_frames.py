@@ -217,7 +217,10 @@ def test_other_values_need_no_other_kernels(run, make_scene, tmp_path, monkeypat
 @pytest.mark.parametrize(("value", "words"), [
     ("3", "frame 0: must return a dict"),
     ("1 / 0", "frame 0: ZeroDivisionError"),
-    ("{'ball.radus': 3}", 'no parameter "ball.radus"'),
+    ("{'bal.to_world': 3}", 'no object of the file has the id "bal": did you mean "ball"?'),
+    ("{'ball.to_wold': 3}", 'no parameter "ball.to_wold": did you mean "ball.to_world"?'),
+    ("{'lamp.to_world': 3}", 'no object of the file has the id "lamp"'),
+    ("{'box.q.q.q.q.q.q.q': 3}", 'no parameter "box.q.q.q.q.q.q.q": it has "box.'),
     ("{'ball.to_world': 'up'}", "must be a number"),
     ("{'ball.to_world': [1, 2]}", "4x4"),
     ("{'ball.to_world': float('nan')}", "finite"),

@@ -124,12 +124,14 @@ def _short(value: Any) -> str:
 
 
 def _unknown(key: str, known: list[str]) -> str:
-    """Says that a scene has no such parameter, and what to do."""
+    """Says that a scene has no such parameter, and what was probably meant."""
     name = key.partition(".")[0]
-    own = [f'"{each}"' for each in known if each.startswith(f"{name}.")]
-    hint = did_you_mean(key, [each for each in known if not re.match(r"object_\d+\.", each)])
-    if not hint and own:
-        hint = f": it has {', '.join(own[:5])}"
-    elif not hint:
-        hint = f': no object of the file has the id "{name}"'
+    own = [each for each in known if each.startswith(f"{name}.")]
+    if own:
+        listed = ", ".join(f'"{each}"' for each in own[:5])
+        hint = did_you_mean(key, own) or f": it has {listed}"
+    else:
+        # Mitsuba calls objects without an id "object_" and their address
+        ids = {each.partition(".")[0] for each in known if not re.match(r"object_\d+\.", each)}
+        hint = f': no object of the file has the id "{name}"{did_you_mean(name, ids)}'
     return f'the scene has no parameter "{key}"{hint}'
