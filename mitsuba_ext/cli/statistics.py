@@ -30,9 +30,7 @@ def lines(
     if totals.learning_seconds > 0:
         costs.append(f"learning {totals.learning_seconds:.1f} s")
     if totals.compile_seconds > 0:
-        count = totals.kernels.get("compiled", 0)
-        kernels = f" {count} kernel{'' if count == 1 else 's'}" if count else ""
-        costs.append(f"compiling{kernels} {totals.compile_seconds:.1f} s")
+        costs.append(f"compiling {totals.compile_seconds:.1f} s")
     if totals.tracing_seconds > 0:
         costs.append(f"tracing {totals.tracing_seconds:.1f} s")
     if totals.memory_bytes:
