@@ -115,8 +115,11 @@ class ComposedPRB(common.RBIntegrator):
             'next_event': 'contribution'
     """
 
+    # Of this variant: in the module, those of a variant that is selected later take their place
+    _paths = RememberingPath, SensitivePath
+
     def __init__(self, props: mi.Properties) -> None:
-        self.path, self._sensitive = RememberingPath(props), SensitivePath(props)
+        self.path, self._sensitive = (path(props) for path in self._paths)
         self._for_gradients = self.path
         super().__init__(props)
         self.name, self.max_depth = self.path.name, self.path.max_depth

@@ -44,6 +44,25 @@ def _run(code: str) -> str:
     return result.stdout
 
 
+def test_an_integrator_works_in_a_variant_that_is_selected_again() -> None:
+    _run("""
+import mitsuba_ext, drjit as dr, mitsuba as mi
+for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
+    mi.set_variant(variant)
+    scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "ball": {"type": "sphere"},
+        "camera": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(
+            [0, 0, 4], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 2, "height": 2}}})
+    parameters = mi.traverse(scene)
+    key = next(key for key in parameters.keys() if key.endswith("reflectance.value"))
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    integrator = mi.load_dict({"type": "composed_prb", "max_depth": 3})
+    dr.backward(dr.mean(mi.render(scene, parameters, integrator=integrator, spp=4), axis=None))
+    assert dr.all(dr.grad(parameters[key]) > 0, axis=None)
+""")
+
+
 def test_every_file_that_is_executed_once_per_variant_is() -> None:
     root = Path(__file__).parents[1]
     named = {
