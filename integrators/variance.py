@@ -153,10 +153,10 @@ class Variance(mi.AdjointIntegrator):
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         sensor = find_sensor(scene, sensor)
-        with in_turn(self, sensor, self._begin):
+        with in_turn(self, sensor, self._forget_cancel):
             return self._render(scene, sensor, seed, spp, develop, evaluate)
 
-    def _begin(self) -> None:
+    def _forget_cancel(self) -> None:
         self.is_cancelled = False
 
     def _render(self, scene, sensor, seed, spp, develop, evaluate) -> mi.TensorXf:

@@ -152,7 +152,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         spp = self._checked(scene, spp) or self.default_spp
         sensor = camera.find_sensor(scene, sensor)
-        with in_turn(self, sensor, self._begin):
+        with in_turn(self, sensor, self._forget_cancel):
             if self.checkpoint and not self._is_batch:
                 return self._render_kept(scene, sensor, seed, spp, develop, evaluate)
             return self.render_once(scene, sensor, seed, spp, develop, evaluate)
@@ -183,7 +183,7 @@ class StagedIntegrator(mi.SamplingIntegrator):
 
     # ---- Checkpointed renders ----
 
-    def _begin(self) -> None:
+    def _forget_cancel(self) -> None:
         """Forgets that an earlier render was cancelled. (Not in turn: whoever cancels a render that
         waits for its turn means this one.)"""
         if not self._is_batch:
