@@ -187,7 +187,7 @@ def test_a_scheduler_that_ends_is_named_in_a_sentence(make_scene, tmp_path, numb
             time.sleep(0.05)
         workers.scheduler.send_signal(number)
         _, err = process.communicate(timeout=60)
-    assert process.returncode == 2 and "Traceback" not in err and "distributed" not in err
+    assert process.returncode == 2 and "Traceback" not in err and "distributed" not in err, err
     assert err.endswith(f"mitsuba-ext: {address}: the Dask scheduler is gone\n")
     assert (tmp_path / "a.exr").exists()
 

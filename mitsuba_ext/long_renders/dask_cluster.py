@@ -111,9 +111,10 @@ def dask_cluster(address: str) -> Iterator[tuple[DaskWorkers, Callable[[], None]
         if client.status != "running":
             raise InputError(f"{address}: the Dask scheduler is gone")
 
-    # Tracebacks of lost connections. Each of its loggers has a level of its own
-    for name in list(logging.Logger.manager.loggerDict):
-        if name.partition(".")[0] == "distributed":
+    # Tracebacks of lost connections, also in callbacks of Dask's event loop, which is Tornado's.
+    # Each of these loggers has a level of its own
+    for name in {"tornado.application", "asyncio", *logging.Logger.manager.loggerDict}:
+        if name.partition(".")[0] in ("distributed", "tornado", "asyncio"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     with client:
         try:
