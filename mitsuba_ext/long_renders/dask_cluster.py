@@ -113,8 +113,8 @@ def dask_cluster(address: str) -> Iterator[tuple[DaskWorkers, Callable[[], None]
 
     # Tracebacks of lost connections, also in callbacks of Dask's event loop, which is Tornado's.
     # Each of these loggers has a level of its own
-    for name in {"tornado.application", "asyncio", *logging.Logger.manager.loggerDict}:
-        if name.partition(".")[0] in ("distributed", "tornado", "asyncio"):
+    for name in {"tornado.application", *logging.Logger.manager.loggerDict}:
+        if name.partition(".")[0] in ("distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     with client:
         try:
