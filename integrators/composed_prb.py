@@ -115,7 +115,7 @@ class ComposedPRB(common.RBIntegrator):
             'next_event': 'contribution'
     """
 
-    # Of this variant: in the module, those of a variant that is selected later take their place
+    # Bound here: a variant that is selected later replaces these names in the module
     _paths = RememberingPath, SensitivePath
 
     def __init__(self, props: mi.Properties) -> None:

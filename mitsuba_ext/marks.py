@@ -162,7 +162,7 @@ def locked(folder: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def written_alone(path: Path) -> Iterator[None]:
     """Locks ``path``, which a render will write, against other renders: the image of the one that
-    ends later would replace that of the other. The lock ends with the process.
+    ends later would replace the image of the other. The lock ends with the process.
 
     Raises:
         InputError: Another render will write it.

@@ -2,7 +2,7 @@
 
 Every run is one EXR: its image, and a header with its cost. The file name contains a hash of
 everything that the run depends on: a comparison that is started again uses the stored runs, but
-never those of another scene, integrator, version or machine, nor files that are damaged or renamed:
+never runs of another scene, integrator, version or machine, nor files that are damaged or renamed:
 they hold their name, and a checksum. A run that was timed again in another session has a JSON file
 with these times beside it.
 """
@@ -127,7 +127,7 @@ class RunFolder:
 
     def load(self, path: Path) -> Run | None:
         """A run that was finished earlier; ``None`` if there is none, or its file is damaged, or
-        that of another run."""
+        the file of another run."""
         if not path.is_file():
             return None
         try:

@@ -49,7 +49,7 @@ def check_target(path: Path) -> None:
 
 
 def load(path: Path, scene: mi.Scene, made_by: str, parameter: str) -> States:
-    """Reads what :func:`save` has written. Parameters and errors are those of :func:`read`."""
+    """Reads what :func:`save` has written. Parameters and errors: see :func:`read`."""
     arrays = read(path, scene, made_by, parameter)
     slots = {name.partition("/")[0] for name in arrays.names if "/" in name}
     return {slot: arrays.part(f"{slot}/") for slot in slots}

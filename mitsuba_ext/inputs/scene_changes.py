@@ -19,10 +19,10 @@ class SceneChanges(NamedTuple):
 
     Attributes:
         crop: The crop window in pixels: width, height, and the place (x, y) of its upper left
-            corner. Replaces that of the film.
+            corner. Replaces the crop window of the film.
         rfilter: The reconstruction filter, as text: :func:`.plugin_text.parse_plugin`. Empty for
             the film's own.
-        max_depth: The maximum depth, in place of that of the scene's integrator.
+        max_depth: The maximum depth, instead of the one that the scene's integrator has.
     """
 
     crop: tuple[int, int, int, int] | None = None

@@ -114,8 +114,8 @@ class LoadedScene:
 
 
 def scene_name(source: str | Path | Mapping[str, Any] | None) -> str:
-    """A short name: that of the file. A file ``scene.xml`` has the name of its folder if the path
-    as it was given names that: ``kitchen/scene.xml`` is "kitchen", and ``scene.xml`` is "scene"."""
+    """A short name, taken from the file. A file ``scene.xml`` gets the name of its folder if the
+    given path names it: ``kitchen/scene.xml`` is "kitchen", and ``scene.xml`` is "scene"."""
     if source is None or isinstance(source, Mapping):
         return "scene"
     path = Path(source)

@@ -137,7 +137,7 @@ class RenderState:
         self.film.fill(film, self.aov_names)
 
     def fits(self, film: mi.Film) -> bool:
-        """Are the images those of a film of this size, with these channels? It is then filled."""
+        """Do the images fit a film of this size, with these channels? If so, fills the film."""
         if not self.done:
             return True
         if self.images.mean.shape[:2] != image_shape(film):

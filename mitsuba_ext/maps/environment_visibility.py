@@ -98,7 +98,7 @@ class VisibilityCounts(Observer):
         return self._counts.numpy()
 
     def restore(self, state: StoredArrays) -> None:
-        """Sets the counts to the array ``counts``, those of a film of the same size.
+        """Sets the counts to the array ``counts``, made for a film of the same size.
 
         Raises:
             DamagedError: They are no such counts.

@@ -33,7 +33,7 @@ _EXACT = ("Sphere", "Disk", "Rectangle")
 
 
 def has_near_surfaces(scene: mi.Scene, offset: Callable[[float], float]) -> bool:
-    """Is another surface closer to that of a small transparent object of ``scene`` than the offset
+    """Is another surface closer to a small transparent object of ``scene`` than the offset
     of rays? It is false, too, where intersections are not exact enough for a smaller offset: on a
     GPU, and where there are shapes other than meshes, spheres, disks and rectangles. Meshes that
     Mitsuba has merged count as one object.

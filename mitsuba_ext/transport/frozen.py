@@ -22,7 +22,7 @@ rendered, or that is neither a daemon nor a timer. Functions are traced then. Wh
 records or replays, it holds its own lock when it calls Python, and may wait for a thread that waits
 for that lock; it keeps the state of a replay in static variables, and releases the lock wherever
 memory is allocated; and it reads and replaces the arrays of all objects that kernels can call,
-those of other scenes included. Processes hung, ended, or returned other images.
+objects of other scenes included. Processes hung, ended, or returned other images.
 
 Rules for a frozen function:
 
@@ -207,8 +207,8 @@ def frozen(function: Callable | None = None, *, any_width: bool = False) -> Call
 
 
 def _is_alone() -> bool:
-    """Does no other thread use Dr.Jit? Those that have rendered may, and those of users, which are
-    no daemons."""
+    """Is this the only thread that may use Dr.Jit? Threads that have rendered may, and so may
+    threads that the user started (they are no daemons)."""
     others = set(threading.enumerate()) - {threading.current_thread()}
     if not _process.threads.isdisjoint(others):
         return False

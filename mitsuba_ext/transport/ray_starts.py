@@ -46,7 +46,7 @@ class RayStarts:
         unit: The length that takes the place of Mitsuba's 1.
         exact: Does the offset follow rounding errors? Then ``unit`` is the size of the scene.
 
-    With the defaults, rays are those of Mitsuba.
+    With the defaults, rays are Mitsuba's.
     """
 
     unit: float = 1.0
